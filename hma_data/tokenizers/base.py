@@ -1,0 +1,134 @@
+"""What a tokenizer is: pictures in, discrete ids or continuous latents out, and back.
+
+N pictures, h·w grid, c channels. Pictures are uint8 RGB (N, S, S, 3) with S = `spec.image_size`.
+A module of this package makes one tokenizer or a family; `get_tokenizer` imports it on use.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import TokenizerError
+
+# name -> (module, keyword arguments of its `load`)
+TOKENIZERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "fsq-16": ("hma_data.tokenizers.fsq", {"image_size": 256}),
+    "fsq-8": ("hma_data.tokenizers.fsq", {"image_size": 128}),
+    "raw": ("hma_data.tokenizers.raw", {}),
+}
+
+
+@dataclass(frozen=True)
+class TokenizerSpec:
+    """All that decides what the tokens mean. Two specs that are equal give the same tokens.
+
+    Attributes:
+        name: as `get_tokenizer` takes it.
+        version: of the code, raised when equal weights would give other tokens.
+        kind: discrete ids or continuous latents.
+        image_size: side of the square picture in pixels.
+        grid: (h, w) of the tokens or latents.
+        vocab_size: number of ids; None when continuous.
+        factored: sizes whose product is the vocabulary, low digit first: id = d0 + factored[0]*d1.
+        channels: c of the latents; None when discrete.
+        latent_scale: a model multiplies stored latents by it.
+        dtype: of what is stored: uint16, uint32 or float16; uint8 for pixels.
+        resize_filter: how pictures are brought to `image_size`; it changes the tokens, so it belongs here.
+        weights_sha256: of the weights' file; empty when there are none.
+    """
+
+    name: str
+    version: int
+    kind: Literal["discrete", "continuous"]
+    image_size: int
+    grid: tuple[int, int]
+    vocab_size: int | None = None
+    factored: tuple[int, ...] = field(default=())
+    channels: int | None = None
+    latent_scale: float = 1.0
+    dtype: str = "uint32"
+    resize_filter: Literal["area", "linear"] = "area"
+    weights_sha256: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, as the manifest and the checkpoint hold them."""
+        return json.loads(json.dumps(asdict(self)))
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "TokenizerSpec":
+        """The spec that `to_json` wrote."""
+        return cls(**{**values, "grid": tuple(values["grid"]), "factored": tuple(values.get("factored") or ())})
+
+    @property
+    def digest(self) -> str:
+        """Sixteen hex digits over everything above."""
+        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
+
+
+@runtime_checkable
+class Tokenizer(Protocol):
+    """`encode` and `decode`; a network-backed one shows its module as `.network` (`encoder`, `decoder`)."""
+
+    spec: TokenizerSpec
+
+    def encode(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+        """(N, S, S, 3) uint8 RGB -> (N, h, w) uint32 ids, or (N, c, h, w) float16 latents."""
+        ...
+
+    def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+        """What `encode` gives -> (N, S, S, 3) uint8 RGB."""
+        ...
+
+
+def get_tokenizer(name_or_path: str, *, weights: str | None = None, device: str = "cpu") -> Tokenizer:
+    """The tokenizer of that name, ready to use.
+
+    Args:
+        name_or_path: a name of `TOKENIZERS`.
+        weights: a file to take the weights from instead of the usual place.
+        device: where a network runs: cpu, cuda, mps.
+
+    Raises:
+        TokenizerError: no such tokenizer, or its weights cannot be used.
+    """
+    if name_or_path not in TOKENIZERS:
+        raise TokenizerError(name_or_path, "is not a tokenizer", f"known: {', '.join(sorted(TOKENIZERS))}")
+    module, arguments = TOKENIZERS[name_or_path]
+    tokenizer: Tokenizer = import_module(module).load(
+        name_or_path, weights=weights, device=device, **arguments
+    )
+    return tokenizer
+
+
+def check_frames(frames: NDArray[Any], spec: TokenizerSpec) -> None:
+    """Raise TokenizerError unless frames are (N, S, S, 3) uint8."""
+    size = spec.image_size
+    if frames.ndim != 4 or frames.shape[1:] != (size, size, 3) or frames.dtype != np.uint8:
+        raise TokenizerError(
+            spec.name,
+            f"takes uint8 pictures (N, {size}, {size}, 3), was given {frames.dtype} {tuple(frames.shape)}",
+            "resize with hma_data.video.resize",
+        )
+
+
+def check_tokens(tokens: NDArray[Any], spec: TokenizerSpec) -> None:
+    """Raise TokenizerError unless tokens have the grid of `spec` and lie in its vocabulary."""
+    if spec.kind == "discrete":
+        shape: tuple[int, ...] = spec.grid
+        fits = tokens.ndim == 3 and tokens.shape[1:] == shape and np.issubdtype(tokens.dtype, np.integer)
+    else:
+        shape = (spec.channels or 0, *spec.grid)
+        fits = tokens.ndim == 4 and tokens.shape[1:] == shape
+    if not fits:
+        raise TokenizerError(
+            spec.name, f"decodes (N, {', '.join(map(str, shape))}), was given {tokens.dtype} {tokens.shape}"
+        )
+    if spec.vocab_size and tokens.size and (int(tokens.max()) >= spec.vocab_size or int(tokens.min()) < 0):
+        raise TokenizerError(
+            spec.name, f"ids must lie in 0..{spec.vocab_size - 1}, met {tokens.min()}..{tokens.max()}"
+        )
