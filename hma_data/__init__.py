@@ -1,3 +1,6 @@
-"""Recordings of any robot in, tokenized parquet shards out: registry, sources, alignment, tokenizers, shards, mixtures."""
+"""Recordings of any robot in, tokenized parquet shards out.
+
+Registry, sources, alignment, tokenizers, shards, mixtures, loader.
+"""
 
 __version__ = "0.1.0"

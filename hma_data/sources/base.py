@@ -1,0 +1,247 @@
+"""What a source is: one recording format, read episode by episode.
+
+A source keeps no open files between calls that would not survive a fork; it is cheap to make
+in every worker. `open_source` finds the module by format name, `detect` by looking at the files.
+
+T frames of an episode, A values of a vector.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.embodiment import Embodiment, Vector
+from hma_data.episode import Episode
+from hma_data.errors import EpisodeError, SourceError
+
+FORMATS = {
+    "rlds": "hma_data.sources.rlds",
+    "hdf5": "hma_data.sources.hdf5",
+    "rosbag": "hma_data.sources.rosbag",
+    "lerobot": "hma_data.sources.lerobot",
+}
+
+
+@dataclass(frozen=True)
+class EpisodeRef:
+    """An episode before it is read.
+
+    Attributes:
+        id: unique and stable within the source.
+        frames: how many it has, or a fair estimate; for planning shards without decoding.
+        split: the source's own, "train" or "val"; None where it has none.
+        fingerprint: changes when the recording's bytes change (size and sample of content, not time stamps).
+    """
+
+    id: str
+    frames: int
+    split: str | None = None
+    fingerprint: str = ""
+
+
+@dataclass(frozen=True)
+class KeyInfo:
+    """One key of a recording: what `hma inspect` lists.
+
+    Attributes:
+        key: as an embodiment's YAML would name it.
+        kind: camera, vector, text or other.
+        shape: of one sample, pictures (H, W, 3).
+        dtype: as recorded.
+        hz: measured or stated rate; None when unknown.
+        names: of the values, where the recording has them.
+        codec: of pictures: jpeg, png, raw, av1, h264.
+        count: samples seen (of one episode, or of the whole recording when it is a topic).
+        jitter_ms: standard deviation of the intervals.
+    """
+
+    key: str
+    kind: str
+    shape: tuple[int, ...]
+    dtype: str
+    hz: float | None = None
+    names: tuple[str, ...] | None = None
+    codec: str | None = None
+    count: int | None = None
+    jitter_ms: float | None = None
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What is in a recording, without an embodiment.
+
+    Attributes:
+        format: rlds, hdf5, rosbag or lerobot.
+        episodes: how many.
+        frames: in all, None when it would need a full read.
+        lengths: of the first episodes (at most 1,000).
+        keys: each key once.
+        robot: as the recording names it.
+        problems: what looks wrong, a sentence each.
+        facts: anything else worth a line.
+    """
+
+    format: str
+    uri: str
+    episodes: int
+    keys: tuple[KeyInfo, ...]
+    frames: int | None = None
+    lengths: tuple[int, ...] = ()
+    hz: float | None = None
+    robot: str | None = None
+    problems: tuple[str, ...] = ()
+    facts: dict[str, str] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        return asdict(self)
+
+
+class Source(Protocol):
+    """One recording format."""
+
+    def inspect(self, uri: str) -> Inspection:
+        """What is in the recording."""
+        ...
+
+    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+        """The episodes, in a stable order, without decoding any."""
+        ...
+
+    def episode_ids(self, uri: str) -> list[str]:
+        """Their ids alone."""
+        ...
+
+    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+        """One episode, lazily."""
+        ...
+
+
+def open_source(name: str) -> Source:
+    """The source of that format, e.g. "rlds".
+
+    Raises:
+        SourceError: no such format.
+    """
+    if name not in FORMATS:
+        raise SourceError(name, "is not a source format", f"known: {', '.join(FORMATS)}")
+    source: Source = import_module(FORMATS[name]).open()
+    return source
+
+
+def detect(uri: str) -> str:
+    """The format of the recording at `uri`, by its files' names and first bytes.
+
+    Raises:
+        SourceError: nothing there, or nothing we know.
+    """
+    if "://" in uri and not uri.startswith("file://"):
+        return "lerobot" if uri.startswith("hf://") else "rlds"
+    path = local_path(uri)
+    files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())[:2000]
+    names = {item.name for item in files}
+    if path.is_dir() and (path / "meta" / "info.json").is_file():
+        return "lerobot"
+    if "features.json" in names or any(".tfrecord" in name or ".array_record" in name for name in names):
+        return "rlds"
+    for item in files:
+        if _is_bag(item):
+            return "rosbag"
+        if item.suffix in (".h5", ".hdf5", ".hdf") or first_bytes(item, 8) == b"\x89HDF\r\n\x1a\n":
+            return "hdf5"
+    raise SourceError(
+        uri,
+        "is not a recording of a known format" if files else "holds no files",
+        "expected RLDS (features.json, *.tfrecord*), HDF5, a ROS bag or MCAP, "
+        "or a LeRobotDataset (meta/info.json)",
+    )
+
+
+def _is_bag(path: Path) -> bool:
+    magic = first_bytes(path, 16)
+    known = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3")
+    return path.suffix in (".bag", ".mcap", ".db3") or magic.startswith(known)
+
+
+def local_path(uri: str) -> Path:
+    """The local path of a plain path or file:// URI.
+
+    Raises:
+        SourceError: it does not exist.
+    """
+    path = Path(uri.removeprefix("file://")).expanduser()
+    if not path.exists():
+        raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
+    return path
+
+
+def first_bytes(path: Path, count: int) -> bytes:
+    """The first bytes of a file; empty when it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(count)
+    except OSError:
+        return b""
+
+
+def file_fingerprint(path: Path) -> str:
+    """Sixteen hex digits over a file's size and its first, middle and last 64 KiB; blind to time stamps."""
+    size = path.stat().st_size
+    digest = hashlib.sha256(str(size).encode())
+    with path.open("rb") as file:
+        for offset in (0, max(0, size // 2 - 32768), max(0, size - 65536)):
+            file.seek(offset)
+            digest.update(file.read(65536))
+    return digest.hexdigest()[:16]
+
+
+def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArray[np.float32]:
+    """The vector over time from what was found at each component's key.
+
+    Slices, sign and offset are applied here and nowhere else.
+
+    Args:
+        vector: of the embodiment.
+        pieces: for each component (T, n) or (T,) numbers as recorded.
+        where: the episode, for the error.
+
+    Returns:
+        (T, A) float32.
+
+    Raises:
+        EpisodeError: a width, a length or a dtype does not fit.
+    """
+    return np.concatenate(
+        [component_values(part, piece, where) for part, piece in zip(vector.components, pieces, strict=True)],
+        axis=1,
+    )
+
+
+def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.float32]:
+    """One component's (T, dims) float32; see `compose`."""
+    if piece.dtype == object or piece.dtype.kind not in "fiub":
+        raise EpisodeError(where, f"{part.key} holds {piece.dtype}, not numbers")
+    values = piece.reshape(len(piece), -1) if piece.ndim != 2 else piece
+    width = values.shape[1]
+    if part.slice:
+        if part.slice[1] > width:
+            raise EpisodeError(
+                where,
+                f"{part.key} has {width} values, slice {list(part.slice)} wants more",
+                "correct slice in the YAML",
+            )
+        values = values[:, part.slice[0] : part.slice[1]]
+    elif width != part.dims:
+        raise EpisodeError(
+            where,
+            f"{part.key} has {width} values, the embodiment says {part.dims}",
+            "correct dims or give slice in the YAML",
+        )
+    values = values.astype(np.float64) * np.asarray(part.sign) + np.asarray(part.offset)
+    return values.astype(np.float32)

@@ -1,0 +1,117 @@
+"""Pictures: decode, rotate, crop, and bring to the tokenizer's square.
+
+N pictures, H×W pixels; uint8 RGB everywhere. Resizing happens here and nowhere else; its filter
+is part of the tokenizer's spec because it changes the tokens.
+"""
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.embodiment import Camera
+from hma_data.errors import EpisodeError, MissingDependencyError
+
+Images = NDArray[np.uint8]
+Filter = Literal["area", "linear"]
+MAX_PIXELS = 64_000_000  # a picture that claims more is a bomb or an error
+
+
+def opencv() -> Any:
+    """The cv2 module.
+
+    Raises:
+        MissingDependencyError: it cannot be imported, usually because a build
+            for displays replaced the headless one.
+    """
+    try:
+        import cv2
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "opencv",
+            str(fault),
+            "pip uninstall opencv-python && pip install --force-reinstall opencv-python-headless",
+        ) from fault
+    return cv2
+
+
+def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
+    """A JPEG, PNG or other still picture -> (H, W, 3) RGB.
+
+    Raises:
+        EpisodeError: the bytes are not a picture.
+    """
+    cv2 = opencv()
+    buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
+    width, height = _png_size(buffer)
+    if width * height > MAX_PIXELS:
+        raise EpisodeError(where, f"a picture claims {width}×{height} pixels")
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        picture = cv2.imdecode(buffer, flags) if len(buffer) else None
+    except cv2.error as fault:
+        raise EpisodeError(
+            where, f"a picture of {len(buffer)} bytes cannot be decoded: {fault.err}"
+        ) from fault
+    if picture is None:
+        raise EpisodeError(where, f"a picture of {len(buffer)} bytes cannot be decoded")
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def _png_size(buffer: NDArray[np.uint8]) -> tuple[int, int]:
+    head = bytes(buffer[:24])
+    if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
+        return 0, 0
+    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+
+
+def prepare(frames: Images, camera: Camera, size: int, resize_filter: Filter = "area") -> Images:
+    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, rotation, crop, resize as its YAML says."""
+    if camera.color == "bgr":
+        frames = frames[..., ::-1]
+    if camera.rotate:
+        frames = np.rot90(frames, k=-camera.rotate // 90, axes=(1, 2))
+    if camera.crop:
+        x, y, width, height = camera.crop
+        if y + height > frames.shape[1] or x + width > frames.shape[2]:
+            raise EpisodeError(
+                f"camera {camera.name}",
+                f"crop {list(camera.crop)} leaves the picture of {frames.shape[2]}×{frames.shape[1]}",
+            )
+        frames = frames[:, y : y + height, x : x + width]
+    return resize(frames, size, camera.resize, resize_filter)
+
+
+def resize(
+    frames: Images, size: int, rule: str = "short_side_crop", resize_filter: Filter = "area"
+) -> Images:
+    """(N, H, W, 3) -> (N, size, size, 3).
+
+    Args:
+        rule: short_side_crop (short side to `size`, centre crop), letterbox (long
+            side to `size`, black borders) or stretch.
+        resize_filter: area averages when shrinking and is linear when enlarging; linear is always linear.
+    """
+    cv2 = opencv()
+    height, width = frames.shape[1:3]
+    if rule == "short_side_crop" and height != width:
+        side = min(height, width)
+        top, left = (height - side) // 2, (width - side) // 2
+        frames = frames[:, top : top + side, left : left + side]
+        height = width = side
+    if (height, width) == (size, size):
+        return np.ascontiguousarray(frames)
+    if rule == "letterbox":
+        scale = size / max(height, width)
+        inner_h, inner_w = max(1, round(height * scale)), max(1, round(width * scale))
+    else:
+        inner_h = inner_w = size
+    shrinks = inner_h < height or inner_w < width
+    interpolation = cv2.INTER_AREA if resize_filter == "area" and shrinks else cv2.INTER_LINEAR
+    out = np.zeros((len(frames), size, size, 3), np.uint8)
+    top, left = (size - inner_h) // 2, (size - inner_w) // 2
+    for i, frame in enumerate(frames):
+        out[i, top : top + inner_h, left : left + inner_w] = cv2.resize(
+            np.ascontiguousarray(frame), (inner_w, inner_h), interpolation=interpolation
+        )
+    return out

@@ -1,0 +1,90 @@
+"""YAML as we accept it: plain values only, no surprises.
+
+No tags, no anchors or aliases (nothing that can grow), no duplicate keys, no tabs, at most
+1 MB. Every refusal names the file and the line.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hma_data.errors import HMAError, RegistryError
+
+MAX_BYTES = 1_000_000
+MAX_DEPTH = 32
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """SafeLoader that refuses aliases, duplicate keys and deep nesting."""
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent) or getattr(self.peek_event(), "anchor", None):
+            raise yaml.constructor.ConstructorError(
+                None,
+                None,
+                "anchors and aliases are not accepted: write the value out",
+                self.peek_event().start_mark,
+            )
+        if self.depth >= MAX_DEPTH:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"nested deeper than {MAX_DEPTH}", self.peek_event().start_mark
+            )
+        self.depth += 1
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self.depth -= 1
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key_node, _ in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(
+                    None, None, "a key must be a word", key_node.start_mark
+                )
+            if key_node.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key_node.value!r} is given twice", key_node.start_mark
+                )
+            seen.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
+def parse_yaml(text: str, where: str, error: type[HMAError] = RegistryError) -> Any:
+    """The plain values of a YAML text.
+
+    Raises:
+        error: the text is not YAML as we accept it; the message carries line and column.
+    """
+    try:
+        loader = _PlainLoader(text)
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+    except (yaml.YAMLError, ValueError, RecursionError) as fault:
+        mark = getattr(fault, "problem_mark", None)
+        place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = getattr(fault, "problem", None) or str(fault).splitlines()[0]
+        raise error(where, f"not valid YAML{place}: {problem}") from fault
+
+
+def read_yaml(path: Path, error: type[HMAError] = RegistryError) -> Any:
+    """The plain values of a YAML file; see `parse_yaml`."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise error(path, f"larger than {MAX_BYTES:,} bytes", "a YAML of ours is a few kilobytes")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as fault:
+        raise error(path, "no such file") from fault
+    except (OSError, UnicodeDecodeError) as fault:
+        raise error(path, f"cannot be read: {fault}") from fault
+    return parse_yaml(text, str(path), error)
+
+
+def write_yaml(values: Any) -> str:
+    """Plain values as YAML in the order given."""
+    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=100)
