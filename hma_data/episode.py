@@ -95,9 +95,9 @@ class Clip:
     def __len__(self) -> int:
         return len(self.timestamps)
 
-    def frames(self, camera: str, start: int, stop: int) -> NDArray[np.uint8]:
-        """Pictures (n, H, W, 3) of grid frames start to stop."""
-        return self.episode.streams[camera].frames(self.frame_indices[camera][start:stop])
+    def frames_at(self, camera: str, grid: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Pictures (n, H, W, 3) of those grid frames."""
+        return self.episode.streams[camera].frames(self.frame_indices[camera][grid])
 
 
 class Pictures:

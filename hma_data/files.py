@@ -1,0 +1,61 @@
+"""Files that are whole or absent: written beside, flushed, renamed."""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hma_data.errors import OutputError
+
+PART = ".part"  # ends the name of whatever is not finished
+
+
+@contextmanager
+def atomic_path(final: Path) -> Iterator[Path]:
+    """A path beside `final` to write to; it becomes `final` when the block ends without an error.
+
+    Raises:
+        OutputError: the folder cannot be written, or the disk is full.
+    """
+    part = final.with_name(f".{final.name}.{os.getpid()}{PART}")
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        part.replace(final)
+        sync_folder(final.parent)
+    except OSError as fault:
+        raise OutputError(
+            final, f"cannot be written: {fault.strerror or fault}", "free space or choose another --out"
+        ) from fault
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_atomic(final: Path, content: str | bytes) -> None:
+    """A whole small file; see `atomic_path`."""
+    with atomic_path(final) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in a folder durable."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def file_sha256(path: Path) -> str:
+    """Hex digest of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def remove_parts(folder: Path) -> None:
+    """Delete what a killed run left unfinished in a folder and the folders right below it."""
+    for part in [*folder.glob(f".*{PART}"), *folder.glob(f"*/.*{PART}")]:
+        part.unlink(missing_ok=True)

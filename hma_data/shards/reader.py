@@ -1,0 +1,159 @@
+"""Read a shard set: its episodes, its rows, a row group at a time.
+
+N rows, S tokens a frame, A values of an action.
+"""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from hma_data.errors import ShardError
+from hma_data.shards.manifest import EPISODES, Manifest
+from hma_data.shards.schema import to_numpy, token_column
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class EpisodeIndex:
+    """Where the episodes of a split lie; one entry an episode and camera, arrays of one length.
+
+    Attributes:
+        episode_index: as in the plan.
+        shard: index into `ShardSet.shards(split)`.
+        start: first row in the shard.
+        length: rows.
+    """
+
+    episode_index: Ints
+    shard: Ints
+    start: Ints
+    length: Ints
+
+
+class ShardSet:
+    """A folder that `hma convert` wrote.
+
+    Opening it reads the manifest only; episodes and rows are read when asked for.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        if not self.folder.is_dir():
+            raise ShardError(self.folder, "is not a folder", "give the --out of an hma convert")
+        self.manifest = Manifest.load(self.folder)
+        self.embodiment = self.manifest.embodiment
+        self.spec = self.manifest.tokenizer
+
+    @property
+    def row_stride(self) -> int:
+        """Rows from one frame of the model's grid to the next."""
+        return self.embodiment.stride // self.manifest.frame_stride
+
+    @cached_property
+    def episodes(self) -> pa.Table:
+        """episodes.parquet.
+
+        Raises:
+            ShardError: it is not there or damaged.
+        """
+        path = self.folder / EPISODES
+        try:
+            return pq.read_table(path)
+        except (OSError, pa.ArrowInvalid) as fault:
+            raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
+
+    def shards(self, split: str) -> list[str]:
+        """Names of a split's shards, in order."""
+        return [shard.path for shard in self.manifest.shards if shard.split == split]
+
+    def row_groups(self, split: str) -> list[tuple[int, ...]]:
+        """Rows of each row group of each shard of a split."""
+        return [shard.row_groups for shard in self.manifest.shards if shard.split == split]
+
+    def index(self, split: str, cameras: int | None = None) -> EpisodeIndex:
+        """The split's episodes, in row order; an episode seen by several cameras counts once for each."""
+        cameras = cameras or len(self.manifest.cameras)
+        table = self.episodes.filter(pc.equal(self.episodes["split"], split))
+        names = pa.array(self.shards(split), pa.string())
+        shard = to_numpy(pc.index_in(table["shard"], value_set=names)).astype(np.int64)
+        start, length = (to_numpy(table[name]).astype(np.int64) for name in ("row_start", "length"))
+        index = to_numpy(table["episode_index"]).astype(np.int64)
+        offsets = np.arange(cameras)
+        starts = (start[:, None] + offsets * length[:, None]).ravel()
+        repeat = lambda values: np.repeat(values, cameras)  # noqa: E731
+        return EpisodeIndex(repeat(index), repeat(shard), starts, repeat(length))
+
+    def read(self, shard: str, row_groups: Sequence[int], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Columns of some row groups of a shard: (N,) or (N, width) each.
+
+        Raises:
+            ShardError: the shard is missing or damaged.
+        """
+        path = self.folder / shard
+        try:
+            with pq.ParquetFile(path, pre_buffer=False) as file:
+                table = file.read_row_groups(list(row_groups), columns=list(columns), use_threads=False)
+        except (OSError, pa.ArrowInvalid, pa.ArrowKeyError) as fault:
+            raise ShardError(
+                path, f"cannot be read: {fault}", "hma shards verify tells what is damaged"
+            ) from fault
+        return {name: to_numpy(table[name]) for name in columns}
+
+    def episode_rows(
+        self, episode_index: int, columns: Sequence[str] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """All rows of one episode, cameras one after the other.
+
+        Raises:
+            ShardError: no such episode.
+        """
+        found = self.episodes.filter(pc.equal(self.episodes["episode_index"], episode_index)).to_pylist()
+        if not found:
+            raise ShardError(self.folder, f"has no episode {episode_index}")
+        row = found[0]
+        groups = next(shard.row_groups for shard in self.manifest.shards if shard.path == row["shard"])
+        edges = np.concatenate([[0], np.cumsum(groups)])
+        first = int(np.searchsorted(edges, row["row_start"], side="right")) - 1
+        last = int(np.searchsorted(edges, row["row_start"] + row["rows"], side="left"))
+        wanted = columns or [token_column(self.spec)[0], "action", "timestamp"]
+        values = self.read(row["shard"], range(first, last), wanted)
+        begin = row["row_start"] - edges[first]
+        return {name: value[begin : begin + row["rows"]] for name, value in values.items()}
+
+    def tokens(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """(N, width) of the token column -> (N, h, w) or (N, c, h, w)."""
+        h, w = self.spec.grid
+        return (
+            rows.reshape(-1, h, w)
+            if self.spec.kind == "discrete"
+            else rows.reshape(-1, self.spec.channels or 1, h, w)
+        )
+
+
+class RowGroupCache:
+    """The last row groups read, decoded; shared by whoever reads one shard set in this process."""
+
+    def __init__(self, shards: ShardSet, split: str, columns: Sequence[str], size: int) -> None:
+        self._set, self._split, self._columns, self._size = shards, split, list(columns), size
+        self._kept: OrderedDict[tuple[int, int], dict[str, NDArray[Any]]] = OrderedDict()
+        self._names = shards.shards(split)
+
+    def get(self, shard: int, row_group: int) -> dict[str, NDArray[Any]]:
+        """Columns of one row group."""
+        key = (shard, row_group)
+        if key not in self._kept:
+            self._kept[key] = self._set.read(self._names[shard], [row_group], self._columns)
+            while len(self._kept) > self._size:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]

@@ -1,0 +1,211 @@
+"""The columns and the footer of a shard.
+
+S = h·w tokens a frame, c channels, A values of an action. docs/format.md states all of this.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from hma_data.errors import ShardError
+from hma_data.stats import Stats
+from hma_data.tokenizers.base import TokenizerSpec
+
+SCHEMA_VERSION = 1
+ROW_GROUP = 2048
+_FOOTER = b"hma"
+
+
+@dataclass(frozen=True)
+class EpisodeRow:
+    """One row of episodes.parquet.
+
+    Attributes:
+        episode_index: place in the plan; the same number stands in the shard's rows.
+        id: of the source.
+        split: train or val.
+        shard: its path below the shard set.
+        row_start: of its first row in the shard.
+        rows: in the shard: frames times cameras.
+        length: frames.
+        skew_p50_ms, skew_p95_ms, skew_max_ms: of the stream that was moved furthest.
+        skew: stream -> [p50, p95, max] in ms, as JSON.
+        trimmed: frames cut at the ends, where not every stream ran.
+        flags: remarks, comma separated.
+    """
+
+    episode_index: int
+    id: str
+    split: str
+    shard: str
+    row_start: int
+    rows: int
+    length: int
+    instruction: str
+    success: bool | None
+    fingerprint: str
+    skew_p50_ms: float
+    skew_p95_ms: float
+    skew_max_ms: float
+    skew: str
+    trimmed: int
+    flags: str
+
+
+@dataclass(frozen=True)
+class Refused:
+    """An episode in quarantine: one line of quarantine.jsonl."""
+
+    id: str
+    type: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Footer:
+    """What a shard says about itself; the manifest is made of these alone.
+
+    Attributes:
+        plan: what the shard was made from, see `hma_data.convert.Plan.facts`.
+        name: its path below the shard set.
+        split: train or val.
+        episodes: its episodes, in row order.
+        quarantine: episodes planned for it that were refused.
+        stats: "action" and, where recorded, "state" -> Stats, per raw dim.
+    """
+
+    plan: dict[str, Any]
+    name: str
+    split: str
+    episodes: tuple[EpisodeRow, ...]
+    quarantine: tuple[Refused, ...]
+    stats: dict[str, Stats]
+
+    def to_metadata(self) -> dict[bytes, bytes]:
+        """Key-value metadata of the parquet footer."""
+        values = {
+            "schema_version": SCHEMA_VERSION,
+            "plan": self.plan,
+            "name": self.name,
+            "split": self.split,
+            "episodes": [asdict(row) for row in self.episodes],
+            "quarantine": [asdict(item) for item in self.quarantine],
+            "stats": {name: stats.to_json() for name, stats in self.stats.items()},
+        }
+        facts = {
+            "hma.embodiment": self.plan["embodiment"],
+            "hma.embodiment_hash": self.plan["embodiment_hash"],
+            "hma.tokenizer": self.plan["tokenizer"]["name"],
+            "hma.tokenizer_sha256": self.plan["tokenizer"]["weights_sha256"],
+            "hma.plan_hash": self.plan["hash"],
+        }
+        return {_FOOTER: json.dumps(values).encode(), **{k.encode(): v.encode() for k, v in facts.items()}}
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[bytes, bytes] | None, where: str) -> "Footer":
+        """The footer of a shard.
+
+        Raises:
+            ShardError: the file is parquet but not a shard of ours, or of a version we do not know.
+        """
+        if not metadata or _FOOTER not in metadata:
+            raise ShardError(where, "is parquet but not a shard: its footer has no 'hma' entry")
+        try:
+            values = json.loads(metadata[_FOOTER])
+            if values["schema_version"] != SCHEMA_VERSION:
+                raise ShardError(
+                    where,
+                    f"has schema version {values['schema_version']}, this release reads {SCHEMA_VERSION}",
+                )
+            return cls(
+                plan=values["plan"],
+                name=values["name"],
+                split=values["split"],
+                episodes=tuple(EpisodeRow(**row) for row in values["episodes"]),
+                quarantine=tuple(Refused(**item) for item in values["quarantine"]),
+                stats={name: Stats.from_json(stats) for name, stats in values["stats"].items()},
+            )
+        except (KeyError, TypeError, ValueError) as fault:
+            raise ShardError(where, f"has a damaged footer: {fault}") from fault
+
+
+def token_column(spec: TokenizerSpec) -> tuple[str, int]:
+    """Name of the column that holds a frame, and its values a row."""
+    if spec.kind == "discrete":
+        return "tokens", spec.grid[0] * spec.grid[1]
+    return "latents", (spec.channels or 1) * spec.grid[0] * spec.grid[1]
+
+
+def _vector(values: pa.DataType, width: int) -> pa.DataType:
+    return pa.list_(pa.field("element", values, nullable=False), width)
+
+
+_STORED = {"uint8": pa.uint8(), "uint16": pa.uint16(), "uint32": pa.uint32(), "float16": pa.float16()}
+
+
+def arrow_schema(spec: TokenizerSpec, action_width: int, state_width: int, cameras: int) -> pa.Schema:
+    """Columns of a shard; no value is ever null."""
+    name, width = token_column(spec)
+    columns: list[tuple[str, pa.DataType]] = [
+        ("episode_index", pa.int32()),
+        ("frame_index", pa.int32()),
+        ("timestamp", pa.float64()),
+    ]
+    if cameras > 1:
+        columns.append(("camera", pa.string()))
+    columns.append((name, _vector(_STORED[spec.dtype], width)))
+    columns.append(("action", _vector(pa.float32(), action_width)))
+    if state_width:
+        columns.append(("state", _vector(pa.float32(), state_width)))
+    return pa.schema([pa.field(column, kind, nullable=False) for column, kind in columns])
+
+
+def encodings(schema: pa.Schema) -> dict[str, str]:
+    """Byte-stream split for what looks random, deltas for what counts up."""
+    chosen: dict[str, str] = {}
+    for column in schema:
+        if pa.types.is_fixed_size_list(column.type):
+            if column.type.value_type != pa.uint8():
+                chosen[f"{column.name}.list.element"] = "BYTE_STREAM_SPLIT"
+        elif pa.types.is_floating(column.type):
+            chosen[column.name] = "BYTE_STREAM_SPLIT"
+        elif pa.types.is_integer(column.type):
+            chosen[column.name] = "DELTA_BINARY_PACKED"
+    return chosen
+
+
+def to_arrow(column: pa.Field, values: NDArray[Any]) -> pa.Array:
+    """(N, …) numpy -> the array of that column."""
+    if pa.types.is_fixed_size_list(column.type):
+        flat = pa.array(np.ascontiguousarray(values).reshape(-1), type=column.type.value_type)
+        return pa.FixedSizeListArray.from_arrays(flat, type=column.type)
+    return pa.array(values, type=column.type)
+
+
+def to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
+    """A column -> (N,) or (N, width) numpy, without a copy where arrow allows it."""
+    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    if pa.types.is_fixed_size_list(array.type):
+        return array.flatten().to_numpy(zero_copy_only=False).reshape(-1, array.type.list_size)
+    return array.to_numpy(zero_copy_only=False)
+
+
+def read_footer(path: Any, where: str) -> tuple[Footer, list[int]]:
+    """Footer and rows of each row group of a shard.
+
+    Raises:
+        ShardError: not a whole parquet file, or not a shard.
+    """
+    try:
+        metadata = pq.read_metadata(path)
+    except (pa.ArrowInvalid, OSError) as fault:
+        raise ShardError(
+            where, f"is not a whole parquet file: {fault}", "delete it and convert again"
+        ) from fault
+    footer = Footer.from_metadata(metadata.metadata, where)
+    return footer, [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]

@@ -1,0 +1,102 @@
+"""Write one shard: rows of whole episodes in, one file that is complete or absent out."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from hma_data.files import atomic_path
+from hma_data.shards.schema import ROW_GROUP, Footer, encodings, to_arrow, token_column
+from hma_data.tokenizers.base import TokenizerSpec
+
+
+@dataclass(frozen=True)
+class EpisodeRows:
+    """The rows of one episode as one camera saw it.
+
+    Attributes:
+        episode_index: as in the plan.
+        timestamps: (T,) seconds from the first frame.
+        tokens: (T, h, w) ids or (T, c, h, w) latents.
+        actions: (T, A) float32; states: (T, A') or None.
+        camera: its name; written only where the shard set has more than one.
+    """
+
+    episode_index: int
+    timestamps: NDArray[np.float64]
+    tokens: NDArray[Any]
+    actions: NDArray[np.float32]
+    states: NDArray[np.float32] | None
+    camera: str
+
+
+class ShardWriter:
+    """Context manager: `add` episodes, then `close` with the footer; without `close` nothing is left."""
+
+    def __init__(self, path: Path, schema: pa.Schema, spec: TokenizerSpec) -> None:
+        self._atomic = atomic_path(path)
+        self._schema, self._tokens = schema, token_column(spec)[0]
+        self._pending: list[pa.Table] = []
+        self._closed = False
+        self.rows = 0
+
+    def __enter__(self) -> "ShardWriter":
+        self._writer = pq.ParquetWriter(
+            self._atomic.__enter__(),
+            self._schema,
+            compression="zstd",
+            compression_level=6,  # 1 % smaller than 3 at half its speed, still far faster than any tokenizer
+            data_page_size=4 << 20,
+            use_dictionary=["camera"] if "camera" in self._schema.names else False,
+            column_encoding=encodings(self._schema),
+            write_statistics=["episode_index", "frame_index"],
+            store_schema=True,
+        )
+        return self
+
+    def add(self, episode: EpisodeRows) -> None:
+        """Append an episode; row groups are made of whole episodes where they fit."""
+        length = len(episode.timestamps)
+        values: dict[str, NDArray[Any]] = {
+            "episode_index": np.full(length, episode.episode_index, np.int32),
+            "frame_index": np.arange(length, dtype=np.int32),
+            "timestamp": episode.timestamps,
+            "camera": np.full(length, episode.camera),
+            self._tokens: episode.tokens,
+            "action": episode.actions,
+        }
+        if episode.states is not None:
+            values["state"] = episode.states
+        table = pa.table([to_arrow(field, values[field.name]) for field in self._schema], schema=self._schema)
+        if self._pending and sum(map(len, self._pending)) + length > ROW_GROUP:
+            self._flush()
+        self._pending.append(table)
+        self.rows += length
+
+    def _flush(self) -> None:
+        table = pa.concat_tables(self._pending).combine_chunks()
+        for start in range(0, len(table), ROW_GROUP):
+            self._writer.write_table(table.slice(start, ROW_GROUP), row_group_size=ROW_GROUP)
+        self._pending = []
+
+    def close(self, footer: Footer) -> None:
+        """Write what is pending and the footer; the shard appears under its name when the block ends."""
+        if self._pending:
+            self._flush()
+        self._writer.add_key_value_metadata(footer.to_metadata())
+        self._writer.close()
+        self._closed = True
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self._closed:
+            self._writer.close()
+            if kind is None:
+                kind, fault = RuntimeError, RuntimeError("a shard was left without its footer")
+        self._atomic.__exit__(kind, fault, trace)
