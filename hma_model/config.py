@@ -1,0 +1,286 @@
+"""What the network is: one frozen configuration, and the action space of each embodiment.
+
+`HMAConfig` describes everything the embodiments share; `ActionSpace` is what the network must know of
+one embodiment. Both are validated when made and go to JSON and back without loss.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from hma_data.errors import RecipeError
+
+CONDITIONINGS = ("modulation", "concat", "add", "cross_attention")
+OBJECTIVES = ("forward", "passive", "policy", "full", "inverse")
+_CHOICES = {
+    "kind": ("discrete", "continuous"),
+    "time_position": ("rotary", "learned"),
+    "action_alignment": ("previous", "current"),
+    "modulation_out": ("trunk", "embodiment"),
+    "absent_action": ("embedding", "skip"),
+    "action_loss": ("mse", "diffusion"),
+    "action_target": ("normalized", "raw"),
+}
+_AT_LEAST_ONE = (
+    *("layers", "width", "heads", "mlp_ratio", "frames", "channels", "patch", "action_tokens", "base_width"),
+    *("history_frames", "diffusion_depth", "diffusion_width", "diffusion_train_steps"),
+    *("diffusion_sample_steps", "diffusion_repeats"),
+)
+_SHARES = ("label_smoothing", "corrupt_max", "history_probability", "mask_ratio_min", "dropout")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HMAConfig:
+    """The network's architecture, objectives and mask schedule (paper section 3).
+
+    Raises:
+        RecipeError: a value is not allowed; it names the field, the value and what is allowed.
+    """
+
+    kind: str = "discrete"  # discrete: VQ tokens, cross-entropy; continuous: latents, diffusion head
+    layers: int = 32
+    width: int = 256
+    heads: int = 8
+    mlp_ratio: float = 4.0
+    frames: int = 12  # T, the window; also how far back temporal attention sees in a longer rollout
+    grid: tuple[int, int] = (
+        16,
+        16,
+    )  # the tokenizer's (h, w); the continuous model's tokens are patches of it
+    dropout: float = 0.0  # in the MLPs
+
+    factored: tuple[int, ...] = (512, 512)  # discrete: values a digit, low digit first
+    channels: int = 4  # continuous: the latents' channels,
+    patch: int = 2  # the side of a patch that becomes one token,
+    latent_scale: float = 1.0  # and what stored latents are multiplied by
+
+    conditioning: tuple[str, ...] = ("modulation",)  # any of CONDITIONINGS together
+    shared_modulation: bool = False  # False: modulation weights per embodiment (paper); True: in the trunk
+    modulation_out: str = "trunk"  # whose the projection after the modulated norm is; released: embodiment
+    action_tokens: int = 1  # copies of the action embedding put after a frame's tokens (concat)
+    absent_action: str = (
+        "embedding"  # without any actions: a learned embedding, or skip conditioning (released)
+    )
+    action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
+
+    time_position: str = "rotary"  # relative, so that a cache may roll; "learned": absolute (released)
+    rotary_base: float = 100.0  # longest wavelength over the shortest; windows are short
+    temporal_norm: bool = True  # norm before temporal attention; the released code has none
+    final_norm: bool = True  # norm after the last block; the released code has none
+    qkv_bias: bool = False
+    proj_bias: bool = True
+    mlp_bias: bool = True
+    qk_norm: bool = False
+    mup: bool = False  # attention scale 8 / head_dim and a readout that shrinks with width
+    base_width: int = 256  # where muP's multipliers are one
+
+    objectives: Mapping[str, float] = field(
+        default_factory=lambda: {"forward": 1.0}
+    )  # how often each is drawn
+    action_loss: str = "mse"
+    action_target: str = "normalized"  # "raw": what the released action heads were trained on
+    action_loss_weight: float = 0.5  # beside the video loss
+    label_smoothing: float = 0.01
+    corrupt_max: float = 0.2  # discrete: a sample's share of digits replaced at random is U(0, this)
+    history_probability: float = (
+        0.2  # how often a longer history stays unmasked, with later frames corrupted more
+    )
+    history_frames: int = 4  # the shortest such history
+    mask_ratio_min: float = 0.0  # a masked frame's smallest mask probability
+
+    diffusion_depth: int = 3
+    diffusion_width: int = 1024
+    diffusion_train_steps: int = 1000
+    diffusion_sample_steps: int = 100
+    diffusion_clip: float = 10.0  # a step's estimate of the clean sample is clipped to ± this
+    diffusion_repeats: int = 1  # noise levels drawn per token and training step
+    diffusion_variance: bool = False  # the head has variance outputs, which DDIM never reads (released)
+
+    tokenizer: Mapping[str, Any] = field(default_factory=dict)  # the tokenizer's spec, kept for checkpoints
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "grid", tuple(self.grid))
+        object.__setattr__(self, "factored", tuple(self.factored))
+        conditioning = self.conditioning
+        if isinstance(conditioning, str):
+            conditioning = tuple(conditioning.split("+"))
+        object.__setattr__(self, "conditioning", tuple(conditioning))
+        object.__setattr__(self, "objectives", dict(self.objectives))
+        object.__setattr__(self, "tokenizer", dict(self.tokenizer))
+        _check_scalars(self)
+        _check_shapes(self)
+        _check_sets(self)
+
+    @property
+    def token_grid(self) -> tuple[int, int]:
+        """(h, w) of the tokens the trunk sees in a frame."""
+        side = self.patch if self.kind == "continuous" else 1
+        return self.grid[0] // side, self.grid[1] // side
+
+    @property
+    def tokens_per_frame(self) -> int:
+        """S, without action tokens."""
+        return math.prod(self.token_grid)
+
+    @property
+    def appended_tokens(self) -> int:
+        """Action tokens after each frame's own."""
+        return self.action_tokens if "concat" in self.conditioning else 0
+
+    @property
+    def vocab_size(self) -> int:
+        """Number of token ids; also the id that means masked."""
+        return math.prod(self.factored)
+
+    @property
+    def patch_dim(self) -> int:
+        """Values in one patch of latents."""
+        return self.channels * self.patch**2
+
+    @property
+    def head_dim(self) -> int:
+        """Width of one attention head."""
+        return self.width // self.heads
+
+    def replace(self, **changes: Any) -> Self:
+        """The same configuration with some fields changed, validated again."""
+        return dataclasses.replace(self, **changes)
+
+    def to_json(self) -> dict[str, Any]:
+        """A dictionary that `json.dumps` takes and `from_json` reads back."""
+        return {
+            f.name: list(value) if isinstance(value := getattr(self, f.name), tuple) else value
+            for f in dataclasses.fields(self)
+        }
+
+    @classmethod
+    def from_json(cls, source: str | Mapping[str, Any], where: str = "model") -> Self:
+        """From `to_json`'s dictionary or its text; unknown fields are an error naming them."""
+        values = json.loads(source) if isinstance(source, str) else dict(source)
+        unknown = sorted(set(values) - {f.name for f in dataclasses.fields(cls)})
+        if unknown:
+            names = ", ".join(f.name for f in dataclasses.fields(cls))
+            raise RecipeError(
+                f"{where}.{unknown[0]}", "is not a field of the model", f"the fields are {names}"
+            )
+        return cls(**values)
+
+
+def _refuse(name: str, value: object, allowed: str) -> RecipeError:
+    return RecipeError(f"model.{name}", f"{value!r} is not allowed", f"give {allowed}")
+
+
+def _check_scalars(config: HMAConfig) -> None:
+    for name, choices in _CHOICES.items():
+        if getattr(config, name) not in choices:
+            raise _refuse(name, getattr(config, name), "one of " + ", ".join(choices))
+    for name in _AT_LEAST_ONE:
+        if not getattr(config, name) >= 1:
+            raise _refuse(name, getattr(config, name), "a number of at least 1")
+    for name in _SHARES:
+        if not 0 <= getattr(config, name) <= 1:
+            raise _refuse(name, getattr(config, name), "a share from 0 to 1")
+    for name in ("latent_scale", "rotary_base", "diffusion_clip"):
+        if not (math.isfinite(value := getattr(config, name)) and value > 0):
+            raise _refuse(name, value, "a positive number")
+    if not (math.isfinite(config.action_loss_weight) and config.action_loss_weight >= 0):
+        raise _refuse("action_loss_weight", config.action_loss_weight, "a number of at least 0")
+
+
+def _check_shapes(config: HMAConfig) -> None:
+    if len(config.grid) != 2 or min(config.grid) < 1:
+        raise _refuse("grid", config.grid, "(h, w), both at least 1")
+    if not config.factored or min(config.factored) < 2:
+        raise _refuse("factored", config.factored, "at least one digit of at least two values")
+    if config.width % config.heads:
+        raise _refuse("heads", config.heads, f"a divisor of the width, {config.width}")
+    if config.time_position == "rotary" and config.head_dim % 2:
+        raise _refuse(
+            "heads", config.heads, f"a width a head that is even, not {config.head_dim}, for rotary time"
+        )
+    if config.kind == "continuous" and any(side % config.patch for side in config.grid):
+        raise _refuse("patch", config.patch, f"a divisor of both sides of the grid, {config.grid}")
+
+
+def _check_sets(config: HMAConfig) -> None:
+    if not config.conditioning or set(config.conditioning) - set(CONDITIONINGS):
+        raise _refuse("conditioning", config.conditioning, "some of " + ", ".join(CONDITIONINGS))
+    if set(config.objectives) - set(OBJECTIVES):
+        raise _refuse("objectives", config.objectives, "weights for some of " + ", ".join(OBJECTIVES))
+    weights = list(config.objectives.values())
+    if not weights or min(weights) < 0 or not 0 < sum(weights) < math.inf:
+        raise _refuse("objectives", config.objectives, "weights of at least 0 that do not all vanish")
+    if config.shared_modulation and config.modulation_out == "embodiment":
+        raise _refuse("modulation_out", "embodiment", "trunk, as shared_modulation is on")
+
+
+class _Embodiment(Protocol):
+    @property
+    def id(self) -> str: ...
+    @property
+    def action_dim(self) -> int: ...
+    @property
+    def stride(self) -> int: ...
+    @property
+    def normalize_mask(self) -> Any: ...
+
+
+class _Stats(Protocol):
+    @property
+    def mean(self) -> Any: ...
+    @property
+    def std(self) -> Any: ...
+
+
+@dataclass(frozen=True)
+class ActionSpace:
+    """What the network must know of an embodiment.
+
+    Attributes:
+        id: the embodiment's id.
+        action_dim: A, values of one raw action.
+        stride: actions in a chunk.
+        mean, std: (A,) of the raw actions.
+        normalize: (A,) False for dims that pass through as they are.
+
+    Raises:
+        RecipeError: lengths differ from action_dim, or statistics are not finite.
+    """
+
+    id: str
+    action_dim: int
+    stride: int
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    normalize: tuple[bool, ...]
+
+    def __post_init__(self) -> None:
+        if self.action_dim < 1 or self.stride < 1:
+            raise RecipeError(
+                self.id, f"action_dim {self.action_dim} and stride {self.stride} must be at least 1"
+            )
+        for name in ("mean", "std", "normalize"):
+            if len(getattr(self, name)) != self.action_dim:
+                fault = f"{name} has {len(getattr(self, name))} values where the action has {self.action_dim}"
+                raise RecipeError(self.id, fault, "recompute the statistics of this embodiment")
+        if not all(map(math.isfinite, (*self.mean, *self.std))) or min(self.std) < 0:
+            raise RecipeError(self.id, "action statistics are not finite", "recompute them on clean data")
+
+    @property
+    def chunk_dim(self) -> int:
+        """K = stride * action_dim."""
+        return self.stride * self.action_dim
+
+    @classmethod
+    def of(cls, embodiment: _Embodiment, stats: _Stats | None = None) -> Self:
+        """From a registry embodiment and its statistics; without any, actions pass unchanged."""
+        dims = embodiment.action_dim
+        mean = np.zeros(dims) if stats is None else np.asarray(stats.mean, dtype=np.float64)
+        std = np.ones(dims) if stats is None else np.asarray(stats.std, dtype=np.float64)
+        mask = np.asarray(embodiment.normalize_mask, dtype=bool)
+        return cls(embodiment.id, dims, embodiment.stride, *(tuple(a.tolist()) for a in (mean, std, mask)))

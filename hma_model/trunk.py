@@ -1,0 +1,294 @@
+"""The space-time transformer that all embodiments share (paper section 3).
+
+A block attends in both directions among a frame's tokens, is modulated by the action, attends to earlier
+frames at the same place, and ends with an MLP. Nothing ever flows backwards in time, so keys and values of
+past frames can be kept (`cache`).
+
+B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers, R cache slots.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from hma_model.config import HMAConfig
+from hma_model.embed import LatentEmbedding, TokenEmbedding
+from hma_model.stem import Modulation
+
+
+@dataclass
+class Conditioning:
+    """What actions tell the trunk.
+
+    Attributes:
+        embedding: (B, T, D) of the chunk in force at each frame; None without conditioning.
+        modulation: (L, B, T, 2D) shift and gain.
+        out: per group of samples, in batch order, its size and the embodiment's projections after the
+            modulated norm (L, D, D) and (L, D); None when the trunk has them.
+    """
+
+    embedding: Tensor | None = None
+    modulation: Tensor | None = None
+    out: list[tuple[int, Tensor, Tensor]] | None = None
+
+
+@dataclass
+class Clock:
+    """When the frames of a call take place.
+
+    Attributes:
+        positions: (T,) int64, the frames' times.
+        allowed: (T, keys) bool, which key frames each frame may see.
+        rotary: cos and sin (T, head_dim / 2) of the rotary angles.
+        causal: `allowed` is the plain lower triangle.
+        slots: (T,) int64, where in the cache the frames' keys and values go; None without a cache.
+    """
+
+    positions: Tensor
+    allowed: Tensor
+    rotary: tuple[Tensor, Tensor]
+    causal: bool = False
+    slots: Tensor | None = None
+
+
+@dataclass
+class LayerCache:
+    """Keys and values of one layer.
+
+    Attributes:
+        time: (2, B*N, heads, R, head_dim).
+        action: (2, B, heads, R, head_dim), with cross-attention.
+    """
+
+    time: Tensor
+    action: Tensor | None = None
+
+
+def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Cos and sin, float32 (T, head_dim / 2), of the rotary angles at the times (T,)."""
+    half = max(config.head_dim // 2, 1)
+    steps = torch.arange(half, device=positions.device, dtype=torch.float32) / half
+    angles = positions.float().unsqueeze(-1) * config.rotary_base**-steps
+    return angles.cos(), angles.sin()
+
+
+def window_clock(config: HMAConfig, frames: int, device: torch.device | str) -> Clock:
+    """The clock of `frames` consecutive frames, each seeing itself and the `config.frames` - 1 before it."""
+    positions = torch.arange(frames, device=device)
+    age = positions.unsqueeze(1) - positions
+    allowed = (age >= 0) & (age < config.frames)
+    return Clock(positions, allowed, rotary_angles(config, positions), causal=frames <= config.frames)
+
+
+def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
+    """Rotate x (..., T, heads, head_dim) by each frame's angles."""
+    cos, sin = (angle.to(x.dtype).unsqueeze(-2) for angle in rotary)
+    first, second = x.chunk(2, dim=-1)
+    return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1)
+
+
+class Attention(nn.Module):
+    """Projections around scaled dot-product attention."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.heads = config.heads
+        self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
+        self.qkv = nn.Linear(width, 3 * width, bias=config.qkv_bias)
+        self.proj = nn.Linear(width, width, bias=config.proj_bias)
+        self.q_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
+        self.k_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
+
+    def project(self, x: Tensor, rotary: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor, Tensor]:
+        """(M, length, D) -> queries, keys, values (M, heads, length, head_dim)."""
+        q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).unbind(2)
+        q, k = self.q_norm(q), self.k_norm(k)
+        if rotary is not None:
+            q, k = rotate(q, rotary), rotate(k, rotary)
+        return q.transpose(1, 2), k.transpose(1, 2), v.transpose(1, 2)
+
+    def merge(
+        self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None, causal: bool = False
+    ) -> Tensor:
+        """Attend and project back: (M, length, D)."""
+        mixed = F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=self.scale)
+        return self.proj(mixed.transpose(1, 2).flatten(-2))
+
+
+class TemporalAttention(Attention):
+    """Causal attention over time, at each place of the frame by itself."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__(config)
+        self.rotary = config.time_position == "rotary"
+
+    def forward(self, x: Tensor, clock: Clock, cache: LayerCache | None) -> Tensor:
+        """(B, T, N, D) -> the same shape."""
+        b, t, n, width = x.shape
+        rows = x.transpose(1, 2).reshape(b * n, t, width)
+        q, k, v = self.project(rows, clock.rotary if self.rotary else None)
+        if cache is not None:
+            assert clock.slots is not None
+            k = cache.time[0].index_copy_(2, clock.slots, k)
+            v = cache.time[1].index_copy_(2, clock.slots, v)
+        mask = None if clock.causal else clock.allowed
+        return self.merge(q, k, v, mask, clock.causal).view(b, n, t, width).transpose(1, 2)
+
+
+class ActionAttention(nn.Module):
+    """Cross-attention: a frame's tokens attend to the action embeddings up to that frame, in rotary time."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.heads = config.heads
+        self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
+        self.q = nn.Linear(width, width, bias=config.qkv_bias)
+        self.kv = nn.Linear(width, 2 * width, bias=config.qkv_bias)
+        self.proj = nn.Linear(width, width, bias=config.proj_bias)
+
+    def forward(self, x: Tensor, embedding: Tensor, clock: Clock, cache: LayerCache | None) -> Tensor:
+        """Tokens (B, T, N, D) and action embeddings (B, T, D) -> (B, T, N, D)."""
+        b, t, n, _ = x.shape
+        q = rotate(
+            self.q(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), clock.rotary
+        )  # (B, N, T, heads, hd)
+        k, v = self.kv(embedding).unflatten(-1, (2, self.heads, -1)).unbind(2)
+        k, v = rotate(k, clock.rotary).transpose(1, 2), v.transpose(1, 2)
+        if cache is not None and cache.action is not None:
+            assert clock.slots is not None
+            k = cache.action[0].index_copy_(2, clock.slots, k)
+            v = cache.action[1].index_copy_(2, clock.slots, v)
+        queries = q.permute(0, 3, 2, 1, 4).flatten(2, 3)  # (B, heads, T*N, head_dim)
+        mask = clock.allowed.repeat_interleave(n, dim=0)
+        mixed = F.scaled_dot_product_attention(queries, k, v, mask, scale=self.scale)
+        return self.proj(mixed.transpose(1, 2).flatten(-2)).view(b, t, n, -1)
+
+
+class MLP(nn.Module):
+    """Two linear maps with a GELU between."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        hidden = int(config.width * config.mlp_ratio)
+        self.fc1 = nn.Linear(config.width, hidden, bias=config.mlp_bias)
+        self.fc2 = nn.Linear(hidden, config.width, bias=config.mlp_bias)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.dropout(self.fc2(self.dropout(F.gelu(self.fc1(x)))))
+
+
+class Block(nn.Module):
+    """Space, action, time, MLP; each is added to the stream."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.space_norm = nn.LayerNorm(width)
+        self.space = Attention(config)
+        self.modulation_out: nn.Linear | None = None
+        if "modulation" in config.conditioning and config.modulation_out == "trunk":
+            self.modulation_out = nn.Linear(width, width)
+        self.action: ActionAttention | None = None
+        if "cross_attention" in config.conditioning:
+            self.action_norm = nn.LayerNorm(width)
+            self.action = ActionAttention(config)
+        self.time_norm = nn.LayerNorm(width) if config.temporal_norm else nn.Identity()
+        self.time = TemporalAttention(config)
+        self.mlp_norm = nn.LayerNorm(width)
+        self.mlp = MLP(config)
+
+    def forward(
+        self, x: Tensor, conditioning: Conditioning, layer: int, clock: Clock, cache: LayerCache | None
+    ) -> Tensor:
+        """(B, T, N, D) -> the same shape."""
+        frames = self.space_norm(x).flatten(0, 1)
+        x = x + self.space.merge(*self.space.project(frames, None)).view(x.shape)
+        if conditioning.modulation is not None:
+            x = x + self.modulate(x, conditioning, layer)
+        if self.action is not None and conditioning.embedding is not None:
+            x = x + self.action(self.action_norm(x), conditioning.embedding, clock, cache)
+        x = x + self.time(self.time_norm(x), clock, cache)
+        return x + self.mlp(self.mlp_norm(x))
+
+    def modulate(self, x: Tensor, conditioning: Conditioning, layer: int) -> Tensor:
+        """The modulated norm of all tokens, projected."""
+        assert conditioning.modulation is not None
+        shift, gain = conditioning.modulation[layer].unsqueeze(2).chunk(2, dim=-1)
+        modulated = torch.addcmul(shift, F.layer_norm(x, x.shape[-1:], eps=1e-6), gain)
+        if self.modulation_out is not None:
+            return self.modulation_out(modulated)
+        assert conditioning.out is not None
+        parts = modulated.split([size for size, _, _ in conditioning.out])
+        projected = [F.linear(part, w[layer], b[layer]) for part, (_, w, b) in zip(parts, conditioning.out)]
+        return projected[0] if len(projected) == 1 else torch.cat(projected)
+
+
+class Trunk(nn.Module):
+    """Embedding, positions, blocks.
+
+    Attributes:
+        checkpointing: recompute each block in the backward pass instead of keeping its activations.
+    """
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.checkpointing = False
+        learned = config.time_position == "learned"
+        tokens = config.tokens_per_frame + config.appended_tokens
+        self.embed = LatentEmbedding(config) if config.kind == "continuous" else TokenEmbedding(config)
+        self.position = nn.Parameter(
+            torch.randn(config.frames if learned else 1, tokens, config.width) * 0.02
+        )
+        self.embed_norm = nn.LayerNorm(config.width) if config.kind == "continuous" else nn.Identity()
+        self.absent = nn.Parameter(torch.randn(config.frames if learned else 1, config.width) * 0.02)
+        self.modulation: Modulation | None = None
+        if "modulation" in config.conditioning and config.shared_modulation:
+            self.modulation = Modulation(config)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
+        self.norm = nn.LayerNorm(config.width) if config.final_norm else nn.Identity()
+        initialize(self, config)
+
+    def forward(
+        self, x: Tensor, conditioning: Conditioning, clock: Clock, caches: list[LayerCache] | None = None
+    ) -> Tensor:
+        """Embedded tokens (B, T, S, D) -> features (B, T, N, D), action tokens after the frame's own."""
+        x = self.embed_norm(self.join(x, conditioning.embedding, clock))
+        for layer, block in enumerate(self.blocks):
+            cache = None if caches is None else caches[layer]
+            if self.checkpointing and self.training and torch.is_grad_enabled():
+                x = checkpoint(block, x, conditioning, layer, clock, cache, use_reentrant=False)
+            else:
+                x = block(x, conditioning, layer, clock, cache)
+        return self.norm(x)
+
+    def join(self, x: Tensor, embedding: Tensor | None, clock: Clock) -> Tensor:
+        """Add or append the action embeddings (B, T, D), and add the positions."""
+        if embedding is not None and "add" in self.config.conditioning:
+            x = x + embedding.unsqueeze(2)
+        if embedding is not None and self.config.appended_tokens:
+            copies = embedding.unsqueeze(2).expand(-1, -1, self.config.appended_tokens, -1)
+            x = torch.cat([x, copies.to(x.dtype)], dim=2)
+        return x + self.at(self.position, clock)[:, : x.shape[2]]
+
+    def at(self, table: Tensor, clock: Clock) -> Tensor:
+        """The rows of a table of times, or its only row."""
+        return table if table.shape[0] == 1 else table[clock.positions]
+
+
+def initialize(trunk: Trunk, config: HMAConfig) -> None:
+    """Unit-variance maps, with the ends of the residual branches scaled so that the stream stays level."""
+    branches = (3 + bool({"modulation", "cross_attention"} & set(config.conditioning))) * config.layers
+    for name, module in trunk.blocks.named_modules():
+        if isinstance(module, nn.Linear):
+            ends = name.endswith(("proj", "fc2", "modulation_out"))
+            std = module.in_features**-0.5 * (branches**-0.5 if ends else 1.0)
+            nn.init.normal_(module.weight, std=std)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
