@@ -11,10 +11,11 @@ import fcntl
 import json
 import os
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +118,7 @@ def plan_conversion(
 def convert(
     embodiment: Embodiment,
     source: str | None,
-    tokenizer: str,
+    tokenizer: str | Tokenizer,
     out: Path,
     *,
     settings: Settings | None = None,
@@ -133,7 +134,7 @@ def convert(
     Args:
         embodiment: the robot.
         source: URI of the recording; None takes the one in the embodiment's YAML.
-        tokenizer: name, see `get_tokenizer`.
+        tokenizer: name, see `get_tokenizer`; or one that is open already, for a single worker.
         workers: processes.
         weights, device: of the tokenizer.
         max_quarantine: fraction of episodes that may be refused.
@@ -145,7 +146,9 @@ def convert(
         HMAError: the source, the embodiment or the tokenizer cannot be used.
     """
     begun = time.monotonic()
-    opened = get_tokenizer(tokenizer, weights=weights, device=device)
+    opened = (
+        get_tokenizer(tokenizer, weights=weights, device=device) if isinstance(tokenizer, str) else tokenizer
+    )
     plan, uri = plan_conversion(embodiment, source, opened, settings or Settings())
     with locked(out):
         if overwrite:
@@ -159,8 +162,8 @@ def convert(
                 progress.frames += unit.frames
         on_progress(progress)
 
-        job = Job(uri, embodiment, tokenizer, weights, device, out.absolute(), plan.facts)
-        ready = opened if workers <= 1 else None
+        job = Job(uri, embodiment, opened.spec.name, weights, device, out.absolute(), plan.facts)
+        ready = opened if min(workers, len(todo)) <= 1 else None
         for _ in run(todo, MakeWork(job, ready), min(workers, len(todo)), _Counter(progress, on_progress)):
             on_progress(progress)
         manifest = _finish(out, plan, embodiment, opened, uri, bool(todo))
@@ -185,6 +188,7 @@ def _finish(
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
     """Only one job writes a folder; the lock goes with the process, however it ends."""
+    made = not out.exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
         handle = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
@@ -192,19 +196,21 @@ def locked(out: Path) -> Iterator[None]:
         raise OutputError(out, f"cannot be written: {fault.strerror}", "choose another --out") from fault
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not (out / LOCK).exists():  # its last owner deleted it between our two calls
+            raise OSError(errno.EAGAIN, "")
     except OSError as fault:
         os.close(handle)
-        if fault.errno in (errno.EACCES, errno.EAGAIN):
-            raise OutputError(
-                out, "is being written by another job", "wait for it, or choose another --out"
-            ) from fault
-        raise
+        if fault.errno not in (errno.EACCES, errno.EAGAIN):
+            raise
+        raise OutputError(
+            out, "is being written by another job", "wait for it, or choose another --out"
+        ) from fault
     try:
         yield
     finally:
         (out / LOCK).unlink(missing_ok=True)
         os.close(handle)
-        if not any(out.iterdir()):
+        if made and not any(out.iterdir()):
             out.rmdir()
 
 
@@ -309,11 +315,10 @@ class MakeWork:
         """Open the tokenizer once for this worker."""
         tokenizer = self.tokenizer
         if tokenizer is None:
-            import torch
-
-            torch.set_num_threads(max(1, usable_cores() // workers))
             tokenizer = get_tokenizer(self.job.tokenizer, weights=self.job.weights, device=self.job.device)
-        job = replace(self.job)
+            if "torch" in sys.modules:
+                sys.modules["torch"].set_num_threads(max(1, usable_cores() // workers))
+        job = self.job
 
         def work(unit: ShardUnit, report: Report) -> str:
             make_shard(job, unit, tokenizer, report)

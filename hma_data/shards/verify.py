@@ -46,9 +46,8 @@ def verify(folder: Path) -> list[str]:
 def _shard_problems(path: Path, footer: Footer, manifest: Manifest) -> list[str]:
     found: list[str] = []
     if footer.plan["hash"] != manifest.plan["hash"]:
-        return [
-            f"{path}: was made by another plan ({footer.plan['hash']}) than the manifest's ({manifest.plan['hash']})"
-        ]
+        theirs, ours = footer.plan["hash"], manifest.plan["hash"]
+        return [f"{path}: was made by another plan ({theirs}) than the manifest's ({ours})"]
     if any(row.split != footer.split or not path.as_posix().endswith(row.shard) for row in footer.episodes):
         found.append(f"{path}: its episodes name another shard or split")
     embodiment, spec = manifest.embodiment, manifest.tokenizer
