@@ -1,0 +1,463 @@
+"""A checkpoint: one folder that is also the layout of the hub (DESIGN section 9).
+
+    config.json                  format version, architecture, tokenizer spec
+    trunk.safetensors            what all embodiments share
+    embodiments/<id>/            stem.safetensors, head.safetensors, embodiment.yaml, stats.json, card.json
+    README.md                    the model card, made from the card.json files
+    training/                    optimizer, sampler and rng state; never published
+
+The trunk's SHA-256 stands in every card and in every stem, with the digests of the tokenizer and of the
+statistics the stem was trained on, so that parts which do not belong together are refused. Only JSON,
+YAML and safetensors are ever read. Nothing outside the folder is followed.
+"""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hma_data.embodiment import ID_PATTERN, Embodiment
+from hma_data.errors import CheckpointError, HMAError
+from hma_data.files import file_sha256, write_atomic
+from hma_model.config import ActionSpace, HMAConfig
+from hma_model.files import new_folder, read_json, read_metadata, read_tensors, to_json, write_tensors
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import TokenizerSpec
+    from hma_model.model import HMA
+
+FORMAT_VERSION = 1
+LIBRARY = "hma-toolkit"
+CONFIG, TRUNK, README, TRAINING = "config.json", "trunk.safetensors", "README.md", "training"
+STEM, HEAD, YAML, STATS, CARD = (
+    "stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json",
+)  # fmt: skip
+PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card last: it says that the others are there
+SAMPLE = "sample.png"  # optional, shown in the model card
+
+
+@dataclass(frozen=True)
+class ActionStats:
+    """Mean and standard deviation (A,) of the raw actions, as `stats.json` states them."""
+
+    mean: list[float]
+    std: list[float]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint's folder, opened and checked as far as it can be without reading weights.
+
+    Attributes:
+        folder: where it is.
+        config: of the network; the tokenizer's spec is in it.
+        embodiments: ids present, sorted.
+        trunk_sha256: of the trunk, as config.json states it.
+    """
+
+    folder: Path
+    config: HMAConfig
+    embodiments: tuple[str, ...]
+    trunk_sha256: str
+    _cards: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False, compare=False)
+
+    @classmethod
+    def open(cls, folder: str | Path) -> "Checkpoint":
+        """The checkpoint in a folder, or the newest one of a training run's folder.
+
+        Raises:
+            CheckpointError: there is none, it is damaged, or of a format this release does not read.
+        """
+        folder = resolve(Path(folder))
+        values = read_json(inside(folder, CONFIG))
+        config = parse_config(values, folder / CONFIG)
+        home = folder / "embodiments"
+        found = sorted(path.name for path in home.iterdir()) if home.is_dir() else []
+        present = tuple(name for name in found if (home / name / CARD).is_file())
+        return cls(folder, config, present, str(values.get("trunk_sha256")))
+
+    def trunk(self) -> Path:
+        """trunk.safetensors.
+
+        Raises:
+            CheckpointError: it is not the file that config.json names.
+        """
+        path = inside(self.folder, TRUNK)
+        if self._measured_sha256 != self.trunk_sha256:
+            raise CheckpointError(
+                path, f"is another trunk than {CONFIG} names", "pull the checkpoint again, into a new folder"
+            )
+        return path
+
+    @cached_property
+    def _measured_sha256(self) -> str:
+        return file_sha256(inside(self.folder, TRUNK))
+
+    def path(self, embodiment: str, part: str) -> Path:
+        """A file of an embodiment.
+
+        Raises:
+            CheckpointError: not an id, no such embodiment or file, or a link out of the folder.
+        """
+        check_id(embodiment, self.folder)
+        if embodiment not in self.embodiments:
+            raise CheckpointError(
+                self.folder,
+                f"has no embodiment {embodiment!r}",
+                f"it has: {', '.join(self.embodiments) or 'none'}",
+            )
+        return inside(self.folder, f"embodiments/{embodiment}/{part}")
+
+    def card(self, embodiment: str) -> dict[str, Any]:
+        """card.json of an embodiment."""
+        if embodiment not in self._cards:
+            self._cards[embodiment] = read_json(self.path(embodiment, CARD))
+        return self._cards[embodiment]
+
+    def embodiment(self, embodiment: str) -> Embodiment:
+        """The embodiment as it was trained on."""
+        return Embodiment.load(self.path(embodiment, YAML))
+
+    def stats(self, embodiment: str) -> dict[str, Any]:
+        """stats.json of an embodiment: at least {"action": {"mean": [...], "std": [...]}}."""
+        path = self.path(embodiment, STATS)
+        values = read_json(path)
+        action_stats(values, path)
+        return values
+
+    def check(self, embodiment: str) -> None:
+        """Raise unless the embodiment's parts belong to this trunk, tokenizer and statistics.
+
+        Raises:
+            CheckpointError: naming the first part that does not, and why.
+        """
+        path = self.path(embodiment, STEM)
+        stem = read_metadata(path)
+        _same(path, stem, "embodiment", embodiment, "was saved for another embodiment")
+        for where, facts in ((path, stem), (self.path(embodiment, CARD), self.card(embodiment))):
+            _same(where, facts, "trunk_sha256", self.trunk_sha256, "belongs to another trunk")
+            _same(
+                where, facts, "tokenizer", digest(self.config.tokenizer), "was trained on another tokenizer"
+            )
+            stats = file_sha256(self.path(embodiment, STATS))
+            _same(where, facts, "stats_sha256", stats, f"was trained with other statistics than {STATS}")
+        files = self.card(embodiment).get("files")
+        for part in (STEM, HEAD):
+            recorded = files.get(part) if isinstance(files, dict) else None
+            if recorded != file_sha256(self.path(embodiment, part)):
+                raise CheckpointError(
+                    self.path(embodiment, part),
+                    f"is not the file that {CARD} names",
+                    "a push or pull was cut short: do it again",
+                )
+
+
+def save(
+    model: "HMA",
+    folder: str | Path,
+    *,
+    embodiment_yaml: Mapping[str, str],
+    stats: Mapping[str, dict[str, Any]],
+    cards: Mapping[str, dict[str, Any]],
+    tokenizer: Mapping[str, Any],
+    training: Callable[[Path], None] | None = None,
+) -> Checkpoint:
+    """Write a model and all its embodiments; an existing checkpoint of that name is replaced in one step.
+
+    Args:
+        model: with every embodiment of `embodiment_yaml`.
+        folder: its name; an error leaves an older checkpoint there as it was.
+        embodiment_yaml: id -> registry YAML.
+        stats: id -> {"action": {"mean", "std", ...}, ...}.
+        cards: id -> what is known of its data and metrics; ids without one get an empty one.
+        tokenizer: the spec, plain values.
+        training: fills the folder `training/` it is given, for what only a resumed run needs.
+
+    Raises:
+        CheckpointError: parts do not agree, the folder holds something else, or cannot be written.
+    """
+    from safetensors import SafetensorError
+
+    folder = Path(folder)
+    _check_parts(model, folder, embodiment_yaml, stats)
+    config = model.config.replace(tokenizer=dict(tokenizer))
+    try:
+        with new_folder(folder) as new:
+            write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"})
+            trunk = file_sha256(new / TRUNK)
+            (new / CONFIG).write_bytes(to_json(config_json(config, trunk)))
+            for name in sorted(embodiment_yaml):
+                home = new / "embodiments" / name
+                home.mkdir(parents=True)
+                (home / YAML).write_text(embodiment_yaml[name], encoding="utf-8")
+                (home / STATS).write_bytes(to_json(stats[name]))
+                _write_embodiment(model, home, trunk, digest(tokenizer), cards.get(name, {}))
+            if training:
+                (new / TRAINING).mkdir()
+                training(new / TRAINING)
+            write_readme(new)
+    except (OSError, SafetensorError) as fault:
+        raise CheckpointError(
+            folder,
+            f"cannot be written: {fault}",
+            "free space or choose another folder; older checkpoints are intact",
+        ) from fault
+    return Checkpoint.open(folder)
+
+
+def load(
+    folder: str | Path,
+    embodiments: Iterable[str] | None = None,
+    device: str = "cpu",
+    tokenizer: "TokenizerSpec | None" = None,
+) -> "HMA":
+    """The model of a checkpoint with the trunk and the embodiments asked for, and nothing else read.
+
+    Args:
+        folder: of a checkpoint, or of a training run.
+        embodiments: ids; None for all that are there.
+        device: where the model goes.
+        tokenizer: refuse a model that was trained on another.
+
+    Raises:
+        CheckpointError: missing, damaged, or parts that do not belong together; each with its reason.
+    """
+    from hma_model.model import HMA
+
+    checkpoint = Checkpoint.open(folder)
+    if tokenizer is not None:
+        require_tokenizer(checkpoint.config, tokenizer, checkpoint.folder)
+    model = HMA(checkpoint.config)
+    model.load_trunk(read_tensors(checkpoint.trunk()))
+    for name in checkpoint.embodiments if embodiments is None else dict.fromkeys(embodiments):
+        add_embodiment(model, checkpoint, name)
+    vars(model)["origin"] = checkpoint.folder  # where hub.push_model finds YAML and statistics again
+    return model.to(device).eval()
+
+
+def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> None:
+    """Load one embodiment's stem and head beside a trunk that is already loaded."""
+    checkpoint.check(embodiment)
+    yaml, path = checkpoint.embodiment(embodiment), checkpoint.path(embodiment, STATS)
+    if yaml.id != embodiment:
+        raise CheckpointError(path.with_name(YAML), f"has id {yaml.id!r}", f"its folder says {embodiment!r}")
+    try:
+        space = ActionSpace.of(yaml, action_stats(checkpoint.stats(embodiment), path))
+    except HMAError as fault:
+        raise CheckpointError(
+            path, f"does not fit {YAML}: {fault.fault}", "pull the embodiment again"
+        ) from fault
+    model.add_embodiment(space)
+    stem = read_tensors(checkpoint.path(embodiment, STEM))
+    model.load_embodiment(embodiment, stem, read_tensors(checkpoint.path(embodiment, HEAD)))
+
+
+def update_card(folder: str | Path, embodiment: str, **facts: Any) -> dict[str, Any]:
+    """Add to an embodiment's card (`metrics` merges, all else replaces) and renew README.md."""
+    checkpoint = Checkpoint.open(folder)
+    card = dict(checkpoint.card(embodiment))
+    metrics = {**card.get("metrics", {}), **facts.pop("metrics", {})}
+    card.update(facts, metrics=metrics)
+    write_atomic(checkpoint.path(embodiment, CARD), to_json(card))
+    write_readme(checkpoint.folder)
+    return card
+
+
+def write_readme(folder: Path) -> None:
+    """Make README.md from the cards in a checkpoint's folder."""
+    from hma_model.model_card import render
+
+    checkpoint = Checkpoint.open(folder)
+    cards = {name: checkpoint.card(name) for name in checkpoint.embodiments}
+    samples = {name for name in cards if (folder / "embodiments" / name / SAMPLE).is_file()}
+    text = render(config_json(checkpoint.config, checkpoint.trunk_sha256), cards, samples=samples)
+    write_atomic(folder / README, text)
+
+
+def remove(folder: Path) -> None:
+    """Delete a checkpoint so that a cut deletion leaves no half of one under its name."""
+    doomed = folder.with_name(f".{folder.name}.partial-removed")
+    shutil.rmtree(doomed, ignore_errors=True)
+    folder.rename(doomed)
+    shutil.rmtree(doomed, ignore_errors=True)
+
+
+# -- pieces the hub shares
+
+
+def config_json(config: HMAConfig, trunk_sha256: str) -> dict[str, Any]:
+    """What config.json holds."""
+    model = config.to_json()
+    tokenizer = model.pop("tokenizer")
+    return {
+        "format_version": FORMAT_VERSION,
+        "library": LIBRARY,
+        "trunk_sha256": trunk_sha256,
+        "tokenizer": tokenizer,
+        "model": model,
+    }
+
+
+def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
+    """The network's config from config.json's values.
+
+    Raises:
+        CheckpointError: of another library, another format version, or not valid.
+    """
+    if values.get("library") != LIBRARY:
+        raise CheckpointError(
+            where,
+            f"is not of {LIBRARY}: library is {values.get('library')!r}",
+            "give a checkpoint of hma train",
+        )
+    version = values.get("format_version")
+    if version != FORMAT_VERSION:
+        newer = isinstance(version, int) and version > FORMAT_VERSION
+        raise CheckpointError(
+            where,
+            f"has format_version {version!r}, this release reads {FORMAT_VERSION}",
+            f"update {LIBRARY}" if newer else "save the checkpoint again",
+        )
+    model, tokenizer = values.get("model"), values.get("tokenizer")
+    if not isinstance(model, dict) or not isinstance(tokenizer, dict):
+        raise CheckpointError(where, "lacks its 'model' or 'tokenizer'", "pull or save the checkpoint again")
+    try:
+        return HMAConfig.from_json({**model, "tokenizer": tokenizer}, str(where))
+    except (HMAError, TypeError, ValueError) as fault:
+        raise CheckpointError(where, f"does not describe a model: {fault}", "update or save again") from fault
+
+
+def resolve(folder: Path) -> Path:
+    """The checkpoint meant by a path: itself, or the newest below a training run's `checkpoints/`.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    if (folder / CONFIG).is_file():
+        return folder
+    steps = training_checkpoints(folder)
+    if steps:
+        return steps[-1]
+    fault = f"has no {CONFIG} and no checkpoints/" if folder.is_dir() else "no such folder"
+    raise CheckpointError(folder, fault, "give a checkpoint, or the folder of a training run")
+
+
+def training_checkpoints(run: Path) -> list[Path]:
+    """Checkpoints of a training run, oldest first."""
+    return sorted(path for path in (run / "checkpoints").glob("step-*") if (path / CONFIG).is_file())
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The path of a file that lies in the folder itself.
+
+    A link is refused, but for those of a Hugging Face cache, which point at its own blobs.
+
+    Raises:
+        CheckpointError: there is none, or it leads out of the folder.
+    """
+    path = folder / name
+    if not path.is_file():
+        raise CheckpointError(path, "no such file", "pull or save the checkpoint again")
+    real, home = path.resolve(), folder.resolve()
+    blobs = home.parent.parent / "blobs" if home.parent.name == "snapshots" else None
+    if real == home / name or (blobs is not None and real.parent == blobs):
+        return path
+    raise CheckpointError(path, "is a link, or lies outside the checkpoint", "put the file itself there")
+
+
+def check_id(embodiment: str, where: object) -> None:
+    """Raise CheckpointError unless the name is an embodiment's id."""
+    if not ID_PATTERN.fullmatch(embodiment) or ".." in embodiment:
+        raise CheckpointError(where, f"{embodiment!r} is not an embodiment's id", "ids are of a-z 0-9 _ - .")
+
+
+def digest(tokenizer: Mapping[str, Any]) -> str:
+    """Sixteen hex digits over a tokenizer's spec."""
+    return hashlib.sha256(json.dumps(dict(tokenizer), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -> None:
+    """Raise CheckpointError naming the difference unless the model was trained on this tokenizer."""
+    ours, theirs = dict(config.tokenizer), spec.to_json()
+    differing = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
+    if differing:
+        key = differing[0]
+        raise CheckpointError(
+            where,
+            f"was trained on tokenizer {ours.get('name')!r}, this is {spec.name!r}: "
+            f"{key} is {ours.get(key)!r} there and {theirs.get(key)!r} here",
+            "use the tokenizer named in its config.json",
+        )
+
+
+def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
+    """Mean and std of the actions from stats.json's values.
+
+    Raises:
+        CheckpointError: they are not there, or not lists of numbers.
+    """
+    try:
+        action = stats["action"]
+        return ActionStats([float(v) for v in action["mean"]], [float(v) for v in action["std"]])
+    except (KeyError, TypeError, ValueError) as fault:
+        raise CheckpointError(where, "lacks action.mean or action.std as lists of numbers") from fault
+
+
+def _write_embodiment(model: "HMA", home: Path, trunk: str, tokenizer: str, given: dict[str, Any]) -> None:
+    links = {"trunk_sha256": trunk, "tokenizer": tokenizer, "stats_sha256": file_sha256(home / STATS)}
+    metadata = {"format": "pt", "format_version": str(FORMAT_VERSION), "embodiment": home.name, **links}
+    write_tensors(home / STEM, model.stem_state(home.name), metadata)
+    write_tensors(home / HEAD, model.head_state(home.name), metadata)
+    card = {**_facts(Embodiment.load(home / YAML)), "data": {}, "metrics": {}, **given, **links}
+    card["files"] = {part: file_sha256(home / part) for part in PARTS[:-1]}
+    (home / CARD).write_bytes(to_json(card))
+
+
+def _facts(embodiment: Embodiment) -> dict[str, Any]:
+    return {
+        "format_version": FORMAT_VERSION,
+        "id": embodiment.id,
+        "description": embodiment.description,
+        "robot": embodiment.robot,
+        "kind": embodiment.kind,
+        "action_space": embodiment.action.space,
+        "action_dim": embodiment.action_dim,
+        "stride": embodiment.stride,
+        "chunk_dim": embodiment.chunk_dim,
+        "effective_hz": embodiment.effective_hz,
+        "license": embodiment.license,
+    }
+
+
+def _check_parts(
+    model: "HMA", folder: Path, yaml: Mapping[str, str], stats: Mapping[str, dict[str, Any]]
+) -> None:
+    for name in yaml:
+        check_id(name, folder)
+        if name not in model.embodiments:
+            raise CheckpointError(folder, f"the model has no embodiment {name!r}", "add it before saving")
+        found = Embodiment.from_yaml(yaml[name], f"{folder}: {name}").id
+        if found != name:
+            raise CheckpointError(folder, f"the YAML given for {name!r} has id {found!r}")
+        action_stats(stats.get(name, {}), f"{folder}: statistics of {name}")
+    unnamed = sorted(set(model.embodiments) - set(yaml))
+    if unnamed:
+        raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
+    if folder.exists() and (
+        not folder.is_dir() or (any(folder.iterdir()) and not (folder / CONFIG).is_file())
+    ):
+        raise CheckpointError(folder, "is there already and is no checkpoint", "choose another folder")
+
+
+def _same(where: Path, facts: Mapping[str, Any], key: str, expected: str, fault: str) -> None:
+    found = facts.get(key)
+    if found != expected:
+        raise CheckpointError(
+            where,
+            f"{fault}: its {key} is {str(found)[:16]}, here it is {expected[:16]}",
+            "pull the embodiment and its trunk together, or finetune it on this trunk",
+        )

@@ -1,0 +1,249 @@
+"""Checkpoints: what is saved comes back, parts that do not belong together do not, and files stay whole."""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from robots import CONFIG, SPEC, make_model, save, yaml
+from robots import stats as stats_of
+from safetensors.torch import load_file, save_file
+
+from hma_data.errors import CheckpointError
+from hma_model import checkpoint
+from hma_model.checkpoint import Checkpoint
+
+ROBOTS = {"arm": 2, "hand.v2": 3}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    save(tmp_path / "model", ROBOTS)
+    return tmp_path / "model"
+
+
+def states(model) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def edit_json(path: Path, **changes) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def test_every_weight_comes_back_bit_for_bit(tmp_path):
+    model = save(tmp_path / "m", ROBOTS)
+    again = checkpoint.load(tmp_path / "m")
+    assert states(again).keys() == states(model).keys()
+    assert all(torch.equal(value, states(again)[name]) for name, value in states(model).items())
+
+
+def test_the_layout_is_the_contracts(folder):
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    parts = ("stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json")
+    expected = {"config.json", "trunk.safetensors", "README.md"}
+    assert files == expected | {f"embodiments/{name}/{part}" for name in ROBOTS for part in parts}
+    assert json.loads((folder / "config.json").read_text())["format_version"] == 1
+
+
+def test_the_cards_and_stems_name_the_trunk_by_its_sha256(folder):
+    trunk = hashlib.sha256((folder / "trunk.safetensors").read_bytes()).hexdigest()
+    for name in ROBOTS:
+        assert Checkpoint.open(folder).card(name)["trunk_sha256"] == trunk
+        stem = folder / "embodiments" / name / "stem.safetensors"
+        assert checkpoint.read_metadata(stem)["trunk_sha256"] == trunk
+
+
+def test_saving_a_loaded_model_gives_the_same_files(folder, tmp_path):
+    save(tmp_path / "again", ROBOTS, model=checkpoint.load(folder))
+    for path in folder.rglob("*.*"):
+        if path.name != "README.md" and path.is_file():
+            same = (tmp_path / "again" / path.relative_to(folder)).read_bytes() == path.read_bytes()
+            # a stem's metadata has several keys, whose order safetensors leaves open
+            assert same or path.suffix == ".safetensors" or path.name == "card.json", path
+    assert (tmp_path / "again/trunk.safetensors").read_bytes() == (folder / "trunk.safetensors").read_bytes()
+
+
+def test_loading_one_embodiment_reads_no_other(folder):
+    for path in (folder / "embodiments/hand.v2").iterdir():
+        path.write_bytes(b"not what it should be")
+    assert list(checkpoint.load(folder, ["arm"]).embodiments) == ["arm"]
+
+
+def test_an_unknown_embodiment_is_named_with_those_there(folder):
+    with pytest.raises(CheckpointError, match=r"no embodiment 'leg'.*arm, hand\.v2"):
+        checkpoint.load(folder, ["leg"])
+
+
+@pytest.mark.parametrize("name", ["../arm", "arm/../arm", "/etc", "", "a\\b", "..", "a..b"])
+def test_a_name_that_is_no_id_is_refused(folder, name):
+    with pytest.raises(CheckpointError, match="not an embodiment's id"):
+        checkpoint.load(folder, [name])
+
+
+def test_a_stem_of_another_trunk_is_refused(folder, tmp_path):
+    save(tmp_path / "other", ROBOTS, seed=1)
+    shutil.rmtree(folder / "embodiments/arm")
+    shutil.copytree(tmp_path / "other/embodiments/arm", folder / "embodiments/arm")
+    with pytest.raises(CheckpointError, match="belongs to another trunk"):
+        checkpoint.load(folder, ["arm"])
+
+
+def test_a_trunk_put_in_place_of_the_own_is_refused(folder, tmp_path):
+    save(tmp_path / "other", ROBOTS, seed=1)
+    shutil.copy(tmp_path / "other/trunk.safetensors", folder / "trunk.safetensors")
+    with pytest.raises(CheckpointError, match="another trunk"):
+        checkpoint.load(folder)
+
+
+def test_a_changed_tokenizer_is_refused(folder):
+    edit_json(folder / "config.json", tokenizer={**SPEC.to_json(), "weights_sha256": "0" * 64})
+    with pytest.raises(CheckpointError, match="trained on another tokenizer"):
+        checkpoint.load(folder)
+
+
+def test_changed_statistics_are_refused(folder):
+    values = stats_of(2)
+    values["action"]["mean"][0] += 1e-6
+    (folder / "embodiments/arm/stats.json").write_text(json.dumps(values))
+    with pytest.raises(CheckpointError, match="other statistics"):
+        checkpoint.load(folder)
+
+
+def test_a_stem_of_another_push_than_its_card_is_refused(folder):
+    stem = folder / "embodiments/arm/stem.safetensors"
+    tensors, metadata = load_file(stem), checkpoint.read_metadata(stem)
+    tensors["input.weight"] += 1
+    save_file(tensors, stem, metadata)
+    with pytest.raises(CheckpointError, match=r"not the file that card\.json names"):
+        checkpoint.load(folder)
+
+
+@pytest.mark.parametrize(("version", "remedy"), [(2, "update"), (0, "save"), (None, "save"), ("1", "save")])
+def test_another_format_version_is_refused(folder, version, remedy):
+    edit_json(folder / "config.json", format_version=version)
+    with pytest.raises(CheckpointError, match=rf"format_version {version!r}.*{remedy}"):
+        checkpoint.load(folder)
+
+
+def test_a_checkpoint_of_another_library_is_refused(folder):
+    edit_json(folder / "config.json", library="diffusers")
+    with pytest.raises(CheckpointError, match="diffusers"):
+        checkpoint.load(folder)
+
+
+def test_a_tokenizer_other_than_the_models_is_refused_with_the_difference(folder):
+    other = {**SPEC.to_json(), "image_size": 32}
+    with pytest.raises(CheckpointError, match="image_size is 16 there and 32 here"):
+        checkpoint.load(folder, tokenizer=type(SPEC).from_json(other))
+
+
+def test_truncated_weights_are_refused(folder):
+    stem = folder / "embodiments/arm/stem.safetensors"
+    stem.write_bytes(stem.read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match="not whole safetensors"):
+        checkpoint.load(folder)
+
+
+def test_a_link_out_of_the_folder_is_refused(folder, tmp_path):
+    secret = tmp_path / "secret.json"
+    shutil.copy(folder / "embodiments/arm/card.json", secret)
+    (folder / "embodiments/arm/card.json").unlink()
+    (folder / "embodiments/arm/card.json").symlink_to(secret)
+    with pytest.raises(CheckpointError, match="is a link"):
+        checkpoint.load(folder)
+
+
+def test_a_linked_embodiment_folder_is_refused(folder, tmp_path):
+    (folder / "embodiments/arm").rename(tmp_path / "arm")
+    (folder / "embodiments/arm").symlink_to(tmp_path / "arm")
+    with pytest.raises(CheckpointError, match="is a link"):
+        checkpoint.load(folder)
+
+
+def test_the_links_of_a_hub_cache_are_followed(folder, tmp_path):
+    snapshot, blobs = tmp_path / "cache/snapshots/abc", tmp_path / "cache/blobs"
+    shutil.copytree(folder, snapshot)
+    blobs.mkdir()
+    for number, path in enumerate(sorted(snapshot.rglob("*.*"))):
+        if path.is_file():
+            path.rename(blobs / str(number))
+            path.symlink_to(os.path.relpath(blobs / str(number), path.parent))
+    assert set(checkpoint.load(snapshot).embodiments) == set(ROBOTS)
+
+
+def test_a_failed_save_leaves_the_older_checkpoint_intact(folder, tmp_path):
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    def full_disk(_: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(CheckpointError, match="No space left on device"):
+        save(folder, ROBOTS, seed=1, training=full_disk)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
+def test_saving_over_a_checkpoint_replaces_it_whole(folder):
+    model = save(folder, {"arm": 2}, seed=1)
+    again = checkpoint.load(folder)
+    assert list(again.embodiments) == ["arm"]
+    assert torch.equal(again.trunk.position, model.trunk.position)
+
+
+def test_a_folder_with_something_else_is_not_overwritten(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(CheckpointError, match="is no checkpoint"):
+        save(tmp_path, {"arm": 2})
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_model_with_an_embodiment_without_yaml_is_not_saved(tmp_path):
+    with pytest.raises(CheckpointError, match="no embodiment YAML was given for hand"):
+        robots = {"arm": yaml("arm")}
+        numbers = {"arm": stats_of(2)}
+        checkpoint.save(
+            make_model(ROBOTS),
+            tmp_path / "m",
+            embodiment_yaml=robots,
+            stats=numbers,
+            cards={},
+            tokenizer=SPEC.to_json(),
+        )
+
+
+def test_a_training_runs_folder_stands_for_its_newest_checkpoint(tmp_path):
+    save(tmp_path / "run/checkpoints/step-00000010", {"arm": 2})
+    newest = save(tmp_path / "run/checkpoints/step-00000020", {"arm": 2}, seed=2)
+    assert torch.equal(checkpoint.load(tmp_path / "run").trunk.position, newest.trunk.position)
+
+
+def test_a_missing_folder_and_an_empty_one_say_so(tmp_path):
+    with pytest.raises(CheckpointError, match="no such folder"):
+        checkpoint.load(tmp_path / "nothing")
+    with pytest.raises(CheckpointError, match=r"has no config\.json"):
+        checkpoint.load(tmp_path)
+
+
+def test_metrics_are_added_to_the_card_and_to_the_readme(folder):
+    checkpoint.update_card(folder, "arm", metrics={"psnr": 21.25})
+    assert Checkpoint.open(folder).card("arm")["metrics"] == {"val_loss": 1.5, "psnr": 21.25}
+    assert "psnr 21.25" in (folder / "README.md").read_text()
+    checkpoint.load(folder)
+
+
+def test_the_config_comes_back(folder):
+    assert Checkpoint.open(folder).config == CONFIG
+
+
+def test_a_hostile_card_stays_in_its_cell(folder):
+    checkpoint.update_card(
+        folder, "arm", robot="x | y\n\n# Title <script>alert(1)</script> [a](javascript:b)"
+    )
+    page = (folder / "README.md").read_text()
+    row = next(line for line in page.splitlines() if line.startswith("| `arm`"))
+    assert len(re.findall(r"(?<!\\)\|", row)) == 9
+    assert "Title" in row and not re.search(r"(?<!\\)[<\[]", row)
