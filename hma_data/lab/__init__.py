@@ -1,0 +1,65 @@
+"""The laboratory: third-party simulators recorded as robots would be, for demo, tests and experiments.
+
+A recorder is a module with `record(out, robot, episodes, seed, on_progress)`; it is imported on use.
+Every robot of RECORDERS has its embodiment in the registry under the same id.
+"""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+
+from hma_data.errors import OutputError, UsageError
+
+Progress = Callable[[int, int], None]
+
+RECORDERS = {
+    "pusht_fast": "hma_data.lab.pusht",
+    "pusht_slow": "hma_data.lab.pusht",
+}
+
+
+def record(robot: str, out: Path, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
+    """Record a laboratory robot.
+
+    Args:
+        robot: a key of RECORDERS.
+        out: folder to put the recording in; made when absent.
+        episodes: how many, at least one.
+        seed: the same seed gives the same recording.
+        on_progress: called after each episode with (episodes done, episodes in all).
+
+    Returns:
+        The recording: what `hma convert --source` takes.
+
+    Raises:
+        UsageError: no such robot, or no episodes asked for.
+        OutputError: the recording is there already, or cannot be written.
+        MissingDependencyError: the simulator is not installed.
+    """
+    if robot not in RECORDERS:
+        raise UsageError(robot, "is not a laboratory robot", f"known: {', '.join(RECORDERS)}")
+    if episodes < 1:
+        raise UsageError("episodes", f"{episodes} asked for", "ask for at least one")
+    recording: Path = import_module(RECORDERS[robot]).record(Path(out), robot, episodes, seed, on_progress)
+    return recording
+
+
+@contextmanager
+def written_beside(final: Path) -> Iterator[Path]:
+    """A path to write a file or folder to; it becomes `final` at the end, or vanishes on failure.
+
+    Raises:
+        OutputError: `final` is there already, or the disk refuses.
+    """
+    if final.exists():
+        raise OutputError(final, "exists already", "remove it or record into another folder")
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=final.parent, prefix=f".{final.name}-") as folder:
+            part = Path(folder) / final.name
+            yield part
+            part.rename(final)
+    except OSError as fault:
+        raise OutputError(final, f"cannot be written: {fault}", "check space and rights") from fault

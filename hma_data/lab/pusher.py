@@ -1,0 +1,295 @@
+"""Who moves the pusher: a planner that pushes the T home, or smooth wandering.
+
+The planner picks a contact on the T's outline and a push length whose predicted outcome brings the
+T nearest to its goal for the time it costs, walks round the T (or flies over it, for a pusher that
+can lift) and pushes. Contact is quasi-static and frictionless as in gym-pusht: the arena forgets
+all velocity, so a push at point c along the inward normal n with speed s moves the T by
+
+    v = n·j/m,  ω = (r × n)·j/I,  j = s / (1/m + (r × n)²/I),  r = c − centre of mass.
+
+Lengths are pixels of the 512 × 512 arena, angles radians. C contacts, N nodes, L push lengths.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+LOW, HIGH = 22.0, 490.0  # where the pusher's centre may be: its radius inside the walls
+GAP = 11.0  # between pusher and T before a push
+CLEARANCE = 3.0  # kept when walking past the T
+STEPS = np.array([1.0, 1.0, 1.5, 1.5, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7, 8, 8, 8, 8])  # of a predicted push
+LENGTHS = np.cumsum(STEPS)
+
+
+def rotation(angle: float) -> Floats:
+    """(2, 2) matrix that turns a column vector by `angle`."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+@dataclass(frozen=True)
+class Tee:
+    """The T in its own frame, as the environment built it.
+
+    Attributes:
+        boxes: (2, 2, 2) lower and upper corner of its two bars.
+        center: (2,) centre of mass.
+        mass, moment: of the body.
+        radius: of the pusher.
+    """
+
+    boxes: Floats
+    center: Floats
+    mass: float
+    moment: float
+    radius: float
+
+    def distance(self, points: Floats) -> Floats:
+        """(...,) signed distance of points (..., 2) to the outline, negative inside."""
+        middle, half = self.boxes.mean(axis=1), (self.boxes[:, 1] - self.boxes[:, 0]) / 2
+        over = np.abs(points[..., None, :] - middle) - half
+        outside = np.linalg.norm(np.maximum(over, 0), axis=-1)
+        nearest: Floats = (outside + np.minimum(over.max(axis=-1), 0)).min(axis=-1)
+        return nearest
+
+    @cached_property
+    def keypoints(self) -> Floats:
+        """(8, 2) corners of the bars; their mean distance from home is the planner's cost."""
+        return np.array([[box[i, 0], box[j, 1]] for box in self.boxes for i in (0, 1) for j in (0, 1)])
+
+    @cached_property
+    def contacts(self) -> tuple[Floats, Floats]:
+        """Points (C, 2) on the outline that a pusher can stand before, and their inward normals (C, 2)."""
+        points, normals = [], []
+        for low, high in self.boxes:
+            for axis in (0, 1):
+                along = np.linspace(low[1 - axis] + 4, high[1 - axis] - 4, 9)
+                for edge, inward in ((low[axis], 1.0), (high[axis], -1.0)):
+                    side = np.empty((len(along), 2))
+                    side[:, axis], side[:, 1 - axis] = edge, along
+                    points.append(side)
+                    normals.append(np.tile(np.eye(2)[axis] * inward, (len(along), 1)))
+        point, normal = np.concatenate(points), np.concatenate(normals)
+        reach = self.radius + GAP
+        free = self.distance(point - normal * reach) > reach - 1.0
+        return point[free], normal[free]
+
+    @cached_property
+    def standoffs(self) -> Floats:
+        """(C, 2) where the pusher's centre waits before each contact."""
+        points, normals = self.contacts
+        return points - normals * (self.radius + GAP)
+
+    @cached_property
+    def corners(self) -> Floats:
+        """(N, 2) way points round the T."""
+        signs = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        nodes = self.keypoints + np.tile(signs, (2, 1)) * (self.radius + GAP) * 0.9
+        return nodes[self.distance(nodes) > self.radius + CLEARANCE]
+
+    @cached_property
+    def between_corners(self) -> Floats:
+        """(N, N), see `legs`."""
+        return self.legs(self.corners, self.corners)
+
+    @cached_property
+    def to_standoffs(self) -> Floats:
+        """(N, C), see `legs`."""
+        return self.legs(self.corners, self.standoffs)
+
+    def legs(self, start: Floats, stop: Floats) -> Floats:
+        """(len(start), len(stop)) length of each straight way, infinite where the T is in it."""
+        share = np.linspace(0, 1, 20)[:, None]
+        way = start[:, None, None] * (1 - share) + stop[None, :, None] * share
+        clear = self.distance(way).min(axis=-1) > self.radius + CLEARANCE
+        return np.where(clear, np.linalg.norm(start[:, None] - stop, axis=-1), np.inf)
+
+    def placed(self, pose: Floats) -> Floats:
+        """(8, 2) keypoints in the arena."""
+        return self.keypoints @ rotation(pose[2]).T + pose[:2]
+
+
+@dataclass(frozen=True)
+class Push:
+    """A way to walk and a push at its end.
+
+    Attributes:
+        path: (n, 2) way points; the last is the standoff.
+        end: (2,) where the pusher's centre stops pushing.
+        retreat: (2,) where it steps back to.
+    """
+
+    path: Floats
+    end: Floats
+    retreat: Floats
+
+
+def plan(
+    tee: Tee, pose: Floats, goal: Floats, agent: Floats, speed: float, fly: bool, rng: np.random.Generator
+) -> Push:
+    """The next push: most progress for its time; one in ten is a blunder, any that is reachable.
+
+    Args:
+        tee: the T.
+        pose, goal: (3,) x, y, angle of the T's frame.
+        agent: (2,) centre of the pusher.
+        speed: px/s.
+        fly: passes over the T instead of round it.
+        rng: of the blunders.
+    """
+    turn = rotation(pose[2])
+    standoffs = tee.standoffs @ turn.T + pose[:2]
+    if fly:
+        lengths, before = np.linalg.norm(standoffs - agent, axis=1), None
+    else:
+        lengths, before = _walks(tee, agent, pose)
+    lengths = np.where(_inside(standoffs), lengths, np.inf)
+    reachable = np.flatnonzero(np.isfinite(lengths))
+    if not len(reachable):  # hemmed in: go somewhere else first
+        away = rng.uniform(LOW, HIGH, 2)
+        return Push(away[None], away, away)
+
+    now = np.linalg.norm(tee.placed(pose) - tee.placed(goal), axis=-1).mean()
+    seconds = (lengths[:, None] + 3 * GAP + LENGTHS) / speed + 0.4
+    rate = (now - predicted_costs(tee, pose, goal)) / seconds
+    contact, length = divmod(int(rate.argmax()), len(LENGTHS))
+    if rng.random() < 0.1:
+        contact, length = int(rng.choice(reachable)), int(rng.integers(8, 16))
+
+    corners = [] if before is None else [tee.corners[i] @ turn.T + pose[:2] for i in before(contact)]
+    inward = tee.contacts[1][contact] @ turn.T
+    end = np.clip(standoffs[contact] + inward * (GAP + LENGTHS[length]), LOW, HIGH)
+    return Push(np.array([*corners, standoffs[contact]]), end, np.clip(end - inward * 2 * GAP, LOW, HIGH))
+
+
+def predicted_costs(tee: Tee, pose: Floats, goal: Floats) -> Floats:
+    """(C, L) mean distance of the keypoints from home after pushing each contact by each of LENGTHS."""
+    points, normals = tee.contacts
+    home = tee.placed(goal)
+    push = normals @ rotation(pose[2]).T  # the direction in the arena stays, the T turns under it
+    angle = np.full(len(points), pose[2])
+    center = np.tile(rotation(pose[2]) @ tee.center + pose[:2], (len(points), 1))
+    touch = points - tee.center
+    costs = np.empty((len(points), len(STEPS)))
+    for column, step in enumerate(STEPS):
+        normal = _turned(normals, angle)
+        arm = touch[:, 0] * normals[:, 1] - touch[:, 1] * normals[:, 0]
+        speed = step * (push * normal).sum(axis=1, keepdims=True)
+        impulse = speed[:, 0] / (1 / tee.mass + arm**2 / tee.moment)
+        touch = touch + _turned(step * push - speed * normal, -angle)  # the contact slides along its edge
+        center = center + normal * (impulse / tee.mass)[:, None]
+        angle = angle + arm * impulse / tee.moment
+        moved = _turned(tee.keypoints - tee.center, angle[:, None]) + center[:, None]
+        costs[:, column] = np.linalg.norm(moved - home, axis=-1).mean(axis=1)
+    return costs
+
+
+def _walks(tee: Tee, agent: Floats, pose: Floats) -> tuple[Floats, Callable[[int], list[int]]]:
+    """(C,) length of the shortest walk to each standoff, and the corners on the way to one of them."""
+    turn = rotation(pose[2])
+    local = ((agent - pose[:2]) @ turn)[None]
+    usable = _inside(tee.corners @ turn.T + pose[:2])
+    reach = np.where(usable, tee.legs(local, tee.corners)[0], np.inf)
+    previous = np.full(len(reach), -1)
+    for _ in range(len(reach)):
+        longer = reach[:, None] + tee.between_corners
+        better = (longer.min(axis=0) < reach - 1e-9) & usable
+        previous = np.where(better, longer.argmin(axis=0), previous)
+        reach = np.where(better, longer.min(axis=0), reach)
+    direct = tee.legs(local, tee.standoffs)[0]
+    around = reach[:, None] + tee.to_standoffs
+
+    def corners(contact: int) -> list[int]:
+        if direct[contact] <= around[:, contact].min():
+            return []
+        chain = [int(around[:, contact].argmin())]
+        while previous[chain[0]] >= 0:
+            chain.insert(0, int(previous[chain[0]]))
+        return chain
+
+    return np.minimum(direct, around.min(axis=0)), corners
+
+
+def _turned(vectors: Floats, angle: Floats) -> Floats:
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def _inside(points: Floats) -> NDArray[np.bool_]:
+    within: NDArray[np.bool_] = ((points > LOW) & (points < HIGH)).all(axis=-1)
+    return within
+
+
+class Policy(Protocol):
+    """Moves the pusher's setpoint."""
+
+    def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
+        """Setpoint (2,) `seconds` from now, and whether the pusher is up.
+
+        Args:
+            pose: (3,) of the T.
+            agent: (2,) centre of the pusher.
+            seconds: until the next call.
+        """
+        ...
+
+
+class Planned:
+    """Plans a push, walks, pushes, steps back, plans again."""
+
+    def __init__(
+        self, tee: Tee, goal: Floats, agent: Floats, speed: float, fly: bool, rng: np.random.Generator
+    ) -> None:
+        self._tee, self._goal, self._speed, self._fly, self._rng = tee, goal, speed, fly, rng
+        self._setpoint = agent.copy()
+        self._phases: list[tuple[Floats, bool]] = []  # way points still to go, and up or down
+
+    def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
+        """See Policy."""
+        if not self._phases:
+            push = plan(self._tee, pose, self._goal, agent, self._speed, self._fly, self._rng)
+            self._phases = [(push.path, self._fly), (push.end[None], False), (push.retreat[None], False)]
+        way, up = self._phases[0]
+        self._setpoint, way = advance(self._setpoint, way, self._speed * seconds)
+        if len(way):
+            self._phases[0] = (way, up)
+        elif np.linalg.norm(agent - self._setpoint) < 6.0:
+            self._phases.pop(0)
+        return self._setpoint + self._rng.normal(0, 0.7, 2), up
+
+
+class Wandering:
+    """Smooth motion from one random point to the next, often through the T."""
+
+    def __init__(self, agent: Floats, fly: bool, rng: np.random.Generator) -> None:
+        self._setpoint, self._fly, self._rng = agent.copy(), fly, rng
+        self._way, self._speed, self._up = np.empty((0, 2)), 0.0, False
+
+    def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
+        """See Policy."""
+        if not len(self._way):
+            near = self._rng.random() < 0.7
+            point = pose[:2] + self._rng.normal(0, 60, 2) if near else self._rng.uniform(LOW, HIGH, 2)
+            self._way = np.clip(point, LOW, HIGH)[None]
+            self._speed = self._rng.uniform(80, 300)
+            self._up = self._fly and self._rng.random() < 0.4
+        self._setpoint, self._way = advance(self._setpoint, self._way, self._speed * seconds)
+        return self._setpoint.copy(), self._up
+
+
+def advance(point: Floats, way: Floats, length: float) -> tuple[Floats, Floats]:
+    """The point `length` further along the way (n, 2), and what is left of it; never past a way's end."""
+    while len(way):
+        step = way[0] - point
+        distance = float(np.linalg.norm(step))
+        if distance > length:
+            return point + step * (length / distance), way
+        point, way, length = way[0], way[1:], length - distance
+    return point.copy(), way

@@ -1,0 +1,301 @@
+"""Record gym-pusht as two robots: one position-controlled into HDF5, one velocity-controlled into MCAP.
+
+Both push a T toward its goal pose in the environment's own physics and are seen by its own
+renderer. They share nothing else:
+
+    pusht_fast  10 Hz   action (x, y): target of the pusher in px, the environment's native action
+    pusht_slow   5 Hz   action (vx, vy, lift): velocity in px/s; lift 1 raises the pusher over the T,
+                        which it then no longer touches. Camera 12.5 Hz, joint states 20 Hz
+
+Three episodes in five are planned pushes from near the goal, one is planned from anywhere, one
+wanders at random. Success is the environment's own: the T covers more than 95 % of the goal.
+An episode ends soon after success, else after a fixed time.
+"""
+
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import MissingDependencyError, UsageError
+from hma_data.lab import Progress, written_beside
+from hma_data.lab.pusher import Floats, Planned, Policy, Tee, Wandering, rotation
+
+TICK_S = 0.01  # of the physics
+LAG_S = 0.2  # the pusher's spring (k_v / k_p of the environment) trails a moving target by this
+SPEED = 300.0  # px/s of planned motion
+STARTS = ("near", "random", "near", "far", "near")
+EPOCH_NS = 1_700_000_000_000_000_000  # of the first bag's stamps; a minute between episodes
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a robot's arena is drawn.
+
+    Attributes:
+        size: of the square pictures in px.
+        block, pusher, raised: colour names.
+    """
+
+    size: int
+    block: str
+    pusher: str
+    raised: str
+
+
+FAST_LOOK = Look(128, "LightSlateGray", "RoyalBlue", "RoyalBlue")
+SLOW_LOOK = Look(96, "Peru", "Crimson", "Pink")
+FAST_STEPS, SLOW_TICKS = 80, 720
+LEAST_S, REST_S = 4.0, 0.6  # shortest episode, and time recorded after success
+
+
+def record_pusht(
+    out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None
+) -> Path:
+    """Record `pusht_fast` as `out/pusht_fast.hdf5`, or `pusht_slow` as MCAP files in `out/pusht_slow/`.
+
+    Same arguments, same bytes. See `hma_data.lab.record`.
+    """
+    if robot not in _WRITERS:
+        raise UsageError(robot, "is not a robot of gym-pusht", f"known: {', '.join(_WRITERS)}")
+    name, write = _WRITERS[robot]
+    with written_beside(Path(out) / name) as part:
+        write(part, episodes, seed, on_progress)
+    return Path(out) / name
+
+
+record = record_pusht
+
+
+class Arena:
+    """The environment, and the little of its state that the robots need.
+
+    Args:
+        look: colours and picture size.
+        start: near, far or random, see STARTS.
+        rng: of the episode.
+
+    Raises:
+        MissingDependencyError: gym-pusht is not installed.
+    """
+
+    def __init__(self, look: Look, start: str, rng: np.random.Generator) -> None:
+        environment, color = _environment()
+        self._env = environment(obs_type="state", observation_width=look.size, observation_height=look.size)
+        self._colors = {True: color(look.raised), False: color(look.pusher)}
+        self._env.reset(seed=int(rng.integers(2**31)))
+        boxes = [(np.min(v, axis=0), np.max(v, axis=0)) for v in map(_vertices, self._env.block.shapes)]
+        body, (pusher,) = self._env.block, self._env.agent.shapes
+        self.tee = Tee(
+            np.array(boxes), np.array(body.center_of_gravity), body.mass, body.moment, pusher.radius
+        )
+        self.goal: Floats = np.asarray(self._env.goal_pose, dtype=np.float64)
+        if start == "near":
+            self._env.reset(options={"reset_to_state": self._near_goal(rng)})
+        for shape in self._env.block.shapes:
+            shape.color = color(look.block)
+        self.raised = False
+        self.lift(False)
+        self.ticks, self.reward, self.success = 0, 0.0, False
+
+    def _near_goal(self, rng: np.random.Generator) -> Floats:
+        """State (5,) with the T within some 50 px and 0.5 rad of its goal.
+
+        The environment sets the angle after the position and turns about the centre of mass, which
+        moves the T; that is undone beforehand.
+        """
+        x, y, angle = self.goal + rng.normal(0, (35, 35, 0.5))
+        place = np.array([x, y]) - self.tee.center + rotation(angle) @ self.tee.center
+        return np.array([*rng.uniform(50, 450, 2), *place, angle])
+
+    @property
+    def pose(self) -> Floats:
+        """(3,) x, y, angle of the T."""
+        return np.array([*self._env.block.position, self._env.block.angle])
+
+    @property
+    def agent(self) -> Floats:
+        """(2,) centre of the pusher."""
+        return np.array(self._env.agent.position)
+
+    @property
+    def velocity(self) -> Floats:
+        """(2,) of the pusher in px/s."""
+        return np.array(self._env.agent.velocity)
+
+    @property
+    def state(self) -> Floats:
+        """(5,) pusher x, y, T x, y, angle: the environment's observation."""
+        return np.asarray(self._env.get_obs(), dtype=np.float64)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(size, size, 3) RGB."""
+        self._env.obs_type = "pixels"
+        pixels: NDArray[np.uint8] = self._env.get_obs()
+        self._env.obs_type = "state"
+        return pixels
+
+    def lift(self, up: bool) -> None:
+        """Raise or lower the pusher; over the T it stays up."""
+        local = (self.agent - self.pose[:2]) @ rotation(self.pose[2])
+        over = float(self.tee.distance(local)) < self.tee.radius
+        self.raised = up or (self.raised and over)
+        (shape,) = self._env.agent.shapes
+        shape.sensor, shape.color = self.raised, self._colors[self.raised]
+
+    def advance(self, target: Floats, ticks: int) -> None:
+        """Run the physics with the pusher drawn to `target` (2,)."""
+        self._env.control_hz = 1 / (TICK_S * (ticks + 0.5))  # the environment rounds down to ticks
+        _, self.reward, _, _, info = self._env.step(target)
+        self.ticks += ticks
+        self.success = self.success or bool(info["is_success"])
+
+
+def _vertices(shape: Any) -> list[tuple[float, float]]:
+    vertices: list[tuple[float, float]] = shape.get_vertices()
+    return vertices
+
+
+def _environment() -> tuple[Any, Any]:
+    """The environment's class and pygame's Color."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            from gym_pusht.envs.pusht import PushTEnv
+            from pygame import Color
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "gym-pusht", f"cannot be imported: {fault}", "pip install 'gym-pusht>=0.1.6'"
+        ) from fault
+    return PushTEnv, Color
+
+
+def _begin(
+    look: Look, robot: int, seed: int, episode: int, fly: bool
+) -> tuple[Arena, Policy, np.random.Generator]:
+    rng = np.random.default_rng((seed, robot, episode))
+    start = STARTS[episode % len(STARTS)]
+    arena = Arena(look, start, rng)
+    if start == "random":
+        return arena, Wandering(arena.agent, fly, rng), rng
+    return arena, Planned(arena.tee, arena.goal, arena.agent, SPEED, fly, rng), rng
+
+
+def _within(target: Floats) -> Floats:
+    return np.clip(target, 15.0, 497.0)
+
+
+# -- pusht_fast
+
+
+def _write_fast(path: Path, episodes: int, seed: int, on_progress: Progress | None) -> None:
+    from hma_data.lab.write_hdf5 import Demo, write_demos
+
+    def demos() -> Iterator[Demo]:
+        for episode in range(episodes):
+            yield _fast_demo(seed, episode)
+            if on_progress:
+                on_progress(episode + 1, episodes)
+
+    kwargs = {"control_hz": 10, "observation_width": FAST_LOOK.size, "observation_height": FAST_LOOK.size}
+    write_demos(path, demos(), {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs})
+
+
+def _fast_demo(seed: int, episode: int) -> Any:
+    from hma_data.lab.write_hdf5 import Demo
+
+    arena, policy, _ = _begin(FAST_LOOK, 0, seed, episode, fly=False)
+    period, setpoint, stop = 0.1, arena.agent, FAST_STEPS
+    images, positions, states, rewards = [], [], [], []
+    actions: list[NDArray[np.float32]] = []
+    while len(actions) < stop:
+        images.append(arena.picture())
+        positions.append(arena.agent)
+        states.append(arena.state)
+        if arena.success:
+            action = actions[-1]
+        else:
+            ahead, _ = policy.act(arena.pose, arena.agent, period)
+            action = _within(ahead + (ahead - setpoint) * ((LAG_S - period / 2) / period)).astype(np.float32)
+            setpoint = ahead
+        actions.append(action)
+        before = arena.success
+        arena.advance(action.astype(np.float64), 10)
+        rewards.append(arena.reward)
+        if arena.success and not before:
+            stop = min(stop, max(round(LEAST_S / period), len(actions) + round(REST_S / period)))
+    return Demo(
+        actions=np.stack(actions),
+        observations={"image": np.stack(images), "agent_pos": np.stack(positions)},
+        states=np.stack(states),
+        rewards=np.array(rewards),
+        success=arena.success,
+        facts={"start": STARTS[episode % len(STARTS)], "seed": seed},
+    )
+
+
+# -- pusht_slow
+
+
+def _write_slow(path: Path, episodes: int, seed: int, on_progress: Progress | None) -> None:
+    path.mkdir()
+    for episode in range(episodes):
+        _slow_bag(path / f"episode_{episode:04d}.mcap", seed, episode)
+        if on_progress:
+            on_progress(episode + 1, episodes)
+
+
+def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
+    """(tick, event) in order. Camera and commands jitter by a tick; stamps say when it really was."""
+    events = [(tick, "joints") for tick in range(0, SLOW_TICKS, 5)]
+    events += [(tick + int(rng.integers(-1, 2)), "command") for tick in range(2, SLOW_TICKS, 20)]
+    events += [(tick + int(rng.integers(-1, 2)), "camera") for tick in range(3, SLOW_TICKS, 8)]
+    return sorted(events)
+
+
+def _slow_bag(path: Path, seed: int, episode: int) -> None:
+    from hma_data.lab.write_mcap import Message, joints, picture, twist, write_messages
+
+    arena, policy, rng = _begin(SLOW_LOOK, 1, seed, episode, fly=True)
+    setpoint, stop = arena.agent, SLOW_TICKS
+    velocity: Floats = np.zeros(2)
+    messages: list[Message] = []
+
+    for tick, event in _slow_schedule(rng):
+        if tick >= stop:
+            break
+        if ticks := tick - arena.ticks:
+            before = arena.success
+            setpoint = _within(setpoint + velocity * ticks * TICK_S)
+            arena.advance(_within(setpoint + velocity * (LAG_S - ticks * TICK_S / 2)), ticks)
+            if arena.success and not before:
+                stop = min(stop, max(round(LEAST_S / TICK_S), tick + round(REST_S / TICK_S)))
+        stamp = EPOCH_NS + episode * 60_000_000_000 + tick * round(TICK_S * 1e9)
+        if event == "camera":
+            late = stamp + int(rng.integers(12_000_000, 20_000_000))
+            messages.append(picture("/camera/image/compressed", stamp, late, arena.picture(), "camera"))
+        elif event == "joints":
+            late = stamp + int(rng.integers(500_000, 2_000_000))
+            place, motion = np.append(arena.agent, arena.raised), np.append(arena.velocity, 0.0)
+            messages.append(joints("/joint_states", stamp, late, ("x", "y", "lift"), place, motion, "arena"))
+        else:
+            ahead, up = policy.act(arena.pose, arena.agent, 0.2)
+            velocity = np.zeros(2) if arena.success else (ahead - setpoint) / 0.2
+            up = up and not arena.success
+            arena.lift(up)
+            late = stamp + int(rng.integers(500_000, 2_000_000))
+            messages.append(twist("/command", stamp, late, np.append(velocity, up), "arena"))
+    facts = {"success": str(arena.success).lower(), "start": STARTS[episode % len(STARTS)], "seed": str(seed)}
+    write_messages(path, messages, {"robot": "pusht_slow", **facts})
+
+
+_WRITERS: dict[str, tuple[str, Callable[[Path, int, int, Progress | None], None]]] = {
+    "pusht_fast": ("pusht_fast.hdf5", _write_fast),
+    "pusht_slow": ("pusht_slow", _write_slow),
+}
