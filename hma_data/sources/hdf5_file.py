@@ -1,0 +1,176 @@
+"""HDF5 files: opened lazily in each process, read a few rows at a time, trusted with nothing.
+
+Only what lies in the file itself is read: links to other files, external storage and virtual
+datasets are refused, as are sizes no recording has.
+"""
+
+import os
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import EpisodeError, HMAError
+
+OPEN_FILES = 8
+CHUNK_CACHE = 16 << 20  # bytes a dataset; frames of one chunk asked for in two calls are inflated once
+MAX_BYTES = 1 << 30  # of a chunk, or of numbers read whole
+MAX_KEYS, MAX_DEPTH = 5_000, 16
+
+
+class OpenFiles:
+    """The files open in this process, the least recently used closed first; none outlives a fork."""
+
+    def __init__(self) -> None:
+        self._process = os.getpid()
+        self._files: OrderedDict[Path, h5py.File] = OrderedDict()
+
+    def get(self, path: Path) -> h5py.File:
+        """The open file.
+
+        Raises:
+            OSError: it is not HDF5, or is cut off; `explained` says so in our words.
+        """
+        if self._process != os.getpid():
+            self._files, self._process = OrderedDict(), os.getpid()
+        if path not in self._files:
+            # No locks: read-only folders and network file systems refuse them.
+            self._files[path] = h5py.File(path, "r", locking=False, rdcc_nbytes=CHUNK_CACHE)
+        self._files.move_to_end(path)
+        while len(self._files) > OPEN_FILES:
+            self._files.popitem(last=False)[1].close()
+        return self._files[path]
+
+    def close(self) -> None:
+        """Close all."""
+        while self._files:
+            self._files.popitem()[1].close()
+
+
+@contextmanager
+def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[None]:
+    """Turns what h5py raises on damaged files into one line of ours."""
+    try:
+        yield
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as fault:
+        lines = str(fault).splitlines() or [type(fault).__name__]
+        raise error(
+            where, f"cannot be read as HDF5: {lines[0]}", "the file may be cut off or damaged"
+        ) from fault
+
+
+def member(group: h5py.Group, key: str, where: str) -> Any:
+    """The group or dataset at a path inside `group`.
+
+    Raises:
+        EpisodeError: it is not there (with the nearest keys), or lies in another file.
+    """
+    found: Any = group
+    for part in key.strip("/").split("/"):
+        link = found.get(part, getlink=True) if isinstance(found, h5py.Group) else None
+        if link is None:
+            raise EpisodeError(where, f"has no {key!r}", _nearest(group, key))
+        if isinstance(link, h5py.ExternalLink):
+            raise EpisodeError(where, f"{key!r} links to another file, {link.filename!r}", "copy it in")
+        found = found[part]
+    return found
+
+
+def child(group: h5py.Group, name: str) -> Any:
+    """The direct member of that name, or None where there is none in this file."""
+    link = group.get(name, getlink=True)
+    return None if link is None or isinstance(link, h5py.ExternalLink) else group.get(name)
+
+
+def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
+    """The dataset at a path inside `group`, known to lie in this file and to have rows.
+
+    Raises:
+        EpisodeError: see `member`; or it is a group, a single value, empty, or of a size no recording has.
+    """
+    found = member(group, key, where)
+    if isinstance(found, h5py.Group):
+        inner = ", ".join(f"{key.strip('/')}/{name}" for name in list(found)[:8])
+        raise EpisodeError(where, f"{key!r} is a group, not a dataset", f"it holds: {inner or 'nothing'}")
+    if not isinstance(found, h5py.Dataset):
+        raise EpisodeError(where, f"{key!r} is a named type, not a dataset")
+    if found.external or found.is_virtual:
+        raise EpisodeError(where, f"{key!r} keeps its values in other files", "write them into this one")
+    if not found.shape:
+        raise EpisodeError(where, f"{key!r} is a single value, not one a frame")
+    if not found.shape[0]:
+        raise EpisodeError(where, f"{key!r} is empty")
+    if found.chunks and np.prod(found.chunks, dtype=float) * found.dtype.itemsize > MAX_BYTES:
+        raise EpisodeError(where, f"{key!r} has chunks of {found.chunks}, too large to read")
+    return found
+
+
+def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
+    """All values (T, …) of a dataset of numbers."""
+    found = dataset(group, key, where)
+    if np.prod(found.shape, dtype=float) * found.dtype.itemsize > MAX_BYTES:
+        raise EpisodeError(where, f"{key!r} has shape {found.shape}, too large for numbers over time")
+    values: NDArray[Any] = found[()]
+    return values
+
+
+def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
+    """The rows of those indices (n, …), in the order asked for.
+
+    Neighbours are read as one slice, and so are rows of one chunk, which is inflated once.
+    """
+    wanted = np.asarray(indices, np.int64).reshape(-1)
+    if not len(wanted):
+        return np.zeros((0, *found.shape[1:]), found.dtype)
+    if not 0 <= wanted.min() <= wanted.max() < len(found):
+        raise IndexError(f"{found.name} has {len(found)} rows, asked for {wanted.min()} to {wanted.max()}")
+    ordered = np.unique(wanted)
+    band = ordered // (found.chunks[0] if found.chunks else 1)
+    breaks = np.flatnonzero((np.diff(ordered) > 1) & (np.diff(band) > 0)) + 1
+    parts = [found[run[0] : run[-1] + 1][run - run[0]] for run in np.split(ordered, breaks)]
+    joined: NDArray[Any] = np.concatenate(parts)
+    return joined[np.searchsorted(ordered, wanted)]
+
+
+def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
+    """Every dataset below `group`, by path; links are not followed."""
+    pending: list[tuple[str, h5py.Group]] = [("", group)]
+    seen = 0
+    while pending:
+        prefix, current = pending.pop(0)
+        for name in current:
+            seen += 1
+            if seen > MAX_KEYS or prefix.count("/") > MAX_DEPTH:
+                return
+            if not isinstance(current.get(name, getlink=True), h5py.HardLink):
+                continue
+            item = current[name]
+            if isinstance(item, h5py.Group):
+                pending.append((f"{prefix}{name}/", item))
+            elif isinstance(item, h5py.Dataset):
+                yield f"{prefix}{name}", item
+
+
+def text(value: Any) -> str:
+    """An attribute or a dataset's value as text; empty when it is none."""
+    if isinstance(value, h5py.Empty):
+        return ""
+    if isinstance(value, np.ndarray):
+        value = value.reshape(-1)[0] if value.size else b""
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", errors="replace")
+    return str(value).strip().strip('"').strip("\x00").strip() if isinstance(value, str) else ""
+
+
+def _nearest(group: h5py.Group, key: str) -> str:
+    keys = [name for name, _ in walk(group)]
+    near = get_close_matches(key.strip("/"), keys, n=3, cutoff=0.5)
+    if near:
+        return f"did you mean {', '.join(near)}?"
+    return f"it has {', '.join(keys[:8])}{', …' if len(keys) > 8 else ''}" if keys else "it has no datasets"
