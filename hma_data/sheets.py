@@ -51,7 +51,7 @@ def write_text(picture: Images, text: str, at: tuple[int, int], scale: float = 0
 def with_actions(
     frames: Images, actions: NDArray[np.float32], low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> Images:
-    """Frames (N, H, W, 3) with a bar an action dim below, from its `low` to its `high` (A,) -> (N, H+…, W, 3)."""
+    """Frames (N, H, W, 3) with a bar for each action dim below it, from `low` to `high` (A,)."""
     count, height, width = frames.shape[:3]
     dims = actions.shape[1]
     line = max(3, min(8, 96 // max(dims, 1)))

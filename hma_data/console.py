@@ -1,0 +1,147 @@
+"""How commands speak: tables and progress on a terminal, JSON for programs, errors in one line.
+
+Shared by the data and model verbs. rich is imported when something is shown.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+
+class Update(Protocol):
+    """Moves a progress display on."""
+
+    def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
+        """`done` so far, a few words beside the bar, and the total where it has become known."""
+        ...
+
+
+def print_json(values: Any) -> None:
+    """Plain values to standard output."""
+    print(json.dumps(values, indent=1, ensure_ascii=False, default=str))
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "") -> None:
+    """A table to standard output; numbers to the right; full width when it is not a terminal."""
+    from rich.box import SIMPLE
+    from rich.table import Table
+
+    table = Table(*columns, title=title or None, title_justify="left", box=SIMPLE, pad_edge=False)
+    for i, column in enumerate(table.columns):
+        if all(isinstance(row[i], int | float) for row in rows):
+            column.justify = "right"
+    for row in rows:
+        table.add_row(*(_cell(value) for value in row))
+    stdout().print(table)
+
+
+def stdout() -> Any:
+    """A console on standard output, wide when nobody sees it as a terminal."""
+    from rich.console import Console
+
+    return Console(
+        width=None if sys.stdout.isatty() else 200, soft_wrap=not sys.stdout.isatty(), highlight=False
+    )
+
+
+def _cell(value: Any) -> str:
+    from rich.markup import escape
+
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:,.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    return escape(str(value))
+
+
+def human_bytes(count: float) -> str:
+    """1234567 -> 1.2 MB."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if count < 1000 or unit == "TB":
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return ""
+
+
+def human_seconds(seconds: float) -> str:
+    """3725 -> 1 h 02 min."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    if seconds < 3600:
+        return f"{seconds // 60:.0f} min {seconds % 60:02.0f} s"
+    return f"{seconds // 3600:.0f} h {seconds % 3600 // 60:02.0f} min"
+
+
+@contextmanager
+def progress(description: str, total: float = 0, unit: str = "frames") -> Iterator[Update]:
+    """A bar with rate and time left on standard error; a line every ten seconds where it is no terminal."""
+    if sys.stderr.isatty():
+        with _bar(description, total, unit) as update:
+            yield update
+    else:
+        lines = _Lines(description, total, unit)
+        yield lines
+        lines.close()
+
+
+@contextmanager
+def _bar(description: str, total: float, unit: str) -> Iterator[Update]:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.completed:,.0f}/{task.total:,.0f} " + unit),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[extra]}"),
+        console=Console(stderr=True),
+        refresh_per_second=5,
+    )
+    with bar:
+        task = bar.add_task(description, total=total or 1, rate="", extra="")
+
+        def update(done: float, extra: str = "", total: float | None = None) -> None:
+            speed = bar.tasks[0].speed
+            rate = f"{speed:,.0f}/s" if speed else ""
+            bar.update(task, completed=done, total=total or bar.tasks[0].total, extra=extra, rate=rate)
+
+        yield update
+
+
+class _Lines:
+    """Progress for logs: one line every ten seconds, and one at the end."""
+
+    def __init__(self, description: str, total: float, unit: str) -> None:
+        self._text, self._total, self._unit = description, total, unit
+        self._start = self._shown = time.monotonic()
+        self._first: float | None = None
+        self._done, self._extra = 0.0, ""
+
+    def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
+        self._done, self._extra, self._total = done, extra, total or self._total
+        if self._first is None:
+            self._first = done  # what an earlier run had done does not count for the rate
+        if time.monotonic() - self._shown >= 10:
+            self._show()
+
+    def close(self) -> None:
+        if self._first is not None:
+            self._show()
+
+    def _show(self) -> None:
+        self._shown = time.monotonic()
+        rate = (self._done - (self._first or 0)) / max(self._shown - self._start, 1e-9)
+        missing = self._total - self._done
+        left = f", {human_seconds(missing / rate)} left" if rate > 0 and missing > 0 else ""
+        words = f", {self._extra}" if self._extra else ""
+        text = f"{self._text}: {self._done:,.0f}/{self._total:,.0f} {self._unit}, {rate:,.0f}/s{left}{words}"
+        print(text, file=sys.stderr, flush=True)
