@@ -56,7 +56,7 @@ def _about(config: Mapping[str, Any]) -> str:
     model, tokenizer = config["model"], config["tokenizer"]
     grid = "×".join(str(side) for side in model.get("grid", ()))
     return (
-        "An action-conditioned video model of robots (Heterogeneous Masked Autoregression): one shared trunk, "
+        "An action-conditioned video model of robots (Heterogeneous Masked Autoregression): one trunk, "
         "and a stem and head for each embodiment, which are published and pulled one at a time.\n\n"
         f"- network: {_line(model.get('kind'))}, {_line(model.get('layers'))} layers, "
         f"width {_line(model.get('width'))}, {_line(model.get('heads'))} heads, "
@@ -118,8 +118,8 @@ def _usage(name: str, cards: Mapping[str, Any]) -> str:
 
 def _links(config: Mapping[str, Any]) -> str:
     return (
-        f"Format version {_line(config.get('format_version'))}. Every `card.json` names the SHA-256 of the trunk "
-        "its stem was trained with; parts that do not belong together are refused on loading."
+        f"Format version {_line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
+        "parts that do not belong together are refused on loading."
     )
 
 

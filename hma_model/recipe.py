@@ -1,0 +1,254 @@
+"""What to train, stated whole before it begins: a frozen recipe from YAML and dotted overrides.
+
+    extends: discrete_tiny          # another recipe, by name or path beside this one
+    data: [shards/arm, shards/hand]
+    model: {layers: 4, width: 128}
+    lr: 1e-3
+
+A recipe refuses what it does not know. What the shards state (kind, grid, vocabulary, latents) is
+derived from them and cannot be given.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from hma_data.errors import RecipeError, UsageError
+from hma_data.shipped import shipped
+from hma_data.yaml_io import parse_yaml, read_yaml
+from hma_model.config import HMAConfig
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import TokenizerSpec
+
+MAX_EXTENDS = 8
+_DERIVED = {"kind", "grid", "factored", "channels", "latent_scale", "frames", "objectives", "tokenizer"}
+# what may differ when a run goes on: where and how often, but nothing that changes the weights
+_FREE = {"data", "out", "device", "workers", "eval_every", "eval_windows", "checkpoint_every", "keep_last"}
+
+
+def _no_bool(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+Count = Annotated[int, BeforeValidator(_no_bool)]
+Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class MixtureSettings(_Settings):
+    """How often each embodiment is drawn; see `hma_data.mixture`."""
+
+    temperature: Number = Field(3.0, gt=0)
+    draw: Literal["per_sample", "per_batch"] = "per_sample"
+    weights: dict[str, Number] = Field({}, description="embodiment id -> factor on its probability")
+
+
+class Recipe(_Settings):
+    """A training run. Made by `load_recipe`, which explains its errors."""
+
+    data: Annotated[tuple[str, ...], BeforeValidator(_listed)] = Field(
+        (), description="folders of shards, one an embodiment"
+    )
+    mixture: MixtureSettings = MixtureSettings()
+    frames: Count = Field(12, ge=2, le=4096, description="T of a window")
+    batch_size: Count = Field(8, ge=1, description="windows a forward pass")
+    accumulate: Count = Field(1, ge=1, description="forward passes a step")
+    model: dict[str, Any] = Field({}, description="fields of HMAConfig")
+    objectives: dict[str, Number] = Field({"forward": 1.0}, description="how often each is drawn")
+
+    steps: Count = Field(1000, ge=1)
+    lr: Number = Field(3e-4, gt=0)
+    lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")
+    warmup: Count = Field(100, ge=0, description="steps in which lr rises from 0")
+    schedule: Literal["constant_with_warmup", "cosine"] = "constant_with_warmup"
+    lr_end: Number = Field(0.1, ge=0, le=1, description="cosine: the last step's share of lr")
+    betas: tuple[Number, Number] = (0.9, 0.95)
+    eps: Number = Field(1e-8, gt=0)
+    weight_decay: Number = Field(0.05, ge=0)
+    clip: Number = Field(1.0, gt=0, description="of the gradient's norm")
+    nonfinite: Literal["stop", "skip"] = Field("stop", description="at a loss that is not a number")
+
+    seed: Count = Field(42, ge=0, lt=2**63)
+    precision: Literal["fp32", "bf16"] = "fp32"
+    device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")
+    workers: Count = Field(0, ge=0, description="processes that decode batches")
+    eval_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
+    eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
+    checkpoint_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
+    keep_last: Count = Field(3, ge=1)
+    out: str | None = Field(None, description="the run's folder")
+
+    @property
+    def windows_per_step(self) -> int:
+        """Windows between two updates of the weights."""
+        return self.batch_size * self.accumulate
+
+    def values(self) -> dict[str, Any]:
+        """Plain values, all of them."""
+        return self.model_dump(mode="json")
+
+    def identity(self) -> dict[str, Any]:
+        """What must be the same for a run to go on."""
+        return {key: value for key, value in self.values().items() if key not in _FREE}
+
+    def network(self, spec: "TokenizerSpec") -> HMAConfig:
+        """The network's config for tokens of this tokenizer.
+
+        Raises:
+            RecipeError: a value of `model` is not allowed.
+        """
+        derived: dict[str, Any] = {"kind": spec.kind, "grid": spec.grid, "tokenizer": spec.to_json()}
+        if spec.kind == "discrete":
+            derived["factored"] = spec.factored or (spec.vocab_size,)
+        else:
+            derived.update(channels=spec.channels, latent_scale=spec.latent_scale)
+        derived.update(frames=self.frames, objectives=self.objectives)
+        try:
+            return HMAConfig(**{**self.model, **derived})
+        except TypeError as fault:  # a text where the config compares numbers
+            raise RecipeError("recipe: model", f"a value is of the wrong type: {fault}") from fault
+
+
+def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
+    """The recipe of a YAML file, with overrides.
+
+    Args:
+        name_or_path: a file, or the name of a recipe that comes with the package.
+        overrides: `key=value` with dots for keys inside keys, values as YAML: `model.layers=4`.
+
+    Raises:
+        RecipeError: no such recipe, or all its problems, each with key, value and what is allowed.
+        UsageError: an override is not key=value.
+    """
+    path = find_recipe(name_or_path)
+    values = merge(_extended(path, []), parse_overrides(overrides), "override")
+    return make_recipe(values, f"{path}" + (" with overrides" if overrides else ""))
+
+
+def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
+    """The recipe of plain values; errors as `load_recipe`."""
+    found = _model_problems(values.get("model"))
+    try:
+        recipe = Recipe.model_validate(dict(values))
+    except ValidationError as fault:
+        found += [_problem(item) for item in fault.errors(include_url=False)]
+    if found:
+        raise RecipeError(where, "; ".join(found), "correct the recipe or the override")
+    return recipe
+
+
+def find_recipe(name_or_path: str | Path) -> Path:
+    """The file of a recipe: a path, or a name below the shipped `recipes/` or `recipes/train/`."""
+    given = Path(name_or_path)
+    if given.is_file():
+        return given
+    folder = shipped("recipes")
+    for candidate in (folder / "train" / f"{given}.yaml", folder / f"{given}.yaml", folder / given):
+        if candidate.is_file() and not given.is_absolute():
+            return candidate
+    known = sorted(path.stem for path in (folder / "train").glob("*.yaml"))
+    near = get_close_matches(str(given), known, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise RecipeError(given, "no such recipe", f"{hint}give a YAML file or one of {', '.join(known)}")
+
+
+def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
+    """`["model.layers=4", "lr=1e-3"]` as nested values.
+
+    Raises:
+        UsageError: one is not key=value.
+    """
+    values: dict[str, Any] = {}
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        parts = key.strip().split(".")
+        if not equals or not all(parts):
+            raise UsageError(f"override {override!r}", "is not key=value", "write for example model.layers=4")
+        nested: Any = parse_yaml(text, f"override {override!r}", UsageError)
+        for part in reversed(parts):
+            nested = {part: nested}
+        values = merge(values, nested, f"override {override!r}")
+    return values
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any], where: object) -> dict[str, Any]:
+    """Mappings merge key by key; anything else of `over` replaces what `base` has."""
+    merged = dict(base)
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(merged.get(key), dict) and key != "objectives":
+            merged[key] = merge(merged[key], value, where)
+        else:
+            merged[key] = value
+    return merged
+
+
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """What differs between two recipes' values: `lr: 0.001, now 0.002`, one an entry."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        return [
+            line
+            for key in sorted(old.keys() | new.keys())
+            for line in differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+        ]
+    return [] if old == new else [f"{path}: {old!r}, now {new!r}"]
+
+
+def _extended(path: Path, seen: list[Path]) -> dict[str, Any]:
+    if path.resolve() in seen or len(seen) >= MAX_EXTENDS:
+        chain = " -> ".join(p.name for p in [*seen, path])
+        raise RecipeError(path, f"extends itself or too deep: {chain}", "extend another recipe")
+    values = read_yaml(path, RecipeError)
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise RecipeError(path, f"must be a mapping, is {type(values).__name__}")
+    base = values.pop("extends", None)
+    if base is None:
+        return values
+    if not isinstance(base, str):
+        raise RecipeError(path, f"extends must name a recipe, is {base!r}")
+    beside = path.parent / base
+    beside = beside if beside.suffix else beside.with_suffix(".yaml")
+    found = beside if beside.is_file() else find_recipe(base)
+    return merge(_extended(found, [*seen, path.resolve()]), values, path)
+
+
+def _model_problems(model: Any) -> list[str]:
+    if not isinstance(model, dict):
+        return []
+    allowed = [f.name for f in fields(HMAConfig) if f.name not in _DERIVED]
+    found = []
+    for key in model:
+        if key in _DERIVED:
+            found.append(f"model.{key}: follows from the shards and the recipe, and cannot be given")
+        elif key not in allowed:
+            found.append(_unknown(f"model.{key}", allowed))
+    return found
+
+
+def _problem(item: Any) -> str:
+    path = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        settings = MixtureSettings if path.startswith("mixture.") else Recipe
+        return _unknown(path, list(settings.model_fields))
+    message = item["msg"].removeprefix("Value error, ").replace("valid tuple", "list")
+    return f"{path}: {message} (is {item['input']!r})"
+
+
+def _unknown(path: str, known: list[str]) -> str:
+    near = get_close_matches(path.rsplit(".", 1)[-1], known, n=1)
+    return f"{path}: unknown key" + (f", did you mean {near[0]!r}?" if near else "")

@@ -1,0 +1,113 @@
+"""The optimizer: what decays, muP's scaling, schedules, and moments that come back."""
+
+import pytest
+import torch
+from robots import CONFIG, make_model
+
+from hma_data.errors import CheckpointError
+from hma_model.optim import (
+    learning_rate,
+    load_optimizer_state,
+    lr_scale,
+    make_optimizer,
+    optimizer_state,
+    parameter_groups,
+)
+from hma_model.recipe import make_recipe
+
+ROBOTS = {"arm": 2, "hand": 3}
+
+
+def by_name(model, lr=1.0, decay=0.1) -> dict[str, tuple[float, float]]:
+    """Name -> (lr, weight decay)."""
+    groups = parameter_groups(model, lr, decay)
+    return {name: (g["lr"], g["weight_decay"]) for g in groups for name in g["names"]}
+
+
+def test_every_parameter_is_in_exactly_one_group():
+    model = make_model(ROBOTS)
+    names = [name for group in parameter_groups(model, 1.0, 0.1) for name in group["names"]]
+    assert sorted(names) == sorted(name for name, _ in model.named_parameters())
+
+
+def test_only_matrices_decay():
+    model = make_model(ROBOTS, config=CONFIG.replace(qkv_bias=True, qk_norm=True))
+    for name, (_, decay) in by_name(model).items():
+        kind = name.rsplit(".", 1)[-1]
+        vector = kind.startswith("bias") or kind in ("mask", "position", "absent") or "norm" in name
+        assert decay == (0.0 if vector or ".digits." in name else 0.1), name
+
+
+def test_frozen_parameters_are_left_out():
+    model = make_model(ROBOTS)
+    model.trunk.requires_grad_(False)
+    assert not any(name.startswith("trunk.") for name in by_name(model))
+
+
+def test_without_mup_every_group_has_the_same_lr():
+    assert {lr for lr, _ in by_name(make_model(ROBOTS)).values()} == {1.0}
+
+
+def test_mup_scales_what_grows_in_both_directions_and_keeps_lr_times_decay():
+    model = make_model(ROBOTS, config=CONFIG.replace(mup=True, base_width=4))
+    found = by_name(model)
+    assert found["trunk.blocks.0.mlp.fc1.weight"] == pytest.approx((0.25, 0.4))
+    assert found["stems.id_arm.modulation.weight"] == pytest.approx((0.25, 0.4))
+    assert found["stems.id_arm.input.weight"] == (1.0, 0.1)
+    assert found["readout.linear.weight"] == (1.0, 0.1)
+    assert found["trunk.position"] == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("width", [32, 128])
+def test_at_its_base_width_mup_changes_no_rate(width):
+    model = make_model({"arm": 2}, config=CONFIG.replace(mup=True, width=width, base_width=width))
+    assert {lr for lr, _ in by_name(model).values()} == {1.0}
+
+
+def test_the_constant_schedule_warms_up_and_stays():
+    recipe = make_recipe({"steps": 10, "warmup": 4})
+    scales = [lr_scale(step, recipe) for step in range(10)]
+    assert scales == [0.25, 0.5, 0.75, 1.0] + [1.0] * 6
+
+
+def test_the_cosine_schedule_ends_at_its_share():
+    recipe = make_recipe({"steps": 21, "warmup": 0, "schedule": "cosine", "lr_end": 0.2})
+    scales = [lr_scale(step, recipe) for step in range(21)]
+    assert scales[0] == 1.0 and scales[20] == pytest.approx(0.2) and scales[10] == pytest.approx(0.6)
+    assert scales == sorted(scales, reverse=True)
+
+
+@pytest.mark.parametrize(("windows", "factor"), [(8, 1), (64, 1), (128, 2), (512, 8), (4096, 8)])
+def test_the_papers_rule_grows_with_the_batch_up_to_eight_times(windows, factor):
+    recipe = make_recipe({"lr": 1e-4, "lr_rule": "paper", "batch_size": windows // 4, "accumulate": 4})
+    assert learning_rate(recipe) == pytest.approx(1e-4 * factor)
+
+
+def test_moments_come_back_and_the_next_step_is_the_same():
+    recipe = make_recipe({})
+    first, second = make_model(ROBOTS), make_model(ROBOTS)
+    optimizers = make_optimizer(first, recipe), make_optimizer(second, recipe)
+
+    def step(model, optimizer, seed):
+        torch.manual_seed(seed)
+        for name, parameter in model.named_parameters():
+            parameter.grad = None if "hand" in name else torch.randn_like(parameter)
+        optimizer.step()
+
+    step(first, optimizers[0], 1)
+    second.load_state_dict(first.state_dict())
+    load_optimizer_state(optimizers[1], optimizer_state(optimizers[0]), "test")
+    for model, optimizer in zip((first, second), optimizers):
+        step(model, optimizer, 2)
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters()))
+
+
+def test_moments_of_another_model_are_refused():
+    recipe = make_recipe({})
+    one, other = make_model({"arm": 2}), make_model({"arm": 3})
+    optimizer = make_optimizer(one, recipe)
+    for parameter in one.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+    with pytest.raises(CheckpointError, match="fits no parameter"):
+        load_optimizer_state(make_optimizer(other, recipe), optimizer_state(optimizer), "test")

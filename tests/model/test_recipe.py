@@ -1,0 +1,147 @@
+"""Recipes: what is accepted, merged and refused, and what follows from the shards."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from robots import SPEC
+
+from hma_data.errors import RecipeError, UsageError
+from hma_model.recipe import differences, load_recipe, make_recipe, parse_overrides
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def write(name: str, text: str) -> Path:
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_the_shipped_recipes_are_valid_and_make_networks():
+    continuous = replace(SPEC, kind="continuous", vocab_size=None, factored=(), channels=4, grid=(16, 16))
+    for name in ("discrete_tiny", "discrete_base", "continuous_tiny"):
+        spec = continuous if name.startswith("continuous") else SPEC
+        assert load_recipe(name).network(spec).kind == spec.kind
+
+
+def test_overrides_reach_nested_keys_and_are_yaml():
+    given = ["model.layers=2", "lr=1e-3", "data=[a, b]", "mixture.weights.arm=2", "out=null"]
+    recipe = load_recipe("discrete_tiny", given)
+    assert recipe.model == {"layers": 2, "width": 128, "heads": 4}
+    assert (recipe.lr, recipe.data, recipe.out) == (1e-3, ("a", "b"), None)
+    assert recipe.mixture.weights == {"arm": 2.0}
+
+
+def test_one_folder_of_data_needs_no_list():
+    assert load_recipe("discrete_tiny", ["data=shards/arm"]).data == ("shards/arm",)
+
+
+def test_a_later_override_wins():
+    assert load_recipe("discrete_tiny", ["steps=5", "steps=7"]).steps == 7
+
+
+@pytest.mark.parametrize("override", ["steps", "=3", "model..layers=2", ".=1", "", "data=[a", "lr=&x 1"])
+def test_a_malformed_override_is_wrong_usage(override):
+    with pytest.raises(UsageError) as caught:
+        load_recipe("discrete_tiny", [override])
+    assert caught.value.exit_code == 2
+
+
+def test_extends_takes_what_is_not_given(write):
+    write("base", "steps: 9\nmodel: {layers: 3, width: 32}\nlr: 0.5\n")
+    recipe = load_recipe(write("mine", "extends: base\nmodel: {width: 64}\nlr: 0.25\n"))
+    assert (recipe.steps, recipe.model, recipe.lr) == (9, {"layers": 3, "width": 64}, 0.25)
+
+
+def test_extends_replaces_objectives_as_a_whole(write):
+    write("base", "objectives: {forward: 1.0}\n")
+    assert load_recipe(write("mine", "extends: base\nobjectives: {passive: 1}\n")).objectives == {
+        "passive": 1.0
+    }
+
+
+def test_extends_finds_the_shipped_recipes(write):
+    assert load_recipe(write("mine", "extends: discrete_tiny\nsteps: 2\n")).model["width"] == 128
+
+
+def test_recipes_that_extend_each_other_are_refused(write):
+    write("a", "extends: b\n")
+    with pytest.raises(RecipeError, match=r"extends itself.*a\.yaml -> b\.yaml -> a\.yaml"):
+        load_recipe(write("b", "extends: a\n").with_name("a.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stepz: 3", r"stepz: unknown key, did you mean 'steps'\?"),
+        ("mixture: {temprature: 3}", r"mixture\.temprature: unknown key, did you mean 'temperature'\?"),
+        ("model: {layer: 3}", r"model\.layer: unknown key, did you mean 'layers'\?"),
+        ("model: {grid: [4, 4]}", r"model\.grid: follows from the shards"),
+        ("steps: many", r"steps: .*integer.*is 'many'"),
+        ("steps: true", "steps: must be a number, not true or false"),
+        ("steps: 0", "steps: .*greater than or equal to 1"),
+        ("lr: .nan", "lr: .*is nan"),
+        ("lr: .inf", "lr: .*finite"),
+        ("lr: -1", "lr: .*greater than 0"),
+        ("schedule: linear", r"schedule: .*'constant_with_warmup' or 'cosine'.*is 'linear'"),
+        ("device: gpu", "device: .*is 'gpu'"),
+        ("data: 3", "data: .*list"),
+        ("[1, 2]", "must be a mapping, is list"),
+        ("steps: 3\nsteps: 4", "given twice"),
+        ("model: 3", "model: .*dictionary"),
+    ],
+)
+def test_what_is_wrong_is_said_with_key_value_and_remedy(write, text, message):
+    with pytest.raises(RecipeError, match=message) as caught:
+        load_recipe(write("broken", text))
+    assert "broken.yaml" in caught.value.where
+    assert caught.value.exit_code == 1
+
+
+def test_all_problems_are_told_at_once(write):
+    with pytest.raises(RecipeError, match=r"model\.layer: .*lr: .*stepz: "):
+        load_recipe(write("broken", "stepz: 3\nlr: fast\nmodel: {layer: 1}\n"))
+
+
+def test_an_unknown_recipe_names_the_nearest():
+    with pytest.raises(RecipeError, match="did you mean 'discrete_tiny'"):
+        load_recipe("discrete_tinny")
+
+
+@pytest.mark.parametrize(
+    "model", [{"layers": 0}, {"layers": "four"}, {"width": 7, "heads": 2}, {"conditioning": "modulate"}]
+)
+def test_a_network_that_cannot_be_is_refused(model):
+    with pytest.raises(RecipeError, match="model"):
+        make_recipe({"model": model}).network(SPEC)
+
+
+def test_the_network_follows_the_shards_tokenizer():
+    config = make_recipe({"frames": 5, "model": {"layers": 1}}).network(SPEC)
+    assert (config.grid, config.factored, config.frames, config.tokenizer) == (
+        (2, 3),
+        (8, 8),
+        5,
+        SPEC.to_json(),
+    )
+
+
+def test_what_only_says_where_and_how_often_may_change_in_a_run():
+    old = make_recipe({"out": "a", "device": "cpu", "keep_last": 1, "workers": 0, "data": ["a"]})
+    new = make_recipe({"out": "b", "device": "cuda:1", "keep_last": 9, "workers": 4, "data": ["b"]})
+    assert differences(old.identity(), new.identity()) == []
+
+
+def test_the_difference_names_keys_with_both_values():
+    old, new = make_recipe({"lr": 1e-3}), make_recipe({"lr": 2e-3, "model": {"layers": 4}})
+    assert differences(old.identity(), new.identity()) == [
+        "lr: 0.001, now 0.002",
+        "model.layers: None, now 4",
+    ]
+
+
+def test_overrides_of_one_mapping_gather():
+    assert parse_overrides(["model.layers=2", "model.width=64"]) == {"model": {"layers": 2, "width": 64}}
