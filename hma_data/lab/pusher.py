@@ -13,7 +13,7 @@ Lengths are pixels of the 512 × 512 arena, angles radians. C contacts, N nodes,
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,7 +196,7 @@ def _walks(tee: Tee, agent: Floats, pose: Floats) -> tuple[Floats, Callable[[int
     local = ((agent - pose[:2]) @ turn)[None]
     usable = _inside(tee.corners @ turn.T + pose[:2])
     reach = np.where(usable, tee.legs(local, tee.corners)[0], np.inf)
-    previous = np.full(len(reach), -1)
+    previous: NDArray[np.int64] = np.full(len(reach), -1)
     for _ in range(len(reach)):
         longer = reach[:, None] + tee.between_corners
         better = (longer.min(axis=0) < reach - 1e-9) & usable
@@ -222,9 +222,8 @@ def _turned(vectors: Floats, angle: Floats) -> Floats:
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def _inside(points: Floats) -> NDArray[np.bool_]:
-    within: NDArray[np.bool_] = ((points > LOW) & (points < HIGH)).all(axis=-1)
-    return within
+def _inside(points: Floats) -> Any:
+    return np.all((points > LOW) & (points < HIGH), axis=-1)
 
 
 class Policy(Protocol):
@@ -270,7 +269,8 @@ class Wandering:
 
     def __init__(self, agent: Floats, fly: bool, rng: np.random.Generator) -> None:
         self._setpoint, self._fly, self._rng = agent.copy(), fly, rng
-        self._way, self._speed, self._up = np.empty((0, 2)), 0.0, False
+        self._way: Floats = np.empty((0, 2))
+        self._speed, self._up = 0.0, False
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
         """See Policy."""

@@ -1,0 +1,296 @@
+"""The laboratory's recordings hold what really happened in the environment, in the layouts they claim."""
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from hma_data.embodiment import Embodiment
+from hma_data.errors import MissingDependencyError, OutputError, UsageError
+from hma_data.lab import RECORDERS, record
+from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
+from hma_data.lab.pusht import SLOW_LOOK, Arena, record_pusht
+from hma_data.shipped import shipped
+
+EPISODES = 5
+
+
+@pytest.fixture(scope="module")
+def fast(tmp_path_factory: pytest.TempPathFactory) -> Iterator[h5py.File]:
+    """An open recording of pusht_fast."""
+    with h5py.File(record("pusht_fast", tmp_path_factory.mktemp("fast"), EPISODES, seed=3)) as file:
+        yield file
+
+
+@pytest.fixture(scope="module")
+def slow(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The bags of a recording of pusht_slow."""
+    return sorted(record("pusht_slow", tmp_path_factory.mktemp("slow"), EPISODES, seed=3).iterdir())
+
+
+def bag(path: Path) -> dict[str, list[tuple[int, int, Any]]]:
+    """topic -> (header stamp, receive time, message) of every message, read by rosbags."""
+    topics: dict[str, list[tuple[int, int, Any]]] = {}
+    with AnyReader([path]) as reader:
+        for connection, received, raw in reader.messages():
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            topics.setdefault(connection.topic, []).append((stamp, received, message))
+    return topics
+
+
+def hashes(path: Path) -> list[str]:
+    files = [path] if path.is_file() else sorted(path.iterdir())
+    return [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+
+
+def arena(start: str = "near", seed: int = 0) -> Arena:
+    return Arena(SLOW_LOOK, start, np.random.default_rng(seed))
+
+
+# -- pusht_fast
+
+
+def test_hdf5_has_robomimic_layout(fast: h5py.File) -> None:
+    total = 0
+    for i in range(EPISODES):
+        demo = fast[f"data/demo_{i}"]
+        length = demo.attrs["num_samples"]
+        total += length
+        assert demo["actions"].shape == (length, 2) and demo["actions"].dtype == np.float32
+        assert demo["obs/image"].shape == (length, 128, 128, 3) and demo["obs/image"].chunks[0] == 1
+        assert {len(demo[key]) for key in ("obs/agent_pos", "states", "rewards", "dones")} == {length}
+        assert demo["dones"][:].tolist() == [0] * (length - 1) + [1]
+    assert fast["data"].attrs["total"] == total
+    masks = [{name.decode() for name in fast[f"mask/{mask}"][:]} for mask in ("train", "valid")]
+    assert masks[0] | masks[1] == set(fast["data"]) and not masks[0] & masks[1] and masks[1]
+
+
+def test_env_args_make_the_environment(fast: h5py.File) -> None:
+    import gym_pusht  # noqa: F401
+    import gymnasium
+
+    args = json.loads(fast["data"].attrs["env_args"])
+    env = gymnasium.make(args["env_name"], obs_type="pixels", **args["env_kwargs"])
+    assert env.observation_space.shape == fast["data/demo_0/obs/image"].shape[1:]
+
+
+@pytest.mark.parametrize("demo", range(EPISODES))
+def test_environment_replays_the_recorded_actions(fast: h5py.File, demo: int) -> None:
+    from gym_pusht.envs.pusht import PushTEnv
+
+    states, actions = fast[f"data/demo_{demo}/states"][:], fast[f"data/demo_{demo}/actions"][:]
+    env = PushTEnv(obs_type="state")
+    env.reset(seed=0)
+    env.agent.position = states[0, :2].tolist()
+    env.block.angle = float(states[0, 4])
+    env.block.position = states[0, 2:4].tolist()
+    replayed, coverage = [env.get_obs()], [0.0]
+    for action in actions.astype(np.float64):
+        observation, _, _, _, info = env.step(action)
+        replayed.append(observation)
+        coverage.append(info["coverage"])
+    np.testing.assert_allclose(np.stack(replayed[:-1]), states, atol=1e-3)
+    assert (max(coverage) > env.success_threshold) == fast[f"data/demo_{demo}"].attrs["success"]
+
+
+def test_pictures_show_the_state_they_are_recorded_with(fast: h5py.File) -> None:
+    demo = fast["data/demo_1"]
+    for t in (0, 20, 40, 60):
+        red, _, blue = np.moveaxis(demo["obs/image"][t].astype(int), -1, 0)
+        rows, columns = np.nonzero((blue > 200) & (red < 120))
+        seen = np.array([columns.mean(), rows.mean()]) * 512 / 128
+        assert np.linalg.norm(seen - demo["obs/agent_pos"][t]) < 6
+
+
+# -- pusht_slow
+
+
+def test_any_mcap_reader_decodes_the_bags_by_their_own_schemas(slow: list[Path]) -> None:
+    topics = bag(slow[0])
+    with slow[0].open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        decoded = [(channel.topic, item) for _, channel, _, item in reader.iter_decoded_messages()]
+    commands = [item.twist.linear for topic, item in decoded if topic == "/command"]
+    expected = [message.twist.linear for _, _, message in topics["/command"]]
+    assert [(v.x, v.y, v.z) for v in commands] == [(v.x, v.y, v.z) for v in expected]
+    assert len(decoded) == sum(map(len, topics.values()))
+
+
+def test_topics_tick_at_their_own_rates_with_jitter(slow: list[Path]) -> None:
+    topics = bag(slow[1])
+    for topic, hz in (("/camera/image/compressed", 12.5), ("/command", 5.0), ("/joint_states", 20.0)):
+        stamps = np.array([stamp for stamp, _, _ in topics[topic]]) / 1e9
+        assert np.median(np.diff(stamps)) == pytest.approx(1 / hz, abs=0.011)
+        assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) == pytest.approx(hz, rel=0.01)
+        assert (np.std(np.diff(stamps)) > 1e-3) == (topic != "/joint_states")
+        assert all(stamp < received for stamp, received, _ in topics[topic])
+
+
+def test_camera_shows_the_joint_states(slow: list[Path]) -> None:
+    topics = bag(slow[1])
+    stamps = np.array([stamp for stamp, _, _ in topics["/joint_states"]], dtype=np.float64)
+    places = np.stack([message.position for _, _, message in topics["/joint_states"]])
+    errors = []
+    for stamp, _, message in topics["/camera/image/compressed"]:
+        blue, green, red = np.moveaxis(cv2.imdecode(message.data, cv2.IMREAD_COLOR).astype(int), -1, 0)
+        rows, columns = np.nonzero(((red > 190) & (green < 80)) | ((blue > 200) & (red < 90)))
+        if len(rows) > 8:
+            true = [np.interp(stamp, stamps, places[:, axis]) for axis in (0, 1)]
+            errors.append(np.hypot(columns.mean() * 512 / 96 - true[0], rows.mean() * 512 / 96 - true[1]))
+    assert len(errors) > 50 and np.median(errors) < 6
+
+
+def test_pusher_moves_as_commanded(slow: list[Path]) -> None:
+    topics = bag(slow[1])
+    stamps = np.array([stamp for stamp, _, _ in topics["/joint_states"]], dtype=np.float64)
+    places = np.stack([message.position for _, _, message in topics["/joint_states"]])
+    commanded, moved = [], []
+    for (start, _, message), (stop, _, _) in pairwise(topics["/command"]):
+        commanded += [message.twist.linear.x, message.twist.linear.y]
+        delay = 5e7  # the setpoint leads the spring
+        moved += [np.diff(np.interp([start + delay, stop + delay], stamps, places[:, a]))[0] for a in (0, 1)]
+    assert np.corrcoef(commanded, moved)[0, 1] > 0.9
+
+
+def test_raised_pusher_passes_over_the_tee_and_lowered_one_pushes_it() -> None:
+    moved = {}
+    for up in (True, False):
+        world = arena()
+        before, start = world.pose, world.agent
+        world.lift(up)
+        for share in np.linspace(0, 1, 40):
+            world.advance(start + (before[:2] - start) * share * 1.2, 5)
+        moved[up] = float(np.abs(world.pose - before).max())
+    assert moved[True] < 1e-6 and moved[False] > 5
+
+
+def test_pusher_does_not_come_down_onto_the_tee() -> None:
+    world = arena()
+    world.lift(True)
+    world.advance(world.pose[:2], 300)
+    world.lift(False)
+    assert world.raised
+
+
+# -- policy
+
+
+@pytest.mark.parametrize("contact", [0, 9, 20, 33])
+def test_planner_predicts_what_the_physics_do(contact: int) -> None:
+    world = arena(seed=contact)
+    pose, column = world.pose, 8
+    turn = rotation(pose[2])
+    start = world.tee.standoffs[contact] @ turn.T + pose[:2]
+    inward = world.tee.contacts[1][contact] @ turn.T
+    world.lift(True)
+    world.advance(start, 300)
+    world.lift(False)
+    assert not world.raised
+    for length in np.linspace(0, 11 + LENGTHS[column], 60):
+        world.advance(start + inward * length, 10)
+    world.advance(start + inward * length, 100)
+    before, after = (world.tee.placed(p) for p in (pose, world.pose))
+    home = world.tee.placed(world.goal)
+    predicted = predicted_costs(world.tee, pose, world.goal)[contact, column]
+    assert np.linalg.norm(after - before, axis=1).mean() > 5
+    assert np.linalg.norm(after - home, axis=1).mean() == pytest.approx(predicted, abs=2.0)
+
+
+def test_episodes_end_well_and_badly(fast: h5py.File, slow: list[Path]) -> None:
+    assert {bool(fast[f"data/{demo}"].attrs["success"]) for demo in fast["data"]} == {True, False}
+    outcomes = set()
+    for path in slow:
+        with path.open("rb") as file:
+            facts = {item.name: item.metadata for item in make_reader(file).iter_metadata()}["episode"]
+            outcomes.add(facts["success"])
+    assert outcomes == {"true", "false"}
+
+
+# -- recorders
+
+
+@pytest.mark.parametrize("robot", RECORDERS)
+def test_same_seed_gives_same_bytes(tmp_path: Path, robot: str) -> None:
+    first, again, other = (record(robot, tmp_path / n, 2, s) for n, s in (("a", 1), ("b", 1), ("c", 2)))
+    assert hashes(first) == hashes(again) != hashes(other)
+
+
+@pytest.mark.parametrize("robot", RECORDERS)
+def test_registry_describes_the_robot(robot: str, fast: h5py.File, slow: list[Path]) -> None:
+    embodiment = Embodiment.load(shipped("registry") / "lab" / f"{robot}.yaml")
+    assert embodiment.id == robot and embodiment.normalize_mask.sum() == 2
+    if robot == "pusht_fast":
+        lengths = [fast[f"data/{demo}"].attrs["num_samples"] for demo in fast["data"]]
+        keys = [part.key for part in embodiment.action.components]
+        assert [fast["data/demo_0"][key].shape[1] for key in keys] == [embodiment.action_dim]
+        assert fast["data/demo_0"][embodiment.cameras[0].key].ndim == 4
+    else:
+        topics = [bag(path) for path in slow]
+        lengths = [len(found[embodiment.cameras[0].key]) - 2 for found in topics]  # ends may be trimmed
+        for part in embodiment.action.components:
+            topic, *fields = part.key.split(".")
+            value: Any = topics[0][topic][0][2]
+            for field in fields:
+                value = getattr(value, field)
+            assert isinstance(value, float) and part.dims == 1
+    assert min(lengths) >= 12 * embodiment.stride
+
+
+def test_progress_counts_episodes(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    record("pusht_slow", tmp_path, 2, on_progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 2), (2, 2)]
+
+
+@pytest.mark.parametrize("robot", RECORDERS)
+def test_failing_midway_leaves_nothing(tmp_path: Path, robot: str) -> None:
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(robot, tmp_path, 2, on_progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_recording_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "pusht_slow").mkdir()
+    with pytest.raises(OutputError, match="exists already"):
+        record("pusht_slow", tmp_path, 1)
+
+
+def test_folder_that_cannot_be_made_is_an_output_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        record("pusht_fast", tmp_path / "file" / "inside", 1)
+
+
+def test_unknown_robot_names_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="pusht_fast, pusht_slow"):
+        record("pusht_medium", tmp_path, 1)
+    with pytest.raises(UsageError, match="pusht_fast, pusht_slow"):
+        record_pusht(tmp_path, "pusht_medium", 1)
+
+
+def test_no_episodes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="0 asked for"):
+        record("pusht_fast", tmp_path, 0)
+
+
+def test_missing_gym_pusht_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gym_pusht.envs.pusht", None)
+    with pytest.raises(MissingDependencyError, match="pip install 'gym-pusht"):
+        record("pusht_fast", tmp_path, 1)
+    assert list(tmp_path.iterdir()) == []
