@@ -15,6 +15,7 @@ from hma_data.yaml_io import write_yaml
 _ACTION = re.compile(r"action|command|cmd|target|control", re.IGNORECASE)
 _STATE = re.compile(r"state|qpos|proprio|joint|eef|agent_pos|robot0", re.IGNORECASE)
 _WRIST = re.compile(r"wrist|hand|gripper", re.IGNORECASE)
+_GENERIC = re.compile(r"compressed|image|image_raw|images|color|rgb|obs|observations?", re.IGNORECASE)
 _NOT_ACTION = re.compile(
     r"image|depth|reward|discount|is_(first|last|terminal)|language|embedding", re.IGNORECASE
 )
@@ -43,7 +44,7 @@ def infer(uri: str, embodiment_id: str) -> str:
     if not actions:
         listed = ", ".join(key.key for key in vectors) or "none"
         raise SourceError(uri, "has nothing that looks like an action", f"its vectors: {listed}")
-    states = [key for key in vectors if key not in actions and _STATE.search(_last(key.key))]
+    states = _states([key for key in vectors if key not in actions])
     return _text(found, uri, embodiment_id, cameras, actions, states)
 
 
@@ -60,6 +61,12 @@ def _actions(vectors: list[KeyInfo], source: str) -> list[KeyInfo]:
     if source == "rosbag":
         return named[:1]
     return named
+
+
+def _states(vectors: list[KeyInfo]) -> list[KeyInfo]:
+    """Keys that name the robot's own state; a simulator's raw state only where nothing better is recorded."""
+    named = [key for key in vectors if _STATE.search(key.key) and not _ACTION.search(key.key)]
+    return [key for key in named if key.key != "states"] or named
 
 
 def _last(key: str) -> str:
@@ -118,8 +125,10 @@ def _component(key: KeyInfo) -> dict[str, Any]:
 
 
 def _camera_names(cameras: list[KeyInfo]) -> list[str]:
-    """Short names that stay apart: the last word of the key, or the whole key."""
-    names = [re.sub(r"[^A-Za-z0-9_.-]+", "_", _last(camera.key)).strip("_") or "camera" for camera in cameras]
+    """Short names that stay apart: the last telling word of the key, or the whole key."""
+    words = [[word for word in re.split(r"[/.]", camera.key) if word] for camera in cameras]
+    telling = [[word for word in group if not _GENERIC.fullmatch(word)] for group in words]
+    names = [re.sub(r"[^A-Za-z0-9_-]+", "_", (told or ["camera"])[-1]).strip("_") for told in telling]
     if len(set(names)) < len(names):
         names = [re.sub(r"[^A-Za-z0-9_.-]+", "_", camera.key).strip("_.") for camera in cameras]
     return names

@@ -1,9 +1,15 @@
 """Fixtures shared by all tests."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
+
+from hma_data.embodiment import Embodiment
+from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
 
 @pytest.fixture(scope="session")
@@ -14,3 +20,68 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}; set HMA_REAL_DATA to their folder")
     return folder
+
+
+class BlockTokenizer:
+    """A tokenizer for tests: 8×8 blocks of a 64-pixel picture, 4 bits a colour channel; fast and exact on flat blocks."""
+
+    spec = TokenizerSpec("block", 1, "discrete", 64, (8, 8), 4096, (64, 64), dtype="uint16")
+
+    def encode(self, frames):
+        check_frames(frames, self.spec)
+        blocks = frames.reshape(-1, 8, 8, 8, 8, 3).astype(np.float32).mean(axis=(2, 4))
+        levels = np.clip(np.rint(blocks / 17), 0, 15).astype(np.uint32)
+        return levels[..., 0] + 16 * levels[..., 1] + 256 * levels[..., 2]
+
+    def decode(self, tokens):
+        check_tokens(tokens, self.spec)
+        levels = np.stack([tokens % 16, tokens // 16 % 16, tokens // 256], axis=-1)
+        return np.repeat(np.repeat((levels * 17).astype(np.uint8), 8, axis=1), 8, axis=2)
+
+
+@pytest.fixture(scope="session")
+def block_tokenizer() -> BlockTokenizer:
+    """See BlockTokenizer."""
+    return BlockTokenizer()
+
+
+ARM_YAML = """
+id: toy_arm
+kind: simulation
+frequency_hz: 10
+target_hz: 5
+action:
+  space: joint_delta
+  components: [{key: actions, dims: 3, names: [a, b, c]}]
+cameras: [{name: top, key: obs/image}, {name: side, key: obs/side}]
+source: {format: hdf5}
+"""
+
+
+@pytest.fixture
+def toy_arm() -> Embodiment:
+    """A robot of three action dims, stride 2, two cameras, recorded in HDF5."""
+    return Embodiment.from_yaml(ARM_YAML)
+
+
+@pytest.fixture
+def toy_recording(tmp_path: Path) -> Path:
+    """Twelve episodes of 20 to 31 frames; the picture's brightness is episode and frame, the action too."""
+    path = tmp_path / "toy.hdf5"
+    write_toy(path, range(20, 32))
+    return path
+
+
+def write_toy(path: Path, lengths: Iterable[int]) -> None:
+    """An HDF5 recording in robomimic's layout whose pictures and actions tell episode and frame."""
+    with h5py.File(path, "w") as file:
+        for i, length in enumerate(lengths):
+            group = file.create_group(f"data/demo_{i}")
+            frame = np.arange(length)
+            group["actions"] = np.stack([np.full(length, i), frame, np.sin(frame / 3)], axis=1).astype(
+                np.float32
+            )
+            picture = np.zeros((length, 64, 64, 3), np.uint8)
+            picture[..., 0], picture[..., 1] = 17 * (i % 16), (17 * (frame % 16))[:, None, None]
+            group["obs/image"] = picture
+            group["obs/side"] = picture[..., ::-1]

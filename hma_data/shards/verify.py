@@ -69,7 +69,7 @@ def _shard_problems(path: Path, footer: Footer, manifest: Manifest) -> list[str]
 
 
 def _row_problems(path: Path, file: pq.ParquetFile, footer: Footer, manifest: Manifest) -> list[str]:
-    """Rows against the footer: whole episodes, frames counting up, tokens in range, numbers finite, statistics."""
+    """Rows against the footer: whole episodes, frames counting up, tokens in range, finite numbers."""
     found: list[str] = []
     column = token_column(manifest.tokenizer)[0]
     episode, frame, time = [], [], []
@@ -78,9 +78,8 @@ def _row_problems(path: Path, file: pq.ParquetFile, footer: Footer, manifest: Ma
         table = file.read_row_group(group)
         tokens = to_numpy(table[column])
         if manifest.tokenizer.vocab_size and tokens.size and tokens.max() >= manifest.tokenizer.vocab_size:
-            found.append(
-                f"{path}: row group {group} has token {tokens.max()}, the vocabulary ends at {manifest.tokenizer.vocab_size - 1}"
-            )
+            last = manifest.tokenizer.vocab_size - 1
+            found.append(f"{path}: row group {group} has token {tokens.max()}, the vocabulary ends at {last}")
         for name in ("action", "state"):
             if name in table.column_names and not np.isfinite(to_numpy(table[name])).all():
                 found.append(f"{path}: row group {group} has {name} values that are not finite")

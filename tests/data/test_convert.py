@@ -1,0 +1,270 @@
+"""Conversion: what lands in shards is what was recorded, whole or not at all, the same every time."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from hma_data.convert import convert, locked
+from hma_data.embodiment import Embodiment
+from hma_data.errors import OutputError, RegistryError, SourceError
+from hma_data.plan import Settings
+from hma_data.shards.manifest import Manifest
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from tests.conftest import BlockTokenizer, write_toy
+
+SMALL = Settings(val_fraction=0.2, shard_frames=60)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
+
+
+def run(
+    arm: Embodiment,
+    recording: Path,
+    out: Path,
+    tokenizer: BlockTokenizer,
+    settings: Settings = SMALL,
+    **options,
+):
+    return convert(arm, str(recording), tokenizer, out, settings=settings, **options)
+
+
+def test_rows_are_the_recording(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+    summary = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    assert verify(tmp_path / "out") == []
+    assert summary.manifest.splits["train"]["episodes"] + summary.manifest.splits["val"]["episodes"] == 12
+    shards = ShardSet(tmp_path / "out")
+    with h5py.File(toy_recording) as file:
+        for row in shards.episodes.to_pylist():
+            values = shards.episode_rows(row["episode_index"])
+            recorded = file[f"data/{row['id']}"]
+            np.testing.assert_array_equal(values["action"], recorded["actions"][()])
+            np.testing.assert_array_equal(
+                block_tokenizer.decode(shards.tokens(values["tokens"])), recorded["obs/image"][()]
+            )
+            np.testing.assert_allclose(values["timestamp"], np.arange(row["length"]) / 10)
+
+
+def test_shards_open_with_plain_pyarrow(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    table = pq.read_table(tmp_path / "out" / "train")
+    assert table.column_names[:4] == ["episode_index", "frame_index", "timestamp", "tokens"]
+    metadata = pq.read_metadata(tmp_path / "out" / "train" / "shard-00000.parquet").metadata
+    assert metadata[b"hma.embodiment"] == b"toy_arm"
+    assert metadata[b"hma.tokenizer"] == b"block"
+
+
+def test_running_again_does_nothing_and_changes_nothing(
+    toy_arm, toy_recording, tmp_path, block_tokenizer
+) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    before = contents(tmp_path / "out")
+    again = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    assert again.made_shards == 0
+    assert contents(tmp_path / "out") == before
+
+
+def test_a_job_stopped_anywhere_ends_with_the_same_bytes(
+    toy_arm, toy_recording, tmp_path, block_tokenizer
+) -> None:
+    whole = tmp_path / "whole"
+    run(toy_arm, toy_recording, whole, block_tokenizer)
+    for stop_at in (1, 4, 9):
+
+        class Stopping(BlockTokenizer):
+            left = stop_at
+
+            def encode(self, frames):
+                self.left -= 1
+                if self.left < 0:
+                    raise KeyboardInterrupt
+                return super().encode(frames)
+
+        out = tmp_path / f"stopped-{stop_at}"
+        with pytest.raises(KeyboardInterrupt):
+            run(toy_arm, toy_recording, out, Stopping())
+        assert not list(out.rglob("*.part"))
+        (out / "train").mkdir(exist_ok=True)
+        (out / "train" / ".shard-00000.parquet.1.part").write_bytes(b"left by a kill")
+        run(toy_arm, toy_recording, out, block_tokenizer)
+        assert contents(out) == contents(whole)
+
+
+def test_the_shards_of_one_file_or_another_path_are_the_same(
+    toy_arm, toy_recording, tmp_path, block_tokenizer
+) -> None:
+    run(toy_arm, toy_recording, tmp_path / "a", block_tokenizer)
+    (tmp_path / "else where").mkdir()
+    moved = tmp_path / "else where" / toy_recording.name
+    shutil.copy(toy_recording, moved)
+    run(toy_arm, moved, tmp_path / "b", block_tokenizer)
+    first, second = contents(tmp_path / "a"), contents(tmp_path / "b")
+    assert {k: v for k, v in first.items() if "shard-" in k} == {
+        k: v for k, v in second.items() if "shard-" in k
+    }
+
+
+def test_a_bad_episode_goes_to_quarantine_and_the_rest_goes_on(
+    toy_arm, toy_recording, tmp_path, block_tokenizer
+) -> None:
+    with h5py.File(toy_recording, "a") as file:
+        file["data/demo_3/actions"][4, 1] = np.nan
+    summary = run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    line = json.loads((tmp_path / "out" / "quarantine.jsonl").read_text())
+    assert line["id"] == "demo_3"
+    assert "not finite at frame 4" in line["message"]
+    assert summary.too_many
+    assert summary.manifest.quarantined == 1
+    assert verify(tmp_path / "out") == []
+    assert not run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, max_quarantine=0.1).too_many
+
+
+def test_another_embodiment_or_tokenizer_is_refused_and_nothing_touched(
+    toy_arm, toy_recording, tmp_path, block_tokenizer
+) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    before = contents(tmp_path / "out")
+    other = toy_arm.model_copy(update={"id": "other_arm"})
+    with pytest.raises(OutputError, match="toy_arm there, other_arm now"):
+        run(other, toy_recording, tmp_path / "out", block_tokenizer)
+    from dataclasses import replace
+
+    class Other(BlockTokenizer):
+        spec = replace(BlockTokenizer.spec, name="blob")
+
+    with pytest.raises(OutputError, match="tokenizer"):
+        run(toy_arm, toy_recording, tmp_path / "out", Other())
+    assert contents(tmp_path / "out") == before
+
+
+def test_overwrite_starts_anew_but_never_deletes_what_is_not_ours(
+    toy_arm, toy_recording, tmp_path, block_tokenizer
+) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, Settings(limit=4), overwrite=True)
+    assert Manifest.load(tmp_path / "out").plan["settings"]["limit"] == 4
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputError, match="thesis.tex"):
+        run(toy_arm, toy_recording, tmp_path / "mine", block_tokenizer, overwrite=True)
+    assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
+
+
+def test_two_jobs_on_one_folder_are_refused(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+    with locked(tmp_path / "out"), pytest.raises(OutputError, match="another job"):
+        run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+
+
+def test_strided_rows_carry_the_whole_chunk(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, Settings(frames="strided"))
+    assert verify(tmp_path / "out") == []
+    shards = ShardSet(tmp_path / "out")
+    values = shards.episode_rows(0)
+    with h5py.File(toy_recording) as file:
+        recorded = file["data/demo_0/actions"][()]
+    np.testing.assert_array_equal(values["action"], recorded.reshape(10, 6))
+    assert shards.row_stride == 1
+
+
+def test_two_cameras_are_rows_of_their_own(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, Settings(cameras=("top", "side")))
+    assert verify(tmp_path / "out") == []
+    shards = ShardSet(tmp_path / "out")
+    values = shards.episode_rows(5, ["tokens", "camera", "frame_index"])
+    assert list(np.unique(values["camera"])) == ["side", "top"]
+    top, side = (
+        block_tokenizer.decode(shards.tokens(values["tokens"][values["camera"] == c]))
+        for c in ("top", "side")
+    )
+    np.testing.assert_array_equal(top, side[..., ::-1])
+
+
+def test_statistics_are_over_train_only(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    shards = ShardSet(tmp_path / "out")
+    train = [row["id"] for row in shards.episodes.to_pylist() if row["split"] == "train"]
+    with h5py.File(toy_recording) as file:
+        actions = np.concatenate([file[f"data/{name}/actions"][()] for name in train]).astype(np.float64)
+    np.testing.assert_allclose(shards.manifest.stats["action"]["mean"], actions.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(shards.manifest.stats["action"]["std"], actions.std(0), rtol=1e-9)
+
+
+def test_an_action_of_the_wrong_width_is_one_clear_reason(toy_arm, tmp_path, block_tokenizer) -> None:
+    write_toy(tmp_path / "toy.hdf5", [12, 12])
+    wide = Embodiment.from_yaml(
+        toy_arm.to_yaml().replace("dims: 3", "dims: 4").replace("  - c\n", "  - c\n    - d\n")
+    )
+    summary = run(wide, tmp_path / "toy.hdf5", tmp_path / "out", block_tokenizer)
+    assert summary.too_many
+    assert "has 3 values, the embodiment says 4" in next(iter(summary.reasons))
+
+
+def test_an_unknown_rate_is_refused_with_how_to_give_it(
+    toy_arm, toy_recording, tmp_path, block_tokenizer
+) -> None:
+    unknown = Embodiment.from_yaml(toy_arm.to_yaml().replace("frequency_hz: 10.0", "frequency_hz: unknown"))
+    with pytest.raises(RegistryError, match="set frequency_hz"):
+        run(unknown, toy_recording, tmp_path / "out", block_tokenizer)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_truncated_recording_writes_nothing(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+    toy_recording.write_bytes(toy_recording.read_bytes()[:5000])
+    with pytest.raises(SourceError, match="toy.hdf5"):
+        run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_an_unwritable_folder_is_one_clear_error(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
+    (tmp_path / "shut").mkdir(mode=0o500)
+    with pytest.raises(OutputError, match="cannot be written"):
+        run(toy_arm, toy_recording, tmp_path / "shut" / "out", block_tokenizer)
+
+
+# -- verification finds damage
+
+
+@pytest.fixture
+def sound(toy_arm, toy_recording, tmp_path, block_tokenizer) -> Path:
+    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
+    return tmp_path / "out"
+
+
+def test_verify_finds_a_flipped_bit_in_any_shard(sound: Path) -> None:
+    for path in sorted(sound.glob("*/shard-*")):
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        whole = path.read_bytes()
+        path.write_bytes(data)
+        assert any(path.name in problem for problem in verify(sound))
+        path.write_bytes(whole)
+    assert verify(sound) == []
+
+
+@pytest.mark.parametrize("damage", ["missing", "stray", "truncated", "episodes", "quarantine", "manifest"])
+def test_verify_finds_what_is_missing_or_foreign(sound: Path, damage: str) -> None:
+    shard = sound / "train" / "shard-00000.parquet"
+    if damage == "missing":
+        shard.unlink()
+    elif damage == "stray":
+        (sound / "train" / "shard-00099.parquet").write_bytes(shard.read_bytes())
+    elif damage == "truncated":
+        shard.write_bytes(shard.read_bytes()[:-20])
+    elif damage == "episodes":
+        pq.write_table(pq.read_table(sound / "episodes.parquet").slice(1), sound / "episodes.parquet")
+    elif damage == "quarantine":
+        (sound / "quarantine.jsonl").write_text('{"id": "x"}\n')
+    else:
+        (sound / "manifest.json").unlink()
+    assert len(verify(sound)) >= 1

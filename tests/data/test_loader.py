@@ -1,0 +1,186 @@
+"""Windows and batches: right against the rows, the same whoever makes them and whenever they stopped."""
+
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hma_data.convert import convert
+from hma_data.embodiment import Embodiment
+from hma_data.errors import ShardError, UsageError
+from hma_data.loader import Batch, MixtureDataset, WindowDataset
+from hma_data.plan import Settings
+from hma_data.shards import writer
+from hma_data.shards.reader import ShardSet
+from hma_data.windows import WindowIndex
+from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two robots of different width and stride; row groups so small that windows cross them."""
+    folder = tmp_path_factory.mktemp("sets")
+    one = Embodiment.from_yaml(ARM_YAML)
+    two = Embodiment.from_yaml(
+        ARM_YAML.replace("toy_arm", "toy_two")
+        .replace("target_hz: 5", "target_hz: 10")
+        .replace("dims: 3, names: [a, b, c]", "dims: 2, slice: [0, 2]")
+    )
+    write_toy(folder / "one.hdf5", range(5, 60, 3))
+    write_toy(folder / "two.hdf5", range(3, 20))
+    patch = pytest.MonkeyPatch()
+    patch.setattr(writer, "ROW_GROUP", 25)
+    for arm, name in ((one, "one"), (two, "two")):
+        settings = Settings(val_fraction=0.1, shard_frames=130)
+        convert(arm, str(folder / f"{name}.hdf5"), BlockTokenizer(), folder / name, settings=settings)
+    patch.undo()
+    return [folder / "one", folder / "two"]
+
+
+def same(a: Batch, b: Batch) -> bool:
+    return (
+        a.embodiment == b.embodiment
+        and torch.equal(a.actions, b.actions)
+        and torch.equal(a.tokens, b.tokens)
+        and torch.equal(a.episode, b.episode)
+        and torch.equal(a.frame, b.frame)
+    )
+
+
+def test_every_window_is_its_rows_and_stays_in_its_episode(sets: list[Path]) -> None:
+    shards = ShardSet(sets[0])
+    windows = WindowDataset(shards, "train", FRAMES)
+    lengths = {r["episode_index"]: r["length"] for r in shards.episodes.to_pylist() if r["split"] == "train"}
+    span = FRAMES * 2
+    assert len(windows) == sum(max(0, n - span + 1) for n in lengths.values())
+    assert windows.index.short_episodes == sum(n < span for n in lengths.values())
+    batch = windows.batch(range(len(windows)))
+    expected = [(e, f) for e in sorted(lengths) for f in range(max(0, lengths[e] - span + 1))]
+    assert sorted(zip(batch.episode.tolist(), batch.frame.tolist(), strict=True)) == expected
+    rows = {e: shards.episode_rows(e) for e in lengths}
+    for i in range(len(windows)):
+        episode, frame = int(batch.episode[i]), int(batch.frame[i])
+        np.testing.assert_array_equal(
+            batch.tokens[i].reshape(FRAMES, -1),
+            rows[episode]["tokens"][frame : frame + span : 2].astype(np.int64),
+        )
+        np.testing.assert_array_equal(
+            batch.actions[i].reshape(span, 3), rows[episode]["action"][frame : frame + span]
+        )
+
+
+def test_one_epoch_of_a_mixture_is_every_window_once(sets: list[Path]) -> None:
+    data = MixtureDataset(sets[:1], batch_size=1, frames=FRAMES, lanes=3, pool=2)
+    count = data.mixture.counts[0]
+    lengths = [data._stream(lane, 0).length for lane in range(3)]
+    assert sum(lengths) == count
+    seen = [
+        (int(e), int(f))
+        for lane, length in enumerate(lengths)
+        for cut in [data._stream(lane, 0).take(0, length)]
+        for e, f in zip(cut["episode"], cut["frame"], strict=True)
+    ]
+    assert len(set(seen)) == len(seen) == count
+
+
+@pytest.mark.parametrize("stop", [1, 5, 23])
+def test_a_restart_goes_on_with_the_same_windows(sets: list[Path], stop: int) -> None:
+    whole = list(islice(MixtureDataset(sets, 6, FRAMES, seed=3), 40))
+    first = MixtureDataset(sets, 6, FRAMES, seed=3)
+    begun = list(islice(first, stop))
+    second = MixtureDataset(sets, 6, FRAMES, seed=3)
+    second.load_state_dict(first.state_dict())
+    rest = list(islice(second, 40 - stop))
+    assert all(same(a, b) for a, b in zip(whole, begun + rest, strict=True))
+
+
+@pytest.mark.parametrize("workers", [2])
+def test_batches_do_not_depend_on_workers(sets: list[Path], workers: int) -> None:
+    alone = list(islice(MixtureDataset(sets, 4, FRAMES, seed=1).batches(), 12))
+    data = MixtureDataset(sets, 4, FRAMES, seed=1)
+    shared = list(islice(data.batches(workers), 12))
+    assert all(same(a, b) for a, b in zip(alone, shared, strict=True))
+    assert data.state_dict()["step"] == 12
+
+
+def test_ranks_see_disjoint_windows(sets: list[Path]) -> None:
+    seen = []
+    for rank in (0, 1):
+        data = MixtureDataset(sets[:1], 2, FRAMES, rank=rank, world=2, lanes=2)
+        streams = [data._stream(lane, 0) for lane in range(2)]
+        cuts = [stream.take(0, stream.length) for stream in streams]
+        seen.append(
+            {(int(e), int(f)) for cut in cuts for e, f in zip(cut["episode"], cut["frame"], strict=True)}
+        )
+    assert not seen[0] & seen[1]
+    assert len(seen[0] | seen[1]) == data.mixture.counts[0]
+
+
+def test_ranks_share_one_draw_of_the_mixture(sets: list[Path]) -> None:
+    single = [batch.embodiment for batch in islice(MixtureDataset(sets, 8, FRAMES), 5)]
+    ranks = [MixtureDataset(sets, 4, FRAMES, rank=rank, world=2) for rank in (0, 1)]
+    halves = [[batch.embodiment for batch in islice(data, 5)] for data in ranks]
+    assert [a + b for a, b in zip(*halves, strict=True)] == single
+
+
+def test_narrow_actions_are_padded_with_zeros(sets: list[Path]) -> None:
+    batch = next(iter(MixtureDataset(sets, 32, FRAMES, temperature=100)))
+    assert batch.actions.shape == (32, FRAMES, 6)
+    narrow = [i for i, name in enumerate(batch.embodiment) if name == "toy_two"]
+    assert narrow
+    assert (batch.actions[narrow, :, 2:] == 0).all()
+    assert batch.tokens.dtype == torch.int64
+    assert batch.action_mask.all()
+
+
+def test_a_state_of_another_run_is_refused(sets: list[Path]) -> None:
+    state = MixtureDataset(sets, 4, FRAMES).state_dict()
+    with pytest.raises(UsageError, match="batch_size 4"):
+        MixtureDataset(sets, 5, FRAMES).load_state_dict(state)
+
+
+def test_no_window_at_all_is_refused_with_what_to_do(sets: list[Path]) -> None:
+    with pytest.raises(ShardError, match="fewer frames"):
+        MixtureDataset(sets, 4, frames=200)
+
+
+def test_one_embodiment_twice_is_refused(sets: list[Path]) -> None:
+    with pytest.raises(ShardError, match="each embodiment once"):
+        MixtureDataset([sets[0], sets[0]], 4, FRAMES)
+
+
+@given(st.lists(st.integers(1, 30), min_size=1, max_size=20), st.integers(1, 6), st.integers(1, 3))
+@settings(max_examples=60, deadline=None)
+def test_window_arithmetic_equals_counting(lengths: list[int], frames: int, stride: int) -> None:
+    class Fake:
+        row_stride = stride
+
+        def row_groups(self, split):
+            groups, rows = [], sum(lengths)
+            while rows:
+                groups.append(min(7, rows))
+                rows -= groups[-1]
+            return [tuple(groups)]
+
+        def index(self, split):
+            from hma_data.shards.reader import EpisodeIndex
+
+            size = np.array(lengths, np.int64)
+            starts = np.concatenate([[0], np.cumsum(size)[:-1]])
+            return EpisodeIndex(np.arange(len(size)), np.zeros(len(size), np.int64), starts, size)
+
+    index = WindowIndex.of(Fake(), "train", frames, stride)
+    starts, row = [], 0
+    for length in lengths:
+        starts += list(range(row, row + max(0, length - frames * stride + 1)))
+        row += length
+    assert index.count == len(starts)
+    np.testing.assert_array_equal(index.first_rows(np.arange(len(starts))), starts)
+    expected = [sum(s < edge for s in starts) for edge in index.edges]
+    np.testing.assert_array_equal(index.unit_first, expected)

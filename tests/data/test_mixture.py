@@ -1,0 +1,91 @@
+"""The mixture's probabilities and draws, against worked numbers."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hma_data.errors import UsageError
+from hma_data.mixture import Mixture, Realised, probabilities
+
+COUNTS = [10**6, 10**5, 10**4, 10**3]
+
+
+@pytest.mark.parametrize(
+    ("temperature", "expected"),
+    [
+        (1, [0.9001, 0.0900, 0.0090, 0.0009]),
+        (3, [0.5619, 0.2608, 0.1211, 0.0562]),
+        (4, [0.4863, 0.2735, 0.1538, 0.0865]),
+        (float("inf"), [0.25] * 4),
+    ],
+)
+def test_worked_numbers(temperature: float, expected: list[float]) -> None:
+    np.testing.assert_allclose(probabilities(COUNTS, temperature), expected, atol=5e-5)
+
+
+def test_worked_numbers_of_eight_datasets() -> None:
+    counts = [580392, 442226, 95658, 87212, 82775, 39350, 902, 150]
+    expected = [0.2437, 0.2226, 0.1336, 0.1296, 0.1273, 0.0994, 0.0282, 0.0155]
+    np.testing.assert_allclose(probabilities(counts, 3), expected, atol=5e-5)
+
+
+@given(st.lists(st.integers(0, 10**12), min_size=1, max_size=50), st.floats(0.1, 100))
+def test_probabilities_sum_to_one_and_keep_the_order(counts: list[int], temperature: float) -> None:
+    if max(counts) == 0:
+        with pytest.raises(UsageError):
+            probabilities(counts, temperature)
+        return
+    p = probabilities(counts, temperature)
+    assert p.sum() == pytest.approx(1)
+    assert (np.diff(p[np.argsort(counts, kind="stable")]) >= -1e-12).all()
+    assert (p[np.array(counts) == 0] == 0).all()
+
+
+def test_weights_multiply_before_normalizing() -> None:
+    p = probabilities([8, 8], 3, weights=[1, 3])
+    np.testing.assert_allclose(p, [0.25, 0.75])
+
+
+def test_groups_share_equally() -> None:
+    p = probabilities([10**6, 10, 10], 1, groups=["real", "human", "human"])
+    np.testing.assert_allclose(p, [0.5, 0.25, 0.25])
+
+
+def test_a_cap_gives_its_excess_to_the_others_in_proportion() -> None:
+    p = probabilities([700, 200, 100], 1, caps=[0.4, 1, 1])
+    np.testing.assert_allclose(p, [0.4, 0.4, 0.2])
+
+
+@pytest.mark.parametrize("temperature", [0, -1, float("nan")])
+def test_a_temperature_that_is_not_positive_is_refused(temperature: float) -> None:
+    with pytest.raises(UsageError, match="temperature"):
+        probabilities(COUNTS, temperature)
+
+
+def test_draws_depend_on_seed_and_step_alone() -> None:
+    mixture = Mixture.of({"a": 1000, "b": 10}, seed=7)
+    first = mixture.batch(12, 64)
+    np.testing.assert_array_equal(first, Mixture.of({"a": 1000, "b": 10}, seed=7).batch(12, 64))
+    assert (first != mixture.batch(13, 64)).any()
+
+
+def test_draws_follow_the_probabilities() -> None:
+    mixture = Mixture.of(dict(zip("abcd", COUNTS, strict=True)), 3)
+    drawn = np.concatenate([mixture.batch(step, 256) for step in range(200)])
+    np.testing.assert_allclose(np.bincount(drawn, minlength=4) / len(drawn), mixture.p, atol=0.01)
+
+
+def test_per_batch_draws_one_embodiment_a_batch() -> None:
+    mixture = Mixture.of({"a": 10, "b": 10}, draw="per_batch")
+    batches = [mixture.batch(step, 8) for step in range(40)]
+    assert all(len(set(batch)) == 1 for batch in batches)
+    assert len({int(batch[0]) for batch in batches}) == 2
+
+
+def test_realised_shares_are_counted() -> None:
+    realised = Realised(Mixture.of({"a": 30, "b": 10}))
+    realised.add(["a", "a", "b", "a"])
+    rows = {row["embodiment"]: row for row in realised.table()}
+    assert rows["a"]["realised"] == 0.75
+    assert rows["b"]["passes"] == 0.1
