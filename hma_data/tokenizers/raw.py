@@ -1,0 +1,58 @@
+"""`raw`: pixels as they are, for baselines and for models that bring their own tokenizer.
+
+Stored channels first, (3, 256, 256) uint8, so that they look like the latents of a continuous
+tokenizer with one cell a pixel; a model maps them to [0, 1] with `spec.latent_scale`.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import TokenizerError
+from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
+
+SIZE = 256
+
+
+class RawTokenizer:
+    """Pixels in, the same pixels out; see `hma_data.tokenizers.base.Tokenizer`."""
+
+    def __init__(self, name: str) -> None:
+        self.spec = TokenizerSpec(
+            name=name,
+            version=1,
+            kind="continuous",
+            image_size=SIZE,
+            grid=(SIZE, SIZE),
+            channels=3,
+            latent_scale=1 / 255,
+            dtype="uint8",
+        )
+
+    def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(N, 256, 256, 3) uint8 -> (N, 3, 256, 256) uint8."""
+        check_frames(frames, self.spec)
+        return np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
+
+    def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+        """(N, 3, 256, 256) uint8 -> (N, 256, 256, 3) uint8.
+
+        Raises:
+            TokenizerError: another shape, or another dtype than uint8.
+        """
+        check_tokens(tokens, self.spec)
+        if tokens.dtype != np.uint8:
+            raise TokenizerError(self.spec.name, f"decodes uint8 pixels, was given {tokens.dtype}")
+        return np.ascontiguousarray(tokens.transpose(0, 2, 3, 1))
+
+
+def load(name: str, *, weights: str | None, device: str) -> RawTokenizer:
+    """The tokenizer of that name; it has no weights and no network, so `device` changes nothing.
+
+    Raises:
+        TokenizerError: weights were given.
+    """
+    if weights is not None:
+        raise TokenizerError(name, f"has no weights, was given {weights}", "leave the weights out")
+    return RawTokenizer(name)
