@@ -121,7 +121,7 @@ def condition(model: "HMA", slots: Slots | None, groups: Groups, clock: Clock) -
             return Conditioning()
         slots = unknown(model, groups, len(clock.positions))
     chunks, known = groups.sort(slots.chunks), groups.sort(slots.known).unsqueeze(-1)
-    absent = model.trunk.at(model.trunk.absent, clock)
+    absent = clock.rows(model.trunk.absent)
     embeddings, modulations, outs = [], [], []
     for name, span in groups.spans():
         stem = model.stem(name)

@@ -276,6 +276,14 @@ class ActionSpace:
         """K = stride * action_dim."""
         return self.stride * self.action_dim
 
+    def agrees_with(self, other: "ActionSpace") -> bool:
+        """Equal up to the rounding of statistics to float32, as a stem keeps them."""
+        sizes = ("id", "action_dim", "stride", "normalize")
+        return all(getattr(self, name) == getattr(other, name) for name in sizes) and all(
+            np.allclose(getattr(self, name), getattr(other, name), rtol=1e-6, atol=1e-30)
+            for name in ("mean", "std")
+        )
+
     @classmethod
     def of(cls, embodiment: _Embodiment, stats: _Stats | None = None) -> Self:
         """From a registry embodiment and its statistics; without any, actions pass unchanged."""

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.diffusion import DiffusionHead
+from hma_model.trunk import Clock
 
 
 class TokenReadout(nn.Module):
@@ -53,15 +54,16 @@ class LatentReadout(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.proj = nn.Linear(config.width, config.width)
-        self.norm = nn.LayerNorm(config.width)
-        self.position = nn.Parameter(torch.zeros(config.tokens_per_frame, config.width))
+        self.norm = nn.LayerNorm(config.width, eps=1e-6)
+        times = config.frames if config.time_position == "learned" else 1
+        self.position = nn.Parameter(torch.zeros(times, config.tokens_per_frame, config.width))
         self.diffusion = DiffusionHead(config, config.patch_dim)
         nn.init.normal_(self.proj.weight, std=config.width**-0.5)
         nn.init.zeros_(self.proj.bias)
 
-    def forward(self, features: Tensor) -> Tensor:
-        """(..., S, D) -> (..., S, D)."""
-        return self.norm(self.proj(features)) + self.position
+    def forward(self, features: Tensor, clock: Clock) -> Tensor:
+        """(B, T, S, D) -> (B, T, S, D)."""
+        return self.norm(self.proj(features)) + clock.rows(self.position)
 
 
 class ActionHead(nn.Module):

@@ -79,9 +79,9 @@ class HMA(nn.Module):
         """
         space = embodiment if isinstance(embodiment, ActionSpace) else ActionSpace.of(embodiment, stats)
         known = self.embodiments.get(space.id)
-        if known == space:
-            return
         if known is not None:
+            if known.agrees_with(space):
+                return
             fault = f"already there with {known.action_dim} dims, stride {known.stride}, or other statistics"
             raise CheckpointError(space.id, fault, "use another id, or the statistics it was trained with")
         like = self.trunk.position
@@ -136,14 +136,11 @@ class HMA(nn.Module):
         self, embodiment: str, stem: Mapping[str, Tensor], head: Mapping[str, Tensor]
     ) -> None:
         """Load what `stem_state` and `head_state` gave; an embodiment not there yet is added from them."""
-        space = space_of_stem(embodiment, stem)
-        if embodiment not in self.embodiments:
-            self.add_embodiment(space)
+        self.add_embodiment(space_of_stem(embodiment, stem))
         check_fit(f"{embodiment}: stem", stem, self.stem_state(embodiment))
         check_fit(f"{embodiment}: head", head, self.head_state(embodiment))
         self.stem(embodiment).load_state_dict(stem)
         self.head(embodiment).load_state_dict(head)
-        self.embodiments[embodiment] = space
 
     @classmethod
     def from_pretrained(
@@ -231,7 +228,7 @@ class HMA(nn.Module):
         conditioning = self._condition(actions, action_mask, groups, clock)
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
         x = self.embed_patches(groups.sort(patches), groups.sort(pixels))
-        conditions = self.latent_readout(self.video_features(self.trunk(x, conditioning, clock)))
+        conditions = self.latent_readout(self.video_features(self.trunk(x, conditioning, clock)), clock)
         return groups.unsort(conditions).unflatten(2, self.config.token_grid)
 
     @torch.no_grad()

@@ -153,7 +153,7 @@ def _video_loss(
         losses = model.token_readout.loss(chosen, to_digits(targets, model.config.factored))
     else:
         readout = model.latent_readout
-        losses = readout.diffusion.loss(targets, readout(features).flatten(0, 2)[rows], generator)
+        losses = readout.diffusion.loss(targets, readout(features, clock).flatten(0, 2)[rows], generator)
     return losses.sum() / max(len(rows), 1), groups.unsort(_means(losses, sample, len(frames)))
 
 

@@ -34,6 +34,13 @@ class Conditioning:
     modulation: Tensor | None = None
     out: list[tuple[int, Tensor, Tensor]] | None = None
 
+    def last(self) -> "Conditioning":
+        """Of the last frame alone."""
+        if self.embedding is None:
+            return self
+        modulation = None if self.modulation is None else self.modulation[:, :, -1:]
+        return Conditioning(self.embedding[:, -1:], modulation, self.out)
+
 
 @dataclass
 class Clock:
@@ -52,6 +59,15 @@ class Clock:
     rotary: tuple[Tensor, Tensor]
     causal: bool = False
     slots: Tensor | None = None
+
+    def rows(self, table: Tensor) -> Tensor:
+        """The frames' rows of a table over absolute times, or the only row of one that has no times."""
+        return table if table.shape[0] == 1 else table[self.positions]
+
+    def last(self) -> "Clock":
+        """Of the last frame alone, without a cache."""
+        cos, sin = self.rotary
+        return Clock(self.positions[-1:], self.allowed[-1:], (cos[-1:], sin[-1:]))
 
 
 @dataclass
@@ -133,8 +149,7 @@ class TemporalAttention(Attention):
         q, k, v = self.project(rows, clock.rotary if self.rotary else None)
         if cache is not None:
             assert clock.slots is not None
-            k = cache.time[0].index_copy_(2, clock.slots, k)
-            v = cache.time[1].index_copy_(2, clock.slots, v)
+            k, v = cache.time[0].index_copy_(2, clock.slots, k), cache.time[1].index_copy_(2, clock.slots, v)
         mask = None if clock.causal else clock.allowed
         return self.merge(q, k, v, mask, clock.causal).view(b, n, t, width).transpose(1, 2)
 
@@ -161,8 +176,10 @@ class ActionAttention(nn.Module):
         k, v = rotate(k, clock.rotary).transpose(1, 2), v.transpose(1, 2)
         if cache is not None and cache.action is not None:
             assert clock.slots is not None
-            k = cache.action[0].index_copy_(2, clock.slots, k)
-            v = cache.action[1].index_copy_(2, clock.slots, v)
+            k, v = (
+                cache.action[0].index_copy_(2, clock.slots, k),
+                cache.action[1].index_copy_(2, clock.slots, v),
+            )
         queries = q.permute(0, 3, 2, 1, 4).flatten(2, 3)  # (B, heads, T*N, head_dim)
         mask = clock.allowed.repeat_interleave(n, dim=0)
         mixed = F.scaled_dot_product_attention(queries, k, v, mask, scale=self.scale)
@@ -246,7 +263,9 @@ class Trunk(nn.Module):
         self.position = nn.Parameter(
             torch.randn(config.frames if learned else 1, tokens, config.width) * 0.02
         )
-        self.embed_norm = nn.LayerNorm(config.width) if config.kind == "continuous" else nn.Identity()
+        self.embed_norm = (
+            nn.LayerNorm(config.width, eps=1e-6) if config.kind == "continuous" else nn.Identity()
+        )
         self.absent = nn.Parameter(torch.randn(config.frames if learned else 1, config.width) * 0.02)
         self.modulation: Modulation | None = None
         if "modulation" in config.conditioning and config.shared_modulation:
@@ -275,11 +294,7 @@ class Trunk(nn.Module):
         if embedding is not None and self.config.appended_tokens:
             copies = embedding.unsqueeze(2).expand(-1, -1, self.config.appended_tokens, -1)
             x = torch.cat([x, copies.to(x.dtype)], dim=2)
-        return x + self.at(self.position, clock)[:, : x.shape[2]]
-
-    def at(self, table: Tensor, clock: Clock) -> Tensor:
-        """The rows of a table of times, or its only row."""
-        return table if table.shape[0] == 1 else table[clock.positions]
+        return x + clock.rows(self.position)[:, : x.shape[2]]
 
 
 def initialize(trunk: Trunk, config: HMAConfig) -> None:
