@@ -211,7 +211,7 @@ def open() -> Hdf5Source:
 
 def picture_kind(found: h5py.Dataset) -> str | None:
     """`raw`, `encoded`, or None for what cannot be pictures, by dtype and shape."""
-    shape = found.shape or ()
+    shape: tuple[int, ...] = found.shape or ()
     if found.dtype == np.uint8 and len(shape) == 4 and (shape[3] in (1, 3, 4) or shape[1] in (1, 3)):
         return "raw"
     if found.dtype == np.uint8 and len(shape) == 3:

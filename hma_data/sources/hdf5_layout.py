@@ -179,7 +179,8 @@ def _stems(uri: str) -> dict[str, Path]:
     path = local_path(uri)
     if path.is_file():
         return {_safe(path.stem): path}
-    inside, found = path.resolve(), {}
+    inside = path.resolve()
+    found: dict[str, Path] = {}
     for file in sorted(path.rglob("*"), key=lambda item: natural(str(item.relative_to(path)))):
         if file.suffix.lower() not in SUFFIXES or not file.is_file():
             continue

@@ -75,7 +75,8 @@ def frame_table(path: Path) -> FrameTable:
 def _cached_table(path: str, size: int, changed: int) -> FrameTable:
     with _explained(path), _open(path) as container:
         stream = _video_stream(container, path)
-        shown, keyframes = [], []
+        shown: list[int] = []
+        keyframes: list[tuple[int, int]] = []
         for packet in container.demux(stream):
             if packet.size == 0:
                 continue
@@ -101,7 +102,7 @@ def _table(path: str, stream: Any, shown: list[int], keyframes: list[tuple[int, 
     order = np.maximum(np.searchsorted(starts[:, 0], stamps, side="right") - 1, 0)
     rate = stream.average_rate
     return FrameTable(
-        times=stamps * float(stream.time_base),
+        times=stamps.astype(np.float64) * np.float64(stream.time_base),
         stamps=stamps,
         keys=np.searchsorted(stamps, starts[order, 0]),
         seek_stamps=starts[order, 1],

@@ -1,0 +1,331 @@
+"""LeRobotDataset versions 2.0, 2.1 and 3.0, read with pyarrow and PyAV alone.
+
+A uri is a folder, `hf://datasets/NAME/DATASET[@REVISION]`, or `NAME/DATASET` on the Hub, from
+where only the files of the episodes read are fetched. Keys are feature names (`action`,
+`observation.images.cam_high`). The rate is `fps` of info.json, and the embodiment must agree.
+
+T frames of an episode.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.align import nearest
+from hma_data.embodiment import Camera, Embodiment, Vector
+from hma_data.episode import Episode, Floats, Signal, Stream, rate_times
+from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.sources.base import EpisodeRef, Inspection, KeyInfo, compose, file_fingerprint
+from hma_data.sources.lerobot_meta import Folder, Metadata, Span, episode_name
+from hma_data.sources.lerobot_rows import Rows, StillPictures, rows_of
+from hma_data.sources.video_file import VideoFile, frame_table
+from hma_data.video import Images
+
+RATE_TOLERANCE = 0.01  # of the rate
+TIME_TOLERANCE = 0.25  # of a frame's period, between a row's time and its picture's
+_PROBED = 10  # videos that inspect opens
+_SAMPLE = 4096  # bytes of a video, at each end, that its fingerprint looks at
+
+
+class LeRobotSource:
+    """See the module."""
+
+    def __init__(self) -> None:
+        self._opened: dict[str, Metadata] = {}
+
+    def inspect(self, uri: str) -> Inspection:
+        """What is in the dataset: its metadata, checked against the files that are there."""
+        meta = self._open(uri, again=True)
+        lengths = [row["length"] for row in meta.episodes.values()]
+        return Inspection(
+            format="lerobot",
+            uri=uri,
+            episodes=len(lengths),
+            keys=_keys(meta),
+            frames=sum(lengths),
+            lengths=tuple(lengths[:1_000]),
+            hz=meta.fps,
+            robot=meta.robot,
+            problems=tuple(_problems(meta)),
+            facts={"version": meta.version, "tasks": str(len(meta.tasks))},
+        )
+
+    def episode_ids(self, uri: str) -> list[str]:
+        """Their ids, `episode_000000` and on."""
+        return [episode_name(index) for index in self._open(uri, again=True).episodes]
+
+    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+        """The episodes by metadata; a missing video is found when the episode is read.
+
+        Raises:
+            SourceError: damaged metadata, another rate than the embodiment's, or no such split.
+        """
+        meta = self._open(uri, again=True)
+        if embodiment:
+            _check_rate(meta, embodiment)
+        chosen = embodiment.source.split if embodiment else None
+        if chosen and chosen not in meta.splits:
+            raise SourceError(
+                uri, f"has no split {chosen!r}", f"its splits: {', '.join(meta.splits) or 'none'}"
+            )
+        samples: dict[str, str] = {}
+        return [
+            EpisodeRef(
+                episode_name(index),
+                row["length"],
+                None if chosen else meta.split_of(index),
+                _fingerprint(meta, index, samples),
+            )
+            for index, row in meta.episodes.items()
+            if not chosen or index in meta.splits[chosen]
+        ]
+
+    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+        """One episode; its pictures are decoded when asked for.
+
+        Raises:
+            EpisodeError: a video is missing or has another number of frames, rows are damaged.
+            SourceError: no such episode, a key that is no feature, another rate than the embodiment's.
+        """
+        meta = self._open(uri)
+        _check_rate(meta, embodiment)
+        index = _number(episode_id)
+        if index not in meta.episodes:
+            raise SourceError(uri, f"has no episode {episode_id!r}", "hma inspect lists what it has")
+        _check_keys(meta, embodiment)
+        path = meta.folder.path(meta.data_path(index))
+        rows = rows_of(path, index)
+        length = meta.episodes[index]["length"]
+        if len(rows) != length:
+            raise EpisodeError(path, f"has {len(rows)} rows of {episode_id}, its metadata says {length}")
+        times = _times(rows, meta.fps)
+        streams = {camera.name: _stream(meta, index, camera, rows, times) for camera in embodiment.cameras}
+        tasks = _tasks(meta, index, rows)
+        return Episode(
+            id=episode_id,
+            streams=streams,
+            actions=(Signal(times, _vector(rows, embodiment.action)),),
+            states=(Signal(times, _vector(rows, embodiment.state)),) if embodiment.state else (),
+            instruction=_instruction(rows, embodiment.source.instruction, tasks),
+            success=_success(rows),
+            source=str(path),
+            metadata={"tasks": tasks} if len(tasks) > 1 else {},
+        )
+
+    def _open(self, uri: str, again: bool = False) -> Metadata:
+        if again or uri not in self._opened:
+            self._opened[uri] = Metadata(Folder(uri))
+        return self._opened[uri]
+
+
+class _Video:
+    """A camera's Stream: an episode's part of a video file.
+
+    Args:
+        path: of the file.
+        span: the part of it.
+        times: (T,) seconds of the rows, from the episode's first frame.
+        fps: of the dataset.
+    """
+
+    def __init__(self, path: Path, span: Span, times: Floats, fps: float) -> None:
+        self.timestamps = times
+        self._file = VideoFile(path)
+        clock = self._file.timestamps
+        half = 0.5 / fps
+        first = 0 if span.stop is None else int(np.searchsorted(clock, span.start - half))
+        last = len(clock) if span.stop is None else int(np.searchsorted(clock, span.stop - half))
+        if last - first != len(times):
+            part = "" if span.stop is None else f" from {span.start:.3f} to {span.stop:.3f} s"
+            raise EpisodeError(path, f"has {last - first} frames{part}, the episode has {len(times)} rows")
+        self._indices, off_ms = nearest(clock, span.start + times)
+        worst = int(np.argmax(off_ms))
+        if off_ms[worst] > TIME_TOLERANCE * 1e3 / fps:
+            fault = f"its picture nearest to row {worst} is {off_ms[worst]:.1f} ms away"
+            raise EpisodeError(path, fault, f"rows and video disagree on time; a frame is {1e3 / fps:.1f} ms")
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        return self._file.frames(self._indices[np.asarray(indices, np.int64)])
+
+
+def open() -> LeRobotSource:
+    """The source."""
+    return LeRobotSource()
+
+
+def _number(episode_id: str) -> int:
+    digits = episode_id.removeprefix("episode_")
+    return int(digits) if digits.isdecimal() and episode_name(int(digits)) == episode_id else -1
+
+
+def _check_rate(meta: Metadata, embodiment: Embodiment) -> None:
+    stated = embodiment.frequency_hz
+    if isinstance(stated, float) and abs(stated - meta.fps) > RATE_TOLERANCE * meta.fps:
+        raise SourceError(
+            meta.folder.uri,
+            f"runs at {meta.fps:g} fps, embodiment {embodiment.id} says frequency_hz {stated:g}",
+            "correct frequency_hz in the YAML",
+        )
+
+
+def _check_keys(meta: Metadata, embodiment: Embodiment) -> None:
+    where = f"{meta.folder.uri}: embodiment {embodiment.id}"
+    vectors = [*embodiment.action.components, *(embodiment.state.components if embodiment.state else ())]
+    for key in [part.key for part in vectors] + [camera.key for camera in embodiment.cameras]:
+        if key not in meta.features:
+            near = get_close_matches(key, meta.features, n=3, cutoff=0.4) or list(meta.features)
+            raise SourceError(where, f"{key!r} is not a feature", f"did you mean {', '.join(near)}?")
+    for camera in embodiment.cameras:
+        feature = meta.features[camera.key]
+        if not feature.is_camera:
+            kind = "a depth map" if feature.depth else feature.dtype
+            cameras = ", ".join(name for name, item in meta.features.items() if item.is_camera)
+            raise SourceError(where, f"{camera.key!r} is {kind}, not colour pictures", f"cameras: {cameras}")
+
+
+def _times(rows: Rows, fps: float) -> Floats:
+    if "timestamp" not in rows.columns:
+        return rate_times(len(rows), fps)
+    times = rows.numbers("timestamp").reshape(len(rows), -1)[:, 0].astype(np.float64)
+    if not np.isfinite(times).all():
+        raise EpisodeError(rows.path, "has timestamps that are not finite")
+    return times
+
+
+def _vector(rows: Rows, vector: Vector) -> NDArray[np.float32]:
+    pieces = {part.key: rows.numbers(part.key) for part in vector.components}
+    return compose(vector, [pieces[part.key] for part in vector.components], str(rows.path))
+
+
+def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Floats) -> Stream:
+    if meta.features[camera.key].dtype == "image":
+        return StillPictures(rows, camera.key, times, meta.folder)
+    span = meta.video(index, camera.key)
+    return _Video(meta.folder.path(span.path), span, times, meta.fps)
+
+
+def _tasks(meta: Metadata, index: int, rows: Rows) -> list[str]:
+    """What was asked, in the order of the rows; by the episode's own list where rows do not say."""
+    if "task_index" in rows.columns and meta.tasks:
+        numbers = rows.numbers("task_index").reshape(-1).tolist()
+        return [meta.tasks[number] for number in dict.fromkeys(numbers) if number in meta.tasks]
+    said = meta.episodes[index].get("tasks")
+    return [str(task) for task in said] if isinstance(said, list) else []
+
+
+def _instruction(rows: Rows, key: str | None, tasks: list[str]) -> str:
+    if key and key != "task":
+        return str(rows.column(key)[0].as_py() or "")
+    return tasks[0] if tasks else ""
+
+
+def _success(rows: Rows) -> bool | None:
+    return bool(rows.numbers("next.success").reshape(-1)[-1]) if "next.success" in rows.columns else None
+
+
+def _fingerprint(meta: Metadata, index: int, samples: dict[str, str]) -> str:
+    """Over samples of the episode's files; each file is looked at once, however many episodes it has."""
+    parts = [str(meta.folder.revision or ""), episode_name(index), str(meta.episodes[index]["length"])]
+    try:
+        spans = [meta.video(index, key) for key, item in meta.features.items() if item.dtype == "video"]
+        parts += [f"{span.start} {span.stop}" for span in spans]
+        files = [(meta.data_path(index), file_fingerprint), *((span.path, _video_sample) for span in spans)]
+        for relative, sample in [] if meta.folder.repo else files:
+            path = meta.folder.path(relative)
+            if relative not in samples:
+                samples[relative] = sample(path) if path.is_file() else "missing"
+            parts.append(samples[relative])
+    except EpisodeError as fault:  # read will say the same
+        parts.append(str(fault))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def _video_sample(path: Path) -> str:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_SAMPLE)
+        file.seek(max(0, size - _SAMPLE))
+        return hashlib.sha256(b"%d" % size + head + file.read(_SAMPLE)).hexdigest()
+
+
+# -- inspect
+
+
+def _keys(meta: Metadata) -> tuple[KeyInfo, ...]:
+    found = []
+    for feature in meta.features.values():
+        kind = "vector" if feature.dtype.startswith(("float", "int", "uint", "bool")) else "other"
+        shape, codec = feature.shape, feature.codec
+        if feature.is_camera:
+            kind, codec = "camera", codec or _codec(meta, feature.name)
+            if len(shape) == 3 and shape[0] in (1, 3) and shape[2] not in (1, 3):  # stated as C, H, W
+                shape = (shape[1], shape[2], shape[0])
+        elif feature.dtype in ("string", "large_string"):
+            kind = "text"
+        found.append(KeyInfo(feature.name, kind, shape, feature.dtype, meta.fps, feature.names, codec))
+    return tuple(found)
+
+
+def _codec(meta: Metadata, key: str) -> str | None:
+    """As the first episode has it; None where it cannot be seen."""
+    index = next(iter(meta.episodes))
+    try:
+        if meta.features[key].dtype == "video":
+            return frame_table(meta.folder.path(meta.video(index, key).path)).codec
+        rows = rows_of(meta.folder.path(meta.data_path(index)), index)
+        return StillPictures(rows, key, np.zeros(len(rows)), meta.folder).codec()
+    except HMAError:
+        return None
+
+
+def _problems(meta: Metadata) -> list[str]:
+    found = []
+    lengths = [row["length"] for row in meta.episodes.values()]
+    for name, actual in (("total_episodes", len(lengths)), ("total_frames", sum(lengths))):
+        stated = meta.info.get(name)
+        if isinstance(stated, int) and stated != actual:
+            found.append(f"info.json says {name} {stated:,}, the episodes listed make {actual:,}")
+    if meta.folder.repo:
+        return found  # what is on the Hub is not fetched to be looked at
+    try:
+        found += _absent(meta, "parquet files", {meta.data_path(index): None for index in meta.episodes})
+    except EpisodeError as fault:
+        found.append(str(fault))
+    for key, feature in meta.features.items():
+        if feature.dtype == "video":
+            try:
+                spans = {index: meta.video(index, key) for index in meta.episodes}
+            except EpisodeError as fault:
+                found.append(str(fault))
+                continue
+            found += _absent(meta, f"videos of {key}", {span.path: None for span in spans.values()})
+            found += _miscounted(meta, spans)
+    return found
+
+
+def _absent(meta: Metadata, what: str, paths: dict[str, None]) -> list[str]:
+    missing = [path for path in paths if not meta.folder.path(path).is_file()]
+    return [f"{len(missing):,} of {len(paths):,} {what} are missing, {missing[0]} first"] if missing else []
+
+
+def _miscounted(meta: Metadata, spans: dict[int, Span]) -> list[str]:
+    """Videos whose number of frames is not that of the rows, among the first that are there."""
+    rows: dict[str, int] = {}
+    for index, span in spans.items():
+        rows[span.path] = rows.get(span.path, 0) + meta.episodes[index]["length"]
+    present = [path for path in rows if meta.folder.path(path).is_file()][:_PROBED]
+    found = []
+    for path in present:
+        try:
+            frames = len(frame_table(meta.folder.path(path)))
+        except EpisodeError as fault:
+            found.append(str(fault))
+            continue
+        if frames != rows[path]:
+            found.append(f"{path} has {frames:,} frames for {rows[path]:,} rows")
+    return found
