@@ -1,0 +1,243 @@
+"""What one RLDS episode holds: its columns, pictures, words and outcome.
+
+Keys are paths inside a step. T steps, H×W pixels.
+"""
+
+import logging
+import math
+from collections.abc import Iterable
+from difflib import get_close_matches
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episode import Decode
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.sources.base import KeyInfo
+from hma_data.sources.tf_example import Example
+from hma_data.sources.tfds_features import Feature, column, column_blobs, scalar, step_count, tensor
+from hma_data.sources.tfds_folder import Folder
+from hma_data.video import decode_image
+
+INSTRUCTIONS = ("language_instruction", "natural_language_instruction")
+MAX_VECTOR = 4096  # wider than this is no action or state
+
+log = logging.getLogger(__name__)
+
+
+class Steps:
+    """One record and its columns over the steps.
+
+    Args:
+        folder: it comes from.
+        example: the record.
+        name: the episode's id, for errors.
+    """
+
+    def __init__(self, folder: Folder, example: Example, name: str) -> None:
+        self.example, self.name = example, name
+        self.features = folder.step_features
+        self.count = step_count(example, self.features, name)
+
+    def numbers(self, key: str) -> NDArray[Any]:
+        """(T, …) of a key."""
+        return column(self.example, self.features[key], self.count, self.name)
+
+    def blobs(self, key: str) -> list[memoryview]:
+        """T byte strings of a key."""
+        return column_blobs(self.example, self.features[key], self.count, self.name)
+
+    def decoder(self, key: str) -> Decode:
+        """Step -> (H, W, 3) picture of a key."""
+        feature = self.features[key]
+        return _Encoded(self, key) if feature.kind == "picture" else _Raw(self, key)
+
+
+class _Encoded:
+    """Pictures kept as JPEG or PNG."""
+
+    def __init__(self, steps: Steps, key: str) -> None:
+        self._blobs = steps.blobs(key)
+        self._where = f"{steps.name}: {key}"
+
+    def __call__(self, index: int, /) -> NDArray[np.uint8]:
+        return decode_image(np.frombuffer(self._blobs[index], np.uint8), f"{self._where}, step {index}")
+
+
+class _Raw:
+    """Pictures kept as tensors of uint8."""
+
+    def __init__(self, steps: Steps, key: str) -> None:
+        self._steps, self._key, self._feature = steps, key, steps.features[key]
+        whole = self._feature.encoding == "none" or self._feature.shape.count(None) > 1
+        self._blobs = [] if whole else steps.blobs(key)
+
+    @cached_property
+    def _all(self) -> NDArray[np.uint8]:
+        return self._steps.numbers(self._key)
+
+    def __call__(self, index: int, /) -> NDArray[np.uint8]:
+        if not self._blobs:
+            return self._all[index]
+        feature = self._feature
+        return tensor(self._blobs[index], feature, np.dtype(np.uint8), feature.shape, self._steps.name)
+
+
+def is_camera(feature: Feature) -> bool:
+    """Whether it gives a colour picture a step, encoded or as a tensor."""
+    if feature.dtype != "uint8" or len(feature.nesting) != 1:
+        return False
+    return feature.kind == "picture" or (
+        feature.kind == "number" and len(feature.shape) == 3 and feature.shape[2] == 3
+    )
+
+
+def described(feature: Feature) -> str:
+    """What it is, for an error."""
+    if feature.kind == "picture":
+        return "a sequence of pictures a step" if len(feature.nesting) > 1 else "a picture"
+    return {"number": "a tensor", "text": "text"}.get(feature.kind, "a feature")
+
+
+def step_feature(folder: Folder, key: str) -> Feature:
+    """The feature of that path inside a step.
+
+    Raises:
+        SourceError: there is none, with the nearest keys.
+    """
+    found = folder.step_features
+    if key in found:
+        return found[key]
+    near = get_close_matches(key, found, n=3) or [name for name in found if name.endswith("/" + key)]
+    raise SourceError(
+        folder.uri,
+        f"has no key {key!r} in its steps",
+        f"did you mean {', '.join(near)}?" if near else f"its keys: {listed(found)}",
+    )
+
+
+def listed(keys: Iterable[str]) -> str:
+    """At most forty keys, for an error."""
+    return ", ".join(list(keys)[:40]) or "none"
+
+
+# -- words, success, metadata
+
+
+def text_feature(folder: Folder, key: str) -> Feature:
+    """The instruction's feature: inside the steps or, of the whole episode, outside them.
+
+    Raises:
+        SourceError: there is none, or it is not text.
+    """
+    inside = key in folder.step_features or key not in folder.features
+    feature = step_feature(folder, key) if inside else folder.features[key]
+    if feature.kind == "text":
+        return feature
+    if inside and feature.kind == "number" and np.dtype(feature.dtype).kind in "iu":  # codes of letters
+        return feature
+    raise SourceError(folder.uri, f"source.instruction: {key} is {described(feature)}, not text")
+
+
+def instruction(folder: Folder, steps: Steps, key: str | None) -> str:
+    """What was asked at the first step."""
+    if key is None:
+        places = [f"{place}{name}" for place in ("", "observation/") for name in INSTRUCTIONS]
+        outside = [f"episode_metadata/{name}" for name in INSTRUCTIONS]
+        key = next((place for place in places if place in folder.step_features), None)
+        key = key or next((place for place in outside + places if place in folder.features), None)
+    if key is None:
+        return ""
+    feature = text_feature(folder, key)
+    if key not in folder.step_features:
+        return str(scalar(steps.example, feature) or "")
+    if feature.kind == "text":
+        return bytes(steps.blobs(key)[0]).decode(errors="replace")
+    codes = steps.numbers(key)[0].ravel()  # language_table: bytes of UTF-8, padded with zeros
+    return bytes(int(code) & 0xFF for code in codes if code).decode(errors="replace")
+
+
+def success(folder: Folder, steps: Steps) -> bool | None:
+    """As the episode says; else True where it ends in a rewarded terminal step; else unknown."""
+    stated = folder.features.get("episode_metadata/success")
+    if stated:
+        value = scalar(steps.example, stated)
+        return bool(value) if isinstance(value, bool | int) else None
+    if any(key not in steps.features for key in ("reward", "is_terminal")):
+        return None
+    ends = [steps.numbers(key)[-1] for key in ("reward", "is_terminal")]
+    return True if all(end.size == 1 and end > 0 for end in ends) else None
+
+
+def metadata(folder: Folder, example: Example) -> dict[str, Any]:
+    """Single values outside the steps."""
+    found = {
+        name.removeprefix("episode_metadata/"): scalar(example, feature)
+        for name, feature in folder.features.items()
+        if not name.startswith("steps/")
+    }
+    return {name: value for name, value in found.items() if value is not None}
+
+
+# -- inspection
+
+
+def facts(folder: Folder) -> dict[str, str]:
+    """What is worth a line about the dataset."""
+    found = {"dataset": folder.name, "version": folder.version}
+    found["splits"] = ", ".join(
+        f"{name} {sum(folder.counted(shard) for shard in shards)}" for name, shards in folder.splits.items()
+    )
+    outside = [name for name in folder.features if not name.startswith("steps/")]
+    found["episode keys"] = ", ".join(outside)
+    return {name: value for name, value in found.items() if value}
+
+
+def key_info(steps: Steps, key: str) -> KeyInfo:
+    """One key as this episode holds it."""
+    feature = steps.features[key]
+    shape = tuple(size or 0 for size in (*feature.nesting[1:], *feature.shape))
+    kind, codec = "other", None
+    try:
+        if is_camera(feature):
+            kind, shape, codec = "camera", steps.decoder(key)(0).shape, _codec(steps, key)
+        elif feature.kind == "text":
+            kind = "text"
+        elif feature.kind == "number":
+            shape = steps.numbers(key).shape[1:]
+            kind = "vector" if math.prod(shape) <= MAX_VECTOR else "other"
+    except EpisodeError as fault:
+        log.warning("%s", fault)  # listed as features.json states it
+    return KeyInfo(key, kind, shape, feature.dtype, codec=codec, count=steps.count)
+
+
+def _codec(steps: Steps, key: str) -> str:
+    """By the first bytes of the first picture; TFDS keeps files as given, whatever features.json states."""
+    if steps.features[key].kind != "picture":
+        return "raw"
+    head = bytes(steps.blobs(key)[0][:8])
+    if head.startswith(b"\xff\xd8"):
+        return "jpeg"
+    return "png" if head.startswith(b"\x89PNG") else steps.features[key].codec or "unknown"
+
+
+def oddities(steps: Steps) -> dict[str, str]:
+    """What looks wrong in an episode that can be read: key -> a sentence."""
+    found = {}
+    for key, feature in steps.features.items():
+        if (
+            feature.kind != "number"
+            or feature.dtype[:5] != "float"
+            or not 0 < (feature.width or 0) <= MAX_VECTOR
+        ):
+            continue
+        try:
+            bad = ~np.isfinite(steps.numbers(key))
+        except EpisodeError as fault:
+            found[key] = str(fault)
+            continue
+        if bad.any():
+            found[key] = f"{steps.name}: {key} is not finite at step {int(np.argwhere(bad)[0, 0])}"
+    return found

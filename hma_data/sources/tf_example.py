@@ -1,0 +1,185 @@
+"""tf.train.Example read off its protobuf wire format, feature by feature, when asked for.
+
+An Example maps names to lists of bytes, float32 or int64. Parsing finds where each list lies;
+numbers are decoded by NumPy and bytes stay views into the record, so what nobody asks for costs
+nothing. (Format: protobuf encoding; messages Example, Features, Feature of TensorFlow.)
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import EpisodeError
+
+VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+KINDS = {1: "bytes", 2: "float", 3: "int"}  # field numbers of Feature's lists
+Span = tuple[int, int]
+
+
+class _WireError(ValueError):
+    """The bytes are not the protobuf message they should be."""
+
+
+class Example:
+    """The features of one record.
+
+    Args:
+        data: the serialized message.
+        where: the episode, for errors.
+
+    Raises:
+        EpisodeError: (here and in every method) the bytes are not an Example, a feature is missing
+            or of another kind.
+    """
+
+    def __init__(self, data: bytes, where: str) -> None:
+        self._data, self._where = data, where
+        try:
+            self._lists = dict(_features(data))
+        except (_WireError, UnicodeDecodeError) as fault:
+            raise EpisodeError(where, f"is not a tf.train.Example: {fault}") from fault
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._lists
+
+    @property
+    def size(self) -> int:
+        """Bytes of the record."""
+        return len(self._data)
+
+    def names(self) -> list[str]:
+        """Of all features."""
+        return list(self._lists)
+
+    def blobs(self, name: str) -> list[memoryview]:
+        """The byte strings of a feature, as views into the record."""
+        view = memoryview(self._data)
+        return [view[start:stop] for _, (start, stop) in self._items(name, "bytes")]
+
+    def count(self, name: str) -> int:
+        """How many byte strings a feature has."""
+        return len(self._items(name, "bytes"))
+
+    def numbers(self, name: str) -> NDArray[np.float32] | NDArray[np.int64]:
+        """The (n,) numbers of a feature, float32 or int64 as stored."""
+        if self._list(name)[0] == "float":
+            return self._joined(name, "float", FIXED32, np.dtype("<f4"))
+        return self.ints(name)
+
+    def ints(self, name: str) -> NDArray[np.int64]:
+        """The (n,) integers of a feature."""
+        return self._joined(name, "int", VARINT, np.dtype(np.int64))
+
+    def _joined(self, name: str, kind: str, single: int, dtype: np.dtype) -> NDArray:
+        parts = []
+        for wire, (start, stop) in self._items(name, kind):
+            if wire not in (single, BYTES):
+                raise EpisodeError(self._where, f"{name} has an entry of wire type {wire}")
+            if kind == "int":
+                parts.append(self._varints(name, start, stop))
+            elif (stop - start) % 4:
+                raise EpisodeError(self._where, f"{name} has {stop - start} bytes of float32")
+            else:
+                parts.append(np.frombuffer(self._data, dtype, (stop - start) // 4, start))
+        if len(parts) == 1:
+            return parts[0]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype)
+
+    def _varints(self, name: str, start: int, stop: int) -> NDArray[np.int64]:
+        try:
+            return varints(np.frombuffer(self._data, np.uint8, stop - start, start))
+        except _WireError as fault:
+            raise EpisodeError(self._where, f"{name}: {fault}") from fault
+
+    def _list(self, name: str) -> tuple[str, Span]:
+        if name not in self._lists:
+            raise EpisodeError(self._where, f"has no feature {name!r}")
+        return self._lists[name]
+
+    def _items(self, name: str, kind: str) -> list[tuple[int, Span]]:
+        found, (start, stop) = self._list(name)
+        if found not in (kind, "empty"):
+            raise EpisodeError(self._where, f"{name} is a list of {found}, not of {kind}")
+        try:
+            return [(wire, span) for number, wire, span in _fields(self._data, start, stop) if number == 1]
+        except _WireError as fault:
+            raise EpisodeError(self._where, f"{name}: {fault}") from fault
+
+
+def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Packed varints -> int64, without a loop over them.
+
+    Raises:
+        ValueError: the last is cut off, or one is longer than ten bytes.
+    """
+    last = np.flatnonzero(data < 0x80)
+    if len(last) == len(data):
+        return data.astype(np.int64)
+    if not len(last) or last[-1] != len(data) - 1:
+        raise _WireError("its last varint is cut off")
+    first = np.concatenate([[0], last[:-1] + 1])
+    lengths = last - first + 1
+    if lengths.max() > 10:
+        raise _WireError("a varint is longer than ten bytes")
+    values = np.zeros(len(last), np.uint64)
+    for place in range(int(lengths.max())):
+        longer = np.flatnonzero(lengths > place)
+        bits = (data[first[longer] + place] & 0x7F).astype(np.uint64)
+        values[longer] |= bits << np.uint64(7 * place)
+    return values.view(np.int64)
+
+
+def _features(data: bytes) -> Iterator[tuple[str, tuple[str, Span]]]:
+    """(name, (kind, where its list lies)) of each feature: Example.features.feature entries."""
+    for number, wire, (start, stop) in _fields(data, 0, len(data)):
+        if number != 1 or wire != BYTES:
+            continue
+        for entry, entry_wire, span in _fields(data, start, stop):
+            if entry == 1 and entry_wire == BYTES:
+                yield _entry(data, *span)
+
+
+def _entry(data: bytes, start: int, stop: int) -> tuple[str, tuple[str, Span]]:
+    """A map entry: key 1, value 2."""
+    name, value = "", ("empty", (start, start))
+    for number, wire, span in _fields(data, start, stop):
+        if wire == BYTES and number == 1:
+            name = data[slice(*span)].decode()
+        elif wire == BYTES and number == 2:
+            for kind, kind_wire, inner in _fields(data, *span):
+                if kind in KINDS and kind_wire == BYTES:
+                    value = (KINDS[kind], inner)
+    return name, value
+
+
+def _fields(data: bytes, position: int, end: int) -> Iterator[tuple[int, int, Span]]:
+    """(field number, wire type, span of its payload) of each field of a message."""
+    while position < end:
+        tag, position = _varint(data, position, end)
+        wire, start = tag & 7, position
+        if wire == BYTES:
+            length, start = _varint(data, position, end)
+            position = start + length
+        elif wire == VARINT:
+            position = _varint(data, position, end)[1]
+        elif wire in (FIXED32, FIXED64):
+            position += 4 if wire == FIXED32 else 8
+        else:
+            raise _WireError(f"wire type {wire} at byte {start}")
+        if position > end:
+            raise _WireError(f"the field at byte {start} reaches beyond its message")
+        yield tag >> 3, wire, (start, position)
+
+
+def _varint(data: bytes, position: int, end: int) -> tuple[int, int]:
+    """(value, position after it)."""
+    value = shift = 0
+    while position < end and shift < 70:
+        byte = data[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, position
+        shift += 7
+    raise _WireError(f"no varint at byte {position}")

@@ -1,0 +1,350 @@
+"""A TFDS folder: its version, splits, shards, and where in them each episode lies.
+
+`dataset_info.json` says how many records each shard of a split has, so the place of an episode is
+known without opening the others; shards that it does not list are found by name and counted.
+Paths are of an fsspec file system, local unless the URI names another.
+"""
+
+import json
+import os
+import re
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import fsspec
+
+from hma_data.errors import EpisodeError, HMAError, MissingDependencyError, SourceError
+from hma_data.sources.tf_example import Example
+from hma_data.sources.tfds_features import Feature, read_features
+from hma_data.sources.tfrecord import Framing, framing, read_record
+
+TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
+NAMED = re.compile(r"(?:.*-)?(?P<split>\w+)\.tfrecord(?:-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?)?")
+NO_LISTING = ("http", "https")
+PACKAGES = {"gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp"}
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One TFRecord file of a split.
+
+    Attributes:
+        path: on the folder's file system.
+        number: its place in the split.
+        records: how many dataset_info.json states, None where it does not.
+        first: index within the split of its first record.
+    """
+
+    path: str
+    number: int
+    records: int | None
+    first: int = 0
+
+
+@dataclass(frozen=True)
+class Folder:
+    """One version of a TFDS dataset.
+
+    Attributes:
+        uri: as given.
+        files: fsspec file system of the paths.
+        features: leaves of features.json by name.
+        splits: name -> the shards that are there, in order.
+        name, version: of the dataset, empty when not stated.
+        problems: what does not fit together, a sentence each.
+    """
+
+    uri: str
+    files: Any
+    features: dict[str, Feature]
+    splits: dict[str, tuple[Shard, ...]]
+    name: str = ""
+    version: str = ""
+    problems: tuple[str, ...] = ()
+
+    @cached_property
+    def step_features(self) -> dict[str, Feature]:
+        """Features over the steps by their path inside a step; by their name where there is no `steps`."""
+        inside = {
+            name.removeprefix("steps/"): leaf
+            for name, leaf in self.features.items()
+            if name.startswith("steps/")
+        }
+        return inside or {name: leaf for name, leaf in self.features.items() if leaf.nesting}
+
+    @property
+    def remote(self) -> bool:
+        """Whether every look into a file is a request over the network."""
+        return not _is_local(self.files)
+
+    def framing(self, shard: Shard) -> Framing:
+        """Where the shard's records lie.
+
+        Raises:
+            SourceError: it cannot be read, or has more records than dataset_info.json says.
+        """
+        frames = framing(self.files, shard.path)
+        if shard.records is not None and len(frames) > shard.records:
+            raise SourceError(
+                shard.path,
+                f"has {len(frames)} records, dataset_info.json says {shard.records}",
+                "write dataset_info.json again, or remove it: the records are then counted",
+            )
+        return frames
+
+    def example(self, episode_id: str) -> tuple[Example, str]:
+        """The record of an episode, parsed; and the path of its shard.
+
+        Raises:
+            EpisodeError: there is no such episode, or its bytes are damaged or missing.
+        """
+        split, _, index = episode_id.partition("/")
+        shards = self.splits.get(split, ())
+        if not shards or not index.isdecimal():
+            raise EpisodeError(
+                episode_id, f"is not in {self.uri}; an id is like {next(iter(self.splits))}/000000"
+            )
+        shard = shards[max(0, bisect_right([item.first for item in shards], int(index)) - 1)]
+        position = int(index) - shard.first
+        frames = self.framing(shard)
+        if not 0 <= position < self.counted(shard):
+            raise EpisodeError(episode_id, f"lies in no shard of {self.uri}")
+        if position >= len(frames):
+            fault = frames.fault or f"ends after {len(frames)} of {shard.records} records"
+            raise EpisodeError(episode_id, f"{shard.path}: {fault}")
+        return Example(
+            read_record(self.files, shard.path, frames, position, episode_id), episode_id
+        ), shard.path
+
+    def counted(self, shard: Shard) -> int:
+        """How many episodes the shard should have; a record cut off at the end counts."""
+        if shard.records is not None:
+            return shard.records
+        frames = self.framing(shard)
+        return len(frames) + bool(frames.fault)
+
+
+def episode_id(split: str, index: int) -> str:
+    """For example train/000012."""
+    return f"{split}/{index:06d}"
+
+
+def open_folder(uri: str) -> Folder:
+    """The TFDS dataset at `uri`: its version folder, a folder above with one version, or one of its shards.
+
+    Kept for the process: a local one while its descriptions stay the same, a remote one for good.
+
+    Raises:
+        SourceError: there is none, or its description cannot be read.
+        MissingDependencyError: the URI's file system needs a package that is not installed.
+    """
+    remote = "://" in uri and not uri.startswith("file://")
+    return _remote(uri, os.getpid()) if remote else _find(uri)
+
+
+@lru_cache(maxsize=64)
+def _remote(uri: str, pid: int) -> Folder:
+    return _find(uri)
+
+
+def _find(uri: str) -> Folder:
+    files, path = _file_system(uri)
+    try:
+        only = path if not _listless(files) and files.isfile(path) else ""
+        root = _version_folder(uri, files, files._parent(path) if only else path)
+        stamps = [_stamp(files, f"{root}/{name}") for name in ("", "features.json", "dataset_info.json")]
+    except HMAError:
+        raise
+    except Exception as fault:  # file systems raise what they like
+        raise SourceError(uri, f"cannot be read: {fault}", "check the path and your access to it") from fault
+    return _open(uri, files, root, only, tuple(stamps), os.getpid())
+
+
+def _file_system(uri: str) -> tuple[Any, str]:
+    try:
+        files, path = fsspec.core.url_to_fs(uri)
+    except ImportError as fault:
+        package = PACKAGES.get(uri.split("://", 1)[0], "")
+        raise MissingDependencyError(uri, str(fault), f"pip install {package}" if package else "") from fault
+    except ValueError as fault:
+        raise SourceError(uri, str(fault), "give a path or an fsspec URI such as gs://bucket/path") from fault
+    return files, path.rstrip("/")
+
+
+def _listless(files: Any) -> bool:
+    protocol = files.protocol if isinstance(files.protocol, str) else files.protocol[0]
+    return protocol in NO_LISTING
+
+
+def _is_local(files: Any) -> bool:
+    return "file" in files.protocol
+
+
+def _stamp(files: Any, path: str) -> str:
+    """Changes when a local file or folder does."""
+    try:
+        return str(Path(path).stat().st_mtime_ns) if _is_local(files) else ""
+    except FileNotFoundError:
+        return "none"
+
+
+def _version_folder(uri: str, files: Any, path: str) -> str:
+    """The folder with features.json, at most two below `path` (configuration and version)."""
+    if files.isfile(f"{path}/features.json"):
+        return path
+    if not files.exists(path) and not _listless(files):
+        raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
+    found = (
+        []
+        if _listless(files)
+        else files.glob(f"{path}/*/features.json") + files.glob(f"{path}/*/*/features.json")
+    )
+    if len(found) == 1:
+        return files._parent(found[0])
+    if found:
+        names = ", ".join(sorted(files._parent(item)[len(path) + 1 :] for item in found))
+        raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
+    raise SourceError(
+        uri, "has no features.json, so its records cannot be understood",
+        "copy it from where the TFRecord files are from, or write it with tensorflow_datasets",
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], pid: int) -> Folder:
+    """See `open_folder`; kept while the folder is unchanged, and not across a fork."""
+    features = read_features(_text(files, f"{root}/features.json"), f"{root}/features.json")
+    info = _info(files, f"{root}/dataset_info.json")
+    listing = None if _listless(files) else sorted(files.find(root, maxdepth=2))
+    if only:
+        listing = [only]
+    shards, problems = _stated_shards(root, info, listing)
+    if not shards:
+        shards, more = _named_shards(root, listing or [], info)
+        problems += more
+    folder = Folder(
+        uri, files, features, {}, str(info.get("name", "")), str(info.get("version", "")), tuple(problems)
+    )
+    splits = {split: _placed(folder, items) for split, items in shards.items()}
+    if not any(splits.values()):
+        raise SourceError(uri, "holds no TFRecord file", "names are like name-train.tfrecord-00000-of-00001")
+    return replace(folder, splits={split: items for split, items in splits.items() if items})
+
+
+def _text(files: Any, path: str) -> str:
+    try:
+        text: str = files.cat_file(path).decode()
+    except Exception as fault:  # file systems raise what they like
+        raise SourceError(path, f"cannot be read: {fault}") from fault
+    return text
+
+
+def _info(files: Any, path: str) -> dict[str, Any]:
+    """dataset_info.json, empty when there is none."""
+    if not files.isfile(path):
+        return {}
+    try:
+        info = json.loads(_text(files, path))
+    except ValueError as fault:
+        raise SourceError(path, f"is not JSON: {fault}", "write it again, or remove it") from fault
+    if not isinstance(info, dict) or not isinstance(info.get("splits", []), list):
+        raise SourceError(path, "is not what TFDS writes", "write it again, or remove it")
+    form = info.get("fileFormat") or info.get("file_format") or "tfrecord"
+    if form != "tfrecord":
+        raise SourceError(
+            path, f"states the file format {form!r}", "convert it to tfrecord with tensorflow_datasets"
+        )
+    return info
+
+
+def _stated_shards(
+    root: str, info: dict[str, Any], listing: list[str] | None
+) -> tuple[dict[str, list[Shard]], list[str]]:
+    """The shards dataset_info.json names, with `first` set; those that are not there are left out."""
+    there = None if listing is None else set(listing)
+    shards: dict[str, list[Shard]] = {}
+    problems = []
+    for split in info.get("splits", []):
+        name, counts = str(split.get("name", "")), _counts(split)
+        template = split.get("filepathTemplate") or split.get("filepath_template") or TEMPLATE
+        items, first = [], 0
+        for number, records in enumerate(counts):
+            path = f"{root}/{_shard_name(template, info, name, number, len(counts))}"
+            items.append(Shard(path, number, records, first))
+            first += records
+        present = [item for item in items if there is None or item.path in there]
+        if present and len(present) < len(items):
+            problems.append(_missing(name, len(items) - len(present), len(items)))
+        if present:
+            shards[name] = present
+    return shards, problems
+
+
+def _counts(split: dict[str, Any]) -> list[int]:
+    try:
+        return [int(count) for count in split.get("shardLengths") or split.get("shard_lengths") or ()]
+    except (TypeError, ValueError) as fault:
+        raise SourceError(
+            "dataset_info.json",
+            f"shardLengths of split {split.get('name')!r} are not numbers",
+            "remove the file",
+        ) from fault
+
+
+def _shard_name(template: str, info: dict[str, Any], split: str, number: int, shards: int) -> str:
+    digits = max(5, len(str(shards)))
+    place, total = f"{number:0{digits}d}", f"{shards:0{digits}d}"
+    values = {
+        "DATASET": str(info.get("name", "")),
+        "SPLIT": split,
+        "FILEFORMAT": "tfrecord",
+        "SHARD_INDEX": place,
+        "NUM_SHARDS": total,
+        "SHARD_X_OF_Y": f"{place}-of-{total}",
+    }
+    return re.sub(r"\{(\w+)\}", lambda match: values.get(match[1], match[0]), template.split("%")[0])
+
+
+def _missing(split: str, missing: int, shards: int) -> str:
+    return f"{missing} of {shards} shards of split {split} are not there"
+
+
+def _named_shards(
+    root: str, listing: Iterable[str], info: dict[str, Any]
+) -> tuple[dict[str, list[Shard]], list[str]]:
+    """Shards found by their names alone: a dataset renamed, or without dataset_info.json."""
+    stated = {str(split.get("name")): _counts(split) for split in info.get("splits", [])}
+    shards: dict[str, list[Shard]] = {}
+    totals: dict[str, int] = {}
+    for path in listing:
+        inside = path[len(root) + 1 :]
+        match = NAMED.fullmatch(inside.rsplit("/", 1)[-1])
+        if not match:
+            continue
+        split = inside.rsplit("/", 1)[0] if "/" in inside else match["split"]
+        number = int(match["shard"] or len(shards.get(split, ())))
+        totals[split] = max(totals.get(split, 0), int(match["shards"] or 0))
+        counts = stated.get(split, [])
+        records = counts[number] if number < len(counts) else None
+        shards.setdefault(split, []).append(Shard(path, number, records, sum(counts[:number])))
+    problems = [
+        _missing(split, totals[split] - len(items), totals[split])
+        for split, items in shards.items()
+        if totals[split] > len(items)
+    ]
+    return {split: sorted(items, key=lambda item: item.number) for split, items in shards.items()}, problems
+
+
+def _placed(folder: Folder, shards: list[Shard]) -> tuple[Shard, ...]:
+    """The shards with `first` set, counting where dataset_info.json does not say."""
+    if all(shard.records is not None for shard in shards):
+        return tuple(shards)
+    placed, first = [], 0
+    for shard in shards:
+        placed.append(replace(shard, first=first))
+        first += folder.counted(shard)
+    return tuple(placed)

@@ -1,0 +1,670 @@
+"""RLDS: what is read equals what an independent writer wrote, and damage is contained."""
+
+import json
+import logging
+import shutil
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import fsspec
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hma_data.align import to_clip
+from hma_data.embodiment import Embodiment, find
+from hma_data.errors import EpisodeError, HMAError, MissingDependencyError, SourceError
+from hma_data.sources.base import open_source
+from hma_data.sources.tf_example import Example, varints
+from hma_data.sources.tfrecord import masked_crc
+
+# -- an independent writer: protobuf's own encoder and a bit-by-bit CRC-32C
+
+
+def _example_class():
+    """tf.train.Example, described by hand for protobuf's runtime."""
+    file = descriptor_pb2.FileDescriptorProto(name="example_of_test.proto", package="t", syntax="proto3")
+
+    def message(name, *fields):
+        item = file.message_type.add(name=name)
+        for number, (field, kind, label, of) in enumerate(fields, 1):
+            item.field.add(name=field, number=number, type=kind, label=label, type_name=of)
+        return item
+
+    one, many = 1, 3
+    message("BytesList", ("value", 12, many, None))
+    message("FloatList", ("value", 2, many, None))
+    message("Int64List", ("value", 3, many, None))
+    feature = message(
+        "Feature",
+        ("bytes_list", 11, one, ".t.BytesList"),
+        ("float_list", 11, one, ".t.FloatList"),
+        ("int64_list", 11, one, ".t.Int64List"),
+    )
+    feature.oneof_decl.add(name="kind")
+    for field in feature.field:
+        field.oneof_index = 0
+    features = message("Features", ("feature", 11, many, ".t.Features.FeatureEntry"))
+    entry = features.nested_type.add(name="FeatureEntry")
+    entry.options.map_entry = True
+    entry.field.add(name="key", number=1, type=9, label=one)
+    entry.field.add(name="value", number=2, type=11, label=one, type_name=".t.Feature")
+    message("Example", ("features", 11, one, ".t.Features"))
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("t.Example"))
+
+
+PROTO = _example_class()
+
+
+def encode(features: dict) -> bytes:
+    """Lists of bytes, floats or ints by name -> a serialized Example."""
+    example = PROTO()
+    for name, values in features.items():
+        values = list(np.ravel(values)) if isinstance(values, np.ndarray) else values
+        slot = example.features.feature[name]
+        if values and isinstance(values[0], bytes):
+            slot.bytes_list.value.extend(values)
+        elif values and isinstance(values[0], float | np.floating):
+            slot.float_list.value.extend(map(float, values))
+        else:
+            slot.int64_list.value.extend(map(int, values))
+    return example.SerializeToString()
+
+
+def _bitwise_masked_crc(data: bytes) -> int:
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)
+    crc ^= 0xFFFFFFFF
+    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def frame(record: bytes) -> bytes:
+    length = struct.pack("<Q", len(record))
+    crc = _bitwise_masked_crc if len(record) < 5000 else masked_crc
+    return length + struct.pack("<I", crc(length)) + record + struct.pack("<I", crc(record))
+
+
+def tensor(shape=(), dtype="float32", encoding="none"):
+    dimensions = {"dimensions": [str(-1 if size is None else size) for size in shape]} if shape else {}
+    return {
+        "pythonClassName": "tensorflow_datasets.core.features.tensor_feature.Tensor",
+        "tensor": {"shape": dimensions, "dtype": dtype, "encoding": encoding},
+    }
+
+
+def image(shape, codec="png", dtype="uint8"):
+    return {
+        "pythonClassName": "x.Image",
+        "image": {"shape": tensor(shape)["tensor"]["shape"], "dtype": dtype, "encodingFormat": codec},
+    }
+
+
+TEXT = {"pythonClassName": "x.Text", "text": {}}
+
+
+def features_dict(items):
+    return {"pythonClassName": "x.FeaturesDict", "featuresDict": {"features": items}}
+
+
+def sequence(item, kind="Sequence"):
+    return {"pythonClassName": f"x.{kind}", "sequence": {"feature": item, "length": "-1"}}
+
+
+STEPS = {
+    "observation": features_dict({"image": image((8, 10, 3)), "state": tensor((3,), "float64")}),
+    "action": features_dict({"move": tensor((2,)), "grip": tensor((), "bool")}),
+    "language_instruction": TEXT,
+    "reward": tensor(),
+    "is_terminal": tensor((), "bool"),
+}
+
+
+def pictures(episode: int, steps: int) -> np.ndarray:
+    return np.random.default_rng(episode).integers(0, 256, (steps, 8, 10, 3), np.uint8)
+
+
+def png(picture: np.ndarray) -> bytes:
+    return cv2.imencode(".png", picture[..., ::-1] if picture.ndim == 3 else picture)[1].tobytes()
+
+
+def record(episode: int, steps: int) -> dict:
+    return {
+        "steps/observation/image": [png(picture) for picture in pictures(episode, steps)],
+        "steps/observation/state": np.arange(steps * 3, dtype=np.float64) + episode,
+        "steps/action/move": np.arange(steps * 2, dtype=np.float32) / 7 - episode,
+        "steps/action/grip": [step % 2 for step in range(steps)],
+        "steps/language_instruction": [f"lift é {episode}".encode()] * steps,
+        "steps/reward": [0.0] * (steps - 1) + [1.0],
+        "steps/is_terminal": [0] * (steps - 1) + [1],
+        "episode_metadata/file_path": [f"/robot/{episode}".encode()],
+    }
+
+
+def write(folder: Path, shards: dict, steps=None, info=True, metadata=None) -> Path:
+    """A TFDS folder from {file name: [features of each record]}."""
+    folder.mkdir(parents=True)
+    tree = {"steps": sequence(features_dict(steps or STEPS), "Dataset")}
+    tree["episode_metadata"] = features_dict(metadata or {"file_path": TEXT})
+    (folder / "features.json").write_text(json.dumps(features_dict(tree)))
+    splits: dict[str, list[str]] = {}
+    for name, records in shards.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"".join(frame(encode(item)) for item in records))
+        splits.setdefault(name.split(".")[0].split("-")[-1], []).append(str(len(records)))
+    if info:
+        stated = [{"name": split, "shardLengths": counts} for split, counts in splits.items()]
+        (folder / "dataset_info.json").write_text(
+            json.dumps({"name": "toy", "version": "1.0.0", "splits": stated})
+        )
+    return folder
+
+
+def toy(folder: Path, lengths=(4, 3, 5), info=True) -> Path:
+    records = [record(i, steps) for i, steps in enumerate(lengths)]
+    return write(folder, {"toy-train.tfrecord-00000-of-00001": records}, info=info)
+
+
+def embodiment(**changes) -> Embodiment:
+    values = {
+        "id": "toy", "kind": "real", "frequency_hz": 5,
+        "action": {"space": "mixed", "components": [
+            {"key": "action/move", "dims": 2}, {"key": "action/grip", "dims": 1, "sign": -1, "offset": 1}]},
+        "state": {"components": [{"key": "observation/state", "dims": 2, "slice": [1, 3]}]},
+        "cameras": [{"name": "primary", "key": "observation/image"}],
+        "source": {"format": "rlds"},
+    }  # fmt: skip
+    return Embodiment.from_values(values | changes, "toy.yaml")
+
+
+def numbers_only(**components) -> Embodiment:
+    """An embodiment of one action component."""
+    return embodiment(action={"space": "mixed", "components": [components]}, state=None)
+
+
+RLDS = open_source("rlds")
+
+
+def read(folder, name, robot=None):
+    return RLDS.read(str(folder), name, robot or embodiment())
+
+
+# -- what is read
+
+
+def test_an_episode_is_read_as_it_was_written(tmp_path):
+    folder = toy(tmp_path / "toy" / "1.0.0")
+    episode = read(folder, "train/000002")
+    grip = 1 - np.arange(5) % 2
+    expected = np.column_stack([(np.arange(10, dtype=np.float32) / 7 - 2).reshape(5, 2), grip])
+    np.testing.assert_array_equal(episode.actions[0].values, expected.astype(np.float32))
+    np.testing.assert_array_equal(episode.states[0].values, (np.arange(15) + 2).reshape(5, 3)[:, 1:])
+    np.testing.assert_allclose(episode.actions[0].timestamps, np.arange(5) / 5)
+    np.testing.assert_array_equal(episode.streams["primary"].frames([3, 0]), pictures(2, 5)[[3, 0]])
+    assert (episode.instruction, episode.success) == ("lift é 2", True)
+    assert episode.metadata == {"file_path": "/robot/2"}
+    assert len(to_clip(episode, embodiment())) == 5
+
+
+def test_pictures_are_decoded_only_when_asked_for(tmp_path):
+    broken = record(0, 3) | {"steps/observation/image": [b"junk", png(pictures(0, 3)[1]), b""]}
+    stream = read(write(tmp_path / "d", {"d-train.tfrecord": [broken]}), "train/000000").streams["primary"]
+    np.testing.assert_array_equal(stream.frames([1])[0], pictures(0, 3)[1])
+    for index in (0, 2):
+        with pytest.raises(EpisodeError, match=f"step {index}.*cannot be decoded"):
+            stream.frames([index])
+
+
+@pytest.mark.parametrize(
+    "dtype", ["float16", "float32", "float64", "int8", "int64", "uint8", "uint64", "bool"]
+)
+@pytest.mark.parametrize("encoding", ["none", "bytes", "zlib"])
+def test_tensors_of_every_dtype_and_encoding(tmp_path, dtype, encoding):
+    values = np.array([[0, 1, 100], [3, 127, 2]]).astype(dtype)
+    stored = values.astype(np.float32 if np.dtype(dtype).kind == "f" else np.int64)
+    if encoding != "none":
+        blobs = [row.tobytes() for row in values]
+        stored = blobs if encoding == "bytes" else [zlib.compress(blob) for blob in blobs]
+    steps = {"observation": STEPS["observation"], "a": tensor((3,), dtype, encoding)}
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | {"steps/a": stored}]}, steps)
+    actions = read(folder, "train/000000", numbers_only(key="a", dims=3)).actions[0].values
+    np.testing.assert_array_equal(actions, values.astype(np.float32))
+
+
+def test_raw_pictures_kept_as_tensors(tmp_path):
+    raw = pictures(5, 2)
+    steps = STEPS | {"plain": tensor((8, 10, 3), "uint8"), "packed": tensor((8, 10, 3), "uint8", "zlib")}
+    stored = {"steps/plain": raw.astype(np.int64), "steps/packed": [zlib.compress(p.tobytes()) for p in raw]}
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | stored]}, steps)
+    cameras = [{"name": "a", "key": "plain"}, {"name": "b", "key": "packed"}]
+    episode = read(folder, "train/000000", embodiment(cameras=cameras))
+    for stream in episode.streams.values():
+        np.testing.assert_array_equal(stream.frames([1, 0]), raw[::-1])
+
+
+def test_a_nested_sequence_of_one_length_is_a_vector_and_a_varying_one_is_refused(tmp_path):
+    steps = STEPS | {"goal": sequence(tensor((2,))), "found": sequence(tensor((), "int32"))}
+    stored = {
+        "steps/goal/ragged_flat_values": np.arange(12, dtype=np.float32),
+        "steps/goal/ragged_row_lengths_0": [3, 3],
+        "steps/found/ragged_flat_values": [1, 2, 3],
+        "steps/found/ragged_row_lengths_0": [1, 2],
+    }
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | stored]}, steps)
+    episode = read(folder, "train/000000", numbers_only(key="goal", dims=6))
+    np.testing.assert_array_equal(episode.actions[0].values, np.arange(12).reshape(2, 6))
+    with pytest.raises(EpisodeError, match="varies from 1 to 2"):
+        read(folder, "train/000000", numbers_only(key="found", dims=2))
+
+
+def test_unpacked_lists_are_read_like_packed_ones():
+    unpacked = b"\x0d" + struct.pack("<f", 1.5) + b"\x0a\x04" + struct.pack("<f", -2.0)
+    feature = b"\x12" + bytes([len(unpacked)]) + unpacked
+    entry = b"\x0a\x01x\x12" + bytes([len(feature)]) + feature
+    features = b"\x0a" + bytes([len(entry)]) + entry
+    example = Example(b"\x0a" + bytes([len(features)]) + features, "e")
+    assert example.numbers("x").tolist() == [1.5, -2.0]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=1, max_size=40), st.text(max_size=9))
+def test_integers_and_names_survive_the_wire(values, name):
+    assert Example(encode({name: values}), "e").numbers(name).tolist() == values
+
+
+def test_varints_cut_off_or_too_long_are_refused():
+    for data in (b"\x01\x80", b"\x80" * 10 + b"\x01"):
+        with pytest.raises(ValueError, match="varint"):
+            varints(np.frombuffer(data, np.uint8))
+
+
+@pytest.mark.parametrize("key", [None, "observation/instruction"])
+def test_an_instruction_kept_as_letter_codes(tmp_path, key):
+    steps = STEPS | {
+        "observation": features_dict({"image": image((8, 10, 3)), "instruction": tensor((12,), "int32")})
+    }
+    del steps["language_instruction"]
+    codes = np.array([*"push é".encode(), 0, 0, 0, 0, 0])
+    stored = record(0, 2) | {"steps/observation/instruction": np.tile(codes, 2)}
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [stored]}, steps)
+    robot = embodiment(source={"format": "rlds", "instruction": key}, state=None)
+    assert read(folder, "train/000000", robot).instruction == ("push é" if key else "")
+
+
+@pytest.mark.parametrize(("stated", "expected"), [(1, True), (0, False)])
+def test_success_as_the_episode_states_it(tmp_path, stated, expected):
+    item = record(0, 2) | {"episode_metadata/success": [stated]}
+    metadata = {"success": tensor((), "bool")}
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [item]}, metadata=metadata)
+    assert read(folder, "train/000000").success is expected
+
+
+def test_success_is_unknown_without_a_rewarded_terminal_step(tmp_path):
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | {"steps/is_terminal": [0, 0]}]})
+    assert read(folder, "train/000000").success is None
+
+
+# -- folders, shards, splits
+
+
+def test_ids_run_over_the_shards_of_a_split_whatever_the_template(tmp_path):
+    names = ["toy-train.tfrecord-00000-of-00002", "toy-train.tfrecord-00001-of-00002"]
+    records = [record(i, 2) for i in range(5)]
+    folder = write(tmp_path / "d", {names[0]: records[:3], names[1]: records[3:]})
+    assert RLDS.episode_ids(str(folder)) == [f"train/{i:06d}" for i in range(5)]
+    assert read(folder, "train/000004").instruction == "lift é 4"
+
+    moved = tmp_path / "e"
+    shutil.copytree(folder, moved)
+    (moved / "train").mkdir()
+    for i, name in enumerate(names):
+        (moved / name).rename(moved / "train" / f"part.tfrecord-{i:05d}")
+    info = json.loads((moved / "dataset_info.json").read_text())
+    info["splits"][0]["filepathTemplate"] = "{SPLIT}/part.{FILEFORMAT}-{SHARD_INDEX}"
+    (moved / "dataset_info.json").write_text(json.dumps(info))
+    assert read(moved, "train/000004").instruction == "lift é 4"
+
+
+def test_without_dataset_info_the_records_are_counted(tmp_path):
+    folder = toy(tmp_path / "d", info=False)
+    assert RLDS.episode_ids(str(folder)) == ["train/000000", "train/000001", "train/000002"]
+
+
+def test_the_sources_own_splits(tmp_path):
+    names = [f"toy-{split}.tfrecord-00000-of-00001" for split in ("train", "test")]
+    folder = write(tmp_path / "d", {name: [record(0, 2)] for name in names})
+    assert [(ref.id, ref.split) for ref in RLDS.index(str(folder))] == [
+        ("train/000000", "train"), ("test/000000", "val"),
+    ]  # fmt: skip
+    chosen = embodiment(source={"format": "rlds", "split": "test"})
+    assert [(ref.id, ref.split) for ref in RLDS.index(str(folder), chosen)] == [("test/000000", None)]
+    with pytest.raises(SourceError, match=r"no split 'dev'.*train, test"):
+        RLDS.index(str(folder), embodiment(source={"format": "rlds", "split": "dev"}))
+
+
+def test_a_dataset_with_one_split_leaves_splitting_to_the_toolkit(tmp_path):
+    assert {ref.split for ref in RLDS.index(str(toy(tmp_path / "d")))} == {None}
+
+
+def test_frames_are_estimated_from_bytes(tmp_path):
+    refs = RLDS.index(str(toy(tmp_path / "d", (10, 20, 5))))
+    assert refs[0].frames == 10
+    assert all(abs(ref.frames - true) <= 1 for ref, true in zip(refs, (10, 20, 5), strict=True))
+
+
+def test_fingerprints_follow_the_content(tmp_path):
+    first = RLDS.index(str(toy(tmp_path / "a", (2, 3))))
+    second = RLDS.index(str(toy(tmp_path / "b", (2, 4))))
+    assert first[0].fingerprint == second[0].fingerprint
+    assert first[1].fingerprint != second[1].fingerprint
+
+
+def test_the_uri_may_name_the_dataset_the_version_or_one_shard(tmp_path):
+    version = toy(tmp_path / "toy" / "1.0.0")
+    shard = version / "toy-train.tfrecord-00000-of-00001"
+    for uri in (version.parent, version, shard, f"file://{version}"):
+        assert len(RLDS.episode_ids(str(uri))) == 3
+    toy(tmp_path / "toy" / "2.0.0")
+    with pytest.raises(SourceError, match=r"several datasets or versions: 1\.0\.0, 2\.0\.0"):
+        RLDS.episode_ids(str(version.parent))
+
+
+def test_missing_shards_keep_the_ids_of_the_others(tmp_path, caplog):
+    names = [f"toy-train.tfrecord-{i:05d}-of-00003" for i in range(3)]
+    folder = write(tmp_path / "d", {name: [record(i, 2), record(i, 3)] for i, name in enumerate(names)})
+    (folder / names[1]).unlink()
+    with caplog.at_level(logging.WARNING):
+        assert RLDS.episode_ids(str(folder)) == [f"train/{i:06d}" for i in (0, 1, 4, 5)]
+    assert "1 of 3 shards of split train" in caplog.text
+    assert read(folder, "train/000005").instruction == "lift é 2"
+    with pytest.raises(EpisodeError, match="lies in no shard"):
+        read(folder, "train/000002")
+
+
+def test_a_renamed_dataset_is_found_by_its_files(tmp_path):
+    folder = toy(tmp_path / "d")
+    shard = next(folder.glob("*.tfrecord*"))
+    shard.rename(folder / shard.name.replace("toy", "other_name"))
+    assert read(folder, "train/000001").instruction == "lift é 1"
+
+
+def test_a_remote_folder_reads_like_a_local_one(tmp_path):
+    folder = toy(tmp_path / "d")
+    uri = f"memory://{tmp_path.name}"
+    for path in folder.iterdir():
+        fsspec.filesystem("memory").pipe(f"{uri}/{path.name}", path.read_bytes())
+    local, remote = read(folder, "train/000001"), read(uri, "train/000001")
+    np.testing.assert_array_equal(remote.actions[0].values, local.actions[0].values)
+    np.testing.assert_array_equal(remote.streams["primary"].frames([2]), local.streams["primary"].frames([2]))
+    assert [ref.id for ref in RLDS.index(uri)] == RLDS.episode_ids(str(folder))
+
+
+def test_features_json_of_older_tfds(tmp_path):
+    def legacy(node):
+        kind = node["pythonClassName"]
+        if "featuresDict" in node:
+            return {
+                "type": kind,
+                "content": {key: legacy(item) for key, item in node["featuresDict"]["features"].items()},
+            }
+        if "sequence" in node:
+            return {"type": kind, "content": {"feature": legacy(node["sequence"]["feature"]), "length": None}}
+        content = next(value for key, value in node.items() if key != "pythonClassName")
+        if "shape" in content:
+            shape = [int(size) for size in content["shape"].get("dimensions", [])]
+            content = {
+                "shape": shape,
+                "dtype": content["dtype"],
+                "encoding_format": content.get("encodingFormat"),
+            }
+        return {"type": kind, "content": content}
+
+    folder = toy(tmp_path / "d")
+    expected = read(folder, "train/000000").actions[0].values
+    tree = json.loads((folder / "features.json").read_text())
+    (folder / "features.json").write_text(json.dumps(legacy(tree)))
+    np.testing.assert_array_equal(read(folder, "train/000000").actions[0].values, expected)
+
+
+# -- inspection
+
+
+def test_inspection_lists_every_key_of_a_step(tmp_path):
+    found = RLDS.inspect(str(toy(tmp_path / "d")))
+    assert (found.episodes, found.frames, found.lengths, found.problems) == (3, 12, (4, 3, 5), ())
+    keys = {key.key: (key.kind, key.shape, key.dtype, key.codec) for key in found.keys}
+    assert keys["observation/image"] == ("camera", (8, 10, 3), "uint8", "png")
+    assert keys["observation/state"] == ("vector", (3,), "float64", None)
+    assert keys["action/grip"] == ("vector", (), "bool", None)
+    assert keys["language_instruction"][0] == "text"
+    assert found.facts["splits"] == "train 3"
+
+
+def test_inspection_names_what_is_wrong(tmp_path):
+    bad = record(1, 3) | {"steps/action/move": [0.0, 1.0, float("nan"), 0.0, 0.0, 0.0]}
+    folder = write(tmp_path / "d", {"d-train.tfrecord-00000-of-00001": [record(0, 2), bad, record(2, 2)]})
+    shard = next(folder.glob("*.tfrecord*"))
+    shard.write_bytes(shard.read_bytes()[:-9])
+    problems = " | ".join(RLDS.inspect(str(folder)).problems)
+    assert "train/000001: action/move is not finite at step 1" in problems
+    assert "cut off at byte" in problems
+
+
+# -- what is refused
+
+
+def test_keys_that_are_not_there_are_answered_with_near_ones(tmp_path):
+    folder = toy(tmp_path / "d")
+    with pytest.raises(SourceError, match=r"no key 'action/mov'.*did you mean action/move"):
+        read(folder, "train/000000", numbers_only(key="action/mov", dims=2))
+    with pytest.raises(SourceError, match="action/move is a tensor of float32, not a colour picture"):
+        read(folder, "train/000000", embodiment(cameras=[{"name": "a", "key": "action/move"}]))
+    with pytest.raises(SourceError, match=r"observation/state has 3 values a step, the embodiment says 7"):
+        RLDS.index(str(folder), numbers_only(key="observation/state", dims=7))
+    with pytest.raises(SourceError, match="language_instruction is text of string, not numbers"):
+        RLDS.index(str(folder), numbers_only(key="language_instruction", dims=1))
+
+
+def test_depth_is_not_a_colour_picture(tmp_path):
+    folder = write(
+        tmp_path / "d",
+        {"d-train.tfrecord": [record(0, 2)]},
+        STEPS | {"depth": image((8, 8, 1), dtype="uint16")},
+    )
+    with pytest.raises(SourceError, match="depth is a picture of uint16, not a colour picture"):
+        RLDS.index(str(folder), embodiment(cameras=[{"name": "a", "key": "depth"}]))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: (d / "features.json").unlink(), "has no features.json"),
+        (lambda d: (d / "features.json").write_text("{"), "not a TFDS features.json"),
+        (lambda d: (d / "dataset_info.json").write_text("{"), "is not JSON"),
+        (lambda d: (d / "dataset_info.json").write_text('{"fileFormat": "array_record"}'), "'array_record'"),
+        (lambda d: next(d.glob("*.tfrecord*")).unlink(), "holds no TFRecord file"),
+        (lambda d: next(d.glob("*.tfrecord*")).write_bytes(b""), "holds no readable episode"),
+        (lambda d: next(d.glob("*.tfrecord*")).write_bytes(b"\x1f\x8b" + bytes(40)), "gzip-compressed"),
+        (lambda d: next(d.glob("*.tfrecord*")).write_bytes(bytes(400)), "holds no readable episode"),
+        (lambda d: shutil.rmtree(d), "does not exist"),
+    ],
+)
+def test_a_recording_that_cannot_be_read(tmp_path, damage, message):
+    folder = toy(tmp_path / "d")
+    damage(folder)
+    with pytest.raises(SourceError, match=message):
+        RLDS.index(str(folder))
+
+
+def test_more_records_than_stated_is_refused(tmp_path):
+    folder = toy(tmp_path / "d")
+    info = (folder / "dataset_info.json").read_text()
+    (folder / "dataset_info.json").write_text(info.replace('"3"', '"2"'))
+    with pytest.raises(SourceError, match=r"has 3 records, dataset_info\.json says 2"):
+        RLDS.index(str(folder))
+
+
+def test_a_file_system_that_is_not_known_or_not_installed():
+    with pytest.raises((SourceError, MissingDependencyError)):
+        RLDS.index("nosuch://bucket/data")
+
+
+@pytest.mark.parametrize("name", ["train/000009", "train/-1", "test/000000", "train", "../x/000000", ""])
+def test_an_unknown_episode(tmp_path, name):
+    with pytest.raises(EpisodeError):
+        read(toy(tmp_path / "d"), name)
+
+
+def test_an_episode_without_steps_or_with_columns_of_other_lengths(tmp_path):
+    short = record(0, 3) | {"steps/action/move": np.zeros(4, np.float32)}
+    blind = record(0, 3) | {"steps/observation/image": [png(pictures(0, 1)[0])]}
+    empty = {name: [] for name in record(0, 3)}
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [short, blind, empty, {}]})
+    for index, message in enumerate(
+        ("4 values", "1 entries for 3 steps", "no steps", "none of the features")
+    ):
+        with pytest.raises(EpisodeError, match=message):
+            read(folder, f"train/{index:06d}")
+
+
+def test_a_compressed_bomb_is_refused_at_its_true_size(tmp_path):
+    bomb = zlib.compress(bytes(50_000_000))
+    steps = STEPS | {"a": tensor((3,), "float32", "zlib")}
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | {"steps/a": [bomb, bomb]}]}, steps)
+    with pytest.raises(EpisodeError, match=r"is not float32 \(3\)"):
+        read(folder, "train/000000", numbers_only(key="a", dims=3))
+
+
+# -- damage anywhere
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A folder, its shard's bytes and the episodes' actions."""
+    folder = toy(tmp_path_factory.mktemp("whole") / "d", (3, 2, 3))
+    actions = {name: read(folder, name).actions[0].values for name in RLDS.episode_ids(str(folder))}
+    return folder, next(folder.glob("*.tfrecord*")).read_bytes(), actions
+
+
+def _read_damaged(whole, data: bytes, tmp_path_factory, info: bool) -> set[str]:
+    """Ids that could be read, each checked to be as it was; the others raised EpisodeError."""
+    folder, _, actions = whole
+    copy = tmp_path_factory.mktemp("damaged")
+    for name in ("features.json", "dataset_info.json")[: 2 if info else 1]:
+        shutil.copy(folder / name, copy)
+    (copy / "toy-train.tfrecord-00000-of-00001").write_bytes(data)
+    try:
+        ids = RLDS.episode_ids(str(copy))
+    except SourceError as fault:
+        assert "holds no readable episode" in str(fault) or "gzip" in str(fault)
+        return set()
+    assert not info or ids == list(actions)
+    good = set()
+    for name in ids:
+        try:
+            episode = read(copy, name)
+        except EpisodeError:
+            continue
+        np.testing.assert_array_equal(episode.actions[0].values, actions[name])
+        good.add(name)
+    return good
+
+
+QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@QUICK
+@given(st.data())
+def test_truncated_at_any_byte_the_whole_episodes_before_it_are_read(whole, tmp_path_factory, data):
+    _, content, actions = whole
+    cut = data.draw(st.integers(0, len(content) - 1))
+    good = _read_damaged(whole, content[:cut], tmp_path_factory, data.draw(st.booleans()))
+    ends, position = [], 0
+    while position < len(content):
+        position += 16 + struct.unpack_from("<Q", content, position)[0]
+        ends.append(position)
+    assert good == {name for name, end in zip(actions, ends, strict=True) if end <= cut}
+
+
+@QUICK
+@given(st.data())
+def test_a_flipped_byte_anywhere_is_noticed(whole, tmp_path_factory, data):
+    _, content, actions = whole
+    place, bits = data.draw(st.integers(0, len(content) - 1)), data.draw(st.integers(1, 255))
+    damaged = content[:place] + bytes([content[place] ^ bits]) + content[place + 1 :]
+    assert len(_read_damaged(whole, damaged, tmp_path_factory, True)) < len(actions)
+
+
+@QUICK
+@given(st.data())
+def test_a_wrong_record_with_a_right_checksum_gives_an_episode_error_or_an_episode(tmp_path_factory, data):
+    raw = bytearray(encode(record(0, 3)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    folder = write(tmp_path_factory.mktemp("wrong") / "d", {"toy-train.tfrecord": []})
+    (folder / "toy-train.tfrecord").write_bytes(frame(bytes(raw)))
+    (folder / "dataset_info.json").unlink()
+    try:
+        episode = read(folder, "train/000000")
+        episode.streams["primary"].frames(range(len(episode.actions[0].values)))
+    except EpisodeError as fault:
+        assert str(fault)
+
+
+@given(st.binary(max_size=80))
+def test_any_bytes_are_an_example_or_an_error(data):
+    try:
+        example = Example(data, "e")
+        for name in example.names():
+            example.numbers(name)
+    except HMAError as fault:
+        assert isinstance(fault, EpisodeError)
+
+
+# -- the real recording
+
+
+@pytest.mark.real
+def test_the_real_bridge_recording_equals_an_independent_parse(real_data):
+    folder = real_data / "rlds" / "bridge_dataset"
+    robot = find("bridge_data_v2")
+    refs = RLDS.index(str(folder), robot)
+    assert [(ref.id, ref.split) for ref in (refs[0], refs[-1])] == [
+        ("train/000000", "train"),
+        ("val/000024", "val"),
+    ]
+    content = next((folder / "1.0.0").glob("*-train.tfrecord*")).read_bytes()
+    position = 0
+    for index in range(25):
+        length = struct.unpack_from("<Q", content, position)[0]
+        truth = PROTO.FromString(content[position + 12 : position + 12 + length]).features.feature
+        position += 16 + length
+        episode = read(folder, f"train/{index:06d}", robot)
+        action = np.array(truth["steps/action"].float_list.value, np.float32).reshape(-1, 7)
+        state = np.array(truth["steps/observation/state"].float_list.value, np.float32).reshape(-1, 7)
+        np.testing.assert_array_equal(episode.actions[0].values, action)
+        np.testing.assert_array_equal(episode.states[0].values, state)
+        assert episode.instruction.encode() == truth["steps/language_instruction"].bytes_list.value[0]
+        assert episode.metadata["episode_id"] == truth["episode_metadata/episode_id"].int64_list.value[0]
+        last = len(action) - 1
+        jpeg = truth["steps/observation/image_0"].bytes_list.value[last]
+        shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        np.testing.assert_array_equal(episode.streams["primary"].frames([last])[0], shown)
+    assert position == len(content)
+
+
+@pytest.mark.real
+def test_the_real_bridge_recording_inspects_without_problems(real_data):
+    found = RLDS.inspect(str(real_data / "rlds" / "bridge_dataset"))
+    assert (found.episodes, found.frames, found.problems) == (50, 500, ())
+    assert sorted(key.key for key in found.keys if key.kind == "camera") == [
+        f"observation/image_{i}" for i in range(4)
+    ]
