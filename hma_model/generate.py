@@ -80,7 +80,7 @@ class Rollout:
         count = frames.shape[1]
         self.frames = self.groups.sort(values.to(self.model.device))
         self.slots = self._slots_of(actions, count)
-        self.passive = True if actions is None else False
+        self.passive = actions is None
         self.begun, self.cache = False, None
         self._keep(self.config.frames)
         self.fresh = self.time = self.frames.shape[1]  # fresh: frames not in the cache yet
@@ -162,7 +162,7 @@ class Rollout:
         return self.passive and self.config.absent_action == "skip"
 
     def _slots_of(self, actions: Tensor | None, frames: int) -> Slots:
-        """The chunk in force at each of the prompt's frames; with alignment "current" the last waits for `step`."""
+        """The chunk in force at each known frame; aligned with the current one, the last waits for `step`."""
         shape, device = (self.batch, frames), self.model.device
         slots = Slots(
             torch.zeros(*shape, self.width, device=device),

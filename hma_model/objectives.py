@@ -86,7 +86,8 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
         action_loss, per_sample = _action_loss(model, features, batch, dropped, objective, groups, generator)
     if objective in ("forward", "passive", "full"):
         own = model.video_features(features)
-        video_loss, per_sample = _video_loss(model, own, frames, video.masked, groups, generator)
+        predictors = own if config.kind == "discrete" else model.latent_readout(own, clock)
+        video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
         if config.kind == "discrete" and not model.training:
             scores = model.token_readout.split(model.token_readout(own.detach()))
             logits = groups.unsort(scores).unflatten(2, config.token_grid)
@@ -152,8 +153,7 @@ def _video_loss(
     if model.config.kind == "discrete":
         losses = model.token_readout.loss(chosen, to_digits(targets, model.config.factored))
     else:
-        readout = model.latent_readout
-        losses = readout.diffusion.loss(targets, readout(features, clock).flatten(0, 2)[rows], generator)
+        losses = model.latent_readout.diffusion.loss(targets, chosen, generator)
     return losses.sum() / max(len(rows), 1), groups.unsort(_means(losses, sample, len(frames)))
 
 

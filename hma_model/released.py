@@ -56,7 +56,7 @@ def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | No
         continuous = bool(config.get("Diffusion", config.get("image_vocab_size") is None))
         network = str(config["action_network"])
         if sorted(network.split("+")) != ["concat", "modulate"] or config["qk_norm"]:
-            fault = f"action_network {network!r} with qk_norm {config['qk_norm']} is not a layout that was released"
+            fault = f"action_network {network!r} with qk_norm {config['qk_norm']} was never released"
             raise CheckpointError(
                 "config.json", fault, "only concat+modulate without qk_norm can be imported"
             )
@@ -134,7 +134,7 @@ def state_from_released(
         config: from `config_from_released`.
 
     Returns:
-        What `HMA.load_trunk` takes, and per embodiment what `HMA.load_embodiment` takes (stem, head); float32.
+        What `HMA.load_trunk` takes, and per embodiment the stem and head `HMA.load_embodiment` takes; float32.
 
     Raises:
         CheckpointError: a tensor is missing.
