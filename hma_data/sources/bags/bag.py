@@ -1,0 +1,220 @@
+"""A bag: one recording, in one file or in a ROS 2 folder of several, told apart by content."""
+
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+from hma_data.errors import EpisodeError
+from hma_data.sources.bags.container import (
+    MAX_CHUNK,
+    Channel,
+    Container,
+    Data,
+    Record,
+    damaged,
+    reading,
+    unzstd,
+)
+from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
+from hma_data.sources.bags.mcap import McapFile
+from hma_data.sources.bags.ros1 import Ros1File
+from hma_data.sources.bags.sqlite import MAGIC as SQLITE_MAGIC
+from hma_data.sources.bags.sqlite import SqliteFile
+from hma_data.sources.base import file_fingerprint, first_bytes
+from hma_data.yaml_io import read_yaml
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+MAX_EXPANSION = 200  # a file that unpacks to more than so many times its size is a bomb
+
+
+class Place(NamedTuple):
+    """Where a message is: which file of the bag, and the place in it."""
+
+    file: int
+    first: int
+    second: int
+
+
+class Bag:
+    """One recording. Cheap to make; holds no open files, and unpacked chunks up to a fixed size.
+
+    Args:
+        path: a bag file, or a folder with rosbag2's metadata.yaml.
+        root: links that lead out of it are refused; default the bag itself.
+
+    Raises:
+        EpisodeError: it cannot be one, by its first bytes or its metadata.
+    """
+
+    def __init__(self, path: Path, root: Path | None = None) -> None:
+        self.path = path
+        self._unpacked: tempfile.TemporaryDirectory[str] | None = None
+        self._message_packed = False
+        self._metadata: dict[str, Any] = {}
+        paths = [path]
+        if path.is_dir():
+            self._metadata = _metadata(path)
+            paths = _listed(path, self._metadata)
+            mode = str(self._metadata.get("compression_mode", "")).lower()
+            self._message_packed = mode == "message"
+        for item in paths:
+            _refuse_link(item, root or path)
+        self._paths = paths
+        self._files: list[Container] | None = None
+
+    def files(self) -> list[Container]:
+        """Its files in recording order; packed ones (.zstd) are unpacked to a temporary folder first."""
+        if self._files is None:
+            self._files = [_container(self._plain(path)) for path in self._paths]
+        return self._files
+
+    def counts(self) -> Counter[Channel]:
+        """Messages of each channel, from indexes where there are any."""
+        if any(path.suffix == ".zstd" for path in self._paths):
+            return self._stated_counts()
+        total: Counter[Channel] = Counter()
+        for file in self.files():
+            for channel, count in file.counts().items():
+                total[channel] += count
+        return total
+
+    def records(self, topics: frozenset[str] | None = None) -> Iterator[tuple[Place, Record]]:
+        """The messages of those topics (of all, with None), file by file."""
+        for number, file in enumerate(self.files()):
+            for record in file.records(topics):
+                if self._message_packed:
+                    record = record._replace(data=self._unpack(record.data))
+                yield Place(number, *record.place), record
+
+    def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
+        """The data of the messages at those places, in that order."""
+        files = self.files()
+        for number, group in groupby(places, key=lambda place: place.file):
+            for data in files[number].payloads([(place.first, place.second) for place in group]):
+                yield self._unpack(data) if self._message_packed else data
+
+    def fingerprint(self) -> str:
+        """Changes when a byte does; see EpisodeRef."""
+        return "-".join(file_fingerprint(path) for path in self._paths)
+
+    def _unpack(self, data: Data) -> bytes:
+        with reading(self.path):
+            unpacked = unzstd(data, MAX_CHUNK)
+            if len(unpacked) > MAX_CHUNK:
+                raise ValueError(f"a message unpacks to more than {MAX_CHUNK:,} bytes")
+        return unpacked
+
+    def _plain(self, path: Path) -> Path:
+        if path.suffix != ".zstd":
+            return path
+        import zstandard
+
+        if self._unpacked is None:
+            self._unpacked = tempfile.TemporaryDirectory(prefix="hma-bag-")
+        target = Path(self._unpacked.name) / path.stem
+        limit = path.stat().st_size * MAX_EXPANSION
+        with reading(path), path.open("rb") as packed, target.open("wb") as plain:
+            try:
+                for piece in zstandard.ZstdDecompressor().read_to_iter(packed):
+                    plain.write(piece)
+                    if plain.tell() > limit:
+                        raise ValueError(f"it unpacks to more than {MAX_EXPANSION} times its size")
+            except zstandard.ZstdError as fault:
+                raise ValueError(str(fault)) from fault
+        return target
+
+    def _stated_counts(self) -> Counter[Channel]:
+        total: Counter[Channel] = Counter()
+        with reading(self.path):
+            for item in self._metadata.get("topics_with_message_count") or ():
+                topic = item["topic_metadata"]
+                channel = Channel(str(topic["name"]), str(topic["type"]), str(topic["serialization_format"]))
+                total[channel] += int(item["message_count"])
+        return total
+
+
+def find_bags(root: Path) -> dict[str, Path]:
+    """Episode id -> bag at or under that path, in order of the ids.
+
+    An id is the path relative to `root` without suffix; the suffix stays where two would be equal.
+    A folder with rosbag2's metadata.yaml is one bag; elsewhere every bag file is.
+    """
+    if root.is_file() or is_bag_folder(root):
+        return {root.stem if root.is_file() else root.name: root}
+    found: list[Path] = []
+    for folder, folders, names in os.walk(root):
+        here = Path(folder)
+        if here != root and is_bag_folder(here):
+            found.append(here)
+            folders.clear()
+            continue
+        found += [here / name for name in names if _is_bag_file(here / name)]
+    ids = {path: _id(path, root) for path in found}
+    repeated = {item for item, count in Counter(ids.values()).items() if count > 1}
+    named = {
+        path.relative_to(root).as_posix() if ids[path] in repeated else ids[path]: path for path in found
+    }
+    return dict(sorted(named.items()))
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Whether the folder is a ROS 2 bag."""
+    return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 4096)
+
+
+def _id(path: Path, root: Path) -> str:
+    relative = path.relative_to(root)
+    return (relative if path.is_dir() else relative.with_suffix("")).as_posix()
+
+
+def _is_bag_file(path: Path) -> bool:
+    if path.suffix in SUFFIXES:
+        return True
+    return first_bytes(path, 8).startswith((b"#ROSBAG", MCAP_MAGIC))
+
+
+def _refuse_link(path: Path, root: Path) -> None:
+    folder = root if root.is_dir() else root.parent
+    if root != path and not path.resolve().is_relative_to(folder.resolve()):
+        raise EpisodeError(
+            path, "is a link to a file outside its folder", "copy the file in, or name it itself"
+        )
+
+
+def _container(path: Path) -> Container:
+    magic = first_bytes(path, 16)
+    if magic.startswith(b"#ROSBAG"):
+        return Ros1File(path)
+    if magic.startswith(MCAP_MAGIC):
+        return McapFile(path)
+    if magic.startswith(SQLITE_MAGIC):
+        return SqliteFile(path)
+    if not magic:
+        raise damaged(path, "is empty")
+    raise damaged(path, f"begins with {magic[:8]!r}, neither as a ROS 1 bag, nor MCAP, nor sqlite3")
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    where = folder / "metadata.yaml"
+    values = read_yaml(where, EpisodeError)
+    information = values.get("rosbag2_bagfile_information") if isinstance(values, dict) else None
+    if not isinstance(information, dict):
+        raise EpisodeError(where, "holds no rosbag2_bagfile_information", "run ros2 bag reindex")
+    return information
+
+
+def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
+    """The files metadata.yaml names, by their last name alone: older versions put the folder before it."""
+    where = folder / "metadata.yaml"
+    names = metadata.get("relative_file_paths")
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
+        raise EpisodeError(where, "relative_file_paths names no files", "run ros2 bag reindex")
+    paths = [folder / PurePosixPath(name).name for name in names]
+    missing = [path.name for path in paths if not path.is_file()]
+    if missing:
+        raise EpisodeError(where, f"names {missing[0]}, which is not in the folder", "run ros2 bag reindex")
+    return paths

@@ -1,0 +1,198 @@
+"""What the three kinds of bag file have in common.
+
+A container is one file. It yields the messages of wanted topics in the file's order, tells how
+many there are without reading them where it has an index, and finds a message again by its
+place, so that nothing but places needs to be kept of pictures. No container holds an open file
+between calls.
+"""
+
+import bz2
+import sqlite3
+import struct
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, Protocol
+
+from hma_data.errors import EpisodeError
+
+MAX_CHUNK = 512 << 20  # bytes; a chunk that unpacks to more is a bomb or an error
+CACHED_BYTES = 64 << 20
+FAULTS = (
+    struct.error, ValueError, LookupError, OverflowError, RecursionError, EOFError, OSError, RuntimeError,
+    MemoryError, sqlite3.Error,
+)  # fmt: skip
+
+Data = bytes | memoryview
+Place = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A topic as one writer declared it.
+
+    Attributes:
+        type: of its messages, "sensor_msgs/msg/JointState" or as the schema names it.
+        encoding: of its messages: ros1, cdr, json, protobuf, or what the file says.
+        schema_encoding: ros1msg, ros2msg, ros2idl, jsonschema, protobuf; empty without a schema.
+        schema: the definition carried by the file.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    schema_encoding: str = ""
+    schema: bytes = field(default=b"", repr=False)
+
+
+class Record(NamedTuple):
+    """A message as stored: `log_ns` is when it was received, `place` where `payloads` finds it again."""
+
+    channel: Channel
+    log_ns: int
+    data: Data
+    place: Place
+
+
+class Container(Protocol):
+    """One file of a bag. Every method raises EpisodeError when the file is damaged."""
+
+    path: Path
+
+    def counts(self) -> Counter[Channel]:
+        """Messages of each channel, from the index where there is one; channels without any included."""
+        ...
+
+    def records(self, topics: frozenset[str] | None = None) -> Iterator[Record]:
+        """The messages of those topics (of all, with None) in the file's order."""
+        ...
+
+    def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
+        """The data of the messages at those places."""
+        ...
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Whatever goes wrong inside is told as damage of that file."""
+    try:
+        yield
+    except FAULTS as fault:
+        detail = str(fault) or type(fault).__name__
+        raise damaged(path, f"is damaged or cut off: {detail}") from fault
+
+
+def damaged(path: Path, fault: str) -> EpisodeError:
+    """The error of a file that cannot be read to its end."""
+    return EpisodeError(
+        path, fault, "copy it again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
+    )
+
+
+def decompress(codec: str, data: Data, size: int) -> bytes:
+    """The `size` bytes that were packed.
+
+    Raises:
+        ValueError: another codec, another size, or more than MAX_CHUNK.
+    """
+    if size > MAX_CHUNK:
+        raise ValueError(f"a chunk claims {size:,} bytes, more than {MAX_CHUNK:,}")
+    if codec in ("", "none"):
+        unpacked = bytes(data)
+    elif codec == "bz2":
+        unpacked = bz2.BZ2Decompressor().decompress(data, size + 1)
+    elif codec == "lz4":
+        from lz4.frame import LZ4FrameDecompressor
+
+        unpacked = LZ4FrameDecompressor().decompress(data, size + 1)
+    elif codec == "zstd":
+        unpacked = unzstd(data, size)
+    else:
+        raise ValueError(f"chunks packed with {codec!r} cannot be read; none, bz2, lz4 and zstd can")
+    if len(unpacked) != size:
+        raise ValueError(f"a chunk unpacks to {len(unpacked):,} bytes where {size:,} are announced")
+    return unpacked
+
+
+def unzstd(data: Data, limit: int) -> bytes:
+    """Up to `limit` + 1 unpacked bytes.
+
+    Raises:
+        ValueError: not zstd.
+    """
+    import zstandard
+
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(bytes(data)) as stream:
+            unpacked: bytes = stream.read(limit + 1)
+    except zstandard.ZstdError as fault:
+        raise ValueError(str(fault)) from fault
+    return unpacked
+
+
+class Fields:
+    """Reads little-endian fields off bytes; ValueError where they end too soon."""
+
+    def __init__(self, data: Data) -> None:
+        self._data = memoryview(data)
+        self._at = 0
+
+    def take(self, size: int) -> memoryview:
+        """The next `size` bytes."""
+        if self._at + size > len(self._data):
+            raise ValueError("a record ends too soon")
+        self._at += size
+        return self._data[self._at - size : self._at]
+
+    def number(self, size: int) -> int:
+        """An unsigned number of `size` bytes."""
+        return int.from_bytes(self.take(size), "little")
+
+    def block(self) -> memoryview:
+        """Bytes after their 32-bit length."""
+        return self.take(self.number(4))
+
+    def text(self) -> str:
+        """UTF-8 after its 32-bit length."""
+        return str(self.block(), "utf-8")
+
+    def __bool__(self) -> bool:
+        return self._at < len(self._data)
+
+
+def read_exact(file: BinaryIO, size: int) -> bytes:
+    """That many bytes.
+
+    Raises:
+        EOFError: the file ends before.
+    """
+    if size > MAX_CHUNK:
+        raise ValueError(f"a record claims {size:,} bytes, more than {MAX_CHUNK:,}")
+    data = file.read(size)
+    if len(data) != size:
+        raise EOFError(f"the file ends {size - len(data):,} bytes before a record does")
+    return data
+
+
+class ChunkCache:
+    """The chunks unpacked last, at most CACHED_BYTES of them (and always one).
+
+    Args:
+        load: the chunk at an offset of the open file, unpacked.
+    """
+
+    def __init__(self, load: Callable[[BinaryIO, int], bytes]) -> None:
+        self._load = load
+        self._chunks: OrderedDict[int, bytes] = OrderedDict()
+
+    def get(self, file: BinaryIO, offset: int) -> bytes:
+        """The chunk at that offset."""
+        if offset in self._chunks:
+            self._chunks.move_to_end(offset)
+            return self._chunks[offset]
+        chunk = self._chunks[offset] = self._load(file, offset)
+        while len(self._chunks) > 1 and sum(map(len, self._chunks.values())) > CACHED_BYTES:
+            self._chunks.popitem(last=False)
+        return chunk

@@ -1,0 +1,208 @@
+"""Keys of bags, and the numbers they stand for.
+
+A camera's key is its topic. A number's key is the topic and a path into its messages:
+`/joint_states.position`, `/joint_states.position[0:7]`, `/markers.poses[2].position.x`,
+`/cmd_vel.linear` (a message of numbers gives them in its fields' order), `/cmd_vel`.
+
+T messages of a topic, A values of a component.
+"""
+
+import re
+from array import array
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.embodiment import Component
+from hma_data.episode import Floats
+from hma_data.errors import EpisodeError
+from hma_data.sources.bags.messages import child, field_names, is_list, numbers
+
+STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\]")
+Step = str | int | slice
+SHOWN = 30  # topics or names in an error
+
+
+@dataclass(frozen=True)
+class Field:
+    """A key taken apart."""
+
+    key: str
+    topic: str
+    steps: tuple[Step, ...]
+
+    def value(self, message: Any, where: str) -> Any:
+        """What is there in the message.
+
+        Raises:
+            EpisodeError: nothing is; names what would be.
+        """
+        for i, step in enumerate(self.steps):
+            message = self._step(message, step, i, where)
+        return message
+
+    def owner(self, message: Any, where: str) -> Any:
+        """The message that holds the last field."""
+        return Field(self.key, self.topic, self.steps[:-1]).value(message, where)
+
+    def _step(self, value: Any, step: Step, i: int, where: str) -> Any:
+        if isinstance(step, str):
+            try:
+                return child(value, step)
+            except KeyError as fault:
+                known = ", ".join(field_names(value)) or "none, it is not a message"
+                raise EpisodeError(
+                    where, f"{self.key}: there is no field {step!r}", f"the fields there: {known}"
+                ) from fault
+        if not is_list(value):
+            raise EpisodeError(where, f"{self.key}: what is before [ is not a list")
+        end = step + 1 if isinstance(step, int) else step.stop or 0
+        if end > len(value):
+            raise EpisodeError(where, f"{self.key}: the list has {len(value)} values in one of the messages")
+        return value[step]
+
+
+def parse_key(key: str, topics: Iterable[str], where: str) -> Field:
+    """The key taken apart; its topic is the longest of the bag's that it begins with.
+
+    Raises:
+        EpisodeError: no topic fits, or the path is not one.
+    """
+    topics = list(topics)
+    fitting = [t for t in topics if key == t or (key.startswith(t) and key[len(t)] in ".[")]
+    if not fitting:
+        raise missing_topic(key, topics, where)
+    topic = max(fitting, key=len)
+    return Field(key, topic, _steps(key, len(topic), where))
+
+
+def _steps(key: str, at: int, where: str) -> tuple[Step, ...]:
+    steps: list[Step] = []
+    while at < len(key):
+        match = STEP.match(key, at)
+        if not match or (not match["name"] and not match["colon"] and not match["start"]):
+            raise EpisodeError(
+                where, f"{key}: {key[at:]!r} is not a path", "write .field, [index] or [from:to]"
+            )
+        if match["name"]:
+            steps.append(match["name"])
+        elif match["colon"]:
+            bounds = [int(bound) if bound else None for bound in (match["start"], match["stop"])]
+            steps.append(slice(*bounds))
+        else:
+            steps.append(int(match["start"]))
+        at = match.end()
+    return tuple(steps)
+
+
+def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
+    """The error of a key whose topic the bag does not have."""
+    known = sorted(topics)
+    near = get_close_matches(re.split(r"[.\[]", key)[0], known, n=2, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    more = f" and {len(known) - SHOWN} more" if len(known) > SHOWN else ""
+    listed = f"its topics: {', '.join(known[:SHOWN])}{more}" if known else "it has no topics"
+    return EpisodeError(where, f"the bag has no topic for {key}", hint + listed)
+
+
+class Column:
+    """The values of one component, message by message.
+
+    Where the message that holds the field also holds a list `name` (JointState), the component's
+    `names` select and order the values, unless the key or the YAML slices; messages of another
+    publisher, with none of those names, are left out.
+    """
+
+    def __init__(self, component: Component, field: Field, where: str) -> None:
+        self.component, self.field = component, field
+        self._where = where
+        self._values = array("d")
+        self._rows = array("q")
+        self._width: int | None = None
+        self._picks: dict[tuple[str, ...], list[int] | None] = {}
+        self._selects = bool(
+            component.names and not component.slice and field.steps and isinstance(field.steps[-1], str)
+        )
+
+    def add(self, message: Any, row: int) -> None:
+        """Takes the values out of message `row`."""
+        value = self.field.value(message, self._where)
+        try:
+            values = numbers(value)
+        except TypeError as fault:
+            known = ", ".join(field_names(value))
+            raise EpisodeError(
+                self._where,
+                f"{self.field.key} holds {fault}, not numbers alone",
+                f"name a field of it: {known}" if known else "",
+            ) from fault
+        if self._selects:
+            picks = self._pick(message, len(values))
+            if picks is None:
+                return
+            values = [values[i] for i in picks]
+        self._check_width(len(values), row)
+        self._values.extend(values)
+        self._rows.append(row)
+
+    def rows(self) -> NDArray[np.int64]:
+        """Which messages gave values.
+
+        Raises:
+            EpisodeError: none did.
+        """
+        if not self._rows:
+            seen = sorted({name for names in self._picks for name in names})[:SHOWN]
+            names = ", ".join(self.component.names or ())
+            raise EpisodeError(
+                self._where, f"{self.field.key}: no message names {names}", f"names there: {', '.join(seen)}"
+            )
+        return np.frombuffer(self._rows, np.int64)
+
+    def values(self) -> Floats:
+        """(T, A) as recorded."""
+        return np.frombuffer(self._values, np.float64).reshape(len(self._rows), -1)
+
+    def _pick(self, message: Any, width: int) -> list[int] | None:
+        """Indices of the wanted names; None where the message has none of them."""
+        owner = self.field.owner(message, self._where)
+        try:
+            names = tuple(child(owner, "name"))
+        except (KeyError, TypeError):
+            names = ()
+        if not names or isinstance(child(owner, "name"), str):
+            return list(range(width))
+        if names not in self._picks:
+            self._picks[names] = self._indices(names)
+        picks = self._picks[names]
+        if picks is not None and len(names) != width:
+            raise EpisodeError(self._where, f"{self.field.key} has {width} values for {len(names)} names")
+        return picks
+
+    def _indices(self, names: tuple[str, ...]) -> list[int] | None:
+        wanted = self.component.names or ()
+        absent = [name for name in wanted if name not in names]
+        if len(absent) == len(wanted):
+            return None
+        if absent:
+            raise EpisodeError(
+                self._where,
+                f"{self.field.key}: a message lacks {', '.join(absent)}",
+                f"it names {', '.join(names)}",
+            )
+        return [names.index(name) for name in wanted]
+
+    def _check_width(self, width: int, row: int) -> None:
+        if self._width is None:
+            self._width = width
+        if width != self._width or not width:
+            raise EpisodeError(
+                self._where,
+                f"{self.field.key} has {self._width} values, then {width} in message {row}"
+                if width
+                else f"{self.field.key} is empty in message {row}",
+            )

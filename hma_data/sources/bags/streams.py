@@ -1,0 +1,125 @@
+"""Cameras of a bag: times and places in memory, pictures read again when asked for.
+
+T pictures of a camera, H×W pixels.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episode import Floats, Stream
+from hma_data.errors import EpisodeError
+from hma_data.sources.bags.bag import Bag, Place
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.messages import decode
+from hma_data.sources.bags.pictures import VIDEO, payload, picture, picture_kind
+from hma_data.sources.bags.track import Track
+from hma_data.sources.bags.video import VideoDecoder
+from hma_data.video import Images
+
+BLOCK = 64  # video messages fetched at a time
+
+
+def camera_stream(bag: Bag, track: Track, clock: str) -> Stream:
+    """The camera whose topic was tracked.
+
+    Raises:
+        EpisodeError: the topic holds no pictures, or video that never begins.
+    """
+    where = f"{bag.path}, {track.topic}"
+    kinds = {picture_kind(channel.type) for channel in track.channels}
+    kind = kinds.pop()
+    if kind is None or kinds:
+        types = ", ".join(sorted({channel.type or channel.encoding for channel in track.channels}))
+        raise EpisodeError(
+            where, f"holds {types}, not pictures", "name a topic of pictures as the camera's key"
+        )
+    order = track.order()
+    if kind != VIDEO:
+        messages = Messages(bag, track.channels, track.places()[order], where)
+        return StillStream(track.seconds(clock)[order], messages, kind)
+    order, keyframes = _from_first_keyframe(track, order, where)
+    messages = Messages(bag, track.channels, track.places()[order], where)
+    return VideoStream(track.seconds(clock)[order], messages, keyframes, track.codec)
+
+
+def _from_first_keyframe(
+    track: Track, order: NDArray[np.int64], where: str
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The messages that can be decoded: what comes before the first key frame cannot."""
+    keyframes = track.keyframes()
+    if keyframes is None:  # then only the beginning is sure to be one
+        return order, np.arange(len(order)) == 0
+    keyframes = keyframes[order]
+    if not keyframes.any():
+        raise EpisodeError(where, f"the {track.codec} video has no key frame")
+    first = int(np.argmax(keyframes))
+    return order[first:], keyframes[first:]
+
+
+class Messages:
+    """The messages of one topic, read again by index.
+
+    Args:
+        places: (T, 4) as Track keeps them, in order of receipt.
+        channels: what the last number of a place means.
+    """
+
+    def __init__(self, bag: Bag, channels: list[Channel], places: NDArray[np.int64], where: str) -> None:
+        self.where = where
+        self._bag, self._channels, self._places = bag, channels, places
+
+    def read(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[object]:
+        """The decoded messages of those indices, in that order."""
+        rows = self._places[np.asarray(indices, np.int64)].tolist()
+        places = [Place(file, first, second) for file, first, second, _ in rows]
+        for row, data in zip(rows, self._bag.payloads(places), strict=True):
+            yield decode(self._channels[row[3]], data, self.where)
+
+
+class StillStream:
+    """A camera of raw or still pictures; see episode.Stream."""
+
+    def __init__(self, timestamps: Floats, messages: Messages, kind: str) -> None:
+        self.timestamps = timestamps
+        self._messages, self._kind = messages, kind
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """See episode.Stream."""
+        distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
+        where = self._messages.where
+        pictures = [picture(message, self._kind, where) for message in self._messages.read(distinct)]
+        stacked = _stack(pictures, where)
+        return stacked if np.array_equal(inverse, np.arange(len(stacked))) else stacked[inverse]
+
+
+class VideoStream:
+    """A camera of video; see episode.Stream."""
+
+    def __init__(
+        self, timestamps: Floats, messages: Messages, keyframes: NDArray[np.bool_], codec: str
+    ) -> None:
+        self.timestamps = timestamps
+        self._messages = messages
+        self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where)
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """See episode.Stream."""
+        wanted = [int(i) for i in indices]
+        found = self._decoder.frames(wanted)
+        distinct = list(found)
+        stacked = _stack([found[i] for i in distinct], self._messages.where)
+        return stacked[[distinct.index(i) for i in wanted]]
+
+    def _from(self, start: int) -> Iterator[bytes]:
+        for block in range(start, len(self.timestamps), BLOCK):
+            for message in self._messages.read(range(block, min(block + BLOCK, len(self.timestamps)))):
+                yield payload(message)
+
+
+def _stack(pictures: list[Images], where: str) -> Images:
+    shapes = sorted({picture.shape for picture in pictures})
+    if len(shapes) > 1:
+        raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
+    return np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)

@@ -1,0 +1,109 @@
+"""Video stored one frame a message (foxglove CompressedVideo), decoded in order.
+
+T messages; H×W pixels, uint8 RGB.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import EpisodeError
+from hma_data.video import MAX_PIXELS, Images
+
+CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}  # Foxglove's and FFmpeg's names
+NAL_UNIT = re.compile(b"\x00\x00\x01(.)", re.DOTALL)
+
+
+def is_keyframe(data: bytes, codec: str) -> bool | None:
+    """Whether decoding can begin at this message; None for a codec that is not looked into."""
+    kinds = {unit[1][0] for unit in NAL_UNIT.finditer(data)}
+    if codec == "h264":
+        return any(kind & 0x1F == 5 for kind in kinds)
+    if codec == "h265":
+        return any(16 <= (kind >> 1) & 0x3F <= 21 for kind in kinds)
+    return None
+
+
+class VideoDecoder:
+    """Pictures of a video; goes on where it stopped when asked in order, else begins at a key frame.
+
+    Args:
+        codec: h264, h265, vp9 or av1.
+        keyframes: (T,) bool, where decoding can begin; True at 0.
+        fetch: the stored bytes of the messages from a position to the last.
+        where: the episode and topic, for the error.
+
+    Raises:
+        EpisodeError: the codec is another.
+    """
+
+    def __init__(
+        self, codec: str, keyframes: NDArray[np.bool_], fetch: Callable[[int], Iterator[bytes]], where: str
+    ) -> None:
+        if codec not in CODECS:
+            raise EpisodeError(where, f"video in {codec!r} cannot be read", f"these can: {', '.join(CODECS)}")
+        self._codec, self._keyframes, self._fetch, self._where = codec, keyframes, fetch, where
+        self._context: Any = None
+        self._next = 0  # message the decoder takes next
+        self._taken = -1  # last picture given out
+        self._ready: dict[int, Any] = {}  # decoded, not given out
+
+    def frames(self, indices: Sequence[int]) -> dict[int, Images]:
+        """Picture (H, W, 3) of each of those indices.
+
+        Raises:
+            EpisodeError: one of them, or one it builds on, cannot be decoded.
+        """
+        found: dict[int, Images] = {}
+        packets: Iterator[bytes] | None = None
+        for index in sorted(set(indices)):
+            if index not in self._ready and self._must_begin(index):
+                self._begin(index)
+                packets = None
+            while index not in self._ready:
+                packets = packets or self._fetch(self._next)
+                self._decode(next(packets, None), index)
+            found[index] = self._ready[index].to_ndarray(format="rgb24")
+            self._ready = {i: frame for i, frame in self._ready.items() if i >= index}
+            self._taken = index
+        return found
+
+    def _must_begin(self, index: int) -> bool:
+        skips = bool(self._keyframes[self._next + 1 : index + 1].any())
+        return self._context is None or index <= self._taken or skips
+
+    def _begin(self, index: int) -> None:
+        import av
+
+        self._context = av.CodecContext.create(CODECS[self._codec], "r")
+        self._context.thread_count = 1
+        self._ready = {}
+        self._next = int(np.flatnonzero(self._keyframes[: index + 1])[-1])
+        self._taken = self._next - 1
+
+    def _decode(self, data: bytes | None, wanted: int) -> None:
+        """Gives the decoder its next message, or with None lets it finish."""
+        import av
+
+        if self._context is None:
+            raise EpisodeError(self._where, f"frame {wanted} of the video cannot be decoded")
+        packet = None
+        if data is not None:
+            packet = av.Packet(data)
+            packet.pts = packet.dts = self._next
+            self._next += 1
+        try:
+            frames = self._context.decode(packet)
+        except (av.FFmpegError, ValueError) as fault:
+            self._context = None
+            raise EpisodeError(self._where, f"frame {wanted} of the video: {fault}") from fault
+        if data is None:
+            self._context = None
+        for frame in frames:
+            if frame.width * frame.height > MAX_PIXELS:
+                raise EpisodeError(self._where, f"the video claims {frame.width}×{frame.height} pixels")
+            if frame.pts is not None:
+                self._ready[frame.pts] = frame

@@ -1,0 +1,158 @@
+"""Bags as a source: ROS 1, ROS 2 (sqlite3, MCAP) and plain MCAP, without ROS.
+
+A bag is an episode; a folder of bags holds many. One pass over the bag gathers times and numbers
+of the topics the embodiment names; pictures are read again when asked for, so memory does not grow
+with the size of a bag. Streams keep their own clocks; `align` brings them together.
+"""
+
+from collections import Counter
+from pathlib import Path
+
+from hma_data.embodiment import Camera, Component, Embodiment
+from hma_data.episode import Episode, Signal, Stream
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.sources.bags.bag import Bag, find_bags
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.fields import Column, Field, missing_topic, parse_key
+from hma_data.sources.bags.messages import decode
+from hma_data.sources.bags.pictures import picture_kind
+from hma_data.sources.bags.report import report
+from hma_data.sources.bags.streams import camera_stream
+from hma_data.sources.bags.track import Track
+from hma_data.sources.base import EpisodeRef, Inspection, component_values, local_path
+
+
+def open() -> "RosbagSource":
+    """The source of bags."""
+    return RosbagSource()
+
+
+class RosbagSource:
+    """See sources.base.Source."""
+
+    def inspect(self, uri: str) -> Inspection:
+        """See Source; measures the first bag that can be read."""
+        return report(uri, local_path(uri), _bags(uri))
+
+    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+        """See Source. A bag that cannot be read has no frames here; `read` says why."""
+        root = local_path(uri)
+        return [_ref(name, path, root, embodiment) for name, path in _bags(uri).items()]
+
+    def episode_ids(self, uri: str) -> list[str]:
+        """See Source."""
+        return list(_bags(uri))
+
+    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+        """See Source.
+
+        Raises:
+            SourceError: no such bag.
+            EpisodeError: the bag is damaged, or lacks what the embodiment names.
+        """
+        bags = _bags(uri)
+        if episode_id not in bags:
+            raise SourceError(uri, f"has no bag {episode_id!r}", f"it has {', '.join(list(bags)[:10])}")
+        return _Reading(Bag(bags[episode_id], local_path(uri)), episode_id, embodiment).episode()
+
+
+def _bags(uri: str) -> dict[str, Path]:
+    bags = find_bags(local_path(uri))
+    if not bags:
+        raise SourceError(uri, "holds no bags", "expected .bag, .mcap, .db3, or folders with a metadata.yaml")
+    return bags
+
+
+def _ref(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> EpisodeRef:
+    try:
+        bag = Bag(path, root)
+        fingerprint = bag.fingerprint()
+        frames = _frames(bag.counts(), embodiment)
+    except (EpisodeError, OSError):
+        return EpisodeRef(name, 0)
+    return EpisodeRef(name, frames, fingerprint=fingerprint)
+
+
+def _frames(counts: Counter[Channel], embodiment: Embodiment | None) -> int:
+    """Pictures of the primary camera; without an embodiment, of the camera that has most."""
+    topics: Counter[str] = Counter()
+    for channel, count in counts.items():
+        if embodiment or picture_kind(channel.type):
+            topics[channel.topic] += count
+    return topics[embodiment.primary_camera.key] if embodiment else max(topics.values(), default=0)
+
+
+class _Reading:
+    """One pass over one bag for one embodiment."""
+
+    def __init__(self, bag: Bag, episode_id: str, embodiment: Embodiment) -> None:
+        self._bag, self._id, self._embodiment = bag, episode_id, embodiment
+        self._where = str(bag.path)
+        self._topics = {channel.topic for channel in bag.counts()}
+        self._tracks: dict[str, Track] = {}
+        self._instruction = ""
+
+    def episode(self) -> Episode:
+        """The pass, and what came of it."""
+        embodiment = self._embodiment
+        for camera in embodiment.cameras:
+            if camera.key not in self._topics:
+                raise missing_topic(camera.key, self._topics, self._where)
+            self._track(camera.key)
+        actions = self._columns(embodiment.action.components)
+        states = self._columns(embodiment.state.components if embodiment.state else ())
+        self._scan(self._instruction_field())
+        return Episode(
+            id=self._id,
+            streams={camera.name: self._stream(camera) for camera in embodiment.cameras},
+            actions=tuple(self._signal(column) for column in actions),
+            states=tuple(self._signal(column) for column in states),
+            rate_stamped=False,
+            instruction=self._instruction,
+            source=self._where,
+            metadata={"clocks": self._clocks()},
+        )
+
+    def _track(self, topic: str) -> Track:
+        return self._tracks.setdefault(topic, Track(topic))
+
+    def _columns(self, components: tuple[Component, ...]) -> list[Column]:
+        columns = []
+        for component in components:
+            field = parse_key(component.key, self._topics, self._where)
+            column = Column(component, field, self._where)
+            self._track(field.topic).columns.append(column)
+            columns.append(column)
+        return columns
+
+    def _instruction_field(self) -> Field | None:
+        key = self._embodiment.source.instruction
+        return parse_key(key, self._topics, self._where) if key else None
+
+    def _scan(self, instruction: Field | None) -> None:
+        topics = frozenset(self._tracks) | ({instruction.topic} if instruction else frozenset())
+        for place, record in self._bag.records(topics):
+            topic = record.channel.topic
+            message = decode(record.channel, record.data, self._where)
+            if instruction and topic == instruction.topic and not self._instruction:
+                self._instruction = str(instruction.value(message, self._where))
+            if topic in self._tracks:
+                self._tracks[topic].add(record.channel, record.log_ns, place, message)
+        empty = [topic for topic, track in self._tracks.items() if not len(track)]
+        if empty:
+            raise EpisodeError(self._where, f"{empty[0]} has no messages")
+
+    def _signal(self, column: Column) -> Signal:
+        track, rows = self._tracks[column.field.topic], column.rows()
+        order = track.order(rows)
+        clock = column.component.stamp or self._embodiment.sync.stamp
+        values = component_values(column.component, column.values()[order], self._where)
+        return Signal(track.seconds(clock)[rows[order]], values)
+
+    def _stream(self, camera: Camera) -> Stream:
+        clock = camera.stamp or self._embodiment.sync.stamp
+        return camera_stream(self._bag, self._tracks[camera.key], clock)
+
+    def _clocks(self) -> dict[str, str]:
+        """Topic -> header or receive: whose times it has where none are forced."""
+        return {topic: "header" if track.stamped else "receive" for topic, track in self._tracks.items()}

@@ -1,0 +1,301 @@
+"""One short recording, written as every kind of bag by the formats' own writers.
+
+A camera of 10 Hz and joints of 50 Hz with header stamps, received 5 ms late; commands of 25 Hz
+without a header.
+"""
+
+import base64
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+START_NS = 1_700_000_000_000_000_000
+LATE_NS = 5_000_000
+JOINTS = ("shoulder", "elbow", "wrist")
+CAMERA, STATE, COMMAND = "/cam/image.raw", "/joint_states", "/command"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What the bags hold: times in ns, (T, H, W, 3) pictures, (S, 3) joints, (C, 2) commands."""
+
+    picture_ns: np.ndarray
+    pictures: np.ndarray
+    joint_ns: np.ndarray
+    joints: np.ndarray
+    command_ns: np.ndarray
+    commands: np.ndarray
+    stamp_shift_ns: np.ndarray | None = None  # (T,) added to the pictures' header stamps alone
+
+
+class Item(NamedTuple):
+    """A message to write: `stamp_ns` None where its type has no header."""
+
+    topic: str
+    log_ns: int
+    stamp_ns: int | None
+    value: np.ndarray
+
+
+def make_recording(frames: int = 10, seed: int = 0) -> Recording:
+    """A recording of that many pictures."""
+    draw = np.random.default_rng(seed)
+    return Recording(
+        START_NS + np.arange(frames) * 100_000_000,
+        draw.integers(0, 256, (frames, 24, 32, 3), dtype=np.uint8),
+        START_NS + np.arange(frames * 5) * 20_000_000,
+        draw.normal(size=(frames * 5, 3)),
+        START_NS + np.arange(frames * 5 // 2) * 40_000_000,
+        draw.normal(size=(frames * 5 // 2, 2)),
+    )
+
+
+def items(recording: Recording) -> Iterator[Item]:
+    """Its messages in order of receipt."""
+    stamps = recording.picture_ns
+    if recording.stamp_shift_ns is not None:
+        stamps = stamps + recording.stamp_shift_ns
+    found = [
+        Item(CAMERA, int(t) + LATE_NS, int(stamp), picture)
+        for t, stamp, picture in zip(recording.picture_ns, stamps, recording.pictures)
+    ]
+    found += [Item(STATE, int(t) + LATE_NS, int(t), v) for t, v in zip(recording.joint_ns, recording.joints)]
+    found += [Item(COMMAND, int(t), None, v) for t, v in zip(recording.command_ns, recording.commands)]
+    return iter(sorted(found, key=lambda item: item.log_ns))
+
+
+ROS_TYPES = {
+    CAMERA: "sensor_msgs/msg/Image",
+    STATE: "sensor_msgs/msg/JointState",
+    COMMAND: "std_msgs/msg/Float64MultiArray",
+}
+
+
+def ros_message(store: Any, item: Item) -> Any:
+    """The item as a message of that typestore (ROS 1 headers have `seq`)."""
+    types = store.types
+    if item.topic == COMMAND:
+        layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+        return types[ROS_TYPES[COMMAND]](layout=layout, data=item.value)
+    seconds, nanoseconds = divmod(item.stamp_ns, 10**9)
+    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+    header_type = types["std_msgs/msg/Header"]
+    more = {"seq": 0} if "seq" in header_type.__dataclass_fields__ else {}
+    header = header_type(stamp=stamp, frame_id="robot", **more)
+    if item.topic == STATE:
+        none = np.zeros(0)
+        return types[ROS_TYPES[STATE]](
+            header, name=list(JOINTS), position=item.value, velocity=none, effort=none
+        )
+    height, width = item.value.shape[:2]
+    return types[ROS_TYPES[CAMERA]](header, height, width, "rgb8", 0, width * 3, item.value.reshape(-1))
+
+
+def write_ros1(path: Path, recording: Recording, compression: str | None = None) -> Path:
+    """A ROS 1 bag by rosbags."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = Ros1Writer(path)
+    if compression:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in ROS_TYPES.items()
+        }
+        for item in items(recording):
+            message = ros_message(store, item)
+            data = store.serialize_ros1(message, ROS_TYPES[item.topic])
+            writer.write(connections[item.topic], item.log_ns, data)
+    return path
+
+
+def write_ros2(
+    path: Path, recording: Recording, plugin: str, mode: CompressionMode = CompressionMode.NONE
+) -> Path:
+    """A ROS 2 bag folder by rosbags."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[plugin])
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in ROS_TYPES.items()
+        }
+        for item in items(recording):
+            message = ros_message(store, item)
+            data = store.serialize_cdr(message, ROS_TYPES[item.topic])
+            writer.write(connections[item.topic], item.log_ns, data)
+    return path
+
+
+class Encoded(NamedTuple):
+    """How a topic's messages go into an MCAP file: `encode` makes an item's bytes."""
+
+    type: str
+    schema_encoding: str
+    schema: bytes
+    encoding: str
+    encode: Callable[[Item], bytes]
+
+
+def write_mcap(path: Path, recording: Recording, how: dict[str, Encoded], **options: Any) -> Path:
+    """An MCAP file by mcap's writer."""
+    with path.open("wb") as file:
+        writer = McapWriter(file, chunk_size=8192, **options)
+        writer.start()
+        channels = {}
+        for topic, encoded in how.items():
+            schema = writer.register_schema(encoded.type, encoded.schema_encoding, encoded.schema)
+            channels[topic] = writer.register_channel(topic, encoded.encoding, schema)
+        for item in items(recording):
+            data = how[item.topic].encode(item)
+            writer.add_message(channels[item.topic], item.log_ns, data, item.log_ns)
+        writer.finish()
+    return path
+
+
+def as_ros1() -> dict[str, Encoded]:
+    """ROS 1 messages."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    return {
+        topic: Encoded(
+            kind.replace("/msg/", "/"),
+            "ros1msg",
+            store.generate_msgdef(kind)[0].encode(),
+            "ros1",
+            lambda item, kind=kind: bytes(store.serialize_ros1(ros_message(store, item), kind)),
+        )
+        for topic, kind in ROS_TYPES.items()
+    }
+
+
+def as_cdr() -> dict[str, Encoded]:
+    """ROS 2 messages."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    return {
+        topic: Encoded(
+            kind,
+            "ros2msg",
+            store.generate_msgdef(kind, ros_version=2)[0].encode(),
+            "cdr",
+            lambda item, kind=kind: bytes(store.serialize_cdr(ros_message(store, item), kind)),
+        )
+        for topic, kind in ROS_TYPES.items()
+    }
+
+
+def as_json() -> dict[str, Encoded]:
+    """JSON, the pictures as PNG."""
+    return {
+        CAMERA: Encoded("foxglove.CompressedImage", "jsonschema", b"{}", "json", _json_picture),
+        STATE: Encoded("JointState", "jsonschema", b"{}", "json", _json_joints),
+        COMMAND: Encoded(
+            "Command", "jsonschema", b"{}", "json", lambda i: json.dumps({"data": i.value.tolist()}).encode()
+        ),
+    }
+
+
+def _json_picture(item: Item) -> bytes:
+    png = cv2.imencode(".png", item.value[..., ::-1])[1].tobytes()
+    seconds, nanoseconds = divmod(item.stamp_ns, 10**9)
+    return json.dumps(
+        {
+            "timestamp": {"sec": seconds, "nsec": nanoseconds},
+            "format": "png",
+            "data": base64.b64encode(png).decode(),
+        }
+    ).encode()
+
+
+def _json_joints(item: Item) -> bytes:
+    seconds, nanoseconds = divmod(item.stamp_ns, 10**9)
+    return json.dumps(
+        {
+            "header": {"stamp": {"sec": seconds, "nsec": nanoseconds}},
+            "name": JOINTS,
+            "position": item.value.tolist(),
+        }
+    ).encode()
+
+
+def as_protobuf() -> dict[str, Encoded]:
+    """Protobuf, the pictures raw."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+
+    files = descriptor_pb2.FileDescriptorSet()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(files.file.add())
+    own = files.file.add(name="robot.proto", package="foxglove", syntax="proto3")
+    own.dependency.append("google/protobuf/timestamp.proto")
+    number, text, many, blob, message = 1, 9, 3, 12, 11  # field types and label of descriptor.proto
+    layout = {
+        "RawImage": [
+            ("width", 7, 1),
+            ("height", 7, 1),
+            ("step", 7, 1),
+            ("encoding", text, 1),
+            ("data", blob, 1),
+        ],
+        "Joints": [("name", text, many), ("position", number, many)],
+        "Command": [("data", number, many)],
+    }
+    for name, fields in layout.items():
+        kind = own.message_type.add(name=name)
+        kind.field.add(
+            name="timestamp", number=1, type=message, label=1, type_name=".google.protobuf.Timestamp"
+        )
+        for i, (field, field_type, label) in enumerate(fields):
+            kind.field.add(name=field, number=i + 2, type=field_type, label=label)
+    pool = descriptor_pool.DescriptorPool()
+    for file in files.file:
+        pool.Add(file)
+    types = {
+        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
+        for name in layout
+    }
+
+    def encode(item: Item) -> bytes:
+        if item.topic == COMMAND:
+            return types["Command"](data=item.value).SerializeToString()
+        if item.topic == STATE:
+            made = types["Joints"](name=JOINTS, position=item.value)
+        else:
+            height, width = item.value.shape[:2]
+            made = types["RawImage"](
+                width=width, height=height, step=width * 3, encoding="rgb8", data=item.value.tobytes()
+            )
+        made.timestamp.FromNanoseconds(item.stamp_ns)
+        return made.SerializeToString()
+
+    schema = files.SerializeToString()
+    names = {CAMERA: "RawImage", STATE: "Joints", COMMAND: "Command"}
+    return {t: Encoded(f"foxglove.{n}", "protobuf", schema, "protobuf", encode) for t, n in names.items()}
+
+
+LZ4, ZSTD, PLAIN = CompressionType.LZ4, CompressionType.ZSTD, CompressionType.NONE
+KINDS: dict[str, Callable[[Path, Recording], Path]] = {
+    "ros1": lambda d, r: write_ros1(d / "run.bag", r),
+    "ros1-bz2": lambda d, r: write_ros1(d / "run.bag", r, "BZ2"),
+    "ros1-lz4": lambda d, r: write_ros1(d / "run.bag", r, "LZ4"),
+    "ros2-sqlite3": lambda d, r: write_ros2(d / "run", r, "SQLITE3"),
+    "ros2-sqlite3-messages-zstd": lambda d, r: write_ros2(d / "run", r, "SQLITE3", CompressionMode.MESSAGE),
+    "ros2-sqlite3-file-zstd": lambda d, r: write_ros2(d / "run", r, "SQLITE3", CompressionMode.FILE),
+    "ros2-mcap": lambda d, r: write_ros2(d / "run", r, "MCAP"),
+    "ros2-mcap-file-zstd": lambda d, r: write_ros2(d / "run", r, "MCAP", CompressionMode.FILE),
+    "ros2-mcap-chunks-zstd": lambda d, r: write_ros2(d / "run", r, "MCAP", CompressionMode.STORAGE),
+    "mcap-ros1-lz4": lambda d, r: write_mcap(d / "run.mcap", r, as_ros1(), compression=LZ4),
+    "mcap-cdr-zstd": lambda d, r: write_mcap(d / "run.mcap", r, as_cdr(), compression=ZSTD),
+    "mcap-json": lambda d, r: write_mcap(d / "run.mcap", r, as_json(), compression=PLAIN),
+    "mcap-protobuf": lambda d, r: write_mcap(d / "run.mcap", r, as_protobuf()),
+    "mcap-without-chunks": lambda d, r: write_mcap(d / "run.mcap", r, as_cdr(), use_chunking=False),
+    "mcap-channels-not-repeated": lambda d, r: write_mcap(d / "run.mcap", r, as_cdr(), repeat_channels=False),
+    "mcap-without-statistics": lambda d, r: write_mcap(d / "run.mcap", r, as_cdr(), use_statistics=False),
+}  # fmt: skip

@@ -1,0 +1,243 @@
+"""Alignment against a reference that looks at one target time after the other."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from hma_data.align import hold, interpolate, nearest, to_clip
+from hma_data.embodiment import Embodiment
+from hma_data.episode import Clip, Episode, Pictures, Signal
+from hma_data.errors import AlignmentError, EpisodeError
+
+QUICK = settings(max_examples=150, deadline=None)
+TICK = 1 / 64  # a binary fraction: sums and differences of times are exact, ties are ties
+
+
+@st.composite
+def times(draw: st.DrawFn, most: int = 20) -> np.ndarray:
+    """Rising times, some twice."""
+    steps = draw(st.lists(st.integers(0, 40), min_size=0, max_size=most - 1))
+    return np.cumsum([draw(st.integers(0, 60)), *steps]) * TICK
+
+
+def one_nearest(source: np.ndarray, target: float) -> int:
+    return min(range(len(source)), key=lambda i: (abs(source[i] - target), source[i], i))
+
+
+def one_held(source: np.ndarray, target: float) -> int:
+    return max((i for i in range(len(source)) if source[i] <= target), default=0)
+
+
+def one_between(source: np.ndarray, values: np.ndarray, target: float) -> float:
+    if target <= source[0]:
+        return values[0]
+    for i in range(len(source) - 1):
+        if source[i] <= target < source[i + 1]:
+            share = (target - source[i]) / (source[i + 1] - source[i])
+            return values[i] + share * (values[i + 1] - values[i])
+    return values[-1]
+
+
+@QUICK
+@given(source=times(), targets=times())
+def test_nearest_is_the_nearest_and_of_two_the_earlier(source: np.ndarray, targets: np.ndarray) -> None:
+    index, skew_ms = nearest(source, targets)
+    expected = [source[one_nearest(source, t)] for t in targets]
+    np.testing.assert_array_equal(source[index], expected)
+    np.testing.assert_array_equal(skew_ms, np.abs(np.array(expected) - targets) * 1e3)
+
+
+@QUICK
+@given(source=times(), targets=times())
+def test_hold_is_the_last_at_or_before(source: np.ndarray, targets: np.ndarray) -> None:
+    index, age_ms = hold(source, targets)
+    np.testing.assert_array_equal(index, [one_held(source, t) for t in targets])
+    assert ((age_ms < 0) == (targets < source[0])).all()
+    np.testing.assert_array_equal(age_ms, (targets - source[index]) * 1e3)
+
+
+@QUICK
+@given(source=times(), targets=times(), seed=st.integers(0, 99))
+def test_interpolate_is_linear_between_neighbours(source: np.ndarray, targets: np.ndarray, seed: int) -> None:
+    assume((np.diff(source) > 0).all())
+    values = np.random.default_rng(seed).normal(size=(len(source), 2)).astype(np.float32)
+    found, skew_ms = interpolate(source, values, targets)
+    expected = [[one_between(source, values[:, a].astype(float), t) for a in range(2)] for t in targets]
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(skew_ms, nearest(source, targets)[1])
+
+
+def embodiment(**sync: object) -> Embodiment:
+    return Embodiment.from_values(
+        {
+            "id": "two_clocks",
+            "kind": "real",
+            "frequency_hz": 10,
+            "action": {"space": "mixed", "components": [{"key": "a", "dims": 1}, {"key": "b", "dims": 2}]},
+            "state": {"components": [{"key": "s", "dims": 1}]},
+            "cameras": [{"name": "front", "key": "/front"}, {"name": "wrist", "key": "/wrist"}],
+            "sync": sync,
+            "source": {"format": "rosbag"},
+        },
+        "test",
+    )
+
+
+def signal(stamps: np.ndarray, dims: int, seed: int) -> Signal:
+    return Signal(stamps, np.random.default_rng(seed).normal(size=(len(stamps), dims)).astype(np.float32))
+
+
+def episode(front: np.ndarray, wrist: np.ndarray, a: np.ndarray, b: np.ndarray, s: np.ndarray) -> Episode:
+    return Episode(
+        "run",
+        {name: Pictures(stamps, lambda i: np.full((2, 2, 3), i, np.uint8)) for name, stamps in
+         (("front", front), ("wrist", wrist))},
+        (signal(a, 1, 1), signal(b, 2, 2)),
+        (signal(s, 1, 3),),
+        rate_stamped=False,
+    )  # fmt: skip
+
+
+def assert_is_reference(clip: Clip, grid: np.ndarray, actions: str, states: str, images: str) -> None:
+    """`clip` is what looking up each time of `grid` alone gives."""
+    np.testing.assert_allclose(clip.timestamps, grid - grid[0], atol=1e-9)
+    pick = {"nearest": one_nearest, "hold": one_held, "interpolate": one_nearest}
+    for name, stream in clip.episode.streams.items():
+        expected = [stream.timestamps[pick[images](stream.timestamps, t)] for t in grid]
+        np.testing.assert_array_equal(stream.timestamps[clip.frame_indices[name]], expected)
+    for found, signals, method in (
+        (clip.actions, clip.episode.actions, actions),
+        (clip.states, clip.episode.states, states),
+    ):
+        rows = []
+        for t in grid:
+            row: list[float] = []
+            for part in signals:
+                columns = part.values.T.astype(float)
+                if method == "interpolate":
+                    row += [one_between(part.timestamps, column, t) for column in columns]
+                else:
+                    row += [column[pick[method](part.timestamps, t)] for column in columns]
+            rows.append(row)
+        np.testing.assert_allclose(found, rows, rtol=1e-6, atol=1e-6)
+
+
+METHODS = st.sampled_from(["nearest", "hold", "interpolate"])
+
+
+@QUICK
+@given(
+    clocks=st.tuples(*[times() for _ in range(5)]),
+    images=st.sampled_from(["nearest", "hold"]),
+    actions=METHODS,
+    states=METHODS,
+    rate=st.sampled_from([None, 4.0, 16.0]),
+)
+def test_a_clip_is_the_lookup_of_every_frame_where_all_streams_run(
+    clocks: tuple[np.ndarray, ...], images: str, actions: str, states: str, rate: float | None
+) -> None:
+    for clock in clocks:
+        assume((np.diff(clock) > 0).all())
+    sync = {"images": images, "actions": actions, "states": states} | ({"rate_hz": rate} if rate else {})
+    try:
+        clip = to_clip(episode(*clocks), embodiment(**sync))
+    except AlignmentError as fault:
+        assert "never run together" in str(fault)
+        return
+    start, stop = reference_span(clocks, images, actions, states, rate)
+    front = clocks[0]
+    if rate:
+        start, stop = max(start, front[0]), min(stop, front[-1])
+        count = int((stop - start) * rate + 1e-9) + 1
+        grid = start + np.arange(count) / rate
+        assert clip.trimmed == 0
+    else:
+        grid = front[(front >= start) & (front <= stop)]
+        assert clip.trimmed == len(front) - len(grid)
+    assert_is_reference(clip, grid, actions, states, images)
+    assert all((values >= 0).all() for values in clip.skew_ms.values())
+
+
+def reference_span(
+    clocks: tuple[np.ndarray, ...], images: str, actions: str, states: str, rate: float | None
+) -> tuple[float, float]:
+    """From when to when every stream has a value by its method."""
+    start, stop = -np.inf, np.inf
+    for i, (clock, method) in enumerate(zip(clocks, (images, images, actions, actions, states))):
+        if i == 0 and not rate:
+            continue
+        reach = np.median(np.diff(clock)) / 2 if method == "nearest" and len(clock) > 1 else 0
+        start = max(start, clock[0] - reach)
+        stop = stop if method == "hold" else min(stop, clock[-1] + reach)
+    return start, stop
+
+
+STEADY = np.arange(20) * 0.1
+FAST = np.arange(200) * 0.01
+
+
+def test_one_clock_for_all_needs_no_moving() -> None:
+    clip = to_clip(episode(*[STEADY] * 5), embodiment(states="nearest"))
+    assert len(clip) == 20 and clip.trimmed == 0
+    assert all((values == 0).all() for values in clip.skew_ms.values())
+    np.testing.assert_array_equal(clip.actions[:, 0], clip.episode.actions[0].values[:, 0])
+
+
+def test_a_command_sent_between_two_frames_acts_from_the_second_on() -> None:
+    clip = to_clip(episode(STEADY, STEADY, np.array([0.0, 0.55]), STEADY, STEADY), embodiment())
+    values = clip.episode.actions[0].values[:, 0]
+    np.testing.assert_array_equal(clip.actions[:, 0], np.where(STEADY >= 0.55, values[1], values[0]))
+
+
+def test_frames_before_the_first_command_are_left_out_and_counted() -> None:
+    clip = to_clip(episode(STEADY, STEADY, STEADY[5:], STEADY, STEADY), embodiment())
+    assert (len(clip), clip.trimmed) == (15, 5)
+    assert clip.frames_at("front", np.arange(1))[0, 0, 0, 0] == 5
+
+
+@QUICK
+@given(limit=st.floats(1, 80), gap=st.integers(1, 12))
+def test_an_episode_is_refused_exactly_when_a_stream_is_further_off_than_allowed(
+    limit: float, gap: int
+) -> None:
+    wrist = np.concatenate([FAST[:100], FAST[100 + gap :]])
+    middle = episode(FAST[:180], wrist, FAST, FAST, FAST)
+    worst = max(min(abs(w - t) for w in wrist) for t in FAST[:180]) * 1e3
+    assume(abs(worst - limit) > 1e-6)
+    if worst > limit:
+        with pytest.raises(AlignmentError, match="wrist is .* ms off at 1"):
+            to_clip(middle, embodiment(max_skew_ms=limit))
+    else:
+        clip = to_clip(middle, embodiment(max_skew_ms=limit))
+        assert clip.skew_ms["wrist"].max() == pytest.approx(worst)
+
+
+def test_a_held_command_ends_with_its_stream_where_a_limit_is_set() -> None:
+    stops = episode(STEADY, STEADY, STEADY[:10], STEADY, STEADY)
+    assert len(to_clip(stops, embodiment())) == 20
+    assert len(to_clip(stops, embodiment(max_skew_ms=150))) == 11
+
+
+def test_streams_that_never_overlap_are_told_with_their_times() -> None:
+    with pytest.raises(AlignmentError, match=r"never run together: .*action/0 100\.000 to 101\.900"):
+        to_clip(episode(STEADY, STEADY, STEADY + 100, STEADY, STEADY), embodiment())
+
+
+def test_time_that_goes_back_is_told_with_the_place() -> None:
+    back = STEADY.copy()
+    back[7] = 0.2
+    with pytest.raises(AlignmentError, match=r"wrist goes back in time at sample 7: 0\.6\d* then 0\.2"):
+        to_clip(episode(STEADY, back, STEADY, STEADY, STEADY), embodiment())
+
+
+def test_values_that_are_not_finite_are_told_with_the_frame() -> None:
+    bad = episode(STEADY, STEADY, STEADY, STEADY, STEADY)
+    bad.actions[1].values[4, 0] = np.nan
+    with pytest.raises(EpisodeError, match="actions are not finite at frame 4"):
+        to_clip(bad, embodiment())
+
+
+def test_a_stream_without_samples_is_told() -> None:
+    with pytest.raises(EpisodeError, match="wrist has no samples"):
+        to_clip(episode(STEADY, STEADY[:0], STEADY, STEADY, STEADY), embodiment())
