@@ -29,28 +29,41 @@ class OpenFiles:
 
     def __init__(self) -> None:
         self._process = os.getpid()
-        self._files: OrderedDict[Path, h5py.File] = OrderedDict()
+        self._files: OrderedDict[Path, tuple[tuple[int, int], h5py.File]] = OrderedDict()
 
     def get(self, path: Path) -> h5py.File:
-        """The open file.
+        """The open file, opened anew where it has changed.
 
         Raises:
             OSError: it is not HDF5, or is cut off; `explained` says so in our words.
         """
         if self._process != os.getpid():
             self._files, self._process = OrderedDict(), os.getpid()
-        if path not in self._files:
-            # No locks: read-only folders and network file systems refuse them.
-            self._files[path] = h5py.File(path, "r", locking=False, rdcc_nbytes=CHUNK_CACHE)
+        status = path.stat()
+        state = (status.st_size, status.st_mtime_ns)
+        held = self._files.get(path)
+        if held and held[0] != state:
+            held[1].close()
+        if not held or held[0] != state:
+            self._files[path] = state, _open(path)
         self._files.move_to_end(path)
         while len(self._files) > OPEN_FILES:
-            self._files.popitem(last=False)[1].close()
-        return self._files[path]
+            self._files.popitem(last=False)[1][1].close()
+        return self._files[path][1]
 
-    def close(self) -> None:
-        """Close all."""
-        while self._files:
-            self._files.popitem()[1].close()
+
+def _open(path: Path) -> h5py.File:
+    """As HDF5 does by itself; else without locks, which network file systems refuse; else with them.
+
+    A file this process already holds otherwise opens only in the way it is held.
+    """
+    for locking in (None, False):
+        try:
+            return h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE, locking=locking)
+        except OSError as fault:
+            if "lock" not in str(fault):
+                raise
+    return h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE, locking=True)
 
 
 @contextmanager

@@ -1,0 +1,187 @@
+"""Frames by index out of video files, against decoding the whole file in order."""
+
+import os
+import shutil
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hma_data.errors import EpisodeError
+from hma_data.sources.video_file import VideoFile, frame_table
+from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
+
+LENGTH = 40
+
+
+@pytest.fixture(scope="module", params=["h264", "av1"])
+def video(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return encode(tmp_path_factory.mktemp("video") / "v.mp4", range(LENGTH), request.param)
+
+
+def in_order(path: Path) -> np.ndarray:
+    """Every frame as PyAV gives them from first to last."""
+    with av.open(str(path)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+
+def test_every_frame_equals_decoding_in_order(video: Path) -> None:
+    assert np.array_equal(VideoFile(video).frames(range(LENGTH)), in_order(video))
+
+
+def test_each_index_shows_its_own_number(video: Path) -> None:
+    file = VideoFile(video)
+    for indices in ([0, 1, 2], [5, 12, 33], [39], [0], [20, 3, 20]):
+        assert [number_of(frame) for frame in file.frames(indices)] == indices
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(calls=st.lists(st.lists(st.integers(0, LENGTH - 1), max_size=6), min_size=1, max_size=5))
+def test_any_order_of_calls_gives_the_frames_asked_for(video: Path, calls: list[list[int]]) -> None:
+    file = VideoFile(video)
+    for indices in calls:
+        assert [number_of(frame) for frame in file.frames(indices)] == indices
+
+
+def test_times_are_those_of_the_packets(video: Path) -> None:
+    np.testing.assert_allclose(VideoFile(video).timestamps, np.arange(LENGTH) / 10, atol=1e-4)
+
+
+def test_rising_batches_decode_each_frame_once(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, seen = VideoFile(video), []
+    inner = VideoFile._index_of
+    monkeypatch.setattr(VideoFile, "_index_of", lambda self, frame: seen.append(1) or inner(self, frame))
+    for start in range(0, LENGTH, 8):
+        file.frames(range(start, start + 8))
+    assert len(seen) == LENGTH
+
+
+def test_a_far_jump_skips_to_its_keyframe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, seen = VideoFile(encode(tmp_path / "v.mp4", range(LENGTH), gop=8, b_frames=0)), []
+    inner = VideoFile._index_of
+    monkeypatch.setattr(VideoFile, "_index_of", lambda self, frame: seen.append(1) or inner(self, frame))
+    file.frames([0, 34])
+    assert len(seen) <= 1 + 8
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_a_forked_child_and_its_parent_read_the_same_file(video: Path) -> None:
+    file = VideoFile(video)
+    file.frames([3])
+    child = os.fork()
+    if child == 0:
+        right = [number_of(frame) for frame in file.frames([4, 5, 30])] == [4, 5, 30]
+        os._exit(0 if right else 1)
+    mine = [number_of(frame) for frame in file.frames([4, 5, 31])]
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert mine == [4, 5, 31]
+
+
+def test_a_closed_file_opens_again(video: Path) -> None:
+    file = VideoFile(video)
+    file.frames([30])
+    file.close()
+    assert number_of(file.frames([2])[0]) == 2
+
+
+def test_no_indices_give_no_pictures(video: Path) -> None:
+    assert VideoFile(video).frames([]).shape == (0, HEIGHT, WIDTH, 3)
+
+
+def test_an_index_outside_is_an_index_error(video: Path) -> None:
+    with pytest.raises(IndexError, match="40 frames"):
+        VideoFile(video).frames([LENGTH])
+
+
+def test_a_file_filmed_upright_is_turned(tmp_path: Path) -> None:
+    path = encode(tmp_path / "v.mp4", [20, 21])
+    whole = path.read_bytes()
+    unit = (1 << 16).to_bytes(4, "big")
+    upright = unit + bytes(12) + unit
+    quarter = bytes(4) + unit + bytes(4) + (-(1 << 16)).to_bytes(4, "big", signed=True) + bytes(4)
+    at = whole.index(upright, whole.index(b"tkhd"))
+    path.write_bytes(whole[:at] + quarter + whole[at + 20 :])
+    frame = VideoFile(path).frames([0])[0]
+    assert frame.shape == (WIDTH, HEIGHT, 3)  # turned clockwise: the mark goes from top left to top right
+    assert frame[:12, -12:].mean() > 200 > frame[-12:].mean()
+    assert frame[:12, :12].mean() < 200
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(EpisodeError, match=r"nowhere\.mp4: no such video"):
+        VideoFile(tmp_path / "nowhere.mp4")
+
+
+def test_sound_alone_is_no_video(tmp_path: Path) -> None:
+    path = tmp_path / "sound.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=16000, layout="mono")
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 16000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    with pytest.raises(EpisodeError, match="no video"):
+        frame_table(path)
+
+
+def test_a_playlist_named_mp4_opens_nothing_else(tmp_path: Path, video: Path) -> None:
+    shutil.copy(video, tmp_path / "inner.mp4")
+    lists = {
+        "hls": "#EXTM3U\n#EXT-X-TARGETDURATION:4\n#EXTINF:4,\ninner.mp4\n#EXT-X-ENDLIST\n",
+        "concat": "ffconcat version 1.0\nfile inner.mp4\n",
+    }
+    for name, text in lists.items():
+        (tmp_path / f"{name}.mp4").write_text(text)
+        with pytest.raises(EpisodeError, match="cannot be decoded"):
+            frame_table(tmp_path / f"{name}.mp4")
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_cut_or_flipped_file_gives_right_frames_or_our_error(
+    video: Path, tmp_path: Path, data: st.DataObject
+) -> None:
+    whole = bytearray(video.read_bytes())
+    at = data.draw(st.integers(0, len(whole) - 1))
+    if cut := data.draw(st.booleans()):
+        whole = whole[:at]
+    else:
+        whole[at] ^= data.draw(st.integers(1, 255))
+    path = tmp_path / "bad.mp4"
+    path.write_bytes(whole)
+    try:
+        file = VideoFile(path)
+        frames = file.frames(range(min(len(file), 1000)))
+    except EpisodeError as fault:
+        assert str(path) in str(fault)
+        return
+    if cut:  # a flipped bit of the picture itself cannot be known
+        assert [number_of(frame) for frame in frames] == list(range(len(frames)))
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    "name",
+    [
+        "lerobot/g1_v21/videos/chunk-000/observation.images.cam_high/episode_000001.mp4",
+        "hands/demo3.mp4",
+        "hands/banner.gif",
+    ],
+)
+def test_a_real_video_strided_equals_decoding_in_order(real_data: Path, name: str) -> None:
+    wanted = [0, 1, 7, 31, 60, 61, 90]
+    with av.open(str(real_data / name)) as container:
+        decoded = [frame for _, frame in zip(range(91), container.decode(video=0))]
+    file = VideoFile(real_data / name)
+    for index, mine in zip(wanted, file.frames(wanted), strict=True):
+        assert np.array_equal(mine, decoded[index].to_ndarray(format="rgb24"))
+    last = len(file) - 1
+    assert np.array_equal(file.frames([last, 0])[1], decoded[0].to_ndarray(format="rgb24"))
+
+
+def test_pictures_survive_their_codec(video: Path) -> None:
+    off = np.abs(VideoFile(video).frames([7])[0].astype(int) - picture(7))
+    assert np.median(off) <= 1
