@@ -69,7 +69,7 @@ def _swap(new: Path, final: Path) -> None:
 
 def to_json(values: Any) -> bytes:
     """Indented JSON with a newline at its end; numbers that are not finite become null."""
-    return (json.dumps(_finite(values), indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
+    return (json.dumps(finite(values), indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def read_json(path: Path, error: type[HMAError] = CheckpointError) -> dict[str, Any]:
@@ -132,9 +132,10 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[st
     save_file(plain, path, metadata)
 
 
-def _finite(values: Any) -> Any:
+def finite(values: Any) -> Any:
+    """The same plain values with null for numbers that JSON cannot hold."""
     if isinstance(values, dict):
-        return {str(key): _finite(value) for key, value in values.items()}
+        return {str(key): finite(value) for key, value in values.items()}
     if isinstance(values, list | tuple):
-        return [_finite(value) for value in values]
+        return [finite(value) for value in values]
     return None if isinstance(values, float) and not math.isfinite(values) else values

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from robots import CONFIG, SPEC, make_model, save, yaml
-from robots import stats as stats_of
 from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError
 from hma_model import checkpoint
 from hma_model.checkpoint import Checkpoint
+from tests.model.robots import CONFIG, SPEC, make_model, save, yaml
+from tests.model.robots import stats as stats_of
 
 ROBOTS = {"arm": 2, "hand.v2": 3}
 

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from robots import CONFIG, make_model
 
 from hma_data.errors import CheckpointError
 from hma_model.optim import (
@@ -14,6 +13,7 @@ from hma_model.optim import (
     parameter_groups,
 )
 from hma_model.recipe import make_recipe
+from tests.model.robots import CONFIG, make_model
 
 ROBOTS = {"arm": 2, "hand": 3}
 

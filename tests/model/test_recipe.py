@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from robots import SPEC
 
 from hma_data.errors import RecipeError, UsageError
 from hma_model.recipe import differences, load_recipe, make_recipe, parse_overrides
+from tests.model.robots import SPEC
 
 
 @pytest.fixture

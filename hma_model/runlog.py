@@ -1,0 +1,160 @@
+"""What a training run leaves to read, and what a person sees while it runs.
+
+`metrics.jsonl` has one line a step (`"kind": "train"`) and one an evaluation (`"kind": "eval"`). On a
+terminal there is a live table; elsewhere a plain line every few seconds.
+"""
+
+import json
+import sys
+import time
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TextIO
+
+from hma_data.console import human_seconds
+from hma_data.errors import OutputError
+from hma_data.files import write_atomic
+from hma_model.files import finite
+from hma_model.metrics import perplexity
+
+if TYPE_CHECKING:
+    from rich.console import Group
+    from rich.live import Live
+
+METRICS = "metrics.jsonl"
+PLAIN_SECONDS = 10.0
+SMOOTHING = 20  # steps a shown loss is averaged over
+
+
+def read_metrics(out: Path) -> list[dict[str, Any]]:
+    """Every whole line of a run's metrics.jsonl; none where there is no such file."""
+    path = out / METRICS
+    if not path.is_file():
+        return []
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    found = []
+    for line in lines:
+        try:
+            found.append(json.loads(line))
+        except json.JSONDecodeError:
+            break  # a killed run's last line
+    return found
+
+
+class RunLog:
+    """Context manager around the steps of a run.
+
+    Args:
+        out: the run's folder.
+        steps: how many the whole run has.
+        begin: steps done before; later lines of an earlier, killed run are dropped.
+        show: anything at all on standard error.
+    """
+
+    def __init__(self, out: Path, steps: int, begin: int, show: bool = True) -> None:
+        self._steps, self._begin, self._show = steps, begin, show
+        self._path = out / METRICS
+        kept = [line for line in read_metrics(out) if line["step"] <= begin]
+        write_atomic(self._path, "".join(_line(values) for values in kept))
+        self._recent: dict[str, deque[float]] = {}
+        self._last: dict[str, Any] = {}
+        evaluations = [line for line in kept if line["kind"] == "eval"]
+        self._evaluation: dict[str, Any] = evaluations[-1] if evaluations else {}
+        self._spent, self._shown = 0.0, 0.0
+        self._live: Live | None = None
+
+    def __enter__(self) -> "RunLog":
+        self._file: TextIO = self._path.open("a", encoding="utf-8")
+        if self._show and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.live import Live
+
+            self._live = Live(console=Console(stderr=True), refresh_per_second=4)
+            self._live.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._present(force=True)
+        if self._live:
+            self._live.__exit__(kind, fault, trace)
+        self._file.close()
+
+    def note(self, text: str) -> None:
+        """A sentence for the person who watches."""
+        if self._live:
+            self._live.console.print(text, markup=False, highlight=False)
+        elif self._show:
+            print(text, file=sys.stderr, flush=True)
+
+    def step(self, facts: dict[str, Any]) -> None:
+        """One line of kind train; `facts` has step, loss_by_embodiment, lr, step_seconds and more."""
+        self._write({"kind": "train", **facts})
+        self._last = facts
+        self._spent += facts["step_seconds"]
+        for name, loss in facts["loss_by_embodiment"].items():
+            self._recent.setdefault(name, deque(maxlen=SMOOTHING)).append(loss)
+        self._present()
+
+    def evaluation(self, facts: dict[str, Any]) -> None:
+        """One line of kind eval."""
+        self._write({"kind": "eval", **facts})
+        self._evaluation = facts
+        if not self._live:
+            self._present(force=True)
+
+    def _write(self, values: dict[str, Any]) -> None:
+        try:
+            self._file.write(_line(values))
+            self._file.flush()
+        except OSError as fault:
+            raise OutputError(self._path, f"cannot be written: {fault.strerror}", "free space") from fault
+
+    def _present(self, force: bool = False) -> None:
+        if not self._last or not self._show:
+            return
+        if self._live:
+            self._live.update(self._table())
+        elif force or time.monotonic() - self._shown >= PLAIN_SECONDS:
+            self._shown = time.monotonic()
+            print(self._text(), file=sys.stderr, flush=True)
+
+    def _pace(self) -> tuple[float, str]:
+        """Windows a second and time left, over this session's steps."""
+        done = self._last["step"] - self._begin
+        seconds = max(self._spent, 1e-9)
+        left = (self._steps - self._last["step"]) * seconds / max(done, 1)
+        return self._last["windows"] * done / seconds, human_seconds(left)
+
+    def _smooth(self) -> dict[str, float]:
+        return {name: sum(values) / len(values) for name, values in sorted(self._recent.items())}
+
+    def _text(self) -> str:
+        rate, left = self._pace()
+        losses = ", ".join(f"{name} {value:.3f}" for name, value in self._smooth().items())
+        held = f", validation {self._evaluation['loss']:.3f}" if self._evaluation else ""
+        return (
+            f"step {self._last['step']}/{self._steps}: loss {losses}{held}, {rate:.1f} windows/s, {left} left"
+        )
+
+    def _table(self) -> "Group":
+        from rich.box import SIMPLE
+        from rich.console import Group
+        from rich.table import Table
+
+        rate, left = self._pace()
+        table = Table("embodiment", "loss", "perplexity", "validation", "ignoring all", box=SIMPLE)
+        held = self._evaluation.get("loss_by_embodiment", {})
+        ignoring = self._evaluation.get("baseline_by_embodiment", {})
+        for name, loss in self._smooth().items():
+            known = [f"{values[name]:.3f}" if name in values else "-" for values in (held, ignoring)]
+            table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.0f}", *known)
+        step, lr = self._last["step"], self._last["lr"]
+        head = f"step {step:,}/{self._steps:,}   {rate:.1f} windows/s   {left} left   lr {lr:.2e}"
+        return Group(head, table)
+
+
+def _line(values: dict[str, Any]) -> str:
+    return json.dumps(finite(values), ensure_ascii=False, allow_nan=False) + "\n"

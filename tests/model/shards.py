@@ -1,0 +1,61 @@
+"""Small shard sets for the tests of this folder: a mark that moves over the grid as its actions say."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hma_data.embodiment import Embodiment
+from hma_data.shards.manifest import finish
+from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema
+from hma_data.shards.writer import EpisodeRows, ShardWriter
+from hma_data.stats import Stats
+from hma_data.tokenizers.base import TokenizerSpec
+from tests.model.robots import SPEC, yaml
+
+
+def episode(rng: np.random.Generator, length: int, dims: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tokens (T, 2, 3) and actions (T, A): the first action's sign moves a mark by one every 2 rows."""
+    signs = rng.choice([-1.0, 1.0], size=length)
+    signs[1::2] = signs[: len(signs[1::2]) * 2 : 2]
+    place = np.concatenate([[0], np.cumsum(signs)[:-1]]) // 2 + rng.integers(6)
+    tokens = np.full((length, 6), 9)
+    tokens[np.arange(length), place.astype(int) % 6] = 50
+    actions = np.concatenate([signs[:, None], rng.normal(size=(length, dims - 1))], axis=1)
+    return tokens.reshape(length, 2, 3), actions.astype(np.float32)
+
+
+def make_shards(
+    folder: Path, name: str, dims: int = 2, episodes: int = 6, length: int = 24, seed: int = 0,
+    spec: TokenizerSpec = SPEC,
+) -> Path:  # fmt: skip
+    """A finished shard set of one embodiment; its last episode is for validation."""
+    rng = np.random.default_rng(seed)
+    embodiment = Embodiment.from_yaml(yaml(name, dims))
+    plan = {
+        "embodiment": name,
+        "embodiment_hash": embodiment.digest,
+        "tokenizer": spec.to_json(),
+        "hash": f"{seed:x}",
+        "frame_stride": 1,
+        "cameras": ["top"],
+    }
+    whole = [episode(rng, length, dims) for _ in range(episodes)]
+    parts = {"train": range(episodes - 1), "val": range(episodes - 1, episodes)}
+    for split, numbers in parts.items():
+        path = f"{split}/shard-00000.parquet"
+        with ShardWriter(folder / path, arrow_schema(spec, dims, 0, 1), spec) as writer:
+            rows = []
+            for number in numbers:
+                tokens, actions = whole[number]
+                frames = tokens.astype(np.uint32)
+                if spec.kind == "continuous":
+                    frames = rng.normal(size=(length, spec.channels, *spec.grid)).astype(np.float16)
+                start, clock = writer.rows, np.arange(length) / 10
+                writer.add(EpisodeRows(number, clock, frames, actions, None, "top"))
+                place = (split, path, start, length, length)
+                rows.append(EpisodeRow(number, f"e{number}", *place, "", None, "", 0, 0, 0, "{}", 0, ""))
+            stats = Stats.of(np.concatenate([whole[number][1] for number in numbers]))
+            writer.close(Footer(plan, path, split, tuple(rows), (), {"action": stats}))
+    names = [f"{split}/shard-00000.parquet" for split in parts]
+    finish(folder, names, embodiment, spec, plan, "made")
+    return folder

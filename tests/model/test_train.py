@@ -1,0 +1,350 @@
+"""The training loop: it learns, survives kills, refuses what has changed, and names what is broken."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, UsageError
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model import checkpoint
+from hma_model.model import HMA
+from hma_model.recipe import Recipe, make_recipe
+from hma_model.resume import seed_for
+from hma_model.runlog import read_metrics
+from hma_model.runtime import own_folder
+from hma_model.train import TrainingError, train
+from tests.model.shards import make_shards
+
+TINY = {
+    "frames": 4, "batch_size": 4, "model": {"layers": 1, "width": 16, "heads": 2}, "device": "cpu",
+    "steps": 6, "lr": 3e-3, "warmup": 2, "schedule": "cosine", "eval_every": 3, "eval_windows": 6,
+    "checkpoint_every": 2,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> list[str]:
+    folder = tmp_path_factory.mktemp("shards")
+    return [
+        str(make_shards(folder / "arm", "arm")),
+        str(make_shards(folder / "hand", "hand", dims=3, episodes=3, seed=1)),
+    ]
+
+
+@pytest.fixture
+def recipe(data):
+    def recipe(**changes) -> Recipe:
+        return make_recipe({**TINY, "data": data, **changes})
+
+    return recipe
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return {
+        f"{path.relative_to(folder)}:{name}": value
+        for path in sorted(folder.rglob("*.safetensors"))
+        for name, value in load_file(path).items()
+    }
+
+
+def same(one: Path, other: Path) -> bool:
+    a, b = weights(one), weights(other)
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def finite(folder: Path) -> bool:
+    return all(torch.isfinite(value).all() for value in checkpoint.load(folder).state_dict().values())
+
+
+class StopAt(Exception):
+    """Stands for a kill."""
+
+
+def kill_at(step: int):
+    def kill(facts) -> None:
+        if facts["step"] == step:
+            raise StopAt
+
+    return kill
+
+
+def test_training_beats_what_ignoring_everything_reaches(recipe, tmp_path):
+    network = {"layers": 2, "width": 32, "heads": 2}
+    result = train(
+        recipe(steps=150, lr=5e-3, batch_size=8, model=network, eval_every=0, checkpoint_every=0),
+        out=tmp_path / "run", show=False,
+    )  # fmt: skip
+    assert result.masked_val_loss < 0.7 * result.baseline
+    assert np.mean([loss for _, loss in result.losses[-10:]]) < np.mean(
+        [loss for _, loss in result.losses[:10]]
+    )
+
+
+def test_the_result_is_a_checkpoint_with_cards(recipe, tmp_path):
+    result = train(recipe(), out=tmp_path / "run", show=False)
+    opened = checkpoint.Checkpoint.open(result.checkpoint)
+    assert set(checkpoint.load(result.checkpoint).embodiments) == {"arm", "hand"}
+    card = opened.card("hand")
+    assert card["data"] == {"episodes": 2, "frames": 48}
+    assert card["metrics"]["val_loss"] > 0 and card["metrics"]["baseline_loss"] > 0
+    assert card["training"] == {"steps": 6, "seed": 42}
+
+
+def test_stems_carry_the_statistics_of_the_shards(recipe, data, tmp_path):
+    model = checkpoint.load(train(recipe(steps=1), out=tmp_path / "run", show=False).checkpoint)
+    manifest = json.loads((Path(data[1]) / "manifest.json").read_text())
+    assert model.embodiments["hand"].mean == pytest.approx(manifest["stats"]["action"]["mean"], abs=1e-6)
+
+
+@pytest.mark.parametrize("killed_after", [1, 3, 5])
+def test_a_killed_run_goes_on_bit_for_bit(recipe, tmp_path, killed_after):
+    changes = {
+        "accumulate": 2,
+        "objectives": {"forward": 1, "full": 1},
+        "model": {**TINY["model"], "dropout": 0.1},
+    }
+    whole = train(recipe(**changes), out=tmp_path / "whole", show=False)
+    with pytest.raises(StopAt):
+        train(recipe(**changes), out=tmp_path / "cut", show=False, on_progress=kill_at(killed_after))
+    again = train(recipe(**changes), out=tmp_path / "cut", show=False)
+    assert again.losses == whole.losses and [step for step, _ in again.losses] == list(range(1, 7))
+    assert same(whole.checkpoint, again.checkpoint)
+    strip = [{k: v for k, v in e.items() if k != "seconds"} for e in whole.evaluations]
+    assert [{k: v for k, v in e.items() if k != "seconds"} for e in again.evaluations] == strip
+
+
+def test_worker_processes_change_nothing(recipe, tmp_path):
+    alone = train(recipe(steps=3), out=tmp_path / "alone", show=False)
+    helped = train(recipe(steps=3, workers=1), out=tmp_path / "helped", show=False)
+    assert helped.losses == alone.losses
+
+
+def test_evaluating_more_often_changes_no_weight(recipe, tmp_path):
+    seldom = train(recipe(eval_every=0, checkpoint_every=0), out=tmp_path / "seldom", show=False)
+    often = train(recipe(eval_every=1, checkpoint_every=1), out=tmp_path / "often", show=False)
+    assert same(seldom.checkpoint, often.checkpoint)
+
+
+def test_another_seed_gives_another_run(recipe, tmp_path):
+    one = train(recipe(steps=2), out=tmp_path / "one", show=False)
+    other = train(recipe(steps=2, seed=43), out=tmp_path / "other", show=False)
+    assert one.losses != other.losses
+
+
+def test_accumulation_is_the_mean_over_its_parts(recipe, tmp_path):
+    result = train(recipe(steps=1, accumulate=3), out=tmp_path / "run", show=False)
+    (line,) = (line for line in read_metrics(result.out) if line["kind"] == "train")
+    assert line["windows"] == 12
+
+
+def test_a_finished_run_is_not_begun_again(recipe, tmp_path):
+    first = train(recipe(), out=tmp_path / "run", show=False)
+    calls = []
+    second = train(recipe(), out=tmp_path / "run", show=False, on_progress=calls.append)
+    assert not calls and second == first
+
+
+def test_only_the_last_checkpoints_are_kept(recipe, tmp_path):
+    result = train(recipe(checkpoint_every=1, keep_last=2), out=tmp_path / "run", show=False)
+    names = sorted(path.name for path in (result.out / "checkpoints").iterdir())
+    assert names == ["step-00000005", "step-00000006"]
+
+
+def test_a_changed_recipe_is_refused_with_the_difference(recipe, tmp_path):
+    train(recipe(), out=tmp_path / "run", show=False)
+    with pytest.raises(RecipeError, match=r"lr: 0\.003, now 0\.004; steps: 6, now 8"):
+        train(recipe(lr=4e-3, steps=8), out=tmp_path / "run", show=False)
+
+
+def test_force_goes_on_with_a_changed_recipe(recipe, tmp_path):
+    train(recipe(), out=tmp_path / "run", show=False)
+    result = train(recipe(lr=4e-3, steps=8, batch_size=2), out=tmp_path / "run", show=False, force=True)
+    assert [step for step, _ in result.losses] == list(range(1, 9))
+
+
+def test_changed_shards_are_refused(recipe, tmp_path):
+    shards = make_shards(tmp_path / "arm", "arm")
+    train(recipe(data=[str(shards)]), out=tmp_path / "run", show=False)
+    shutil.rmtree(shards)
+    make_shards(shards, "arm", seed=5)
+    with pytest.raises(RecipeError, match=r"data\.arm: "):
+        train(recipe(data=[str(shards)]), out=tmp_path / "run", show=False)
+
+
+def test_moved_shards_are_the_same_shards(recipe, tmp_path):
+    shards = make_shards(tmp_path / "arm", "arm")
+    with pytest.raises(StopAt):
+        train(recipe(data=[str(shards)]), out=tmp_path / "run", show=False, on_progress=kill_at(3))
+    shards.rename(tmp_path / "elsewhere")
+    assert train(recipe(data=[str(tmp_path / "elsewhere")]), out=tmp_path / "run", show=False).step == 6
+
+
+def test_a_damaged_newest_checkpoint_is_passed_over(recipe, tmp_path, capsys):
+    whole = train(recipe(), out=tmp_path / "run", show=False)
+    kept = shutil.copytree(whole.checkpoint, tmp_path / "kept")
+    trunk = whole.checkpoint / "trunk.safetensors"
+    trunk.write_bytes(trunk.read_bytes()[:-1])
+    again = train(recipe(), out=tmp_path / "run")
+    assert "passed over a damaged checkpoint" in capsys.readouterr().err
+    assert same(kept, again.checkpoint)
+
+
+def test_when_every_checkpoint_is_damaged_nothing_is_overwritten(recipe, tmp_path):
+    result = train(recipe(keep_last=1), out=tmp_path / "run", show=False)
+    (result.checkpoint / "training/optimizer.safetensors").write_bytes(b"")
+    with pytest.raises(CheckpointError, match="not whole safetensors"):
+        train(recipe(keep_last=1), out=tmp_path / "run", show=False)
+
+
+@pytest.fixture
+def poisoned(monkeypatch):
+    """The loss of window 1 of the third batch is not a number."""
+    plain, calls = HMA.forward, []
+
+    def forward(self, batch, objective=None, generator=None):
+        output = plain(self, batch, objective, generator)
+        if self.training:
+            calls.append(batch)
+            if len(calls) == 3:
+                output.per_sample[1] = float("nan")
+                output.loss = output.loss * float("nan")
+        return output
+
+    monkeypatch.setattr(HMA, "forward", forward)
+    return calls
+
+
+def test_a_loss_that_is_no_number_stops_and_names_the_window(recipe, tmp_path, poisoned):
+    with pytest.raises(TrainingError) as caught:
+        train(recipe(checkpoint_every=1), out=tmp_path / "run", show=False)
+    batch = poisoned[2]
+    place = f"{batch.embodiment[1]} episode {batch.episode[1]} frame {batch.frame[1]}"
+    assert f"windows: {place}" in caught.value.fault and caught.value.where == "step 3"
+    last = checkpoint.resolve(tmp_path / "run")
+    assert last.name == "step-00000002"
+    assert finite(last)
+
+
+def test_a_loss_that_is_no_number_can_be_skipped_and_is_counted(recipe, tmp_path, poisoned):
+    result = train(recipe(nonfinite="skip"), out=tmp_path / "run", show=False)
+    assert (result.step, result.skipped) == (6, 1)
+    assert all(
+        torch.isfinite(value).all() for value in checkpoint.load(result.checkpoint).state_dict().values()
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_and_the_run_goes_on_bit_for_bit(recipe, tmp_path, number):
+    whole = train(recipe(checkpoint_every=0), out=tmp_path / "whole", show=False)
+
+    def send(facts) -> None:
+        if facts["step"] == 3:
+            os.kill(os.getpid(), number)
+
+    cut = train(recipe(checkpoint_every=0), out=tmp_path / "cut", show=False, on_progress=send)
+    assert cut.interrupted and cut.step == 3 and cut.checkpoint.name == "step-00000003"
+    again = train(recipe(checkpoint_every=0), out=tmp_path / "cut", show=False)
+    assert not again.interrupted and again.losses == whole.losses
+    assert same(whole.checkpoint, again.checkpoint)
+
+
+def test_a_run_killed_at_once_goes_on_bit_for_bit(recipe, tmp_path):
+    program = (
+        "import json, os, signal, sys\n"
+        "from hma_model.recipe import make_recipe\n"
+        "from hma_model.train import train\n"
+        "kill = lambda facts: facts['step'] == 5 and os.kill(os.getpid(), signal.SIGKILL)\n"
+        "train(make_recipe(json.loads(sys.argv[1])), out=sys.argv[2], show=False, on_progress=kill)\n"
+    )
+    values = json.dumps(recipe().values())
+    done = subprocess.run([sys.executable, "-c", program, values, str(tmp_path / "cut")], check=False)
+    assert done.returncode == -signal.SIGKILL
+    whole = train(recipe(), out=tmp_path / "whole", show=False)
+    again = train(recipe(), out=tmp_path / "cut", show=False)
+    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
+
+
+def test_the_folder_of_something_else_is_refused(recipe, tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(OutputError, match=r"holds letter\.txt"):
+        train(recipe(), out=tmp_path, show=False)
+
+
+def test_two_trainings_in_one_folder_are_refused(recipe, tmp_path):
+    with own_folder(tmp_path / "run"), pytest.raises(OutputError, match="another training"):
+        train(recipe(), out=tmp_path / "run", show=False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"data": []}, RecipeError, "names no shards"),
+        ({"data": ["nowhere"]}, ShardError, "nowhere"),
+        ({"batch_size": 1000}, RecipeError, r"1000 windows a step are more than the \d+ there are"),
+        ({"frames": 20}, ShardError, "no window of 20 frames"),
+        ({"device": "cuda:99"}, RecipeError, "cuda:99 is not there"),
+        ({"model": {"width": 15, "heads": 2}}, RecipeError, "heads"),
+        ({"mixture": {"weights": {"leg": 2}}}, UsageError, "leg"),
+        ({"objectives": {"foward": 1}}, RecipeError, "foward"),
+    ],
+)
+def test_what_does_not_fit_the_data_is_said_before_anything_is_trained(
+    recipe, tmp_path, changes, error, message
+):
+    with pytest.raises(error, match=message):
+        train(recipe(**changes), out=tmp_path / "run", show=False)
+
+
+def test_a_run_needs_a_folder(recipe):
+    with pytest.raises(UsageError, match="out: is not given"):
+        train(recipe(), show=False)
+
+
+def test_without_a_terminal_progress_is_plain_lines(recipe, tmp_path, capsys):
+    train(recipe(), out=tmp_path / "run")
+    shown = capsys.readouterr().err
+    assert "step 6/6: loss arm" in shown and "validation" in shown and "\x1b" not in shown
+
+
+def test_without_validation_windows_training_goes_on_without_evaluation(recipe, tmp_path, capsys):
+    shards = make_shards(tmp_path / "arm", "arm")
+    for path in (shards / "val").iterdir():
+        path.unlink()
+    manifest = json.loads((shards / "manifest.json").read_text())
+    manifest["shards"] = [shard for shard in manifest["shards"] if shard["split"] == "train"]
+    (shards / "manifest.json").write_text(json.dumps(manifest))
+    result = train(recipe(data=[str(shards)]), out=tmp_path / "run")
+    assert result.masked_val_loss is None and result.evaluations == []
+    assert "no validation windows of 4 frames: arm" in capsys.readouterr().err
+
+
+def test_seeds_differ_by_purpose_and_place():
+    seeds = {seed_for(0, "masks", 1), seed_for(0, "masks", 2), seed_for(0, "init"), seed_for(1, "init")}
+    assert len(seeds) == 4 and all(0 <= seed < 2**63 for seed in seeds)
+
+
+def test_a_continuous_model_trains(tmp_path):
+    spec = TokenizerSpec(
+        name="raw", version=1, kind="continuous", image_size=16, grid=(4, 4), channels=2, dtype="float16"
+    )
+    shards = make_shards(tmp_path / "arm", "arm", spec=spec)
+    model = {**TINY["model"], "patch": 2, "diffusion_width": 16, "diffusion_depth": 1}
+    result = train(
+        make_recipe({**TINY, "data": [str(shards)], "model": model}), out=tmp_path / "run", show=False
+    )
+    assert result.step == 6 and result.masked_val_loss > 0 and result.baseline is None
+
+
+def test_bf16_trains(recipe, tmp_path):
+    assert np.isfinite(
+        train(recipe(steps=2, precision="bf16"), out=tmp_path / "r", show=False).masked_val_loss
+    )
