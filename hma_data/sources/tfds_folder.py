@@ -209,9 +209,10 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
         names = ", ".join(sorted(files._parent(item)[len(path) + 1 :] for item in found))
         raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
     raise SourceError(
-        uri, "has no features.json, so its records cannot be understood",
-        "copy it from where the TFRecord files are from, or write it with tensorflow_datasets",
-    )  # fmt: skip
+        uri,
+        "cannot be reached, or has no features.json" if _listless(files) else "has no features.json",
+        "records cannot be understood without; copy it from where they are from, or write it with TFDS",
+    )
 
 
 @lru_cache(maxsize=64)

@@ -668,3 +668,20 @@ def test_the_real_bridge_recording_inspects_without_problems(real_data):
     assert sorted(key.key for key in found.keys if key.kind == "camera") == [
         f"observation/image_{i}" for i in range(4)
     ]
+
+
+@pytest.mark.real
+def test_the_real_bridge_recording_equals_tensorflow_datasets(real_data):
+    pytest.importorskip("tensorflow")
+    tfds = pytest.importorskip("tensorflow_datasets")
+    folder = real_data / "rlds" / "bridge_dataset" / "1.0.0"
+    truth = tfds.builder_from_directory(str(folder)).as_dataset(split="train", shuffle_files=False)
+    robot = find("bridge_data_v2")
+    for index, theirs in enumerate(truth):
+        ours = read(folder, f"train/{index:06d}", robot)
+        steps = [{"action": s["action"].numpy(), **s["observation"]} for s in theirs["steps"]]
+        np.testing.assert_array_equal(ours.actions[0].values, [step["action"] for step in steps])
+        np.testing.assert_array_equal(ours.states[0].values, [step["state"].numpy() for step in steps])
+        pictures = ours.streams["primary"].frames(range(len(steps)))
+        differences = pictures.astype(int) - np.array([step["image_0"].numpy() for step in steps])
+        assert np.abs(differences).mean() < 4  # TensorFlow decodes with the fast inverse DCT by default
