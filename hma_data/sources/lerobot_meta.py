@@ -221,7 +221,15 @@ def parquet_explained(where: object, error: type[HMAError]) -> Iterator[None]:
         yield
     except FileNotFoundError as fault:
         raise error(where, "no such file") from fault
-    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError, MemoryError) as fault:
+    except (
+        pa.ArrowException,
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        OverflowError,
+        MemoryError,
+    ) as fault:
         lines = str(fault).splitlines() or [type(fault).__name__]
         remedy = "the file may be cut off or damaged"
         raise error(where, f"cannot be read as parquet: {lines[0]}", remedy) from fault

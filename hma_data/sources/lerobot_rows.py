@@ -50,8 +50,8 @@ class Rows:
         """
         if key not in self.columns:
             raise EpisodeError(self.path, f"has no column {key!r}", f"it has {', '.join(self.columns)}")
-        parts = [self._group(group, key).take(self._within(group)) for group in self.groups]
         with parquet_explained(self.path, EpisodeError):
+            parts = [self._group(group, key).take(self._within(group)) for group in self.groups]
             joined = pa.chunked_array(parts).combine_chunks()
             return joined.combine_chunks() if isinstance(joined, pa.ChunkedArray) else joined
 
@@ -122,7 +122,7 @@ class StillPictures:
         self._rows, self._key, self._folder = rows, key, folder
         if key not in rows.columns:
             raise EpisodeError(rows.path, f"has no column {key!r}", f"it has {', '.join(rows.columns)}")
-        self._held: tuple[int, pa.Array | None] = (-1, None)
+        self._held: tuple[int, pa.Array] | None = None
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
         """See Stream."""
@@ -141,13 +141,8 @@ class StillPictures:
 
     def _bytes(self, index: int) -> bytes:
         group, within = (int(place) for place in self._rows.places[index])
-        if self._held[0] != group:
-            with parquet_explained(self._rows.path, EpisodeError), pq.ParquetFile(self._rows.path) as file:
-                self._held = (
-                    group,
-                    _only(file.read_row_group(group, [self._key], use_threads=False), self._key),
-                )
-        value = self._held[1][within].as_py() if self._held[1] is not None else None
+        with parquet_explained(self._rows.path, EpisodeError):
+            value = self._column(group)[within].as_py()
         if isinstance(value, dict):
             value = value.get("bytes") or value.get("path")
         where = f"{self._rows.path} {self._key}[{index}]"
@@ -156,6 +151,13 @@ class StillPictures:
         if not isinstance(value, bytes):
             raise EpisodeError(where, "holds no picture")
         return value
+
+    def _column(self, group: int) -> pa.Array:
+        if self._held is None or self._held[0] != group:
+            with pq.ParquetFile(self._rows.path) as file:
+                table = file.read_row_group(group, [self._key], use_threads=False)
+            self._held = group, _only(table, self._key)
+        return self._held[1]
 
     def _file(self, relative: str, where: str) -> bytes:
         if Path(relative).is_absolute() or ".." in Path(relative).parts or "\0" in relative:

@@ -237,8 +237,10 @@ def _open(path: str) -> Any:
 
 def _video_stream(container: Any, path: str) -> Any:
     stream = container.streams.best("video")
-    if stream is None or not stream.width:
+    if stream is None:
         raise EpisodeError(path, "has no video in it")
+    if stream.codec_context is None or not stream.width:
+        raise EpisodeError(path, "holds video of a kind that is not known", "the file may be damaged")
     if stream.width * stream.height > MAX_PIXELS:
         raise EpisodeError(path, f"claims {stream.width}×{stream.height} pixels")
     return stream

@@ -1,0 +1,467 @@
+"""LeRobotDatasets of every version, against what was written and against lerobot itself."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hma_data.align import to_clip
+from hma_data.embodiment import Embodiment, find
+from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.sources.base import detect, open_source
+from hma_data.sources.lerobot_meta import fill
+from tests.data.videos import (
+    CAMERA,
+    HEIGHT,
+    STILL,
+    TASKS,
+    WIDTH,
+    actions_of,
+    encode,
+    make_v2,
+    make_v3,
+    number_of,
+)
+
+LENGTHS = (12, 9, 15)
+
+
+def embodiment(**changes: Any) -> Embodiment:
+    """The robot of the made datasets."""
+    values: dict[str, Any] = {
+        "id": "testbot",
+        "kind": "real",
+        "frequency_hz": 10,
+        "action": {"space": "joint_position", "components": [{"key": "action", "dims": 2}]},
+        "state": {"components": [{"key": "observation.state", "dims": 1, "slice": [1, 2]}]},
+        "cameras": [{"name": "cam", "key": CAMERA}, {"name": "still", "key": STILL}],
+        "source": {"format": "lerobot"},
+    }
+    for path, value in changes.items():
+        section, _, key = path.partition("__")
+        values[section] = {**values[section], key: value} if key else value
+    return Embodiment.from_values(values, "test")
+
+
+@pytest.fixture(scope="session", params=["v2.0", "v2.1", "v2.1 av1", "v3.0", "v3.0 av1"])
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of each version and codec, not to be changed."""
+    version, _, codec = request.param.partition(" ")
+    folder = tmp_path_factory.mktemp("lerobot")
+    if version == "v3.0":
+        return make_v3(folder, LENGTHS, codec or "h264")
+    return make_v2(folder, LENGTHS, version, codec or "h264")
+
+
+@pytest.fixture(scope="session")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    made = {"v2": make_v2, "v3": make_v3}
+    return {name: make(tmp_path_factory.mktemp(name), LENGTHS) for name, make in made.items()}
+
+
+@pytest.fixture
+def copy(originals: dict[str, Path], tmp_path: Path) -> Callable[[str], Path]:
+    """Gives a dataset that may be damaged."""
+
+    def make(name: str) -> Path:
+        return Path(shutil.copytree(originals[name], tmp_path / name))
+
+    return make
+
+
+def change_info(folder: Path, **changes: Any) -> None:
+    path = folder / "meta/info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+# -- reading
+
+
+def test_every_frame_goes_with_its_action(whole: Path) -> None:
+    source = open_source("lerobot")
+    for episode, length in enumerate(LENGTHS):
+        clip = to_clip(source.read(str(whole), f"episode_{episode:06d}", embodiment()), embodiment())
+        np.testing.assert_array_equal(clip.actions, actions_of(episode, length))
+        np.testing.assert_array_equal(clip.states, 2 * actions_of(episode, length)[:, 1:])
+        np.testing.assert_allclose(clip.timestamps, np.arange(length) / 10, atol=1e-6)
+        for camera in ("cam", "still"):
+            shown = [number_of(frame) for frame in clip.frames_at(camera, np.arange(length))]
+            assert shown == [10 * episode + i for i in range(length)], camera
+
+
+def test_strided_frames_are_those_asked_for(whole: Path) -> None:
+    episode = open_source("lerobot").read(str(whole), "episode_000002", embodiment())
+    for camera in ("cam", "still"):
+        frames = episode.streams[camera].frames([0, 4, 14])
+        assert frames.shape == (3, HEIGHT, WIDTH, 3) and frames.dtype == np.uint8
+        assert [number_of(frame) for frame in frames] == [20, 24, 34]
+
+
+def test_task_and_success_are_the_episodes_own(whole: Path) -> None:
+    source = open_source("lerobot")
+    read = [source.read(str(whole), f"episode_{i:06d}", embodiment()) for i in range(3)]
+    assert [episode.instruction for episode in read] == [TASKS[0], TASKS[1], TASKS[0]]
+    assert [episode.success for episode in read] == [True, False, True]
+
+
+def test_the_index_needs_no_decoding(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hma_data.sources.lerobot.VideoFile", None)
+    refs = open_source("lerobot").index(str(whole), embodiment())
+    assert [(ref.id, ref.frames) for ref in refs] == [(f"episode_{i:06d}", n) for i, n in enumerate(LENGTHS)]
+    assert len({ref.fingerprint for ref in refs}) == 3
+    assert open_source("lerobot").index(str(whole)) == refs
+
+
+def test_inspect_tells_features_lengths_and_rate(whole: Path) -> None:
+    found = open_source("lerobot").inspect(str(whole))
+    keys = {info.key: info for info in found.keys}
+    assert detect(str(whole)) == "lerobot"
+    assert (found.episodes, found.frames, found.lengths, found.hz) == (3, 36, LENGTHS, 10)
+    assert keys["action"].names == ("which", "row") == keys["observation.state"].names
+    assert (keys[CAMERA].kind, keys[CAMERA].shape) == ("camera", (HEIGHT, WIDTH, 3))
+    assert keys[CAMERA].codec in ("h264", "av1") and keys[STILL].codec == "png"
+    assert (found.robot, found.problems) == ("testbot", ())
+
+
+def test_splits_count_where_there_are_two(copy: Callable[[str], Path]) -> None:
+    folder = copy("v2")
+    index = open_source("lerobot").index
+    assert {ref.split for ref in index(str(folder))} == {None}
+    change_info(folder, splits={"train": "0:2", "val": "2:3"})
+    assert [ref.split for ref in index(str(folder))] == ["train", "train", "val"]
+    chosen = index(str(folder), embodiment(source__split="val"))
+    assert [(ref.id, ref.split) for ref in chosen] == [("episode_000002", None)]
+    with pytest.raises(SourceError, match="no split 'gold'.*train, val"):
+        index(str(folder), embodiment(source__split="gold"))
+
+
+def test_pictures_named_by_path_are_read(copy: Callable[[str], Path]) -> None:
+    folder = copy("v2")
+    path = folder / "data/chunk-000/episode_000000.parquet"
+    table = pq.read_table(path)
+    column = table.column_names.index(STILL)
+    rows = table[STILL].to_pylist()
+    (folder / "images").mkdir()
+    for i, row in enumerate(rows):
+        (folder / f"images/{i}.png").write_bytes(row["bytes"])
+    named = [{"bytes": None, "path": f"images/{i}.png"} for i in range(len(rows))]
+    pq.write_table(table.set_column(column, STILL, pa.array(named)), path)
+    still = open_source("lerobot").read(str(folder), "episode_000000", embodiment()).streams["still"]
+    assert [number_of(frame) for frame in still.frames([2, 11])] == [2, 11]
+    pq.write_table(
+        table.set_column(column, STILL, pa.array([{"path": "../../etc/passwd"}] * len(rows))), path
+    )
+    with pytest.raises(EpisodeError, match="outside the dataset"):
+        open_source("lerobot").read(str(folder), "episode_000000", embodiment()).streams["still"].frames([0])
+
+
+def test_a_dataset_of_the_hub_is_read_from_its_cache(
+    originals: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
+
+    home, commit = tmp_path / "datasets--team--arm", "a" * 40
+    (home / "refs").mkdir(parents=True)
+    (home / "refs/main").write_text(commit)
+    for i, file in enumerate(sorted(originals["v3"].rglob("*.*"))):
+        if file.is_file():  # the cache holds links to blobs
+            link = home / "snapshots" / commit / file.relative_to(originals["v3"])
+            link.parent.mkdir(parents=True, exist_ok=True)
+            (home / "blobs").mkdir(exist_ok=True)
+            shutil.copy(file, home / f"blobs/{i}")
+            link.symlink_to(home / f"blobs/{i}")
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    source = open_source("lerobot")
+    for uri in ("hf://datasets/team/arm", "team/arm"):
+        assert [ref.frames for ref in source.index(uri, embodiment())] == list(LENGTHS)
+        episode = source.read(uri, "episode_000001", embodiment())
+        assert number_of(episode.streams["cam"].frames([3])[0]) == 13
+    with pytest.raises(SourceError, match="cannot be fetched from the Hub"):
+        source.index("hf://datasets/team/other")
+
+
+# -- what is refused
+
+
+def test_another_rate_names_both_numbers(originals: dict[str, Path]) -> None:
+    for call in ("index", "read"):
+        arguments = [str(originals["v2"]), *(["episode_000000"] if call == "read" else [])]
+        with pytest.raises(SourceError, match=r"runs at 10 fps.*frequency_hz 30"):
+            getattr(open_source("lerobot"), call)(*arguments, embodiment(frequency_hz=30))
+
+
+@pytest.mark.parametrize("rate", [10.05, "unknown", None])
+def test_a_rate_within_a_hundredth_or_not_stated_is_accepted(originals: dict[str, Path], rate: Any) -> None:
+    assert len(open_source("lerobot").index(str(originals["v2"]), embodiment(frequency_hz=rate))) == 3
+
+
+@pytest.mark.parametrize("name", ["v2", "v3"])
+def test_a_missing_video_is_one_refused_episode(copy: Callable[[str], Path], name: str) -> None:
+    folder, source = copy(name), open_source("lerobot")
+    videos = sorted(folder.rglob("*.mp4"))
+    videos[0].unlink()
+    assert len(source.index(str(folder), embodiment())) == 3
+    with pytest.raises(EpisodeError, match=rf"{videos[0].name}: no such video"):
+        source.read(str(folder), "episode_000000", embodiment())
+    said = source.inspect(str(folder)).problems
+    assert f"1 of {len(videos)} videos of {CAMERA} are missing" in said[0] and videos[0].name in said[0]
+
+
+@pytest.mark.parametrize("shown", [11, 13])
+def test_a_video_of_another_length_is_refused(copy: Callable[[str], Path], shown: int) -> None:
+    folder, source = copy("v2"), open_source("lerobot")
+    encode(folder / f"videos/chunk-000/{CAMERA}/episode_000000.mp4", range(shown))
+    with pytest.raises(EpisodeError, match=f"has {shown} frames, the episode has 12 rows"):
+        source.read(str(folder), "episode_000000", embodiment())
+    assert f"has {shown} frames for 12 rows" in source.inspect(str(folder)).problems[0]
+
+
+def test_a_shared_video_that_ends_early_refuses_only_the_last(copy: Callable[[str], Path]) -> None:
+    folder, source = copy("v3"), open_source("lerobot")
+    shown = [10 * e + i for e, n in enumerate(LENGTHS) for i in range(n)]
+    encode(next(folder.rglob("*.mp4")), shown[:-1])
+    assert source.read(str(folder), "episode_000001", embodiment()).id == "episode_000001"
+    with pytest.raises(EpisodeError, match=r"has 14 frames from 2\.100 to 3\.600 s, the episode has 15 rows"):
+        source.read(str(folder), "episode_000002", embodiment())
+
+
+def test_a_video_of_another_rate_is_refused(copy: Callable[[str], Path]) -> None:
+    folder = copy("v2")
+    encode(folder / f"videos/chunk-000/{CAMERA}/episode_000000.mp4", range(12), fps=15)
+    with pytest.raises(EpisodeError, match="disagree on time"):
+        open_source("lerobot").read(str(folder), "episode_000000", embodiment())
+
+
+def test_rows_that_metadata_does_not_count_are_refused(copy: Callable[[str], Path]) -> None:
+    folder = copy("v2")
+    path = folder / "data/chunk-000/episode_000000.parquet"
+    pq.write_table(pq.read_table(path).slice(1), path)
+    with pytest.raises(EpisodeError, match="has 11 rows of episode_000000, its metadata says 12"):
+        open_source("lerobot").read(str(folder), "episode_000000", embodiment())
+
+
+def test_a_key_that_is_no_feature_names_the_nearest(originals: dict[str, Path]) -> None:
+    arm = embodiment(cameras=[{"name": "cam", "key": "observation.images.camera"}])
+    with pytest.raises(SourceError, match=rf"is not a feature.*did you mean {CAMERA}"):
+        open_source("lerobot").read(str(originals["v2"]), "episode_000000", arm)
+    arm = embodiment(cameras=[{"name": "cam", "key": "action"}])
+    with pytest.raises(SourceError, match=rf"'action' is float32, not colour pictures.*{CAMERA}, {STILL}"):
+        open_source("lerobot").read(str(originals["v2"]), "episode_000000", arm)
+
+
+def test_a_wrong_width_is_told_with_both_numbers(originals: dict[str, Path]) -> None:
+    arm = embodiment(action__components=[{"key": "action", "dims": 6}])
+    with pytest.raises(EpisodeError, match="action has 2 values, the embodiment says 6"):
+        open_source("lerobot").read(str(originals["v3"]), "episode_000000", arm)
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        (pa.array([[1.0, 2.0]] * 11 + [[1.0]]), "holds lists of"),
+        (pa.array([[1.0, 2.0]] * 11 + [None]), "1 missing values"),
+        (pa.array([[1.0, None]] * 12), "12 missing values"),
+        (pa.array([["a", "b"]] * 12), "not numbers"),
+        (pa.array([[1.0, float("nan")]] * 12), "not finite at frame 0"),
+    ],
+)
+def test_actions_that_are_none_are_refused(copy: Callable[[str], Path], column: pa.Array, said: str) -> None:
+    folder = copy("v2")
+    path = folder / "data/chunk-000/episode_000000.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(table.column_names.index("action"), "action", column), path)
+    with pytest.raises(EpisodeError, match=said):
+        to_clip(open_source("lerobot").read(str(folder), "episode_000000", embodiment()), embodiment())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"codebase_version": "v1.6"}, r"version 'v1\.6'; v2\.0, v2\.1, v3\.0 are read"),
+        ({"codebase_version": None}, "version 'None'"),
+        ({"fps": 0}, "fps must be a positive number, is 0"),
+        ({"fps": "fast"}, "is 'fast'"),
+        ({"features": {}}, "lists no features"),
+        ({"features": {"action": {"dtype": "float32"}}}, "has no shape"),
+    ],
+)
+def test_metadata_out_of_bounds_is_one_clear_line(
+    copy: Callable[[str], Path], change: dict[str, Any], said: str
+) -> None:
+    folder = copy("v2")
+    change_info(folder, **change)
+    with pytest.raises(SourceError, match=said) as found:
+        open_source("lerobot").index(str(folder))
+    assert "info.json" in str(found.value) and "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("info.json", "{", r"info\.json: is not JSON"),
+        ("info.json", "[1]", "must be a mapping, is list"),
+        ("info.json", "[" * 100_000, "is not JSON"),
+        (
+            "episodes.jsonl",
+            '{"episode_index": 0, "length": 3}\n{"epi',
+            r"episodes\.jsonl line 2: is not JSON",
+        ),
+        ("episodes.jsonl", '{"episode_index": -1, "length": 3}', "whole number from 0, is -1"),
+        ("episodes.jsonl", '{"episode_index": 0, "length": 3}\n' * 2, "lists episode 0 a second time"),
+        ("episodes.jsonl", "", "has no episodes"),
+        ("tasks.jsonl", None, r"tasks\.jsonl: no such file"),
+    ],
+)
+def test_damaged_metadata_is_one_clear_line(
+    copy: Callable[[str], Path], name: str, text: str | None, said: str
+) -> None:
+    folder = copy("v2")
+    path = folder / "meta" / name
+    path.unlink() if text is None else path.write_text(text)
+    with pytest.raises(SourceError, match=said) as found:
+        open_source("lerobot").index(str(folder))
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize(
+    "template",
+    [
+        "../{episode_index:06d}.parquet",
+        "/etc/{episode_index}.parquet",
+        "a/{video_key}/../../../x",
+        "{episode_index.__class__}",
+        "{episode_index!r}",
+        "{episode_index:>999999999d}",
+        "{other}",
+        "{",
+        7,
+    ],
+)
+def test_a_template_that_leaves_the_folder_or_tricks_is_refused(template: Any) -> None:
+    values = {"episode_index": 1, "video_key": "cam"}
+    with pytest.raises(SourceError, match=r"info\.json"):
+        fill(template, values, "info.json")
+
+
+def test_a_feature_name_cannot_lead_out_of_the_folder() -> None:
+    with pytest.raises(SourceError, match="outside the dataset"):
+        fill("videos/{video_key}/0.mp4", {"video_key": "../.."}, "info.json")
+
+
+def test_a_link_out_of_the_folder_is_refused(copy: Callable[[str], Path], tmp_path: Path) -> None:
+    folder = copy("v2")
+    video = folder / f"videos/chunk-000/{CAMERA}/episode_000000.mp4"
+    video.rename(tmp_path / "elsewhere.mp4")
+    video.symlink_to(tmp_path / "elsewhere.mp4")
+    with pytest.raises(SourceError, match="leads out of the dataset's folder"):
+        open_source("lerobot").read(str(folder), "episode_000000", embodiment())
+
+
+def test_a_folder_that_is_none_says_so(tmp_path: Path) -> None:
+    for uri, said in ((tmp_path, "has no meta/info.json"), (tmp_path / "no", "does not exist")):
+        with pytest.raises(SourceError, match=said):
+            open_source("lerobot").index(str(uri))
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_cut_or_flipped_file_gives_only_our_errors(
+    originals: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("bad") / "set"
+    shutil.copytree(originals[data.draw(st.sampled_from(["v2", "v3"]))], folder)
+    files = sorted(path for path in folder.rglob("*.*") if path.is_file())
+    path = data.draw(st.sampled_from(files))
+    content = bytearray(path.read_bytes())
+    at = data.draw(st.integers(0, len(content) - 1))
+    if data.draw(st.booleans()):
+        content = content[:at]
+    else:
+        content[at] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(content)
+    source = open_source("lerobot")
+    try:
+        source.inspect(str(folder))
+        for ref in source.index(str(folder), embodiment()):
+            episode = source.read(str(folder), ref.id, embodiment())
+            for stream in episode.streams.values():
+                stream.frames([0, len(stream.timestamps) - 1])
+    except HMAError as fault:
+        assert "\n" not in str(fault)
+
+
+# -- against lerobot, and real recordings
+
+
+def test_equal_to_lerobots_own_reader(tmp_path: Path) -> None:
+    pytest.importorskip("lerobot")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    features = {
+        "action": {"dtype": "float32", "shape": (2,), "names": ["which", "row"]},
+        CAMERA: {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"]},
+    }
+    root = tmp_path / "written"
+    writer = LeRobotDataset.create("team/arm", 10, features, root=root, robot_type="testbot")
+    noise = np.random.default_rng(0).integers(0, 256, (sum(LENGTHS), HEIGHT, WIDTH, 3), dtype=np.uint8)
+    pictures = iter(noise)
+    for episode, length in enumerate(LENGTHS):
+        for row in actions_of(episode, length):
+            writer.add_frame({"action": row, CAMERA: next(pictures), "task": TASKS[episode % 2]})
+        writer.save_episode()
+    writer.finalize()
+    theirs = LeRobotDataset("team/arm", root=root, video_backend="pyav", return_uint8=True)
+    arm = embodiment(cameras=[{"name": "cam", "key": CAMERA}], state=None)
+    source, row = open_source("lerobot"), 0
+    for ref in source.index(str(root), arm):
+        episode = source.read(str(root), ref.id, arm)
+        frames = episode.streams["cam"].frames(range(ref.frames))
+        for i in range(ref.frames):
+            item = theirs[row]
+            np.testing.assert_array_equal(episode.actions[0].values[i], item["action"].numpy())
+            np.testing.assert_array_equal(frames[i], item[CAMERA].permute(1, 2, 0).numpy())
+            assert episode.streams["cam"].timestamps[i] == item["timestamp"].item()
+            assert episode.instruction == item["task"]
+            row += 1
+    assert row == len(theirs) == sum(LENGTHS)
+
+
+@pytest.mark.real
+def test_the_real_g1_reads_its_four_episodes_and_refuses_the_rest(real_data: Path) -> None:
+    uri, arm, source = str(real_data / "lerobot/g1_v21"), find("g1_inspire"), open_source("lerobot")
+    refs = source.index(uri, arm)
+    assert len(refs) == 100 and sum(ref.frames for ref in refs) == 35_965
+    read, refused = [], 0
+    for ref in refs:
+        try:
+            read.append(source.read(uri, ref.id, arm))
+        except EpisodeError as fault:
+            assert f"{ref.id}.mp4: no such video" in str(fault)
+            refused += 1
+    assert [episode.id for episode in read] == [f"episode_{i:06d}" for i in (1, 2, 4, 5)] and refused == 96
+    clip = to_clip(read[0], arm)
+    assert clip.actions.shape == (393, 26) and clip.frames_at("head", np.arange(390, 393)).shape == (
+        3,
+        480,
+        640,
+        3,
+    )
+    assert read[0].instruction == "Pick up the yellow bottle on the table."
+
+
+@pytest.mark.real
+def test_the_real_g1_is_inspected(real_data: Path) -> None:
+    found = open_source("lerobot").inspect(str(real_data / "lerobot/g1_v21"))
+    keys = {info.key: info for info in found.keys}
+    assert keys["action"].names == tuple(find("g1_inspire").action.names())
+    assert keys["observation.images.cam_high"].codec == "av1" and found.frames == 35_965
+    assert len(found.problems) == 1 and "96 of 100 videos" in found.problems[0]
