@@ -26,9 +26,9 @@ def episode(rng: np.random.Generator, length: int, dims: int) -> tuple[np.ndarra
 
 def make_shards(
     folder: Path, name: str, dims: int = 2, episodes: int = 6, length: int = 24, seed: int = 0,
-    spec: TokenizerSpec = SPEC,
+    spec: TokenizerSpec = SPEC, held_out: int = 1,
 ) -> Path:  # fmt: skip
-    """A finished shard set of one embodiment; its last episode is for validation."""
+    """A finished shard set of one embodiment; its last episodes are for validation."""
     rng = np.random.default_rng(seed)
     embodiment = Embodiment.from_yaml(yaml(name, dims))
     plan = {
@@ -40,7 +40,8 @@ def make_shards(
         "cameras": ["top"],
     }
     whole = [episode(rng, length, dims) for _ in range(episodes)]
-    parts = {"train": range(episodes - 1), "val": range(episodes - 1, episodes)}
+    parts = {"train": range(episodes - held_out), "val": range(episodes - held_out, episodes)}
+    parts = {split: numbers for split, numbers in parts.items() if numbers}
     for split, numbers in parts.items():
         path = f"{split}/shard-00000.parquet"
         with ShardWriter(folder / path, arrow_schema(spec, dims, 0, 1), spec) as writer:

@@ -1,0 +1,201 @@
+"""Evaluation: losses by their definition, the baseline by hand, and rollouts of models that are known."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hma_data.errors import CheckpointError, UsageError
+from hma_data.loader import Batch, WindowDataset
+from hma_data.shards.reader import ShardSet
+from hma_model.evaluate import (
+    digit_frequencies,
+    evaluate,
+    masked_val_loss,
+    rollout,
+    shuffled_actions,
+    teacher_forced,
+    unconditional_baseline,
+    validation_losses,
+    windows,
+)
+from hma_model.model import HMA
+from tests.model.robots import CONFIG, SPEC, make_model
+from tests.model.shards import make_shards
+
+
+class Blocks:
+    """A tokenizer of 16-pixel pictures whose cells have the grey of their id."""
+
+    spec = SPEC
+
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        rows = np.repeat(tokens, 8, axis=1)
+        cells = np.repeat(rows, 6, axis=2)[:, :, :16]
+        return np.repeat((cells * 4).astype(np.uint8)[..., None], 3, axis=3)
+
+
+class Oracle(HMA):
+    """Gives the true continuation for true actions, and zeros for others."""
+
+    truth: list[Batch]
+
+    def generate(self, prompt: Any, actions: Any, embodiment: Any, frames: int, **_: Any) -> torch.Tensor:
+        size, first = prompt.shape[:2]
+        made = torch.zeros(size, frames, *prompt.shape[2:], dtype=torch.long)
+        for batch in self.truth:
+            for tokens, true in zip(batch.tokens, batch.actions):
+                for place in range(size):
+                    same = torch.equal(actions[place], true[: first + frames])
+                    if same and torch.equal(prompt[place], tokens[:first]):
+                        made[place] = tokens[first : first + frames]
+        return made
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm")
+
+
+@pytest.fixture
+def batch(data: Path) -> Batch:
+    return next(windows(data, "val", 4, 5))
+
+
+@pytest.fixture
+def model() -> HMA:
+    return make_model({"arm": 2})
+
+
+def test_validation_windows_are_spread_and_always_the_same(data):
+    batches = [list(windows(data, "val", 4, 5, batch_size=2)) for _ in range(2)]
+    frames = [[int(frame) for batch in run for frame in batch.frame] for run in batches]
+    assert frames[0] == frames[1] == [0, 4, 8, 12, 16]
+
+
+def test_fewer_windows_than_asked_for_are_all_given(data):
+    count = len(WindowDataset(data, "val", 4))
+    assert sum(len(batch) for batch in windows(data, "val", 4, 10_000)) == count
+
+
+def test_the_loss_of_a_frame_looks_at_the_past_alone(model, batch):
+    nats, _ = teacher_forced(model, batch)
+    later = replace(batch, tokens=batch.tokens.clone(), actions=batch.actions.clone())
+    later.tokens[:, 3], later.actions[:, 3] = 1, 9.0
+    changed, _ = teacher_forced(model, later)
+    assert torch.equal(nats[:, :2], changed[:, :2]) and not torch.equal(nats[:, 2], changed[:, 2])
+
+
+def test_a_model_with_equal_scores_has_the_log_of_the_vocabulary(model, batch):
+    torch.nn.init.zeros_(model.readout.linear.weight)
+    torch.nn.init.zeros_(model.readout.linear.bias)
+    assert masked_val_loss(model, [batch]) == pytest.approx(math.log(64), rel=1e-5)
+
+
+def test_a_models_accuracy_is_the_share_of_whole_tokens(model, batch):
+    torch.nn.init.zeros_(model.readout.linear.weight)
+    with torch.no_grad():
+        model.readout.linear.bias.zero_()
+        model.readout.linear.bias[[1, 8 + 1]] = 9.0  # digits 1 and 1: id 9, the ground
+    expected = (batch.tokens[:, 1:] == 9).float().mean()
+    assert validation_losses(model, [batch])[1].mean() == pytest.approx(float(expected))
+
+
+def test_validation_leaves_training_mode_and_random_state_as_they_were(model, batch):
+    model.train()
+    state = torch.get_rng_state()
+    validation_losses(model, [batch])
+    assert model.training and torch.equal(torch.get_rng_state(), state)
+
+
+def test_the_baseline_is_the_cross_entropy_of_the_training_digits(data, batch):
+    shards = ShardSet(data)
+    tokens = np.concatenate([shards.episode_rows(number)["tokens"].ravel() for number in range(5)])
+    low, high = (np.bincount(digits, minlength=8) + 1 for digits in (tokens % 8, tokens // 8))
+    truth = batch.tokens[:, 1:].numpy()
+    expected = -np.log(low / low.sum())[truth % 8] - np.log(high / high.sum())[truth // 8]
+    assert unconditional_baseline([data], [batch]).mean() == pytest.approx(expected.mean())
+
+
+def test_the_baseline_of_each_embodiment_is_its_own(data, tmp_path):
+    other = make_shards(tmp_path / "hand", "hand", dims=3, seed=3)
+    batches = [next(windows(folder, "val", 4, 5)) for folder in (data, other)]
+    both = unconditional_baseline([data, other], batches)
+    assert both.by_embodiment() == {
+        "arm": unconditional_baseline([data], batches[:1]).mean(),
+        "hand": unconditional_baseline([other], batches[1:]).mean(),
+    }
+
+
+def test_frequencies_of_a_part_of_the_data_stay_frequencies(data):
+    for part in digit_frequencies(ShardSet(data), max_frames=1):
+        assert part.sum() == pytest.approx(1) and (part > 0).all()
+
+
+def test_a_rollout_begins_with_the_prompt_and_has_the_windows_length(model, batch):
+    pictures = rollout(model, Blocks(), batch, prompt=2)
+    assert pictures.predicted.shape == pictures.truth.shape == (5, 4, 16, 16, 3)
+    assert (pictures.predicted[:, :2] == pictures.truth[:, :2]).all()
+
+
+def test_a_rollout_repeats_with_its_seed(model, batch):
+    options: dict[str, Any] = {"prompt": 1, "temperature": 1.0}
+    one, same, other = (rollout(model, Blocks(), batch, seed=seed, **options) for seed in (1, 1, 2))
+    assert (one.predicted == same.predicted).all() and (one.predicted != other.predicted).any()
+
+
+def test_a_rollout_longer_than_the_window_is_refused(model, batch):
+    with pytest.raises(UsageError, match=r"2 \+ 3 frames do not fit windows of 4"):
+        rollout(model, Blocks(), batch, frames=3, prompt=2)
+
+
+def test_shuffled_actions_are_another_windows_of_the_same_embodiment(batch):
+    mixed = replace(batch, embodiment=["arm", "hand", "arm", "hand", "arm"])
+    mixed.actions[:, 0, 0] = torch.arange(5.0)
+    shuffled = shuffled_actions(mixed)[:, 0, 0].long().tolist()
+    assert sorted(shuffled) == [0, 1, 2, 3, 4]
+    assert all(a != b and (a - b) % 2 == 0 for a, b in enumerate(shuffled))
+
+
+def test_shuffling_keeps_the_actions_among_the_prompt(batch):
+    shuffled = shuffled_actions(batch, begin=2)
+    assert torch.equal(shuffled[:, :2], batch.actions[:, :2])
+    assert not torch.equal(shuffled[:, 2:], batch.actions[:, 2:])
+
+
+def test_a_perfect_model_has_the_highest_psnr_and_loses_it_with_shuffled_actions(data):
+    oracle = Oracle(CONFIG)
+    oracle.add_embodiment(make_model({"arm": 2}).embodiments["arm"])
+    oracle.truth = list(windows(data, "val", 4, 6, batch_size=3))
+    figures = evaluate(oracle.eval(), Blocks(), data, count=6, batch_size=3, prompt=1)
+    assert (figures["true"]["psnr"], figures["true"]["ssim"]) == (60.0, pytest.approx(1.0))
+    assert figures["shuffled"]["psnr_last"] < 30 and figures["psnr_action_gain_last"] > 30
+    assert figures["windows"] == 6 and len(figures["true"]["psnr_by_frame"]) == 3
+    assert figures["copy"]["psnr"] < 60
+
+
+def test_rollouts_are_held_against_real_frames_where_they_are_given(model, data):
+    asked = []
+
+    def real(episode: int, frames: np.ndarray) -> np.ndarray:
+        asked.append((episode, frames.tolist()))
+        return np.full((len(frames), 16, 16, 3), 36, np.uint8)
+
+    figures = evaluate(model, Blocks(), data, count=2, real=real, prompt=1)
+    assert figures["against"] == "real frames"
+    assert asked == [(5, [0, 2, 4, 6]), (5, [16, 18, 20, 22])]
+
+
+def test_a_model_of_another_tokenizer_is_refused(data):
+    other = CONFIG.replace(tokenizer={**SPEC.to_json(), "version": 2})
+    with pytest.raises(CheckpointError, match="version is 2 there and 1 here"):
+        evaluate(make_model({"arm": 2}, config=other), Blocks(), data)
+
+
+def test_a_split_without_windows_is_refused(model, data):
+    with pytest.raises(UsageError, match="no window of 40 frames in val"):
+        evaluate(model, Blocks(), data, frames=40)
