@@ -12,7 +12,7 @@ from hma_data.embodiment import Camera, Component, Embodiment
 from hma_data.episode import Episode, Signal, Stream
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag, find_bags
-from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.container import Channel, damaged
 from hma_data.sources.bags.fields import Column, Field, missing_topic, parse_key
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.pictures import picture_kind
@@ -64,12 +64,13 @@ def _bags(uri: str) -> dict[str, Path]:
 
 
 def _ref(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> EpisodeRef:
+    frames, fingerprint = 0, ""
     try:
         bag = Bag(path, root)
         fingerprint = bag.fingerprint()
         frames = _frames(bag.counts(), embodiment)
     except (EpisodeError, OSError):
-        return EpisodeRef(name, 0)
+        pass  # `read` meets it again and says what it is
     return EpisodeRef(name, frames, fingerprint=fingerprint)
 
 
@@ -88,7 +89,9 @@ class _Reading:
     def __init__(self, bag: Bag, episode_id: str, embodiment: Embodiment) -> None:
         self._bag, self._id, self._embodiment = bag, episode_id, embodiment
         self._where = str(bag.path)
-        self._topics = {channel.topic for channel in bag.counts()}
+        self._counts: Counter[str] = Counter()
+        for channel, count in bag.counts().items():
+            self._counts[channel.topic] += count
         self._tracks: dict[str, Track] = {}
         self._instruction = ""
 
@@ -96,8 +99,8 @@ class _Reading:
         """The pass, and what came of it."""
         embodiment = self._embodiment
         for camera in embodiment.cameras:
-            if camera.key not in self._topics:
-                raise missing_topic(camera.key, self._topics, self._where)
+            if camera.key not in self._counts:
+                raise missing_topic(camera.key, self._counts, self._where)
             self._track(camera.key)
         actions = self._columns(embodiment.action.components)
         states = self._columns(embodiment.state.components if embodiment.state else ())
@@ -119,7 +122,7 @@ class _Reading:
     def _columns(self, components: tuple[Component, ...]) -> list[Column]:
         columns = []
         for component in components:
-            field = parse_key(component.key, self._topics, self._where)
+            field = parse_key(component.key, self._counts, self._where)
             column = Column(component, field, self._where)
             self._track(field.topic).columns.append(column)
             columns.append(column)
@@ -127,7 +130,7 @@ class _Reading:
 
     def _instruction_field(self) -> Field | None:
         key = self._embodiment.source.instruction
-        return parse_key(key, self._topics, self._where) if key else None
+        return parse_key(key, self._counts, self._where) if key else None
 
     def _scan(self, instruction: Field | None) -> None:
         topics = frozenset(self._tracks) | ({instruction.topic} if instruction else frozenset())
@@ -138,9 +141,12 @@ class _Reading:
                 self._instruction = str(instruction.value(message, self._where))
             if topic in self._tracks:
                 self._tracks[topic].add(record.channel, record.log_ns, place, message)
-        empty = [topic for topic, track in self._tracks.items() if not len(track)]
-        if empty:
-            raise EpisodeError(self._where, f"{empty[0]} has no messages")
+        for topic, track in self._tracks.items():
+            if not len(track):
+                raise EpisodeError(self._where, f"{topic} has no messages")
+            if len(track) != self._counts[topic]:
+                fault = f"its index counts {self._counts[topic]} messages of {topic}, it holds {len(track)}"
+                raise damaged(self._bag.path, fault)
 
     def _signal(self, column: Column) -> Signal:
         track, rows = self._tracks[column.field.topic], column.rows()

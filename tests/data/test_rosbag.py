@@ -589,6 +589,17 @@ def test_a_flipped_bit_gives_an_answer_or_our_error(
         assert "\n" not in str(fault)
 
 
+def test_a_bag_that_holds_less_than_its_index_counts_is_refused(
+    bags: dict[str, Path], tmp_path: Path
+) -> None:
+    zipped = tmp_path / "zipped"
+    shutil.copytree(bags["ros2-sqlite3-file-zstd"], zipped)
+    metadata = zipped / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("message_count: 10\n", "message_count: 12\n"))
+    with pytest.raises(EpisodeError, match=r"its index counts 12 messages of /cam/image\.raw, it holds 10"):
+        read(zipped, arm())
+
+
 def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(
     bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -80,7 +80,7 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except FAULTS as fault:
-        detail = str(fault) or type(fault).__name__
+        detail = " ".join(str(fault).split())[:200] or type(fault).__name__
         raise damaged(path, f"is damaged or cut off: {detail}") from fault
 
 

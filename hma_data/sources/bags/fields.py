@@ -101,7 +101,7 @@ def _steps(key: str, at: int, where: str) -> tuple[Step, ...]:
 
 def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
     """The error of a key whose topic the bag does not have."""
-    known = sorted(topics)
+    known = sorted(" ".join(topic.split()) for topic in topics)
     near = get_close_matches(re.split(r"[.\[]", key)[0], known, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     more = f" and {len(known) - SHOWN} more" if len(known) > SHOWN else ""

@@ -30,7 +30,7 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
     """
     try:
         read = _decoder(channel)
-    except (*FAULTS, TypeError, AssertionError) as fault:
+    except (*FAULTS, TypeError, AssertionError, SyntaxError, AttributeError) as fault:
         raise EpisodeError(where, f"{channel.topic}: {_line(fault)}") from fault
     try:
         return read(data)
@@ -62,13 +62,16 @@ def _decoder(channel: Channel) -> Decode:
 
 def _ros_decoder(channel: Channel) -> Decode:
     from rosbags.serde import SerdeError
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, TypesysError, get_typestore
     from rosbags.typesys.msg import normalize_msgtype
 
     kind = normalize_msgtype(channel.type)
     if channel.schema.strip():
         store = get_typestore(Stores.EMPTY)
-        store.register(_definitions(channel, kind))
+        try:
+            store.register(_definitions(channel, kind))
+        except TypesysError as fault:
+            raise ValueError(f"the definition of {channel.type} cannot be read: {_line(fault)}") from fault
         stores = [store]
     else:
         stores = [get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.LATEST)]
@@ -95,25 +98,18 @@ def _telling(read: Decode, error: type[Exception]) -> Decode:
 
 
 def _definitions(channel: Channel, kind: str) -> Any:
-    from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
-    try:
-        return _parsed(channel, kind, get_types_from_msg, get_types_from_idl)
-    except TypesysError as fault:
-        raise ValueError(f"the definition of {channel.type} cannot be read: {fault}") from fault
-
-
-def _parsed(channel: Channel, kind: str, from_msg: Callable[..., Any], from_idl: Callable[..., Any]) -> Any:
     text = channel.schema.decode("utf-8")
     if channel.schema_encoding in ("ros1msg", "ros2msg"):
-        return from_msg(text, kind)
+        return get_types_from_msg(text, kind)
     if channel.schema_encoding != "ros2idl":
         raise ValueError(f"definitions written as {channel.schema_encoding!r} cannot be read")
     if not text.startswith(IDL_SEPARATOR):
-        return from_idl(text)
+        return get_types_from_idl(text)
     types: dict[str, Any] = {}
     for part in text.split(IDL_SEPARATOR)[1:]:
-        types |= from_idl(part.partition("\n")[2])  # the first line names the type
+        types |= get_types_from_idl(part.partition("\n")[2])  # the first line names the type
     return types
 
 

@@ -105,7 +105,7 @@ def _measure(bag: Bag) -> tuple[dict[str, _Topic], bool]:
         read, messages = read + len(record.data), messages + 1
         if read > MAX_BYTES or messages > MAX_MESSAGES:
             return topics, False
-        topic = topics[record.channel.topic]
+        topic = topics.setdefault(record.channel.topic, _Topic(Track(record.channel.topic)))
         try:
             message = None if topic.fault else decode(record.channel, record.data, str(bag.path))
             topic.track.add(record.channel, record.log_ns, place, message)
