@@ -153,7 +153,9 @@ class Sync(_Model):
     """How streams of different rates meet: on the primary camera's frames, or on a fixed grid."""
 
     primary: str | None = Field(None, description="the camera whose frames are the grid; default the first")
-    rate_hz: Number | None = Field(None, gt=0, description="a fixed grid instead of a camera's frames")
+    rate_hz: Number | None = Field(
+        None, gt=0, le=100_000, description="a fixed grid instead of a camera's frames"
+    )
     images: Method = "nearest"
     actions: Method = "hold"
     states: Method = "interpolate"
@@ -182,7 +184,7 @@ class Embodiment(_Model):
     frequency_hz: Number | Literal["unknown"] | None = Field(
         description="control rate of the recording; null only with per-recording timestamps"
     )
-    target_hz: Number = Field(2.0, gt=0)
+    target_hz: Number = Field(2.0, ge=0.001, le=100_000)
     stride_override: Count | None = Field(None, alias="stride", ge=1)
     action: Action
     state: Vector | None = None
@@ -342,9 +344,9 @@ def problems(values: Any) -> list[str]:
     except ValidationError as fault:
         open_paths = {path for path, _ in todos(values)}
         for item in fault.errors(include_url=False):
-            path = _yaml_path(item["loc"])
-            if path not in open_paths:
-                found.append(_problem(path, item, values))
+            path = _yaml_path(item["loc"], values, missing=item["type"] == "missing")
+            if path not in open_paths and not _follows_from_another(item):
+                found.append(_problem(path, item))
     return list(dict.fromkeys(found))
 
 
@@ -363,19 +365,25 @@ def todos(values: Any, path: str = "") -> list[tuple[str, str]]:
     return []
 
 
-def _yaml_path(location: tuple[int | str, ...]) -> str:
-    path = ""
-    for part in location:
-        if isinstance(part, int):
+def _yaml_path(location: tuple[int | str, ...], values: Any, missing: bool) -> str:
+    """The place as the YAML has it; pydantic also names the branch of a union, which is no key."""
+    path, here = "", values
+    for i, part in enumerate(location):
+        if isinstance(here, dict) and (part in here or (missing and i == len(location) - 1)):
+            path += f".{part}" if path else str(part)
+            here = here.get(part)
+        elif isinstance(here, list | tuple) and isinstance(part, int):
             path += f"[{part}]"
-        elif not re.search(
-            r"[\[\]()|]|^(float|int|str|literal|tuple|constrained)", part
-        ):  # pydantic's union branches
-            path += f".{part}" if path else part
+            here = here[part] if part < len(here) else None
     return path
 
 
-def _problem(path: str, item: Any, values: Any) -> str:
+def _follows_from_another(item: Any) -> bool:
+    """A list whose items are all wrong is also too short, says pydantic."""
+    return item["type"] == "too_short" and bool(item["input"])
+
+
+def _problem(path: str, item: Any) -> str:
     value = item.get("input")
     message = item["msg"].removeprefix("Value error, ")
     if item["type"] == "missing":
@@ -432,19 +440,28 @@ def find(name_or_path: str, beside: Path | None = None) -> Embodiment:
     if name_or_path.endswith((".yaml", ".yml")) or os.sep in name_or_path:
         return Embodiment.load(name_or_path)
     folders = registry_folders(beside)
-    for path in registry_files(folders):
-        name = path.parent.name if path.stem == "embodiment" else path.stem
-        if name == name_or_path:
-            embodiment = Embodiment.load(path)
+    for folder in folders:
+        paths = [path for path in registry_files([folder]) if _file_id(path) == name_or_path]
+        if len(paths) > 1:
+            raise RegistryError(paths[1], f"has the id of {paths[0]}", "remove or rename one")
+        if paths:
+            embodiment = Embodiment.load(paths[0])
             if embodiment.id != name_or_path:
-                raise RegistryError(path, f"has id {embodiment.id!r}", "file name and id must be the same")
+                raise RegistryError(
+                    paths[0], f"has id {embodiment.id!r}", "file name and id must be the same"
+                )
             return embodiment
     from difflib import get_close_matches
 
-    near = get_close_matches(name_or_path, [path.stem for path in registry_files(folders)], n=3)
+    near = get_close_matches(name_or_path, [_file_id(path) for path in registry_files(folders)], n=3)
     hint = f"did you mean {', '.join(near)}? " if near else ""
     raise RegistryError(
         f"embodiment {name_or_path!r}",
         f"is not in {', '.join(map(str, folders)) or 'any registry folder'}",
         f"{hint}give a YAML file's path, or set HMA_REGISTRY; hma registry list shows all",
     )
+
+
+def _file_id(path: Path) -> str:
+    """The id a registry file is found by; a checkpoint keeps each in a folder of its own."""
+    return path.parent.name if path.stem == "embodiment" else path.stem

@@ -1,6 +1,6 @@
 """YAML as we accept it: plain values only, no surprises.
 
-No tags, no anchors or aliases (nothing that can grow), no duplicate keys, no tabs, at most
+No tags, no anchors, aliases or merges (nothing that can grow), no duplicate keys, no tabs, at most
 1 MB. Every refusal names the file and the line.
 """
 
@@ -21,17 +21,13 @@ class _PlainLoader(yaml.SafeLoader):
     depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent) or getattr(self.peek_event(), "anchor", None):
-            raise yaml.constructor.ConstructorError(
-                None,
-                None,
-                "anchors and aliases are not accepted: write the value out",
-                self.peek_event().start_mark,
-            )
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+            raise _refused("anchors and aliases are not accepted: write the value out", event)
+        if getattr(event, "tag", None):
+            raise _refused(f"tags are not accepted, here {event.tag}: write the plain value", event)
         if self.depth >= MAX_DEPTH:
-            raise yaml.constructor.ConstructorError(
-                None, None, f"nested deeper than {MAX_DEPTH}", self.peek_event().start_mark
-            )
+            raise _refused(f"nested deeper than {MAX_DEPTH}", event)
         self.depth += 1
         try:
             return super().compose_node(parent, index)
@@ -42,15 +38,17 @@ class _PlainLoader(yaml.SafeLoader):
         seen: set[str] = set()
         for key_node, _ in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(
-                    None, None, "a key must be a word", key_node.start_mark
-                )
+                raise _refused("a key must be a word", key_node)
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                raise _refused("merge keys << are not accepted: write the values out", key_node)
             if key_node.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key_node.value!r} is given twice", key_node.start_mark
-                )
+                raise _refused(f"key {key_node.value!r} is given twice", key_node)
             seen.add(key_node.value)
         return super().construct_mapping(node, deep)
+
+
+def _refused(fault: str, at: Any) -> yaml.MarkedYAMLError:
+    return yaml.constructor.ConstructorError(None, None, fault, at.start_mark)
 
 
 def parse_yaml(text: str, where: str, error: type[HMAError] = RegistryError) -> Any:
