@@ -1,4 +1,4 @@
-"""One short recording, written as every kind of bag by the formats' own writers.
+"""One short recording, written as every kind of bag by the formats' own writers, and its embodiment.
 
 A camera of 10 Hz and joints of 50 Hz with header stamps, received 5 ms late; commands of 25 Hz
 without a header.
@@ -19,6 +19,10 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
+
+from hma_data.embodiment import Embodiment
+from hma_data.episode import Episode
+from hma_data.sources.base import open_source
 
 START_NS = 1_700_000_000_000_000_000
 LATE_NS = 5_000_000
@@ -299,3 +303,34 @@ KINDS: dict[str, Callable[[Path, Recording], Path]] = {
     "mcap-channels-not-repeated": lambda d, r: write_mcap(d / "run.mcap", r, as_cdr(), repeat_channels=False),
     "mcap-without-statistics": lambda d, r: write_mcap(d / "run.mcap", r, as_cdr(), use_statistics=False),
 }  # fmt: skip
+
+
+YAML = f"""
+id: test_arm
+kind: real
+frequency_hz: 10
+action:
+  space: joint_position
+  components:
+    - {{key: {COMMAND}.data, dims: 2}}
+    - {{key: {STATE}.position, dims: 2, names: [wrist, shoulder]}}
+state: {{components: [{{key: "{STATE}.position[0:2]", dims: 2, sign: -1, offset: 0.5}}]}}
+cameras: [{{name: front, key: {CAMERA}}}]
+sync: {{max_skew_ms: 60}}
+source: {{format: rosbag}}
+"""
+
+
+def arm(text: str = YAML, **changes: str) -> Embodiment:
+    """The embodiment of the recording, with pieces of its YAML replaced."""
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    return Embodiment.from_yaml(text)
+
+
+SOURCE = open_source("rosbag")
+
+
+def read(path: Path, embodiment: Embodiment) -> Episode:
+    """The first bag at that path."""
+    return SOURCE.read(str(path), SOURCE.episode_ids(str(path))[0], embodiment)

@@ -1,88 +1,36 @@
-"""Bags against the formats' own writers and readers, and against damage."""
+"""Bags against the formats' own writers: every kind, keys, folders."""
 
-import contextlib
 import json
 import re
 import shutil
-import sqlite3
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from mcap.reader import NonSeekingReader, make_reader
-from rosbags.rosbag1 import Reader as Ros1Reader
+from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment
-from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
-from hma_data.sources.bags.messages import decode, numbers
-from hma_data.sources.bags.pictures import picture
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.bags.messages import decode
+from hma_data.sources.base import detect
 from tests.data.bag_files import (
     CAMERA,
     COMMAND,
     JOINTS,
     KINDS,
     LATE_NS,
+    SOURCE,
     STATE,
     Recording,
+    arm,
     make_recording,
+    read,
     write_ros1,
 )
-
-YAML = f"""
-id: test_arm
-kind: real
-frequency_hz: 10
-action:
-  space: joint_position
-  components:
-    - {{key: {COMMAND}.data, dims: 2}}
-    - {{key: {STATE}.position, dims: 2, names: [wrist, shoulder]}}
-state: {{components: [{{key: "{STATE}.position[0:2]", dims: 2, sign: -1, offset: 0.5}}]}}
-cameras: [{{name: front, key: {CAMERA}}}]
-sync: {{max_skew_ms: 60}}
-source: {{format: rosbag}}
-"""
-
-
-def arm(text: str = YAML, **changes: str) -> Embodiment:
-    for old, new in changes.items():
-        text = text.replace(old, new)
-    return Embodiment.from_yaml(text)
-
-
-@pytest.fixture(scope="module")
-def recording() -> Recording:
-    return make_recording()
-
-
-@pytest.fixture(scope="module")
-def bags(tmp_path_factory: pytest.TempPathFactory, recording: Recording) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("bags")
-    made = {}
-    for kind, write in KINDS.items():
-        (folder / kind).mkdir()
-        made[kind] = write(folder / kind, recording)
-    return made
-
-
-SOURCE = open_source("rosbag")
-
-
-def read(path: Path, embodiment: Embodiment) -> Any:
-    return SOURCE.read(str(path), SOURCE.episode_ids(str(path))[0], embodiment)
-
-
-# -- the same recording in every container and encoding
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -187,9 +135,6 @@ def test_messages_out_of_order_come_in_order_of_receipt(tmp_path: Path) -> None:
         track.add(record.channel, record.log_ns, place, message)
         values.append(message["value"])
     assert [values[i] for i in track.order()] == expected == list(range(50))
-
-
-# -- keys
 
 
 @pytest.fixture
@@ -304,174 +249,6 @@ def test_a_missing_camera_or_one_without_pictures_is_told(numbers_bag: Path) -> 
         read(numbers_bag, Embodiment.from_yaml(text))
 
 
-# -- pictures
-
-
-def image(encoding: str, data: np.ndarray, width: int, height: int, step: int) -> dict[str, Any]:
-    flat = np.frombuffer(data.tobytes(), np.uint8)
-    return {"encoding": encoding, "width": width, "height": height, "step": step, "data": flat}
-
-
-def smooth(height: int = 16, width: int = 24) -> np.ndarray:
-    y, x = np.mgrid[:height, :width]
-    return np.stack([x * 8, y * 12, 255 - x * 5 - y * 4], -1).astype(np.uint8)
-
-
-@pytest.mark.parametrize("padding", [0, 5])
-def test_raw_encodings_become_rgb(padding: int) -> None:
-    rgb = smooth()
-    height, width = rgb.shape[:2]
-    alpha = np.full((height, width, 1), 7, np.uint8)
-    for encoding, pixels in {
-        "rgb8": rgb,
-        "bgr8": rgb[..., ::-1],
-        "rgba8": np.concatenate([rgb, alpha], -1),
-        "bgra8": np.concatenate([rgb[..., ::-1], alpha], -1),
-    }.items():
-        rows = pixels.reshape(height, -1)
-        rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=99)
-        found = picture(image(encoding, rows, width, height, rows.shape[1]), "raw", "")
-        np.testing.assert_array_equal(found, rgb, err_msg=encoding)
-    grey = picture(image("mono8", rgb[..., 0], width, height, width), "raw", "")
-    np.testing.assert_array_equal(grey, np.repeat(rgb[..., :1], 3, -1))
-
-
-@pytest.mark.parametrize(
-    ("encoding", "corners"), [("rggb", "RGGB"), ("bggr", "BGGR"), ("gbrg", "GBRG"), ("grbg", "GRBG")]
-)
-def test_bayer_patterns_keep_the_colours_in_place(encoding: str, corners: str) -> None:
-    rgb = smooth()
-    mosaic = np.zeros(rgb.shape[:2], np.uint8)
-    for i, colour in enumerate(corners):
-        mosaic[i // 2 :: 2, i % 2 :: 2] = rgb[i // 2 :: 2, i % 2 :: 2, "RGB".index(colour)]
-    found = picture(image(f"bayer_{encoding}8", mosaic, 24, 16, 24), "raw", "")
-    assert np.abs(found[2:-2, 2:-2].astype(int) - rgb[2:-2, 2:-2]).max() <= 6
-
-
-@pytest.mark.parametrize(("encoding", "luma"), [("yuv422", 1), ("yuv422_yuy2", 0)])
-def test_yuv_is_the_inverse_of_the_standard_conversion(encoding: str, luma: int) -> None:
-    """Rec. 601, studio range: grey of luma 126 is 128; a red sample is red."""
-    packed = np.zeros((2, 4, 2), np.uint8)
-    packed[..., luma], packed[..., 1 - luma] = 126, 128
-    grey = picture(image(encoding, packed, 4, 2, 8), "raw", "")
-    np.testing.assert_allclose(grey, 128, atol=1)
-    packed[..., luma], packed[:, ::2, 1 - luma], packed[:, 1::2, 1 - luma] = 81, 90, 240
-    np.testing.assert_allclose(
-        picture(image(encoding, packed, 4, 2, 8), "raw", "")[0, 0], [254, 0, 0], atol=2
-    )
-
-
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "mono16", "rgb16", ""])
-def test_what_is_no_8_bit_colour_is_refused(encoding: str) -> None:
-    with pytest.raises(EpisodeError, match=r"not 8-bit colour.*rgb8"):
-        picture(image(encoding, np.zeros(32, np.uint8), 4, 4, 8), "raw", "depth")
-
-
-@pytest.mark.parametrize(
-    "broken",
-    [
-        {"data": np.zeros(5, np.uint8)},
-        {"width": 10**6, "height": 10**6},
-        {"step": 3},
-        {"height": 0},
-        {"width": -4},
-        {"width": None},
-    ],
-)
-def test_a_raw_picture_that_does_not_fit_is_refused(broken: dict[str, Any]) -> None:
-    message = image("rgb8", np.zeros(48, np.uint8), 4, 4, 12) | broken
-    with pytest.raises(EpisodeError):
-        picture(message, "raw", "camera")
-
-
-def test_compressed_depth_is_refused_and_jpeg_is_decoded() -> None:
-    jpeg = cv2.imencode(".jpg", smooth())[1]
-    found = picture({"format": "rgb8; jpeg compressed bgr8", "data": jpeg.reshape(-1)}, "still", "")
-    np.testing.assert_array_equal(found, cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1])
-    with pytest.raises(EpisodeError, match="depth"):
-        picture({"format": "16UC1; compressedDepth png", "data": jpeg.reshape(-1)}, "still", "")
-    for data in (b"no picture", "n@t base64", 5):
-        with pytest.raises(EpisodeError):
-            picture({"format": "jpeg", "data": data}, "still", "")
-
-
-def write_video(path: Path, codec: str, name: str, options: dict[str, str], drop: int = 0) -> np.ndarray:
-    """An MCAP of CompressedVideo, one frame a message; the pictures that went in."""
-    import base64
-
-    import av
-    from mcap.writer import Writer
-
-    y, x = np.mgrid[:64, :96]
-    pictures = np.stack([np.stack([x * 2, y * 3, np.full_like(x, 8 * i)], -1) for i in range(30)]).astype(
-        np.uint8
-    )
-    encoder = av.CodecContext.create(codec, "w")
-    encoder.width, encoder.height, encoder.pix_fmt = 96, 64, "yuv420p"
-    encoder.time_base = Fraction(1, 30)
-    encoder.options = options
-    packets = []
-    for i, pixels in enumerate(pictures):
-        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p")
-        frame.pts = i
-        packets += encoder.encode(frame)
-    packets += encoder.encode(None)
-    assert len(packets) == 30
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4096)
-        writer.start()
-        schema = writer.register_schema("foxglove.CompressedVideo", "jsonschema", b"{}")
-        channel = writer.register_channel("/video", "json", schema)
-        number = writer.register_channel("/n", "json", 0)
-        for i, packet in list(enumerate(packets))[drop:]:
-            text = {
-                "timestamp": {"sec": 1 + i, "nsec": 0},
-                "format": name,
-                "data": base64.b64encode(bytes(packet)).decode(),
-            }
-            writer.add_message(channel, i + 1, json.dumps(text).encode(), i)
-            writer.add_message(number, i + 1, b'{"value": 1}', i)
-        writer.finish()
-    return pictures
-
-
-VIDEO_YAML = """
-id: video
-kind: real
-frequency_hz: 30
-action: {space: mixed, components: [{key: /n.value, dims: 1}]}
-cameras: [{name: cam, key: /video}]
-source: {format: rosbag}
-"""
-LOW_DELAY = {"preset": "ultrafast", "tune": "zerolatency", "g": "10", "crf": "10"}
-
-
-@pytest.mark.parametrize(("codec", "name"), [("libx264", "h264"), ("libx265", "h265")])
-def test_video_gives_the_asked_frames_in_any_order(tmp_path: Path, codec: str, name: str) -> None:
-    options = LOW_DELAY | ({"x265-params": "log-level=none:keyint=10:bframes=0"} if name == "h265" else {})
-    pictures = write_video(tmp_path / "v.mcap", codec, name, options)
-    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
-    for indices in ([0, 1, 2], [3, 7, 7], [25, 29], [12], [5, 4], [11, 28]):
-        found = stream.frames(indices).astype(int)
-        assert np.abs(found - pictures[indices]).mean() < 4, indices
-
-
-def test_video_begins_at_its_first_key_frame(tmp_path: Path) -> None:
-    pictures = write_video(tmp_path / "v.mcap", "libx264", "h264", LOW_DELAY, drop=4)
-    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
-    assert stream.timestamps[0] == 11
-    assert np.abs(stream.frames([0]).astype(int) - pictures[10]).mean() < 4
-
-
-def test_unknown_video_is_refused(tmp_path: Path) -> None:
-    write_video(tmp_path / "v.mcap", "libx264", "mjpeg2000", LOW_DELAY)
-    with pytest.raises(EpisodeError, match=r"'mjpeg2000' cannot be read.*h264"):
-        read(tmp_path / "v.mcap", arm(VIDEO_YAML))
-
-
-# -- folders
-
-
 def test_a_folder_of_bags_is_many_episodes(bags: dict[str, Path], tmp_path: Path) -> None:
     (tmp_path / "day1").mkdir()
     for name, kind in {"day1/a.bag": "ros1", "b.bag": "ros1-lz4", "b.mcap": "mcap-json"}.items():
@@ -533,145 +310,6 @@ def test_a_listed_file_that_is_missing_is_told(bags: dict[str, Path], tmp_path: 
         read(tmp_path / "bag", arm())
 
 
-# -- damage
-
-
-def touch_everything(path: Path) -> None:
-    """Whatever a job would do with the bag."""
-    SOURCE.index(str(path), arm())
-    with contextlib.suppress(HMAError):
-        SOURCE.inspect(str(path))
-    episode = read(path, arm())
-    episode.streams["front"].frames(range(len(episode.streams["front"].timestamps)))
-
-
-SINGLE = {"ros1": "ros1", "ros1-bz2": "ros1", "ros1-lz4": "ros1", "mcap-cdr-zstd": "", "mcap-json": "",
-          "mcap-without-chunks": "", "mcap-protobuf": "", "db3": ""}  # fmt: skip
-PATIENT = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
-
-
-def single(bags: dict[str, Path], kind: str) -> bytes:
-    path = bags["ros2-sqlite3"] / "run.db3" if kind == "db3" else bags[kind]
-    return path.read_bytes()
-
-
-@pytest.mark.parametrize("kind", SINGLE)
-@PATIENT
-@given(share=st.floats(0, 1, exclude_max=True))
-def test_a_bag_cut_off_anywhere_is_refused(
-    kind: str, share: float, bags: dict[str, Path], tmp_path: Path
-) -> None:
-    whole = single(bags, kind)
-    path = tmp_path / "cut.bag"
-    path.write_bytes(whole[: int(len(whole) * share)])
-    with pytest.raises(EpisodeError) as fault:
-        touch_everything(path)
-    assert "\n" not in str(fault.value)
-
-
-@pytest.mark.parametrize("kind", SINGLE)
-@PATIENT
-@given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7), fill=st.booleans())
-def test_a_flipped_bit_gives_an_answer_or_our_error(
-    kind: str, share: float, bit: int, fill: bool, bags: dict[str, Path], tmp_path: Path
-) -> None:
-    data = bytearray(single(bags, kind))
-    at = int(len(data) * share)
-    if fill:
-        data[at : at + 8] = b"\xff" * 8
-    else:
-        data[at] ^= 1 << bit
-    path = tmp_path / "flipped.bag"
-    path.write_bytes(data)
-    try:
-        touch_everything(path)
-    except HMAError as fault:
-        assert "\n" not in str(fault)
-
-
-def test_a_bag_that_holds_less_than_its_index_counts_is_refused(
-    bags: dict[str, Path], tmp_path: Path
-) -> None:
-    zipped = tmp_path / "zipped"
-    shutil.copytree(bags["ros2-sqlite3-file-zstd"], zipped)
-    metadata = zipped / "metadata.yaml"
-    metadata.write_text(metadata.read_text().replace("message_count: 10\n", "message_count: 12\n"))
-    with pytest.raises(EpisodeError, match=r"its index counts 12 messages of /cam/image\.raw, it holds 10"):
-        read(zipped, arm())
-
-
-def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(
-    bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from hma_data.sources.bags import container
-
-    monkeypatch.setattr(container, "MAX_CHUNK", 4000)
-    for kind in ("ros1-bz2", "mcap-cdr-zstd", "mcap-ros1-lz4"):
-        with pytest.raises(EpisodeError, match="more than 4,000"):
-            read(bags[kind], arm())
-    for codec, packed in {"zstd": _zstd(10**6), "bz2": _bz2(10**6), "lz4": _lz4(10**6)}.items():
-        with pytest.raises(ValueError, match="unpacks to"):
-            container.decompress(codec, packed, 1000)
-
-
-def _zstd(size: int) -> bytes:
-    import zstandard
-
-    return zstandard.compress(bytes(size))
-
-
-def _bz2(size: int) -> bytes:
-    import bz2
-
-    return bz2.compress(bytes(size))
-
-
-def _lz4(size: int) -> bytes:
-    import lz4.frame
-
-    return lz4.frame.compress(bytes(size))
-
-
-def test_an_sqlite_log_that_was_not_merged_is_read_too(tmp_path: Path, recording: Recording) -> None:
-    folder = KINDS["ros2-sqlite3"](tmp_path, recording)
-    database = folder / "run.db3"
-    base = sqlite3.connect(database)
-    base.execute("PRAGMA journal_mode=WAL")
-    base.execute(
-        "INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp + 1, data FROM messages"
-    )
-    base.commit()
-    killed = tmp_path / "killed"
-    shutil.copytree(folder, killed)  # as a recorder that was killed leaves it: the rows are in the log
-    base.close()
-    assert (killed / "run.db3-wal").stat().st_size > 0
-    assert SOURCE.index(str(killed), arm())[0].frames == 2 * len(recording.pictures)
-
-
-def test_reading_leaves_nothing_beside_the_bag(bags: dict[str, Path]) -> None:
-    for kind in ("ros2-sqlite3", "ros2-sqlite3-file-zstd"):
-        before = sorted(bags[kind].iterdir())
-        touch_everything(bags[kind])
-        assert sorted(bags[kind].iterdir()) == before
-
-
-def test_pictures_are_not_kept_in_memory(tmp_path: Path) -> None:
-    import tracemalloc
-
-    path = write_ros1(tmp_path / "long.bag", make_recording(400))
-    size = path.stat().st_size
-    tracemalloc.start()
-    stream = read(path, arm()).streams["front"]
-    tracemalloc.reset_peak()
-    kept = tracemalloc.get_traced_memory()[0]
-    tracemalloc.stop()
-    assert kept < size / 2
-    assert stream.frames([399]).shape == (1, 24, 32, 3)
-
-
-# -- inspect
-
-
 def test_inspect_lists_keys_as_a_yaml_names_them(bags: dict[str, Path]) -> None:
     found = SOURCE.inspect(str(bags["ros2-mcap"]))
     keys = {key.key: key for key in found.keys}
@@ -705,133 +343,3 @@ def test_inspect_tells_of_stamps_that_repeat_pause_or_go_back(tmp_path: Path) ->
         assert fault in problems
     with pytest.raises(EpisodeError, match="goes back in time"):
         to_clip(read(path, arm()), arm())
-
-
-# -- real recordings
-
-
-@pytest.mark.real
-def test_the_three_compressions_of_a_real_bag_are_equal(real_data: Path) -> None:
-    folder = real_data / "ros1" / "foxglove" / "fixtures"
-    contents = []
-    for name in ("example", "example-bz2", "example-lz4"):
-        records = [record for _, record in Bag(folder / f"{name}.bag").records()]
-        contents.append(sorted((r.channel.topic, r.log_ns, bytes(r.data)) for r in records))
-    with Ros1Reader(folder / "example.bag") as reader:
-        expected = sorted((c.topic, t, bytes(data)) for c, t, data in reader.messages())
-    assert len(expected) == 8647
-    assert contents == [expected] * 3
-
-
-@pytest.mark.real
-def test_real_joint_states_are_those_of_rosbags(real_data: Path) -> None:
-    path = real_data / "ros1" / "fake_joint_state.bag"
-    store = get_typestore(Stores.ROS1_NOETIC)
-    with Ros1Reader(path) as reader:
-        expected = [store.deserialize_ros1(data, c.msgtype).position for c, _, data in reader.messages()]
-    found = [numbers(decode(record.channel, record.data, "").position) for _, record in Bag(path).records()]
-    np.testing.assert_array_equal(found, expected)
-    assert len(found) == 2725
-
-
-@pytest.mark.real
-def test_real_ros2_bags_hold_as_many_messages_as_their_metadata_says(real_data: Path) -> None:
-    import yaml
-
-    seen = 0
-    for path in sorted((real_data / "ros2").rglob("metadata.yaml")):
-        stated = yaml.safe_load(path.read_text())["rosbag2_bagfile_information"]
-        found = sum(1 for _ in Bag(path.parent).records())
-        assert found == stated["message_count"] == Bag(path.parent).counts().total(), path
-        seen += 1
-    assert seen >= 15
-
-
-@pytest.mark.real
-def test_ros2_twins_in_sqlite_and_mcap_hold_the_same_values(real_data: Path) -> None:
-    folder = real_data / "ros2" / "rosbag2" / "rosbag2_tests" / "resources"
-    store = get_typestore(Stores.ROS2_JAZZY)
-    raw = [
-        sorted(
-            (r.channel.topic, r.log_ns, bytes(r.data)) for _, r in Bag(folder / kind / "cdr_test").records()
-        )
-        for kind in ("mcap", "sqlite3")
-    ]
-    assert raw[0] == raw[1] and store
-    values = [
-        decode(record.channel, record.data, "").float64_values.tolist()
-        for _, record in Bag(folder / "mcap" / "cdr_test").records(frozenset({"/array_topic"}))
-    ]
-    assert len(values) == 4 and all(len(value) == 3 for value in values)
-
-
-@pytest.mark.real
-def test_the_conformance_suite_of_mcap_reads_as_its_json_says(real_data: Path) -> None:
-    folder = real_data / "mcap" / "conformance" / "data"
-    paths = sorted(folder.rglob("*.mcap"))
-    assert len(paths) == 416
-    for path in paths:
-        stated = json.loads(path.with_suffix(".json").read_text())["records"]
-        fields = [dict(record["fields"]) for record in stated if record["type"] == "Message"]
-        expected = [(int(f["log_time"]), bytes(int(b) for b in f["data"])) for f in fields]
-        bag = Bag(path)
-        found = [(place, record) for place, record in bag.records()]
-        assert [(r.log_ns, bytes(r.data)) for _, r in found] == expected, path.name
-        assert [bytes(data) for data in bag.payloads([place for place, _ in found])] == [
-            d for _, d in expected
-        ]
-        assert bag.counts().total() == len(expected), path.name
-        with path.open("rb") as file:
-            messages = NonSeekingReader(file).iter_messages(log_time_order=False)
-            assert [(r.channel.topic, r.log_ns) for _, r in found] == [
-                (c.topic, m.log_time) for _, c, m in messages
-            ]
-
-
-CALIBRATION = """
-id: camera_model
-kind: real
-frequency_hz: 10
-action:
-  space: mixed
-  components:
-    - {key: "/camera_calibration.K", dims: 9}
-    - {key: "/camera_calibration/custom.D[0:2]", dims: 2}
-state: {components: [{key: /camera_calibration.width, dims: 1}]}
-cameras: [{name: cam, key: /image/compressed}]
-sync: {max_skew_ms: 20}
-source: {format: rosbag}
-"""
-
-
-@pytest.mark.real
-def test_a_real_recording_with_pictures_becomes_a_clip(real_data: Path) -> None:
-    path = real_data / "mcap" / "custom-camera-model.mcap"
-    with path.open("rb") as file:
-        messages = [(c.topic, json.loads(m.data)) for _, c, m in make_reader(file).iter_messages()]
-    embodiment = arm(CALIBRATION)
-    assert SOURCE.index(str(path), embodiment)[0].frames == 10
-    clip = to_clip(read(path, embodiment), embodiment)
-    calibrations = [m for topic, m in messages if topic == "/camera_calibration"]
-    np.testing.assert_array_equal(clip.actions[:, :9], np.float32([m["K"] for m in calibrations]))
-    np.testing.assert_array_equal(clip.actions[:, 9:], np.float32([[-0.2, 0.1]] * 10))
-    np.testing.assert_array_equal(clip.states, np.float32([[m["width"]] for m in calibrations]))
-    frames = clip.frames_at("cam", np.arange(len(clip)))
-    assert frames.shape == (10, 360, 520, 3)
-    import base64
-
-    first = base64.b64decode(next(m["data"] for topic, m in messages if topic == "/image/compressed"))
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    expected = cv2.imdecode(np.frombuffer(first, np.uint8), flags)[..., ::-1]
-    np.testing.assert_array_equal(frames[0], expected)
-
-
-@pytest.mark.real
-def test_an_empty_bag_and_one_without_messages_are_told(real_data: Path) -> None:
-    folder = real_data / "ros1" / "foxglove" / "fixtures"
-    with pytest.raises(SourceError, match="is empty"):
-        SOURCE.inspect(str(folder / "empty-file.bag"))
-    with pytest.raises(SourceError, match="no bag holds a message"):
-        SOURCE.inspect(str(folder / "no-messages.bag"))
-    with pytest.raises(EpisodeError, match="it has no topics"):
-        read(folder / "no-messages.bag", arm())

@@ -1,0 +1,154 @@
+"""Bags cut off, flipped, bombs, and what reading leaves behind."""
+
+import contextlib
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hma_data.errors import EpisodeError, HMAError
+from tests.data.bag_files import (
+    KINDS,
+    SOURCE,
+    Recording,
+    arm,
+    make_recording,
+    read,
+    write_ros1,
+)
+
+
+def touch_everything(path: Path) -> None:
+    """Whatever a job would do with the bag."""
+    SOURCE.index(str(path), arm())
+    with contextlib.suppress(HMAError):
+        SOURCE.inspect(str(path))
+    episode = read(path, arm())
+    episode.streams["front"].frames(range(len(episode.streams["front"].timestamps)))
+
+
+SINGLE = {"ros1": "ros1", "ros1-bz2": "ros1", "ros1-lz4": "ros1", "mcap-cdr-zstd": "", "mcap-json": "",
+          "mcap-without-chunks": "", "mcap-protobuf": "", "db3": ""}  # fmt: skip
+PATIENT = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+
+
+def single(bags: dict[str, Path], kind: str) -> bytes:
+    path = bags["ros2-sqlite3"] / "run.db3" if kind == "db3" else bags[kind]
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("kind", SINGLE)
+@PATIENT
+@given(share=st.floats(0, 1, exclude_max=True))
+def test_a_bag_cut_off_anywhere_is_refused(
+    kind: str, share: float, bags: dict[str, Path], tmp_path: Path
+) -> None:
+    whole = single(bags, kind)
+    path = tmp_path / "cut.bag"
+    path.write_bytes(whole[: int(len(whole) * share)])
+    with pytest.raises(EpisodeError) as fault:
+        touch_everything(path)
+    assert "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize("kind", SINGLE)
+@PATIENT
+@given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7), fill=st.booleans())
+def test_a_flipped_bit_gives_an_answer_or_our_error(
+    kind: str, share: float, bit: int, fill: bool, bags: dict[str, Path], tmp_path: Path
+) -> None:
+    data = bytearray(single(bags, kind))
+    at = int(len(data) * share)
+    if fill:
+        data[at : at + 8] = b"\xff" * 8
+    else:
+        data[at] ^= 1 << bit
+    path = tmp_path / "flipped.bag"
+    path.write_bytes(data)
+    try:
+        touch_everything(path)
+    except HMAError as fault:
+        assert "\n" not in str(fault)
+
+
+def test_a_bag_that_holds_less_than_its_index_counts_is_refused(
+    bags: dict[str, Path], tmp_path: Path
+) -> None:
+    zipped = tmp_path / "zipped"
+    shutil.copytree(bags["ros2-sqlite3-file-zstd"], zipped)
+    metadata = zipped / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("message_count: 10\n", "message_count: 12\n"))
+    with pytest.raises(EpisodeError, match=r"its index counts 12 messages of /cam/image\.raw, it holds 10"):
+        read(zipped, arm())
+
+
+def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(
+    bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hma_data.sources.bags import container
+
+    monkeypatch.setattr(container, "MAX_CHUNK", 4000)
+    for kind in ("ros1-bz2", "mcap-cdr-zstd", "mcap-ros1-lz4"):
+        with pytest.raises(EpisodeError, match="more than 4,000"):
+            read(bags[kind], arm())
+    for codec, packed in {"zstd": _zstd(10**6), "bz2": _bz2(10**6), "lz4": _lz4(10**6)}.items():
+        with pytest.raises(ValueError, match="unpacks to"):
+            container.decompress(codec, packed, 1000)
+
+
+def _zstd(size: int) -> bytes:
+    import zstandard
+
+    return zstandard.compress(bytes(size))
+
+
+def _bz2(size: int) -> bytes:
+    import bz2
+
+    return bz2.compress(bytes(size))
+
+
+def _lz4(size: int) -> bytes:
+    import lz4.frame
+
+    return lz4.frame.compress(bytes(size))
+
+
+def test_an_sqlite_log_that_was_not_merged_is_read_too(tmp_path: Path, recording: Recording) -> None:
+    folder = KINDS["ros2-sqlite3"](tmp_path, recording)
+    database = folder / "run.db3"
+    base = sqlite3.connect(database)
+    base.execute("PRAGMA journal_mode=WAL")
+    base.execute(
+        "INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp + 1, data FROM messages"
+    )
+    base.commit()
+    killed = tmp_path / "killed"
+    shutil.copytree(folder, killed)  # as a recorder that was killed leaves it: the rows are in the log
+    base.close()
+    assert (killed / "run.db3-wal").stat().st_size > 0
+    assert SOURCE.index(str(killed), arm())[0].frames == 2 * len(recording.pictures)
+
+
+def test_reading_leaves_nothing_beside_the_bag(bags: dict[str, Path]) -> None:
+    for kind in ("ros2-sqlite3", "ros2-sqlite3-file-zstd"):
+        before = sorted(bags[kind].iterdir())
+        touch_everything(bags[kind])
+        assert sorted(bags[kind].iterdir()) == before
+
+
+def test_pictures_are_not_kept_in_memory(tmp_path: Path) -> None:
+    import tracemalloc
+
+    path = write_ros1(tmp_path / "long.bag", make_recording(400))
+    size = path.stat().st_size
+    tracemalloc.start()
+    stream = read(path, arm()).streams["front"]
+    tracemalloc.reset_peak()
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert kept < size / 2
+    assert stream.frames([399]).shape == (1, 24, 32, 3)
