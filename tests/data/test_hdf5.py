@@ -17,41 +17,7 @@ from hma_data.embodiment import Embodiment
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.base import detect, open_source
 from hma_data.sources.hdf5_file import rows
-
-T, H, W = 9, 12, 16
-
-
-def embodiment(**changes: Any) -> Embodiment:
-    """An arm of robomimic's layout, with changes by `section__key`."""
-    values: dict[str, Any] = {
-        "id": "test_arm",
-        "kind": "simulation",
-        "frequency_hz": 20,
-        "action": {"space": "eef_delta", "components": [{"key": "actions", "dims": 3}]},
-        "cameras": [{"name": "front", "key": "obs/agentview_image"}],
-        "source": {"format": "hdf5"},
-    }
-    for path, value in changes.items():
-        *parents, last = path.split("__")
-        holder = values
-        for part in parents:
-            holder = holder[part]
-        holder[last] = value
-    return Embodiment.from_values(values, "test")
-
-
-def pictures(length: int = T, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (length, H, W, 3), dtype=np.uint8)
-
-
-def fill(group: h5py.Group, length: int = T, seed: int = 0) -> None:
-    """An episode of robomimic's layout."""
-    group["actions"] = np.random.default_rng(seed).normal(size=(length, 3))
-    group["rewards"] = np.zeros(length)
-    group["dones"] = np.arange(length) == length - 1
-    group.create_dataset(
-        "obs/agentview_image", data=pictures(length, seed), chunks=(4, H, W, 3), compression="gzip"
-    )
+from tests.data.hdf5_files import H, T, W, embodiment, fill
 
 
 @pytest.fixture
