@@ -1,0 +1,328 @@
+"""Publish and pull checkpoints, one embodiment at a time.
+
+A hub is a folder, any fsspec URI, or a repository of the Hugging Face Hub; all hold the layout of
+`hma_model.checkpoint`. `org/name` is a repository, `hf://org/name` too; `./org/name` or any other path is a
+folder. A push touches the files of its embodiments and README.md, and the trunk only when there is none yet.
+"""
+
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from hma_data.embodiment import ID_PATTERN
+from hma_data.errors import CheckpointError, HMAError, HubError
+from hma_model import checkpoint as checkpoints
+from hma_model.checkpoint import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
+from hma_model.files import parse_json
+from hma_model.model_card import render
+
+if TYPE_CHECKING:
+    import torch
+
+    from hma_model.model import HMA
+
+Content = Path | bytes
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
+
+
+class Store(Protocol):
+    """Where a checkpoint is published."""
+
+    name: str  # for errors
+
+    @property
+    def repo(self) -> str | None:
+        """For the model card; None where it is only a path."""
+        ...
+
+    def files(self) -> dict[str, int]:
+        """Sizes by name of what is there."""
+        ...
+
+    def read(self, name: str) -> bytes:
+        """A small file."""
+        ...
+
+    def publish(self, changes: Callable[[], Mapping[str, Content]], message: str) -> str:
+        """Put files in place and return the address; `changes` is asked again if somebody else was faster."""
+        ...
+
+    def pull(self, names: list[str], out: Path | None) -> Path:
+        """Bring files here, card last; returns their folder."""
+        ...
+
+
+def open_store(address: str | Path, revision: str | None = None, write: bool = False) -> Store:
+    """The hub behind an address.
+
+    Raises:
+        HubError: it is not there, or cannot be reached.
+    """
+    if is_repository(address):
+        from hma_model.hub_hf import HuggingFaceStore
+
+        return HuggingFaceStore(str(address).removeprefix("hf://"), revision, write)
+    from hma_model.hub_folder import FolderStore
+
+    if revision is not None:
+        raise HubError(address, f"is a folder, and has no revision {revision!r}", "leave the revision out")
+    return FolderStore(address, write)
+
+
+def is_repository(address: str | Path) -> bool:
+    """Whether an address means a repository of the hub: hf://org/name, or org/name that is no folder here."""
+    if isinstance(address, Path):
+        return False
+    if address.startswith("hf://"):
+        if not _REPOSITORY.fullmatch(address.removeprefix("hf://")):
+            raise HubError(address, "is not hf://ORGANISATION/NAME", "name a model repository")
+        return True
+    return _REPOSITORY.fullmatch(address) is not None and not Path(address).is_dir()
+
+
+def push(checkpoint: str | Path, target: str | Path, embodiments: Iterable[str] | None = None) -> str:
+    """Publish embodiments of a checkpoint, with the trunk where there is none yet.
+
+    Args:
+        checkpoint: its folder, or that of a training run.
+        target: a folder, a URI, or a repository; made where it is not there.
+        embodiments: ids; None for all.
+
+    Returns:
+        Where it is now: a path, URI or web address.
+
+    Raises:
+        CheckpointError: the checkpoint's parts do not belong together, or it lacks an embodiment.
+        HubError: what is there has another trunk or is something else, or it cannot be reached or written.
+    """
+    source = Checkpoint.open(checkpoint)
+    ids = sorted(set(source.embodiments if embodiments is None else embodiments))
+    source.trunk()
+    for name in ids:
+        source.check(name)
+    store = open_store(target, write=True)
+
+    def changes() -> dict[str, Content]:
+        return _changes(source, ids, store)
+
+    return store.publish(changes, f"Add {', '.join(ids)}" if ids else "Add the trunk")
+
+
+def pull(
+    source: str | Path,
+    embodiments: Iterable[str] | None = None,
+    out: str | Path | None = None,
+    revision: str | None = None,
+) -> Path:
+    """Bring the trunk and the embodiments asked for, and nothing else.
+
+    Args:
+        source: a folder, a URI, or a repository.
+        embodiments: ids; None for all.
+        out: a folder; what it has already is not transferred again. By default a local folder stays where it
+            is, and all else goes to the cache.
+        revision: branch, tag or commit of a repository.
+
+    Returns:
+        A checkpoint's folder.
+
+    Raises:
+        HubError: not there, not reachable, no such embodiment or revision.
+        CheckpointError: what came does not belong together.
+    """
+    return _pull(source, embodiments, Path(out) if out else None, revision)[0]
+
+
+def _pull(
+    source: str | Path, embodiments: Iterable[str] | None, out: Path | None, revision: str | None
+) -> tuple[Path, list[str]]:
+    """The checkpoint's folder, and the ids that were asked for; the folder may hold others from before."""
+    store = open_store(source, revision)
+    files = store.files()
+    values = _config(store, files)
+    there = _ids(files)
+    wanted = list(dict.fromkeys(there if embodiments is None else embodiments))
+    for name in wanted:
+        check_id(name, store.name)
+        if name not in there:
+            known = ", ".join(there) or "none"
+            raise HubError(store.name, f"has no embodiment {name!r}", f"it has: {known}")
+    names = [f"embodiments/{name}/{part}" for name in wanted for part in (SAMPLE, *PARTS)]
+    place = out
+    if place is None and "://" in str(source) and not is_repository(source):
+        key = f"{store.name} {values.get('trunk_sha256')}".encode()
+        place = cache_folder() / "hub" / hashlib.sha256(key).hexdigest()[:24]
+    folder = store.pull([CONFIG, TRUNK, *(name for name in names if name in files)], place)
+    pulled = Checkpoint.open(folder)
+    pulled.trunk()
+    for name in wanted:
+        pulled.check(name)
+    if out:
+        checkpoints.write_readme(folder)
+    return folder, wanted
+
+
+def list_embodiments(source: str | Path, revision: str | None = None) -> dict[str, dict[str, Any]]:
+    """The card of every embodiment published there, by id."""
+    store = open_store(source, revision)
+    files = store.files()
+    _config(store, files)
+    return {name: _card(store, name) for name in _ids(files)}
+
+
+def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
+    """What is published: the trunk's hash and bytes, tokenizer and model, and of each id `card`, `bytes`."""
+    store = open_store(source, revision)
+    files = store.files()
+    values = _config(store, files)
+    return {
+        "source": store.name,
+        **{key: values[key] for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
+        "trunk_bytes": files.get(TRUNK, 0),
+        "embodiments": {
+            name: {
+                "card": _card(store, name),
+                "bytes": sum(files.get(f"embodiments/{name}/{part}", 0) for part in PARTS),
+            }
+            for name in _ids(files)
+        },
+    }
+
+
+def from_pretrained(
+    source: str | Path,
+    embodiments: Iterable[str] | None = None,
+    revision: str | None = None,
+    device: "str | torch.device" = "cpu",
+) -> "HMA":
+    """See `HMA.from_pretrained`; the source may also be a training run's folder."""
+    if not is_repository(source) and "://" not in str(source):
+        source = checkpoints.resolve(Path(source).expanduser())
+    folder, ids = _pull(source, embodiments, None, revision)
+    return checkpoints.load(folder, ids, str(device))
+
+
+def push_model(model: "HMA", target: str | Path, embodiments: Iterable[str] | None = None) -> str:
+    """See `HMA.push_to_hub`: YAML, statistics and cards are those the model was loaded with.
+
+    Raises:
+        HubError: an embodiment has no YAML, neither where the model was loaded from nor in the registry.
+    """
+    origin = getattr(model, "origin", None)
+    known = Checkpoint.open(origin) if origin else None
+    yaml, stats, cards = {}, {}, {}
+    for name, space in model.embodiments.items():
+        if known and name in known.embodiments:
+            yaml[name] = known.embodiment(name).to_yaml()
+            stats[name] = known.stats(name)
+            cards[name] = {key: known.card(name).get(key, {}) for key in ("data", "metrics", "training")}
+        else:
+            yaml[name] = _registered(name)
+            stats[name] = {"action": {"mean": list(space.mean), "std": list(space.std)}}
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoints.save(
+            model,
+            Path(folder) / "model",
+            embodiment_yaml=yaml,
+            stats=stats,
+            cards=cards,
+            tokenizer=model.config.tokenizer,
+        )
+        return push(Path(folder) / "model", target, embodiments)
+
+
+def cache_folder() -> Path:
+    """Where pulled URIs are kept: $HMA_CACHE, or below the user's cache."""
+    given = os.environ.get("HMA_CACHE")
+    return Path(given) if given else Path.home() / ".cache" / "hma-toolkit"
+
+
+# -- what a push changes
+
+
+def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
+    files = store.files()
+    present: dict[str, Content] = {}
+    if CONFIG in files:
+        _require_trunk(source, _config(store, files), store.name)
+    else:
+        present[CONFIG] = inside(source.folder, CONFIG)
+    if TRUNK not in files:
+        present[TRUNK] = source.trunk()
+    for name in ids:
+        sample = source.folder / "embodiments" / name / SAMPLE
+        parts = (SAMPLE, *PARTS) if sample.is_file() else PARTS
+        present.update({f"embodiments/{name}/{part}": source.path(name, part) for part in parts})
+    cards = {name: _readable_card(store, name) for name in _ids(files)}
+    cards.update({name: source.card(name) for name in ids})
+    suffix = f"/{SAMPLE}"
+    samples = {path.split("/")[1] for path in (*files, *present) if path.endswith(suffix)}
+    config = checkpoints.config_json(source.config, source.trunk_sha256)
+    present[README] = render(config, cards, repo=store.repo, samples=samples)
+    return present
+
+
+def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:
+    if there.get("trunk_sha256") != source.trunk_sha256:
+        raise HubError(
+            where,
+            f"has another trunk: {str(there.get('trunk_sha256'))[:16]}, this checkpoint's is "
+            f"{source.trunk_sha256[:16]}",
+            "push to a hub of its own, or finetune on the trunk that is there",
+        )
+    if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
+        raise HubError(where, "has the same trunk with another tokenizer", "push to a hub of its own")
+
+
+def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
+    """config.json's values, checked."""
+    if CONFIG not in files:
+        raise HubError(store.name, f"has no {CONFIG}", "it is no checkpoint of hma-toolkit; check the name")
+    values = parse_json(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
+    try:
+        checkpoints.parse_config(values, f"{store.name}: {CONFIG}")
+    except CheckpointError as fault:
+        raise HubError(fault.where, fault.fault, fault.remedy) from fault
+    return values
+
+
+def _ids(files: Iterable[str]) -> list[str]:
+    """Ids with a card, which is written last."""
+    found = set()
+    for path in files:
+        parts = path.split("/")
+        if len(parts) != 3 or parts[0] != "embodiments" or parts[2] != CARD:
+            continue
+        if ID_PATTERN.fullmatch(parts[1]) and ".." not in parts[1]:
+            found.add(parts[1])
+    return sorted(found)
+
+
+def _card(store: Store, name: str) -> dict[str, Any]:
+    path = f"embodiments/{name}/{CARD}"
+    return parse_json(store.read(path), f"{store.name}: {path}", HubError)
+
+
+def _readable_card(store: Store, name: str) -> dict[str, Any]:
+    """Somebody else's card for the table; an empty one where it is broken, which is theirs to mend."""
+    try:
+        return _card(store, name)
+    except HubError:
+        return {}
+
+
+def _registered(name: str) -> str:
+    from hma_data.embodiment import find
+
+    try:
+        return find(name).to_yaml()
+    except HMAError as fault:
+        raise HubError(
+            f"embodiment {name}",
+            "has no YAML where the model was loaded from, nor in the registry",
+            "save with hma_model.checkpoint.save and push the folder",
+        ) from fault

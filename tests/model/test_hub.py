@@ -1,0 +1,350 @@
+"""Hubs in folders and behind fsspec: one embodiment at a time, atomic, and never another trunk."""
+
+import json
+import shutil
+import threading
+from pathlib import Path
+
+import fsspec
+import pytest
+import torch
+import yaml as plain_yaml
+
+from hma_data.errors import CheckpointError, HubError
+from hma_model import checkpoint, hub
+from hma_model.checkpoint import Checkpoint
+from hma_model.hub_folder import FolderStore
+from hma_model.model import HMA
+from tests.model.robots import make_model, save
+from tests.model.robots import yaml as robot_yaml
+
+ROBOTS = {"arm": 2, "hand": 3}
+MEMORY = "memory://hub/team/model"
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    save(tmp_path / "model", ROBOTS)
+    return tmp_path / "model"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch) -> Path:
+    monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture(params=["folder", "memory"])
+def target(request, tmp_path: Path):
+    if request.param == "folder":
+        yield str(tmp_path / "hub/team/model")
+    else:
+        yield MEMORY
+        fsspec.filesystem("memory").store.clear()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def other_robot(source: Path, out: Path, name: str, dims: int, seed: int) -> Path:
+    """A checkpoint of another robot on the same trunk, as finetuning gives it."""
+    model = checkpoint.load(source, [])
+    torch.manual_seed(seed)
+    space = make_model({name: dims}, seed).embodiments[name]
+    model.add_embodiment(space)
+    save(out, {name: dims}, model=model)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("address", "repository"),
+    [
+        ("org/name", True), ("hf://org/name", True), ("./org/name", False), ("/org/name", False),
+        ("a/b/c", False), ("s3://bucket/name", False), ("~/models/x", False), (Path("org/name"), False),
+        ("name", False),
+    ],
+)  # fmt: skip
+def test_which_addresses_are_repositories(address, repository):
+    assert hub.is_repository(address) is repository
+
+
+def test_a_folder_that_is_there_is_no_repository(tmp_path, monkeypatch):
+    (tmp_path / "org/name").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert not hub.is_repository("org/name")
+
+
+def test_what_is_pushed_and_pulled_is_the_same(source, target, tmp_path):
+    hub.push(source, target)
+    pulled = hub.pull(target, out=tmp_path / "pulled")
+    assert {**contents(pulled), "README.md": b""} == {**contents(source), "README.md": b""}
+    one, other = checkpoint.load(source).state_dict(), checkpoint.load(pulled).state_dict()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_one_embodiment_is_pushed_alone(source, target):
+    hub.push(source, target, ["hand"])
+    assert list(hub.list_embodiments(target)) == ["hand"]
+
+
+def test_training_state_is_not_published(source, tmp_path):
+    def training(folder: Path) -> None:
+        (folder / "state.json").write_text("{}")
+
+    save(tmp_path / "run", ROBOTS, training=training)
+    hub.push(tmp_path / "run", tmp_path / "hub")
+    assert not (tmp_path / "hub/training").exists()
+
+
+def test_a_second_push_touches_only_its_embodiment_and_the_readme(source, tmp_path):
+    hub.push(source, tmp_path / "hub", ["arm"])
+    before = {
+        p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in (tmp_path / "hub").rglob("*") if p.is_file()
+    }
+    hub.push(source, tmp_path / "hub", ["hand"])
+    after = {p: (p.stat().st_mtime_ns, p.stat().st_ino) for p in (tmp_path / "hub").rglob("*") if p.is_file()}
+    changed = {str(p.relative_to(tmp_path / "hub")) for p in after if before.get(p) != after[p]}
+    assert {name for name in changed if not name.startswith("embodiments/hand/")} == {"README.md"}
+
+
+def test_stems_of_different_people_on_one_trunk_load_together(source, target, tmp_path):
+    hub.push(source, target, ["arm"])
+    hub.push(other_robot(source, tmp_path / "theirs", "leg", 4, seed=7), target)
+    model = HMA.from_pretrained(target)
+    assert set(model.embodiments) == {"arm", "leg"}
+    alone = checkpoint.load(source, ["arm"])
+    tokens, actions = torch.randint(0, 64, (1, 4, 2, 3)), torch.randn(1, 4, 4)
+    assert torch.equal(model.video_logits(tokens, actions, "arm"), alone.video_logits(tokens, actions, "arm"))
+
+
+def test_another_trunk_is_refused_and_nothing_is_touched(source, target, tmp_path):
+    hub.push(source, target, ["arm"])
+    before = FolderStore(target).files()
+    save(tmp_path / "other", ROBOTS, seed=1)
+    with pytest.raises(HubError, match="has another trunk"):
+        hub.push(tmp_path / "other", target, ["hand"])
+    assert FolderStore(target).files() == before
+
+
+def test_pushing_an_embodiment_that_is_not_there_is_refused(source, target):
+    with pytest.raises(CheckpointError, match="no embodiment 'leg'"):
+        hub.push(source, target, ["leg"])
+
+
+def test_a_damaged_checkpoint_is_not_published(source, tmp_path):
+    (source / "embodiments/arm/stats.json").write_text('{"action": {"mean": [0, 0], "std": [1, 1]}}')
+    with pytest.raises(CheckpointError, match="other statistics"):
+        hub.push(source, tmp_path / "hub")
+    assert not (tmp_path / "hub").exists()
+
+
+def test_pulling_one_embodiment_reads_no_other(source, target, tmp_path, monkeypatch):
+    hub.push(source, target)
+    asked = []
+    plain = FolderStore._path
+    monkeypatch.setattr(FolderStore, "_path", lambda self, name: asked.append(name) or plain(self, name))
+    hub.pull(target, ["arm"], tmp_path / "pulled")
+    assert {name.split("/")[1] for name in asked if "/" in name} == {"arm"}
+    assert sorted(p.name for p in (tmp_path / "pulled/embodiments").iterdir()) == ["arm"]
+
+
+def test_pulling_again_adds_and_transfers_only_what_is_missing(source, target, tmp_path, monkeypatch):
+    hub.push(source, target)
+    hub.pull(target, ["arm"], tmp_path / "pulled")
+    trunk = tmp_path / "pulled/trunk.safetensors"
+    inode = trunk.stat().st_ino
+    hub.pull(target, ["hand"], tmp_path / "pulled")
+    assert trunk.stat().st_ino == inode
+    assert Checkpoint.open(tmp_path / "pulled").embodiments == ("arm", "hand")
+
+
+def test_an_interrupted_pull_goes_on(source, target, tmp_path):
+    hub.push(source, target)
+    hub.pull(target, out=tmp_path / "pulled")
+    (tmp_path / "pulled/embodiments/hand/card.json").unlink()
+    (tmp_path / "pulled/embodiments/hand/head.safetensors").write_bytes(b"half")
+    checkpoint.load(hub.pull(target, out=tmp_path / "pulled"))
+
+
+def test_a_pull_does_not_mix_trunks(source, tmp_path):
+    hub.push(source, tmp_path / "hub")
+    save(tmp_path / "mine", {"arm": 2}, seed=1)
+    before = contents(tmp_path / "mine")
+    with pytest.raises(HubError, match="with embodiments of its own"):
+        hub.pull(tmp_path / "hub", out=tmp_path / "mine")
+    assert contents(tmp_path / "mine") == before
+
+
+def test_a_uri_is_pulled_to_the_cache(source, cache):
+    hub.push(source, MEMORY)
+    assert hub.pull(MEMORY, ["arm"]).is_relative_to(cache)
+    fsspec.filesystem("memory").store.clear()
+
+
+@pytest.mark.parametrize("name", ["../arm", "arm/..", "a\nb", ""])
+def test_a_name_that_is_no_id_is_refused(source, target, name):
+    hub.push(source, target)
+    with pytest.raises(CheckpointError, match="not an embodiment's id"):
+        hub.pull(target, [name])
+
+
+def test_an_embodiment_that_is_not_published_is_named_with_those_that_are(source, target):
+    hub.push(source, target)
+    with pytest.raises(HubError, match=r"no embodiment 'leg'.*it has: arm, hand"):
+        hub.pull(target, ["leg"])
+
+
+def test_a_hub_that_is_not_there_says_so(tmp_path):
+    with pytest.raises(HubError, match="no such folder"):
+        hub.pull(tmp_path / "nothing")
+    with pytest.raises(HubError, match="cannot be used"):
+        hub.pull("nosuch://place/model")
+
+
+def test_a_folder_of_something_else_says_so(tmp_path):
+    (tmp_path / "config.json").write_text('{"architectures": ["GPT2"]}')
+    with pytest.raises(HubError, match="is not of hma-toolkit"):
+        hub.pull(tmp_path)
+
+
+def test_a_revision_of_a_folder_is_refused(source, tmp_path):
+    hub.push(source, tmp_path / "hub")
+    with pytest.raises(HubError, match="has no revision 'v1'"):
+        hub.pull(tmp_path / "hub", revision="v1")
+
+
+def test_a_linked_file_in_a_hub_is_not_followed(source, tmp_path):
+    hub.push(source, tmp_path / "hub")
+    trunk = tmp_path / "hub/trunk.safetensors"
+    shutil.move(trunk, tmp_path / "elsewhere")
+    trunk.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(CheckpointError, match="is a link"):
+        hub.pull(tmp_path / "hub", out=tmp_path / "pulled")
+
+
+def test_a_linked_folder_in_a_hub_is_not_written_to(source, tmp_path):
+    hub.push(source, tmp_path / "hub", ["arm"])
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "hub/embodiments/hand").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(HubError, match="is a link"):
+        hub.push(source, tmp_path / "hub", ["hand"])
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_strange_files_in_a_hub_are_never_pulled(source, tmp_path):
+    hub.push(source, tmp_path / "hub")
+    (tmp_path / "hub/embodiments/arm/weights.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
+    (tmp_path / "hub/embodiments/..evil").mkdir()
+    (tmp_path / "hub/embodiments/..evil/card.json").write_text("{}")
+    pulled = hub.pull(tmp_path / "hub", out=tmp_path / "pulled")
+    assert not list(pulled.rglob("*.pkl")) and sorted(hub.list_embodiments(tmp_path / "hub")) == [
+        "arm",
+        "hand",
+    ]
+
+
+def test_a_failed_push_leaves_the_hub_as_it_was(source, tmp_path, monkeypatch):
+    hub.push(source, tmp_path / "hub", ["arm"])
+    before = contents(tmp_path / "hub")
+    plain = FolderStore._stage
+
+    def full_disk(self, name, content):
+        if name.endswith("stats.json"):
+            raise OSError(28, "No space left on device")
+        return plain(self, name, content)
+
+    monkeypatch.setattr(FolderStore, "_stage", full_disk)
+    with pytest.raises(HubError, match="No space left on device"):
+        hub.push(source, tmp_path / "hub", ["hand"])
+    assert contents(tmp_path / "hub") == before
+
+
+def test_a_push_cut_before_the_card_leaves_nothing_listed(source, tmp_path, monkeypatch):
+    hub.push(source, tmp_path / "hub", ["arm"])
+    plain = FolderStore._rename
+
+    def cut(self, beside, final):
+        if final.endswith("hand/card.json"):
+            raise OSError(5, "cut")
+        plain(self, beside, final)
+
+    monkeypatch.setattr(FolderStore, "_rename", cut)
+    with pytest.raises(HubError):
+        hub.push(source, tmp_path / "hub", ["hand"])
+    assert list(hub.list_embodiments(tmp_path / "hub")) == ["arm"]
+    monkeypatch.setattr(FolderStore, "_rename", plain)
+    hub.push(source, tmp_path / "hub", ["hand"])
+    checkpoint.load(tmp_path / "hub")
+
+
+def test_people_who_push_at_once_all_get_in_and_into_the_readme(source, tmp_path):
+    names = [f"robot{number}" for number in range(4)]
+    folders = [other_robot(source, tmp_path / name, name, 2, seed) for seed, name in enumerate(names)]
+    threads = [threading.Thread(target=hub.push, args=(folder, tmp_path / "hub")) for folder in folders]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(checkpoint.load(tmp_path / "hub").embodiments) == names
+    page = (tmp_path / "hub/README.md").read_text()
+    assert all(f"| `{name}` |" in page for name in names)
+    assert not [path for path in (tmp_path / "hub").rglob("*") if ".partial-" in path.name]
+
+
+def test_the_model_card_has_front_matter_and_a_row_for_each_embodiment(source, tmp_path):
+    hub.push(source, tmp_path / "hub")
+    _, front, page = (tmp_path / "hub/README.md").read_text().split("---\n", 2)
+    values = plain_yaml.safe_load(front)
+    assert values["library_name"] == "hma-toolkit" and values["license"] == "apache-2.0"
+    assert {"robotics", "world-model", "embodiment:arm", "embodiment:hand"} <= set(values["tags"])
+    row = next(line for line in page.splitlines() if line.startswith("| `hand` |"))
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells[1:5] == ["an arm", "3 (joint_position)", "5", "2"]
+    assert cells[5:] == ["windows 12", "val loss 1.5", "apache-2.0"]
+
+
+def test_what_is_published_is_described(source, target):
+    hub.push(source, target, ["arm"])
+    facts = hub.describe(target)
+    assert facts["trunk_sha256"] == Checkpoint.open(source).trunk_sha256
+    assert facts["trunk_bytes"] == (source / "trunk.safetensors").stat().st_size
+    assert facts["embodiments"]["arm"]["card"]["action_dim"] == 2
+    assert facts["embodiments"]["arm"]["bytes"] > 1000
+    json.dumps(facts)
+
+
+def test_a_loaded_model_is_pushed_with_what_it_was_loaded_with(source, target):
+    model = HMA.from_pretrained(str(source))
+    model.push_to_hub(target, embodiments=["arm"])
+    card = hub.list_embodiments(target)["arm"]
+    assert card["robot"] == "an arm" and card["metrics"] == {"val_loss": 1.5}
+
+
+def test_a_made_model_without_yaml_is_not_pushed(target):
+    with pytest.raises(HubError, match="embodiment arm: has no YAML"):
+        make_model({"arm": 2}).push_to_hub(target)
+
+
+def test_a_made_model_is_pushed_with_the_registrys_yaml(target, tmp_path, monkeypatch):
+    (tmp_path / "arm.yaml").write_text(robot_yaml("arm"))
+    monkeypatch.setenv("HMA_REGISTRY", str(tmp_path))
+    make_model({"arm": 2}).push_to_hub(target)
+    assert list(HMA.from_pretrained(target).embodiments) == ["arm"]
+
+
+def test_from_pretrained_loads_only_what_is_asked_for(source, target):
+    hub.push(source, target)
+    assert list(HMA.from_pretrained(target, embodiments=["hand"]).embodiments) == ["hand"]
+
+
+def test_a_repository_without_a_token_says_how_to_get_one(source, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.get_token", lambda: None)
+    with pytest.raises(HubError, match=r"needs a token.*HF_TOKEN.*\./org/name"):
+        hub.push(source, "org/name")
+
+
+@pytest.mark.parametrize("address", ["hf://name", "hf://a/b/c", "hf://../x"])
+def test_a_wrong_repository_name_is_refused(source, address):
+    with pytest.raises(HubError, match="is not hf://ORGANISATION/NAME"):
+        hub.push(source, address)
