@@ -1,4 +1,4 @@
-"""Repositories of the Hugging Face Hub: commits, conflicts, errors and the cache, on a repository in memory."""
+"""Repositories of the hub: commits, conflicts, errors and the cache, on a repository kept in memory."""
 
 import hashlib
 from pathlib import Path
