@@ -105,12 +105,18 @@ def shrink(picture: Picture, short_side: int) -> Picture:
 
 def push_pictures(count: int, seed: int) -> Iterator[Picture]:
     """Frames of gym-pusht, 256×256, the agent wandering towards random points."""
-    import gymnasium
     import gym_pusht  # noqa: F401  registers the environment
+    import gymnasium
 
     rng = np.random.default_rng([seed, 1])
-    env = gymnasium.make("gym_pusht/PushT-v0", obs_type="state", render_mode="rgb_array", max_episode_steps=40,
-                         observation_width=256, observation_height=256)  # fmt: skip
+    env = gymnasium.make(
+        "gym_pusht/PushT-v0",
+        obs_type="state",
+        render_mode="rgb_array",
+        max_episode_steps=40,
+        observation_width=256,
+        observation_height=256,
+    )
     made = 0
     while made < count:
         env.reset(seed=int(rng.integers(2**31)))
@@ -120,8 +126,8 @@ def push_pictures(count: int, seed: int) -> Iterator[Picture]:
                 goal = rng.uniform(50, 460, 2)
             env.step(goal.astype(np.float32))
             if step % 6 == 5 and made < count:
-                frame = np.asarray(env.unwrapped._render(visualize=bool(rng.random() < 0.5)), np.uint8)  # type: ignore[attr-defined]
-                yield frame
+                whole = bool(rng.random() < 0.5)  # at 680 pixels with the target of the action, or at 256
+                yield np.asarray(env.unwrapped._render(visualize=whole), np.uint8)
                 made += 1
     env.close()
 
@@ -158,13 +164,13 @@ def _draw_shape(canvas: Picture, rng: np.random.Generator, colour: tuple[float, 
     reach = int(math.exp(rng.uniform(math.log(5), math.log(size / 2.5))))
     kind = rng.integers(0, 4)
     if kind == 0:
-        points = rng.integers(-reach, reach, (int(rng.integers(3, 7)), 2)) + [x, y]
+        points = rng.integers(-reach, reach, (int(rng.integers(3, 7)), 2)) + np.array([x, y])
         cv2.fillPoly(canvas, [np.asarray(points, np.int32)], colour, cv2.LINE_AA)
     elif kind == 1:
         axes = (max(2, reach // 2), max(2, int(reach * rng.uniform(0.15, 0.5))))
         cv2.ellipse(canvas, (x, y), axes, rng.uniform(0, 180), 0, 360, colour, -1, cv2.LINE_AA)
     elif kind == 2:
-        other = rng.integers(-2 * reach, 2 * reach, 2) + [x, y]
+        other = rng.integers(-2 * reach, 2 * reach, 2) + np.array([x, y])
         thick = int(rng.integers(1, max(2, reach // 4) + 1))
         cv2.line(canvas, (x, y), (int(other[0]), int(other[1])), colour, min(thick, 60), cv2.LINE_AA)
     else:
@@ -262,9 +268,8 @@ def _crop(levels: list[Picture], side: int, rng: np.random.Generator) -> Picture
     centre = np.array([x, y]) - back @ np.array([(side - 1) / 2, (side - 1) / 2])
     matrix = np.hstack([back, centre[:, None]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpAffine(picture, matrix, (side, side), flags=flags, borderMode=cv2.BORDER_REFLECT_101), np.uint8
-    )
+    crop = cv2.warpAffine(picture, matrix, (side, side), flags=flags, borderMode=cv2.BORDER_REFLECT_101)
+    return np.asarray(crop, np.uint8)
 
 
 def _recolour(crop: Picture, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -279,7 +284,9 @@ def _recolour(crop: Picture, rng: np.random.Generator) -> NDArray[np.float32]:
         grey = x.mean(axis=2, keepdims=True)
         x = grey + (x - grey) * np.float32(math.exp(rng.normal(-0.1, 0.4)))
         cast = np.exp(rng.normal(0, 0.08, 3)).astype(np.float32)
-        x = (x - 0.5) * np.float32(math.exp(rng.normal(0, 0.2))) * cast + np.float32(0.5 + rng.normal(0, 0.08))
+        x = (x - 0.5) * np.float32(math.exp(rng.normal(0, 0.2))) * cast + np.float32(
+            0.5 + rng.normal(0, 0.08)
+        )
     if rng.random() < 0.15:
         x = x[:, :, rng.permutation(3)]
     if rng.random() < 0.1:

@@ -10,7 +10,6 @@ whatever company it comes.
 
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from hma_data.errors import TokenizerError
+from hma_data.files import write_atomic
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 from hma_data.tokenizers.fsq_network import STRIDE, FsqAutoencoder, FsqConfig
 
@@ -35,9 +35,15 @@ def save_weights(path: Path, config: FsqConfig, tensors: dict[str, Tensor], fact
     """Write parameters as float16 with the network's shape and `facts` in the metadata, atomically."""
     halves = {name: tensor.detach().half().contiguous() for name, tensor in sorted(tensors.items())}
     metadata = {"format": FORMAT, "config": json.dumps(config.to_json()), "training": json.dumps(facts)}
-    beside = path.with_name(path.name + ".part")
-    beside.write_bytes(save(halves, metadata))
-    os.replace(beside, path)
+    write_atomic(path, _sorted_header(save(halves, metadata)))
+
+
+def _sorted_header(content: bytes) -> bytes:
+    """The same safetensors file with its header in one order: the library's varies from run to run."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + content[end:]
 
 
 def read_weights(path: Path) -> tuple[FsqConfig, dict[str, Tensor], str]:
@@ -49,7 +55,9 @@ def read_weights(path: Path) -> tuple[FsqConfig, dict[str, Tensor], str]:
     remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise TokenizerError(path, f"larger than {MAX_BYTES} bytes: not weights of this tokenizer", remedy)
+            raise TokenizerError(
+                path, f"larger than {MAX_BYTES} bytes: not weights of this tokenizer", remedy
+            )
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
@@ -59,9 +67,7 @@ def read_weights(path: Path) -> tuple[FsqConfig, dict[str, Tensor], str]:
     except SafetensorError as fault:
         raise TokenizerError(path, f"is no whole safetensors file: {fault}", remedy) from fault
     if metadata.get("format") != FORMAT:
-        raise TokenizerError(
-            path, f"holds no {FORMAT} weights (format {metadata.get('format')!r})", remedy
-        )
+        raise TokenizerError(path, f"holds no {FORMAT} weights (format {metadata.get('format')!r})", remedy)
     try:
         config = FsqConfig.from_json(json.loads(metadata["config"]))
     except (KeyError, TypeError, ValueError) as fault:

@@ -26,7 +26,7 @@ def orthogonal(matrix: Tensor) -> Tensor:
 
 
 class Muon(torch.optim.Optimizer):
-    """For weights of two dimensions or more; `lr` is the spectral size of a step per unit of √(rows/columns)."""
+    """For weights of two dimensions or more; `lr` is the spectral norm of a step (× √(rows/columns))."""
 
     def __init__(self, params: Iterable[Tensor], lr: float, momentum: float = 0.95) -> None:
         super().__init__(params, {"lr": lr, "momentum": momentum})

@@ -5,129 +5,31 @@
 The loss is what can be had without a pretrained network: squared and absolute error, gradients at
 several scales, and SSIM. Before the first step the network is the best linear code of 16×16 patches
 (their principal components); the rest starts at zero and learns what is left. A weights' file is
-written at every report, so a run can be stopped at any time.
+written now and then, and the state of the run beside it: running it again goes on.
 
 B crops, S side of a crop, C latent channels.
 """
 
-import hashlib
-import json
 import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
 from hma_data.errors import RecipeError
-from hma_data.tokenizers.corpus import DrawnSource, FileSource, Pool, PushtSource, draw_batch, load_pools
+from hma_data.files import write_atomic
+from hma_data.tokenizers.corpus import Pool, draw_batch, load_pools
 from hma_data.tokenizers.eval import ssim_map
 from hma_data.tokenizers.fsq import save_weights
-from hma_data.tokenizers.fsq_network import STRIDE, FsqAutoencoder, FsqConfig
+from hma_data.tokenizers.fsq_network import STRIDE, FsqAutoencoder
 from hma_data.tokenizers.muon import Muon
-from hma_data.yaml_io import read_yaml
-
-
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class NetworkRecipe(_Strict):
-    """`FsqConfig` as a recipe says it."""
-
-    levels: list[list[int]]
-    width: tuple[int, int]
-    hidden: int
-    encoder_blocks: tuple[int, int]
-    decoder_blocks: tuple[int, int, int]
-    fine_width: int
-
-    @model_validator(mode="after")
-    def _is_a_network(self) -> "NetworkRecipe":
-        self.config()
-        return self
-
-    def config(self) -> FsqConfig:
-        """The network's shape."""
-        return FsqConfig.from_json(self.model_dump())
-
-
-class TrainingRecipe(_Strict):
-    """How long and how fast.
-
-    Attributes:
-        steps: of the optimizer.
-        batch, crop: crops a step, and their side in pixels, a multiple of 16.
-        learning_rate: the highest, of Muon (matrices) in units of the spectral norm.
-        adam_learning_rate: the highest, of Adam (biases, first and last layers).
-        warmup_steps: of linear rise; from there the rate falls linearly to nothing.
-        ema: decay of the averaged weights, which are the ones kept.
-        threads: of torch; the result depends on it in the last bits only.
-    """
-
-    steps: int = Field(gt=0)
-    batch: int = Field(gt=0)
-    crop: int = Field(gt=0, multiple_of=STRIDE)
-    learning_rate: float = Field(gt=0)
-    adam_learning_rate: float = Field(gt=0)
-    warmup_steps: int = Field(ge=0, default=100)
-    ema: float = Field(ge=0, lt=1, default=0.998)
-    threads: int = Field(gt=0, default=1)
-
-
-class LossRecipe(_Strict):
-    """Weights of the parts of the loss; pixels in [0, 1]."""
-
-    l2: float = Field(ge=0)
-    l1: float = Field(ge=0)
-    gradient: float = Field(ge=0)
-    ssim: float = Field(ge=0)
-
-
-class TokenizerRecipe(_Strict):
-    """A whole training, so that it can be done again."""
-
-    job: Literal["tokenizer"]
-    name: str
-    seed: int = Field(ge=0)
-    corpus: str
-    network: NetworkRecipe
-    training: TrainingRecipe
-    loss: LossRecipe
-    sources: list[FileSource | PushtSource | DrawnSource] = Field(min_length=1)
-
-    def digest(self) -> str:
-        """SHA-256 over all but where the corpus lies."""
-        values = self.model_dump(mode="json", exclude={"corpus"})
-        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-def load_recipe(path: Path, overrides: dict[str, Any] | None = None) -> TokenizerRecipe:
-    """The recipe of a YAML file; `overrides` replace values by dotted key (`training.steps`).
-
-    Raises:
-        RecipeError: the file or an override is not valid.
-    """
-    values = read_yaml(path, RecipeError)
-    for key, value in (overrides or {}).items():
-        *parents, last = key.split(".")
-        node = values
-        for parent in parents:
-            node = node.get(parent) if isinstance(node, dict) else None
-        if not isinstance(node, dict):
-            raise RecipeError(path, f"has no key {key!r} to override")
-        node[last] = value
-    try:
-        return TokenizerRecipe.model_validate(values)
-    except ValidationError as fault:
-        first = fault.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise RecipeError(path, f"{place}: {first['msg']}, got {first['input']!r:.80}") from fault
+from hma_data.tokenizers.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
 
 
 def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
@@ -185,23 +87,98 @@ def start_linear(network: FsqAutoencoder, crops: Tensor) -> None:
         network.decoder.head.weight.mul_(0.1)
 
 
-class _Average:
-    """Exponential moving average of a network's parameters."""
+class Run:
+    """A training under way: network, averaged weights, optimizers, and the step it has reached."""
 
-    def __init__(self, network: nn.Module, decay: float) -> None:
-        self.decay, self.step = decay, 0
-        self.values = {name: p.detach().clone() for name, p in network.named_parameters()}
+    def __init__(self, recipe: TokenizerRecipe, pools: list[Pool]) -> None:
+        self.recipe, self.pools, self.step = recipe, pools, 0
+        torch.manual_seed(recipe.seed)
+        network = FsqAutoencoder(recipe.network.config())
+        start_linear(network, self.batch(2**32 - 1, 256))
+        self.network: FsqAutoencoder = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.average = {name: p.detach().clone() for name, p in self.network.named_parameters()}
+        self.optimizers = _optimizers(self.network, recipe.training)
 
-    @torch.no_grad()
-    def update(self, network: nn.Module) -> None:
+    def batch(self, step: int, count: int) -> Tensor:
+        """(B, 3, S, S) crops of a step."""
+        crops = draw_batch(self.pools, self.recipe.training.crop, count, self.recipe.seed, step)
+        return torch.from_numpy(crops).permute(0, 3, 1, 2)
+
+    def advance(self) -> float:
+        """One step; the mean squared error of its crops, pixels in [0, 1]."""
+        training = self.recipe.training
+        for optimizer, highest in zip(self.optimizers, (training.learning_rate, training.adam_learning_rate)):
+            optimizer.param_groups[0]["lr"] = highest * training.rate(self.step)
+        crops = self.batch(self.step, training.batch)
+        made, latents = self.network(crops)
+        loss, squared = reconstruction_loss(made, crops, self.recipe.loss)
+        (loss + 0.01 * _latent_penalty(latents)).backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        for optimizer in self.optimizers:
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
         self.step += 1
-        decay = min(self.decay, self.step / (self.step + 10))
-        for name, parameter in network.named_parameters():
-            self.values[name].lerp_(parameter, 1 - decay)
+        decay = min(training.ema, self.step / (self.step + 10))
+        with torch.no_grad():
+            for name, parameter in self.network.named_parameters():
+                self.average[name].lerp_(parameter, 1 - decay)
+        return float(squared)
+
+    def save(self, path: Path) -> None:
+        """Write what `resume` needs, atomically."""
+        metadata = {"course": self.recipe.course(), "step": str(self.step)}
+        tensors = {name: tensor.contiguous() for name, tensor in self._state().items()}
+        write_atomic(path, save(tensors, metadata))
+
+    def _state(self) -> dict[str, Tensor]:
+        """Copies of parameters, averages and the optimizers' moments, by name."""
+        state = {f"network.{name}": p.detach().clone() for name, p in self.network.named_parameters()}
+        state |= {f"average.{name}": tensor.clone() for name, tensor in self.average.items()}
+        for number, optimizer in enumerate(self.optimizers):
+            for index, moments in optimizer.state_dict()["state"].items():
+                state |= {f"moment.{number}.{index}.{key}": m.clone() for key, m in moments.items()}
+        return state
+
+    def resume(self, path: Path) -> None:
+        """Go on from a state that `save` wrote.
+
+        Raises:
+            RecipeError: it is no such state, or of a training with other settings.
+        """
+        remedy = f"remove {path.name} to start anew"
+        try:
+            with safe_open(path, "pt") as file:
+                metadata = file.metadata() or {}
+                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            step = int(metadata.get("step", -1))
+            if metadata.get("course") != self.recipe.course() or not 0 <= step <= self._constant_until():
+                raise RecipeError(path, "is the state of a training with other settings", remedy)
+            self._restore(state)
+        except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as fault:
+            raise RecipeError(path, f"is no state of a training: {fault!s:.120}", remedy) from fault
+        self.step = step
+
+    def _restore(self, state: dict[str, Tensor]) -> None:
+        with torch.no_grad():
+            for name, parameter in self.network.named_parameters():
+                parameter.copy_(state[f"network.{name}"])
+                self.average[name].copy_(state[f"average.{name}"])
+        for number, optimizer in enumerate(self.optimizers):
+            moments: dict[int, dict[str, Tensor]] = {}
+            for name, tensor in state.items():
+                kind, *place = name.split(".")
+                if kind == "moment" and int(place[0]) == number:
+                    moments.setdefault(int(place[1]), {})[place[2]] = tensor
+            groups = optimizer.state_dict()["param_groups"]
+            optimizer.load_state_dict({"state": moments, "param_groups": groups})
+
+    def _constant_until(self) -> int:
+        return self.recipe.training.steps - self.recipe.training.decay_steps
 
 
 def _optimizers(network: FsqAutoencoder, recipe: TrainingRecipe) -> list[torch.optim.Optimizer]:
-    matrices, others = [], []
+    matrices: list[nn.Parameter] = []
+    others: list[nn.Parameter] = []
     for name, parameter in network.named_parameters():
         inner = ".at" in name or ".down" in name or ".up" in name
         (matrices if inner and parameter.ndim == 4 else others).append(parameter)
@@ -209,16 +186,6 @@ def _optimizers(network: FsqAutoencoder, recipe: TrainingRecipe) -> list[torch.o
         Muon(matrices, lr=recipe.learning_rate),
         torch.optim.Adam(others, lr=recipe.adam_learning_rate, betas=(0.9, 0.99)),
     ]
-
-
-def _rate(step: int, recipe: TrainingRecipe) -> float:
-    rise = min(1.0, (step + 1) / max(1, recipe.warmup_steps))
-    return rise * min(1.0, 1.25 * (1 - step / recipe.steps) + 0.002)
-
-
-def _batch(pools: list[Pool], recipe: TokenizerRecipe, step: int) -> Tensor:
-    crops = draw_batch(pools, recipe.training.crop, recipe.training.batch, recipe.seed, step)
-    return torch.from_numpy(crops).permute(0, 3, 1, 2)
 
 
 def _latent_penalty(latents: Tensor) -> Tensor:
@@ -235,82 +202,47 @@ def train(
     *,
     report: Callable[[str], None] = print,
     report_every: int = 100,
-    start_from: Path | None = None,
 ) -> dict[str, Any]:
-    """Train as the recipe says and write the weights.
+    """Train as the recipe says and write the weights; a run that was stopped goes on.
 
     Args:
-        recipe_path: YAML, see `TokenizerRecipe`.
-        out: the weights' file; rewritten at every tenth report and at the end.
+        recipe_path: YAML, see `hma_data.tokenizers.recipe.TokenizerRecipe`.
+        out: the weights' file, rewritten at every report; `<out>.state` holds the run until it ends.
         overrides: values to replace in the recipe, by dotted key.
         report: takes a line of progress.
         report_every: steps between reports.
-        start_from: weights of an earlier run of the same network to go on from.
 
     Returns:
         what the file's metadata says: recipe and corpus digests, steps, training PSNR.
 
     Raises:
-        RecipeError: the recipe is not valid, or its corpus is not there.
-        TokenizerError: `start_from` is not a weights' file of this network.
+        RecipeError: the recipe is not valid, its corpus is not there, or the state beside `out`
+            is another training's.
     """
     recipe = load_recipe(recipe_path, overrides)
     torch.set_num_threads(recipe.training.threads)
-    torch.manual_seed(recipe.seed)
-    pools, corpus_digest = load_pools(list(recipe.sources), Path(recipe.corpus).expanduser(), recipe.seed)
+    pools, corpus_sha256 = load_pools(list(recipe.sources), Path(recipe.corpus).expanduser(), recipe.seed)
     report("pictures: " + ", ".join(f"{pool.name} {len(pool.pictures)}" for pool in pools))
-    network = _network(recipe, pools, start_from)
-    optimizers = _optimizers(network, recipe.training)
-    average = _Average(network, recipe.training.ema)
-    facts = {"recipe": recipe.name, "recipe_sha256": recipe.digest(), "corpus_sha256": corpus_digest, "seed": recipe.seed}  # fmt: skip
-    started, squared = time.monotonic(), 0.0
-    for step in range(recipe.training.steps):
-        squared += _step(network, optimizers, _batch(pools, recipe, step), recipe, step)
-        average.update(network)
-        done = step + 1
-        if done % report_every == 0 or done == recipe.training.steps:
-            mean = squared / ((done - 1) % report_every + 1)
-            facts |= {"steps": done, "train_psnr_db": round(-10 * math.log10(mean), 2)}
-            report(f"step {done}: training PSNR {facts['train_psnr_db']} dB, {time.monotonic() - started:.0f} s")
-            squared = 0.0
-            if done % (10 * report_every) == 0 or done == recipe.training.steps:
-                save_weights(out, recipe.network.config(), average.values, facts)
+    run, state = Run(recipe, pools), out.with_name(out.name + ".state")
+    if state.exists():
+        run.resume(state)
+        report(f"going on from step {run.step}")
+    facts: dict[str, Any] = {
+        "recipe": recipe.name,
+        "recipe_sha256": recipe.digest(),
+        "corpus_sha256": corpus_sha256,
+        "seed": recipe.seed,
+    }
+    started, errors = time.monotonic(), []
+    while run.step < recipe.training.steps:
+        errors.append(run.advance())
+        if run.step % report_every == 0 or run.step == recipe.training.steps:
+            psnr = round(-10 * math.log10(sum(errors) / len(errors)), 2)
+            facts |= {"steps": run.step, "train_psnr_db": psnr}
+            report(f"step {run.step}: training PSNR {psnr} dB, {time.monotonic() - started:.0f} s")
+            errors.clear()
+            save_weights(out, recipe.network.config(), run.average, facts)
+            if run.step <= recipe.training.steps - recipe.training.decay_steps:
+                run.save(state)
+    state.unlink(missing_ok=True)
     return facts
-
-
-def _network(recipe: TokenizerRecipe, pools: list[Pool], start_from: Path | None) -> FsqAutoencoder:
-    from hma_data.tokenizers.fsq import read_weights
-
-    network = FsqAutoencoder(recipe.network.config())
-    if start_from is None:
-        first = draw_batch(pools, recipe.training.crop, 256, recipe.seed, -1 % 2**32)
-        start_linear(network, torch.from_numpy(np.ascontiguousarray(first.transpose(0, 3, 1, 2))))
-    else:
-        config, tensors, _ = read_weights(start_from)
-        if config != recipe.network.config():
-            raise RecipeError(start_from, "holds another network than the recipe's")
-        network.load_state_dict(tensors)
-    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
-
-
-def _step(
-    network: FsqAutoencoder,
-    optimizers: list[torch.optim.Optimizer],
-    crops: Tensor,
-    recipe: TokenizerRecipe,
-    step: int,
-) -> float:
-    rate = _rate(step, recipe.training)
-    for optimizer, highest in zip(
-        optimizers, (recipe.training.learning_rate, recipe.training.adam_learning_rate)
-    ):
-        optimizer.param_groups[0]["lr"] = highest * rate
-    made, latents = network(crops)
-    loss, squared = reconstruction_loss(made, crops, recipe.loss)
-    loss = loss + 0.01 * _latent_penalty(latents)
-    loss.backward()
-    nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-    for optimizer in optimizers:
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
-    return float(squared)

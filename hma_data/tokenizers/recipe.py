@@ -1,0 +1,131 @@
+"""What a training of the embedded tokenizer is decided by, as YAML.
+
+Every value is checked before anything is read or trained; unknown keys are refused.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from hma_data.errors import RecipeError
+from hma_data.tokenizers.corpus import DrawnSource, FileSource, PushtSource
+from hma_data.tokenizers.fsq_network import STRIDE, FsqConfig
+from hma_data.yaml_io import read_yaml
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class NetworkRecipe(_Strict):
+    """`FsqConfig` as a recipe says it."""
+
+    levels: list[list[int]]
+    width: tuple[int, int]
+    hidden: int
+    encoder_blocks: tuple[int, int]
+    decoder_blocks: tuple[int, int, int]
+    fine_width: int
+
+    @model_validator(mode="after")
+    def _is_a_network(self) -> "NetworkRecipe":
+        self.config()
+        return self
+
+    def config(self) -> FsqConfig:
+        """The network's shape."""
+        return FsqConfig.from_json(self.model_dump())
+
+
+class TrainingRecipe(_Strict):
+    """How long and how fast.
+
+    Attributes:
+        steps: of the optimizer.
+        batch, crop: crops a step, and their side in pixels, a multiple of 16.
+        learning_rate: the highest, of Muon (matrices) in units of the spectral norm.
+        adam_learning_rate: the highest, of Adam (biases, first and last layers).
+        warmup_steps: of linear rise at the start.
+        decay_steps: of linear fall at the end; in between the rate is constant, so a run that is
+            given more steps later goes on as if it had been meant so.
+        ema: decay of the averaged weights, which are the ones kept.
+        threads: of torch; the result depends on it in the last bits only.
+    """
+
+    steps: int = Field(gt=0)
+    batch: int = Field(gt=0)
+    crop: int = Field(gt=0, multiple_of=STRIDE)
+    learning_rate: float = Field(gt=0)
+    adam_learning_rate: float = Field(gt=0)
+    warmup_steps: int = Field(ge=0, default=100)
+    decay_steps: int = Field(ge=0, default=0)
+    ema: float = Field(ge=0, lt=1, default=0.998)
+    threads: int = Field(gt=0, default=1)
+
+    def rate(self, step: int) -> float:
+        """Share of the highest learning rate at a step, counted from 0."""
+        rise = min(1.0, (step + 1) / max(1, self.warmup_steps))
+        return min(rise, (self.steps - step) / max(1, self.decay_steps), 1.0)
+
+
+class LossRecipe(_Strict):
+    """Weights of the parts of the loss; pixels in [0, 1]."""
+
+    l2: float = Field(ge=0)
+    l1: float = Field(ge=0)
+    gradient: float = Field(ge=0)
+    ssim: float = Field(ge=0)
+
+
+class TokenizerRecipe(_Strict):
+    """A whole training, so that it can be done again."""
+
+    job: Literal["tokenizer"]
+    name: str
+    seed: int = Field(ge=0)
+    corpus: str
+    network: NetworkRecipe
+    training: TrainingRecipe
+    loss: LossRecipe
+    sources: list[FileSource | PushtSource | DrawnSource] = Field(min_length=1)
+
+    def digest(self) -> str:
+        """SHA-256 over all but where the corpus lies."""
+        return _digest(self.model_dump(mode="json", exclude={"corpus"}))
+
+    def course(self) -> str:
+        """SHA-256 over what decides the steps before the decay: runs of the same course can go on."""
+        values = self.model_dump(mode="json", exclude={"corpus"})
+        for key in ("steps", "decay_steps", "threads"):
+            values["training"].pop(key)
+        return _digest(values)
+
+
+def _digest(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def load_recipe(path: Path, overrides: dict[str, Any] | None = None) -> TokenizerRecipe:
+    """The recipe of a YAML file; `overrides` replace values by dotted key (`training.steps`).
+
+    Raises:
+        RecipeError: the file or an override is not valid.
+    """
+    values = read_yaml(path, RecipeError)
+    for key, value in (overrides or {}).items():
+        *parents, last = key.split(".")
+        node = values
+        for parent in parents:
+            node = node.get(parent) if isinstance(node, dict) else None
+        if not isinstance(node, dict):
+            raise RecipeError(path, f"has no key {key!r} to override")
+        node[last] = value
+    try:
+        return TokenizerRecipe.model_validate(values)
+    except ValidationError as fault:
+        first = fault.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise RecipeError(path, f"{place}: {first['msg']}, got {first['input']!r:.80}") from fault

@@ -1,0 +1,454 @@
+"""The tokenizers inside the package: what they give back, and what they refuse."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from hma_data.errors import RecipeError, TokenizerError
+from hma_data.shipped import shipped
+from hma_data.tokenizers.base import TOKENIZERS, Tokenizer, TokenizerSpec, get_tokenizer
+from hma_data.tokenizers.corpus import DrawnSource, draw_batch, draw_scene, load_pools
+from hma_data.tokenizers.eval import CodebookUse, evaluate, psnr_db, read_frames, ssim, to_markdown
+from hma_data.tokenizers.fsq import WEIGHTS, FsqTokenizer, read_weights, save_weights
+from hma_data.tokenizers.fsq_network import FsqAutoencoder, FsqConfig, Quantizer
+from hma_data.tokenizers.muon import orthogonal
+from hma_data.tokenizers.recipe import load_recipe
+from hma_data.tokenizers.train import train
+
+RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
+SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
+
+
+@pytest.fixture(scope="module")
+def fsq8() -> Tokenizer:
+    return get_tokenizer("fsq-8")
+
+
+@pytest.fixture(scope="module")
+def fsq16() -> Tokenizer:
+    return get_tokenizer("fsq-16")
+
+
+def scenes(count: int, size: int) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return np.stack([draw_scene(rng, size) for _ in range(count)])
+
+
+# -- contract
+
+
+@pytest.mark.parametrize("name", sorted(TOKENIZERS))
+def test_every_tokenizer_keeps_the_contract(name):
+    tokenizer = get_tokenizer(name)
+    assert isinstance(tokenizer, Tokenizer)
+    spec = tokenizer.spec
+    assert spec.name == name
+    assert TokenizerSpec.from_json(spec.to_json()) == spec
+    frames = scenes(3, spec.image_size)
+    tokens = tokenizer.encode(frames)
+    cells = spec.grid if spec.kind == "discrete" else (spec.channels, *spec.grid)
+    assert tokens.shape == (3, *cells)
+    assert tokens.dtype == np.dtype(spec.dtype)
+    made = tokenizer.decode(tokens)
+    assert made.shape == frames.shape and made.dtype == np.uint8
+    assert psnr_db(frames, made).mean() > 20
+
+
+@pytest.mark.parametrize("name", sorted(TOKENIZERS))
+def test_no_frames_give_no_tokens(name):
+    tokenizer = get_tokenizer(name)
+    size = tokenizer.spec.image_size
+    tokens = tokenizer.encode(np.empty((0, size, size, 3), np.uint8))
+    assert len(tokens) == 0
+    assert tokenizer.decode(tokens).shape == (0, size, size, 3)
+
+
+def test_the_embedded_vocabulary_is_two_digits_of_512(fsq16):
+    assert fsq16.spec.vocab_size == 2**18
+    assert fsq16.spec.factored == (512, 512)
+    assert fsq16.spec.grid == (16, 16)
+
+
+def test_the_weights_fit_into_the_package():
+    assert WEIGHTS.stat().st_size <= 12_000_000
+
+
+def test_raw_gives_the_same_pixels_back():
+    raw = get_tokenizer("raw")
+    frames = scenes(2, 256)
+    assert np.array_equal(raw.decode(raw.encode(frames)), frames)
+
+
+# -- determinism
+
+
+@pytest.mark.parametrize("split", [(1,) * 5, (4, 1), (2, 3)])
+def test_a_frame_has_the_same_ids_in_any_batch(fsq16, split):
+    frames = scenes(5, 256)
+    whole = fsq16.encode(frames)
+    ends = np.cumsum(split)
+    parts = [fsq16.encode(frames[end - n : end]) for n, end in zip(split, ends)]
+    assert np.array_equal(np.concatenate(parts), whole)
+
+
+def test_a_frame_has_the_same_ids_in_any_order(fsq8):
+    frames = scenes(21, 128)
+    order = np.random.default_rng(0).permutation(21)
+    assert np.array_equal(fsq8.encode(frames[order]), fsq8.encode(frames)[order])
+
+
+def test_a_frame_has_the_same_ids_with_any_number_of_threads(fsq8):
+    frames = scenes(16, 128)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = fsq8.encode(frames)
+        torch.set_num_threads(2)
+        two = fsq8.encode(frames)
+    finally:
+        torch.set_num_threads(before)
+    assert np.array_equal(one, two)
+
+
+# -- quantizer
+
+
+@pytest.mark.parametrize("levels", [((8, 8, 8), (8, 8, 8)), ((16, 4), (3,))])
+def test_ids_and_levels_are_one_to_one(levels):
+    quantizer = Quantizer(FsqConfig(levels=levels))
+    count = int(np.prod(quantizer.factored))
+    ids = torch.arange(count).view(1, 1, count)
+    assert torch.equal(quantizer.to_ids(quantizer.to_digits(ids)), ids)
+
+
+def test_the_low_digit_is_made_of_the_first_channels():
+    quantizer = Quantizer(FsqConfig())
+    levels = torch.zeros(1, 6, 1, 2)
+    levels[0, :3, 0, 0] = torch.tensor([1.0, 2.0, 3.0])
+    levels[0, 3:, 0, 1] = torch.tensor([4.0, 5.0, 6.0])
+    low, high = 1 + 2 * 8 + 3 * 64, 4 + 5 * 8 + 6 * 64
+    assert quantizer.to_ids(levels).tolist() == [[[low, 512 * high]]]
+
+
+def test_every_level_is_equally_likely_for_normal_latents():
+    quantizer = Quantizer(FsqConfig())
+    latents = torch.randn(40, 6, 50, 50, generator=torch.Generator().manual_seed(0))
+    share = torch.bincount(quantizer.to_levels(latents).flatten().long(), minlength=8) / latents.numel()
+    assert torch.allclose(share, torch.full((8,), 1 / 8), atol=2e-3)
+
+
+def test_levels_stay_in_range_for_extreme_latents():
+    quantizer = Quantizer(FsqConfig())
+    latents = torch.tensor([-1e30, -9.0, 9.0, 1e30]).view(4, 1, 1, 1).expand(4, 6, 1, 1)
+    levels = quantizer.to_levels(latents)[:, 0, 0, 0].tolist()
+    assert levels == [0, 0, 7, 7]
+
+
+def test_quantisation_passes_the_gradient_of_the_squashing():
+    quantizer = Quantizer(FsqConfig())
+    latents = torch.linspace(-2, 2, 24).view(4, 6, 1, 1).requires_grad_()
+    quantizer(latents).sum().backward()
+    expected = torch.exp(-(latents.detach() ** 2) / 2) * (2 / np.pi) ** 0.5  # derivative of erf(z/√2)
+    assert torch.allclose(latents.grad, expected, atol=1e-6)
+
+
+# -- bad input
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        np.zeros((2, 256, 256, 3), np.uint8),
+        np.zeros((2, 128, 128, 3), np.float32),
+        np.zeros((128, 128, 3), np.uint8),
+        np.zeros((2, 128, 128, 4), np.uint8),
+    ],
+)
+def test_frames_of_another_size_or_dtype_are_refused(fsq8, frames):
+    with pytest.raises(TokenizerError, match="takes uint8 pictures"):
+        fsq8.encode(frames)
+
+
+@pytest.mark.parametrize("bad", [2**18, 2**32 - 1])
+def test_ids_outside_the_vocabulary_are_refused(fsq8, bad):
+    tokens = np.zeros((1, 8, 8), np.uint32)
+    tokens[0, 3, 3] = bad
+    with pytest.raises(TokenizerError, match="262143"):
+        fsq8.decode(tokens)
+
+
+def test_negative_ids_are_refused(fsq8):
+    with pytest.raises(TokenizerError, match="-1"):
+        fsq8.decode(np.full((1, 8, 8), -1, np.int64))
+
+
+@pytest.mark.parametrize("tokens", [np.zeros((1, 16, 16), np.uint32), np.zeros((1, 8, 8), np.float32)])
+def test_tokens_of_another_grid_or_kind_are_refused(fsq8, tokens):
+    with pytest.raises(TokenizerError, match="decodes"):
+        fsq8.decode(tokens)
+
+
+def test_raw_refuses_floats():
+    with pytest.raises(TokenizerError, match="float32"):
+        get_tokenizer("raw").decode(np.zeros((1, 3, 256, 256), np.float32))
+
+
+def test_an_unknown_name_is_answered_with_the_known_ones():
+    with pytest.raises(TokenizerError, match="fsq-16"):
+        get_tokenizer("fsq-17")
+
+
+def test_an_unknown_device_is_refused():
+    with pytest.raises(TokenizerError, match="abacus"):
+        get_tokenizer("fsq-8", device="abacus")
+
+
+# -- weights' file
+
+
+def test_missing_weights_are_named(tmp_path):
+    with pytest.raises(TokenizerError, match=r"gone\.safetensors"):
+        get_tokenizer("fsq-8", weights=str(tmp_path / "gone.safetensors"))
+
+
+@pytest.mark.parametrize("keep", [0, 4, 100, 5000, -1])
+def test_truncated_weights_are_refused(tmp_path, keep):
+    path = tmp_path / "cut.safetensors"
+    path.write_bytes(WEIGHTS.read_bytes()[:keep])
+    with pytest.raises(TokenizerError, match="safetensors"):
+        get_tokenizer("fsq-8", weights=str(path))
+
+
+def test_a_pickle_is_not_opened(tmp_path):
+    path = tmp_path / "evil.safetensors"
+    torch.save({"encoder": torch.zeros(2)}, path)
+    with pytest.raises(TokenizerError, match="no whole safetensors file"):
+        get_tokenizer("fsq-8", weights=str(path))
+
+
+def test_weights_of_another_architecture_are_refused(tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_file({"conv.weight": torch.zeros(3, 3)}, path, {"format": "pt"})
+    with pytest.raises(TokenizerError, match="hma-fsq-1"):
+        get_tokenizer("fsq-8", weights=str(path))
+
+
+@pytest.mark.parametrize(
+    "change", [{"width": [64, 256]}, {"levels": [[1]]}, {"hidden": "many"}, {"width": 3}]
+)
+def test_weights_whose_config_lies_are_refused(tmp_path, change):
+    path = tmp_path / "lying.safetensors"
+    config, tensors, _ = read_weights(WEIGHTS)
+    values = json.dumps(config.to_json() | change)
+    save_file(tensors, path, {"format": "hma-fsq-1", "config": values})
+    with pytest.raises(TokenizerError, match=r"fit the network|describes no network"):
+        get_tokenizer("fsq-8", weights=str(path))
+
+
+def test_other_weights_are_another_tokenizer(tmp_path, fsq8):
+    path = tmp_path / "small.safetensors"
+    save_weights(path, SMALL, dict(FsqAutoencoder(SMALL).named_parameters()), {})
+    other = get_tokenizer("fsq-8", weights=str(path))
+    assert other.spec.digest != fsq8.spec.digest
+    assert other.encode(scenes(2, 128)).shape == (2, 8, 8)
+
+
+def test_weights_say_how_they_were_trained():
+    from safetensors import safe_open
+
+    with safe_open(WEIGHTS, "pt") as file:
+        facts = json.loads(file.metadata()["training"])
+    assert facts["recipe_sha256"] == load_recipe(RECIPE).digest()
+    assert facts["steps"] == load_recipe(RECIPE).training.steps
+
+
+def test_weights_hold_nothing_but_the_network():
+    config, _, _ = read_weights(WEIGHTS)
+    expected = {name: tuple(p.shape) for name, p in FsqAutoencoder(config).named_parameters()}
+    assert {name: tuple(t.shape) for name, t in load_file(WEIGHTS).items()} == expected
+
+
+# -- measuring
+
+
+def test_ssim_and_psnr_agree_with_scikit_image():
+    metrics = pytest.importorskip("skimage.metrics")
+    true = scenes(2, 64)
+    noise = np.random.default_rng(1).normal(0, 20, true.shape)
+    made = np.clip(true + noise, 0, 255).astype(np.uint8)
+    for index in range(2):
+        grey = [(x[index] / 255.0) @ [0.299, 0.587, 0.114] for x in (true, made)]
+        theirs = metrics.structural_similarity(
+            *grey, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+        )
+        assert ssim(true, made)[index] == pytest.approx(theirs, abs=1e-6)
+        theirs = metrics.peak_signal_noise_ratio(true[index], made[index])
+        assert psnr_db(true, made)[index] == pytest.approx(theirs)
+
+
+def test_codebook_use_of_known_ids(fsq8):
+    use = CodebookUse(fsq8.spec)
+    use.add(np.array([[[0, 1], [512, 513]]]))
+    result = use.result()
+    assert result["digit_use"] == [round(2 / 512, 4)] * 2
+    assert result["joint_perplexity"] == 4 and result["entropy_bits_per_token"] == 2
+
+
+def test_evaluation_does_not_depend_on_how_frames_are_batched(fsq8):
+    frames = scenes(5, 128)
+    single, whole = evaluate(fsq8, iter(frames), worst=2), evaluate(fsq8, [frames], worst=2)
+    for key in ("frames", "psnr_db", "ssim", "digit_use", "joint_perplexity"):
+        assert single[key] == whole[key]
+    value, index, true, made = whole["worst_frames"][0]
+    assert value == pytest.approx(whole["psnr_db_min"], abs=1e-3)
+    assert np.array_equal(true, frames[index]) and made.shape == true.shape
+
+
+def test_raw_is_measured_as_lossless():
+    result = evaluate(get_tokenizer("raw"), [scenes(1, 256)])
+    assert result["psnr_db"] == 99 and result["ssim"] == pytest.approx(1)
+    assert result["bits_per_frame"] == 256 * 256 * 24
+    assert "| raw |" in to_markdown({"raw": result})
+
+
+def test_no_frames_cannot_be_measured(fsq8, tmp_path):
+    with pytest.raises(TokenizerError, match="no frame"):
+        evaluate(fsq8, [])
+    with pytest.raises(TokenizerError, match="no picture"):
+        list(read_frames(tmp_path, 128))
+
+
+@pytest.mark.real
+def test_real_robot_frames_come_back_as_promised(real_data, fsq16):
+    folder = real_data / "lerobot" / "g1_v21" / "videos"
+    videos = sorted(folder.rglob("*.mp4"))[:1]
+    result = evaluate(fsq16, read_frames(videos[0], 256, frames=8))
+    assert result["psnr_db"] >= PROMISED_PSNR_DB and result["ssim"] >= PROMISED_SSIM
+
+
+PROMISED_PSNR_DB, PROMISED_SSIM = 25.0, 0.80
+
+
+# -- training
+
+
+def write_recipe(folder: Path, **training: object) -> Path:
+    import yaml
+
+    values = {
+        "job": "tokenizer",
+        "name": "small",
+        "seed": 1,
+        "corpus": str(folder),
+        "network": SMALL.to_json(),
+        "training": {
+            "steps": 6,
+            "batch": 4,
+            "crop": 32,
+            "learning_rate": 0.02,
+            "adam_learning_rate": 0.001,
+            "warmup_steps": 2,
+            **training,
+        },
+        "loss": {"l2": 10.0, "l1": 0.3, "gradient": 0.3, "ssim": 0.05},
+        "sources": [{"kind": "drawn", "pictures": 4}],
+    }
+    path = folder / "recipe.yaml"
+    path.write_text(yaml.safe_dump(json.loads(json.dumps(values))))
+    return path
+
+
+def test_training_makes_weights_that_tokenize(tmp_path):
+    out = tmp_path / "w.safetensors"
+    lines: list[str] = []
+    facts = train(write_recipe(tmp_path), out, report=lines.append, report_every=3)
+    assert facts["steps"] == 6 and len(lines) == 3
+    tokenizer = get_tokenizer("fsq-8", weights=str(out))
+    assert isinstance(tokenizer, FsqTokenizer)
+    assert psnr_db(scenes(4, 128), tokenizer.decode(tokenizer.encode(scenes(4, 128)))).mean() > 14
+
+
+def test_training_learns(tmp_path):
+    out = tmp_path / "w.safetensors"
+    lines: list[str] = []
+    train(write_recipe(tmp_path, steps=60), out, report=lines.append, report_every=30)
+    first, last = (float(line.split("PSNR ")[1].split(" ")[0]) for line in lines[1:])
+    assert last > first
+
+
+def test_training_again_gives_the_same_weights(tmp_path):
+    recipe = write_recipe(tmp_path)
+    for name in ("a", "b"):
+        train(recipe, tmp_path / name, report=lambda _: None)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path):
+    recipe = write_recipe(tmp_path, decay_steps=2)
+    train(recipe, tmp_path / "whole", report=lambda _: None)
+
+    class Stopped(Exception):
+        pass
+
+    def stop(line: str) -> None:
+        if line.startswith("step 4"):
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        train(recipe, tmp_path / "parts", report=stop, report_every=1)
+    train(recipe, tmp_path / "parts", report=lambda _: None)
+    whole, parts = load_file(tmp_path / "whole"), load_file(tmp_path / "parts")
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_a_state_of_another_training_is_refused(tmp_path):
+    (tmp_path / "w.state").write_bytes(b"junk")
+    with pytest.raises(RecipeError, match=r"w\.state"):
+        train(write_recipe(tmp_path), tmp_path / "w", report=lambda _: None)
+
+
+def test_crops_depend_on_seed_and_step_alone(tmp_path):
+    pools, digest = load_pools([DrawnSource(kind="drawn", pictures=3)], tmp_path, 7)
+    again, same = load_pools([DrawnSource(kind="drawn", pictures=3)], tmp_path, 7)
+    assert digest == same
+    crops = draw_batch(pools, 48, 6, 7, 3)
+    assert np.array_equal(crops, draw_batch(again, 48, 6, 7, 3))
+    assert not np.array_equal(crops, draw_batch(pools, 48, 6, 7, 4))
+    assert crops.min() >= -1 and crops.max() <= 1
+
+
+def test_the_shipped_recipe_is_valid_and_makes_the_shipped_network():
+    config, _, _ = read_weights(WEIGHTS)
+    assert load_recipe(RECIPE).network.config() == config
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ({"training.steps": 0}, "training.steps"),
+        ({"training.stepz": 5}, "training.stepz"),
+        ({"loss.l2": float("nan")}, "loss.l2"),
+        ({"network.hidden": 0}, "network"),
+        ({"seed.x": 1}, "seed.x"),
+        ({"sources": []}, "sources"),
+    ],
+)
+def test_recipe_faults_name_the_key(overrides, named):
+    with pytest.raises(RecipeError, match=named):
+        load_recipe(RECIPE, overrides)
+
+
+def test_a_corpus_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(RecipeError, match="scikit-image"):
+        train(RECIPE, tmp_path / "w", {"corpus": str(tmp_path)})
+
+
+@pytest.mark.parametrize("shape", [(6, 40), (40, 6)])
+def test_orthogonal_brings_singular_values_near_one(shape):
+    matrix = torch.randn(*shape, generator=torch.Generator().manual_seed(0))
+    values = torch.linalg.svdvals(orthogonal(matrix))
+    assert values.min() > 0.6 and values.max() < 1.3
