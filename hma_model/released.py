@@ -134,7 +134,7 @@ def state_from_released(
         config: from `config_from_released`.
 
     Returns:
-        What `HMA.load_trunk` takes, and per embodiment the stem and head `HMA.load_embodiment` takes; float32.
+        What `HMA.load_trunk` takes, and per embodiment the stem and head for `HMA.load_embodiment`; float32.
 
     Raises:
         CheckpointError: a tensor is missing.

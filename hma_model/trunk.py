@@ -100,10 +100,27 @@ def window_clock(config: HMAConfig, frames: int, device: torch.device | str) -> 
 
 
 def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
-    """Rotate x (..., T, heads, head_dim) by each frame's angles."""
+    """Rotate neighbouring pairs of x (..., T, heads, head_dim) by each frame's angles."""
     cos, sin = (angle.to(x.dtype).unsqueeze(-2) for angle in rotary)
-    first, second = x.chunk(2, dim=-1)
-    return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1)
+    even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
+    return torch.stack([even * cos - odd * sin, odd * cos + even * sin], dim=-1).flatten(-2)
+
+
+def rotate_qkv(qkv: Tensor, rotary: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotate the queries and keys of (M, T, 3, heads, head_dim), the values staying; give the three.
+
+    Without a compiler to fuse it, one complex product over contiguous memory is several times as fast.
+    """
+    if qkv.dtype != torch.float32 or torch.compiler.is_compiling():
+        q, k, v = qkv.unbind(2)
+        return rotate(q, rotary), rotate(k, rotary), v
+    turn = torch.complex(*rotary)
+    turns = (
+        torch.stack([turn, turn, torch.ones_like(turn)], dim=1).unsqueeze(2).expand(-1, -1, qkv.shape[3], -1)
+    )
+    flat = torch.view_as_complex(qkv.view(*qkv.shape[:2], -1, 2)) * turns.flatten(1)
+    q, k, v = torch.view_as_real(flat).view_as(qkv).unbind(2)
+    return q, k, v
 
 
 class Attention(nn.Module):
@@ -112,7 +129,7 @@ class Attention(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         width = config.width
-        self.heads = config.heads
+        self.heads, self.normed = config.heads, config.qk_norm
         self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
         self.qkv = nn.Linear(width, 3 * width, bias=config.qkv_bias)
         self.proj = nn.Linear(width, width, bias=config.proj_bias)
@@ -121,10 +138,14 @@ class Attention(nn.Module):
 
     def project(self, x: Tensor, rotary: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor, Tensor]:
         """(M, length, D) -> queries, keys, values (M, heads, length, head_dim)."""
-        q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).unbind(2)
-        q, k = self.q_norm(q), self.k_norm(k)
-        if rotary is not None:
-            q, k = rotate(q, rotary), rotate(k, rotary)
+        qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1))
+        if rotary is not None and not self.normed:
+            q, k, v = rotate_qkv(qkv, rotary)
+        else:
+            q, k, v = qkv.unbind(2)
+            q, k = self.q_norm(q), self.k_norm(k)
+            if rotary is not None:
+                q, k = rotate(q, rotary), rotate(k, rotary)
         return q.transpose(1, 2), k.transpose(1, 2), v.transpose(1, 2)
 
     def merge(

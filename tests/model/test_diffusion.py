@@ -1,0 +1,82 @@
+"""The diffusion head against the closed form of a Gaussian, and its schedule."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from hma_model.diffusion import DiffusionHead, cosine_levels
+from tests.model.network_parts import small_config
+
+
+class _Gaussian(DiffusionHead):
+    """Knows the best noise prediction for samples from N(mean, spread^2)."""
+
+    def __init__(self, mean: float, spread: float) -> None:
+        super().__init__(small_config(kind="continuous"), 4)
+        self.mean, self.spread = mean, spread
+
+    def _level(self, level: Tensor) -> Tensor:
+        return self.levels[level].unsqueeze(-1)
+
+    def _noise(self, noisy: Tensor, level: Tensor, condition: Tensor) -> Tensor:
+        variance = level * self.spread**2 + 1 - level
+        return (1 - level).sqrt() * (noisy - level.sqrt() * self.mean) / variance
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+@pytest.mark.parametrize(("steps", "tolerance"), [(1000, 0.03), (100, 0.05), (20, 0.15)])
+def test_sampling_gives_the_distribution_back(steps: int, tolerance: float, temperature: float) -> None:
+    head = _Gaussian(mean=0.7, spread=0.5)
+    generator = torch.Generator().manual_seed(0)
+    samples = head.sample(torch.zeros(4000, 32), steps, temperature, generator)
+    assert abs(samples.mean().item() - 0.7) < tolerance
+    assert abs(samples.std().item() - 0.5) < tolerance
+
+
+def test_levels_fall_from_signal_to_noise_along_the_cosine() -> None:
+    levels = cosine_levels(1000)
+    assert (levels.diff() < 0).all() and levels[0] > 0.999 and levels[-1] < 1e-4
+    expected = math.cos((0.5 + 0.008) / 1.008 * math.pi / 2) ** 2 / math.cos(0.008 / 1.008 * math.pi / 2) ** 2
+    assert levels[499].item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_estimates_are_clipped_in_every_step() -> None:
+    head = _Gaussian(mean=50.0, spread=0.1)
+    head.clip = 3.0
+    samples = head.sample(torch.zeros(16, 32), 10, 0.0, torch.Generator().manual_seed(0))
+    assert samples.abs().max() <= 3.0
+
+
+def test_a_new_head_predicts_no_noise() -> None:
+    head = DiffusionHead(small_config(kind="continuous"), 4)
+    loss = head.loss(torch.randn(2000, 4), torch.randn(2000, 32), torch.Generator().manual_seed(0))
+    assert loss.shape == (2000,) and abs(loss.mean().item() - 1) < 0.05
+
+
+def test_repeats_average_more_noise_levels() -> None:
+    config = small_config(kind="continuous", diffusion_repeats=8)
+    loss = DiffusionHead(config, 4).loss(torch.randn(500, 4), torch.randn(500, 32))
+    assert loss.shape == (500,) and loss.std() < 0.5
+
+
+def test_variance_outputs_are_there_but_not_read() -> None:
+    head = DiffusionHead(small_config(kind="continuous", diffusion_variance=True), 4)
+    noise = head(torch.randn(3, 4), torch.tensor([0, 500, 999]), torch.randn(3, 32))
+    assert head.output.out_features == 8 and noise.shape == (3, 4)
+
+
+def test_the_head_learns_what_its_condition_says() -> None:
+    torch.manual_seed(0)
+    head = DiffusionHead(small_config(kind="continuous", diffusion_width=64), 2)
+    condition = torch.randn(256, 32)
+    target = condition[:, :2].sign()
+    optimizer = torch.optim.AdamW(head.parameters(), 3e-3)
+    for _ in range(200):
+        loss = head.loss(target, condition).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    samples = head.sample(condition, 20, generator=torch.Generator().manual_seed(0))
+    assert (samples.sign() == target).float().mean() > 0.9

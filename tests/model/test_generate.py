@@ -1,0 +1,165 @@
+"""Rollouts: the cache against computing everything again, and what decoding promises."""
+
+import pytest
+import torch
+
+from hma_data.errors import HMAError
+from hma_model.generate import Rollout
+from hma_model.model import HMA
+from tests.model.network_parts import ARM, small_batch, small_model
+
+LAYOUTS = {
+    "rotary": {},
+    "learned": {"time_position": "learned"},
+    "released": {
+        "time_position": "learned", "conditioning": ("concat", "modulation"), "action_tokens": 3,
+        "modulation_out": "embodiment", "absent_action": "skip", "action_alignment": "current",
+        "temporal_norm": False, "final_norm": False,
+    },
+    "cross": {"conditioning": ("add", "cross_attention")},
+}  # fmt: skip
+
+
+def _seed(value: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(value)
+
+
+def _rollout(
+    model: HMA, cache: bool, prompt: int, frames: int, actions: bool = True, **how: object
+) -> torch.Tensor:
+    batch = small_batch(model.config, ["arm", "hand.v1", "arm"], frames=prompt + frames)
+    known = batch.tokens if model.config.kind == "discrete" else batch.latents
+    chunks = batch.actions if actions else None
+    return model.generate(
+        known[:, :prompt], chunks, batch.embodiment, frames, generator=_seed(), cache=cache, **how
+    )  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("actions", [True, False])
+@pytest.mark.parametrize("prompt", [1, 3, 7])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_cache_changes_nothing(layout: str, prompt: int, actions: bool) -> None:
+    model = small_model(**LAYOUTS[layout])
+    how = {"unmask_steps": 3, "temperature": 0.5}
+    cached, plain = (_rollout(model, cache, prompt, 7, actions, **how) for cache in (True, False))
+    assert torch.equal(cached, plain)
+
+
+@pytest.mark.parametrize("layout", ["rotary", "released"])
+def test_the_cache_changes_no_latents(layout: str) -> None:
+    model = small_model(kind="continuous", **LAYOUTS[layout])
+    for parameter in model.latent_readout.diffusion.parameters():
+        parameter.data *= 0.3  # a random head with many steps would enlarge rounding
+    cached, plain = (_rollout(model, cache, 2, 6, unmask_steps=3, temperature=0.5) for cache in (True, False))
+    assert (cached - plain).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("order", ["random", "confidence"])
+def test_the_cache_keeps_features_within_rounding(order: str) -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"], frames=4)
+    rollouts = [Rollout(model, "arm", cache=cache, order=order, generator=_seed()) for cache in (True, False)]
+    features = []
+    for rollout in rollouts:
+        rollout.prompt(batch.tokens[:, :3], batch.actions)
+        rollout._take(batch.actions[:, 2], None)
+        with torch.no_grad():
+            features.append(rollout._features(rollout._blank(), rollout._condition(4), first=True)[0])
+    assert (features[0] - features[1]).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("unmask_steps", [1, 2, 5, 40])
+def test_every_token_is_unmasked(unmask_steps: int) -> None:
+    made = _rollout(small_model(), True, 2, 3, unmask_steps=unmask_steps)
+    assert made.shape == (3, 3, 4, 4) and made.min() >= 0 and made.max() < 24
+
+
+def test_one_pass_takes_the_likeliest_tokens() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"], frames=3)
+    made = model.generate(batch.tokens[:, :2], batch.actions, "arm", 1, unmask_steps=1)
+    window = torch.cat([batch.tokens[:, :2], torch.full((1, 1, 4, 4), 24)], dim=1)
+    with torch.no_grad():
+        logits = model.video_logits(window, batch.actions, "arm")[:, 2]
+    low, high = logits[..., 0, :6].argmax(-1), logits[..., 1, :4].argmax(-1)
+    assert torch.equal(made[:, 0], low + 6 * high)
+
+
+def test_temperature_flattens_what_is_drawn() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"], frames=2)
+    prompt, actions = batch.tokens[:, :1].expand(64, -1, -1, -1), batch.actions.expand(64, -1, -1)
+
+    def kinds(temperature: float) -> float:
+        made = model.generate(prompt, actions, "arm", 1, 1, temperature, _seed())
+        return sum(made[:, 0, y, x].unique().numel() for y in range(4) for x in range(4)) / 16
+
+    assert kinds(0.0) == 1
+    assert 1 < kinds(0.2) < kinds(5.0)
+
+
+def test_the_same_generator_gives_the_same_frames() -> None:
+    model = small_model()
+    first, second = (_rollout(model, True, 2, 3, temperature=1.0) for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def test_actions_steer_the_frames_after_them() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"], frames=6)
+    first = model.generate(batch.tokens[:, :2], batch.actions, "arm", 4, generator=_seed())
+    batch.actions[:, 3:] += 3
+    second = model.generate(batch.tokens[:, :2], batch.actions, "arm", 4, generator=_seed())
+    assert torch.equal(first[:, :2], second[:, :2]) and not torch.equal(first[:, 2:], second[:, 2:])
+
+
+def test_stepping_equals_generating() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=6)
+    made = model.generate(batch.tokens[:, :3], batch.actions, batch.embodiment, 3, generator=_seed())
+    rollout = Rollout(model, batch.embodiment, 2, generator=_seed())
+    rollout.prompt(batch.tokens[:, :3], batch.actions[:, :2])
+    steps = torch.stack([rollout.step(batch.actions[:, k]) for k in (2, 3, 4)], dim=1)
+    assert torch.equal(made, steps)
+
+
+def test_a_prompt_begins_a_rollout_anew() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"], frames=6)
+    rollout = Rollout(model, "arm")
+    frames = []
+    for _ in range(2):
+        rollout.prompt(batch.tokens[:, :2], batch.actions)
+        torch.manual_seed(0)
+        frames.append([rollout.step(batch.actions[:, k]) for k in (1, 2)])
+    assert all(torch.equal(a, b) for a, b in zip(*frames))
+
+
+def test_latents_come_back_in_the_scale_they_are_stored_in() -> None:
+    made = _rollout(small_model(kind="continuous"), True, 2, 2, sample_steps=3)
+    assert made.shape == (3, 2, 3, 8, 8) and made.dtype == torch.float32 and torch.isfinite(made).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"unmask_steps": 0}, "unmask_steps"),
+        ({"temperature": -1.0}, "temperature"),
+        ({"order": "spiral"}, "order"),
+    ],
+)
+def test_wrong_decoding_is_refused(change: dict, message: str) -> None:
+    with pytest.raises(HMAError, match=message):
+        _rollout(small_model(), True, 2, 1, **change)
+
+
+def test_too_few_actions_are_refused() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"])
+    with pytest.raises(HMAError, match="5 action chunks for 3 \\+ 4 frames"):
+        model.generate(batch.tokens[:, :3], batch.actions, "arm", 4)
+
+
+def test_a_prompt_of_another_shape_is_refused() -> None:
+    with pytest.raises(HMAError, match="prompt"):
+        small_model().generate(torch.zeros(1, 2, 4, 3, dtype=torch.long), None, ARM.id, 1)

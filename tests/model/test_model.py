@@ -1,0 +1,233 @@
+"""Objectives, losses, states and predictions of the whole model."""
+
+import math
+
+import pytest
+import torch
+
+from hma_data.errors import CheckpointError, HMAError
+from hma_model.config import OBJECTIVES, ActionSpace
+from hma_model.embed import from_digits, patchify, to_digits, unpatchify
+from hma_model.model import HMA
+from tests.model.network_parts import ARM, HAND, small_batch, small_config, small_model
+
+KINDS = ["discrete", "continuous"]
+
+
+def _seed(value: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(value)
+
+
+def test_digits_are_low_first_and_come_back() -> None:
+    tokens = torch.arange(24)
+    digits = to_digits(tokens, (6, 4))
+    assert digits[7].tolist() == [1, 1] and digits[5].tolist() == [5, 0]
+    assert torch.equal(from_digits(digits, (6, 4)), tokens)
+
+
+def test_patches_keep_neighbours_together_and_come_back() -> None:
+    latents = torch.arange(2 * 3 * 4 * 6).view(1, 2, 3, 4, 6).float()
+    patches = patchify(latents, 2)
+    assert torch.equal(patches[0, 0, 4].view(3, 2, 2), latents[0, 0, :, 2:4, 2:4])
+    assert torch.equal(unpatchify(patches, 2, (2, 3)), latents)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_the_same_generator_gives_the_same_loss(kind: str, objective: str) -> None:
+    model = small_model(kind=kind)
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    first, second = (model(batch, objective, _seed(3)) for _ in range(2))
+    assert torch.equal(first.loss, second.loss) and torch.isfinite(first.loss)
+    assert not torch.equal(first.loss, model(batch, objective, _seed(4)).loss)
+
+
+def test_an_untrained_model_knows_nothing() -> None:
+    torch.manual_seed(0)
+    model = HMA(small_config(width=64, label_smoothing=0.0))
+    model.add_embodiment(ARM)
+    loss = model(small_batch(model.config, ["arm"] * 8), "forward", _seed()).video_loss
+    assert loss is not None and abs(loss.item() - math.log(24)) < 0.1
+
+
+def test_video_loss_is_the_mean_over_masked_tokens_of_later_frames() -> None:
+    model = small_model(label_smoothing=0.0)
+    batch = small_batch(model.config, ["arm", "hand.v1", "arm"])
+    out = model(batch, "forward", _seed())
+    assert not out.masked[:, 0].any() and out.masked[:, 1:].any()
+    assert out.video_logits is not None and out.video_loss is not None
+    digits = to_digits(batch.tokens, model.config.factored)
+    sizes = model.config.factored
+    log_p = sum(
+        out.video_logits[..., i, : sizes[i]].log_softmax(-1).gather(-1, digits[..., i : i + 1])[..., 0]
+        for i in range(len(sizes))
+    )
+    assert torch.allclose(out.video_loss, -log_p[out.masked].mean(), atol=1e-5)  # type: ignore[index]
+    sample = -log_p[1][out.masked[1]].mean()  # type: ignore[index]
+    assert torch.allclose(out.per_sample[1], sample, atol=1e-5)
+
+
+def test_logits_are_not_kept_in_training() -> None:
+    model = small_model().train()
+    assert model(small_batch(model.config, ["arm"]), "forward", _seed()).video_logits is None
+
+
+@pytest.mark.parametrize("objective", ["policy", "inverse", "full"])
+def test_action_loss_ignores_absent_chunks(objective: str) -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    batch.action_mask[:, 2] = False
+    first = model(batch, objective, _seed()).action_loss
+    batch.actions[:, 2] += 100
+    assert torch.equal(first, model(batch, objective, _seed()).action_loss)
+    batch.actions[:, :2] += 100
+    assert not torch.equal(first, model(batch, objective, _seed()).action_loss)
+
+
+def test_policy_and_inverse_see_all_video() -> None:
+    model = small_model()
+    for objective in ("policy", "inverse"):
+        out = model(small_batch(model.config, ["arm"]), objective, _seed())
+        assert out.video_loss is None and not out.masked.any() and out.action_loss is not None
+
+
+@pytest.mark.parametrize("objective", ["forward", "policy"])
+def test_gradients_reach_exactly_the_stems_present(objective: str) -> None:
+    model = small_model().train()
+    model.add_embodiment(ActionSpace("third", 2, 1, (0.0, 0.0), (1.0, 1.0), (True, True)))
+    model(small_batch(model.config, ["arm", "third"]), objective, _seed()).loss.backward()
+    for name in ("arm", "third"):
+        assert model.stem(name).input.weight.grad.abs().sum() > 0
+        assert model.stem(name).modulation.weight.grad.abs().sum() > 0
+    assert all(
+        p.grad is None for p in [*model.stem("hand.v1").parameters(), *model.head("hand.v1").parameters()]
+    )
+    reached = model.head("arm").policy.weight.grad is not None
+    assert reached == (objective == "policy")
+
+
+@pytest.mark.parametrize(
+    ("objective", "change"),
+    [
+        *((objective, {}) for objective in OBJECTIVES),
+        ("policy", {"action_loss": "diffusion"}),
+        ("full", {"conditioning": ("concat", "modulation")}),
+    ],
+)
+def test_each_objective_overfits_a_handful_of_windows(objective: str, change: dict) -> None:
+    torch.manual_seed(0)
+    model = HMA(small_config(corrupt_max=0.0, history_probability=0.0, label_smoothing=0.0, **change))
+    model.add_embodiment(ARM)
+    batch, generator = small_batch(model.config, ["arm"] * 4), _seed()
+    optimizer = torch.optim.AdamW(model.parameters(), 3e-3)
+    losses = []
+    for _ in range(150):
+        out = model(batch, objective, generator)
+        optimizer.zero_grad()
+        out.loss.backward()
+        optimizer.step()
+        losses.append(out.loss.item())
+    assert sum(losses[-10:]) < 0.6 * sum(losses[:10])
+
+
+def test_predicted_actions_are_raw_and_padded() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    chunks = model.predict_actions(batch.tokens, batch.embodiment)
+    assert chunks.shape == (2, 5, ARM.chunk_dim)
+    assert (chunks[1, :, HAND.chunk_dim :] == 0).all()
+    assert (chunks[1, :, 1] == 3.0).all()  # the dim that never varies
+    alone = model.predict_actions(batch.tokens[1:], "hand.v1")
+    assert torch.allclose(chunks[1:, :, :2], alone, atol=1e-5)
+
+
+def test_inverse_reads_the_frame_after_and_policy_does_not() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"])
+    changed = batch.tokens.clone()
+    changed[:, 3] = (changed[:, 3] + 1) % 24
+    for readout, first in (("policy", 3), ("inverse", 2)):
+        one, two = (model.predict_actions(t, "arm", readout=readout) for t in (batch.tokens, changed))
+        change = (one - two).abs().amax((0, 2))
+        assert (change[:first] == 0).all() and change[first] > 0
+
+
+def test_continuous_loss_is_over_masked_patches() -> None:
+    model = small_model(kind="continuous")
+    out = model(small_batch(model.config, ["arm"]), "forward", _seed())
+    assert out.masked.shape == (1, 5, 4, 4) and not out.masked[:, 0].any() and torch.isfinite(out.loss)
+
+
+def test_masked_latents_are_not_seen() -> None:
+    model = small_model(kind="continuous")
+    batch = small_batch(model.config, ["arm"])
+    mask = torch.zeros(1, 5, 8, 8, dtype=torch.bool)
+    mask[:, 2, 2:4, 4:6] = True
+    with torch.no_grad():
+        one = model.video_conditions(batch.latents, mask, batch.actions, "arm")
+        batch.latents[:, 2, :, 2:4, 4:6] += 5
+        assert torch.equal(one, model.video_conditions(batch.latents, mask, batch.actions, "arm"))
+        batch.latents[:, 2, :, 0, 0] += 5
+        assert not torch.equal(one, model.video_conditions(batch.latents, mask, batch.actions, "arm"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_divide_and_join_without_loss(kind: str) -> None:
+    model = small_model(kind=kind, conditioning=("concat", "modulation"))
+    other = HMA(model.config).eval()
+    other.load_trunk(model.trunk_state())
+    for name in model.embodiments:
+        other.load_embodiment(name, model.stem_state(name), model.head_state(name))
+    assert other.embodiments.keys() == model.embodiments.keys()
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    assert torch.equal(model(batch, "full", _seed()).loss, other(batch, "full", _seed()).loss)
+    parts = {**model.trunk_state(), **model.stem_state("arm"), **model.head_state("arm")}
+    assert len(parts) == len({id(p) for p in parts.values()})
+
+
+def test_a_state_that_does_not_fit_names_every_key() -> None:
+    model = small_model()
+    state = model.trunk_state()
+    state["trunk.extra"] = state.pop("trunk.position")
+    state["readout.linear.bias"] = torch.zeros(3)
+    with pytest.raises(CheckpointError) as error:
+        model.load_trunk(state)
+    assert all(
+        name in str(error.value) for name in ("trunk.extra", "trunk.position", "readout.linear.bias is (3,)")
+    )
+
+
+def test_another_embodiment_of_the_same_id_is_refused() -> None:
+    model = small_model()
+    model.add_embodiment(ARM)
+    with pytest.raises(CheckpointError, match="arm"):
+        model.add_embodiment(ActionSpace("arm", 2, 1, (0.0, 0.0), (1.0, 1.0), (True, True)))
+
+
+def test_an_embodiment_that_is_not_there_is_named() -> None:
+    model = small_model()
+    with pytest.raises(HMAError, match="dog: the model has no such embodiment; it has arm, hand.v1"):
+        model.video_logits(small_batch(model.config, ["arm"]).tokens, None, "dog")
+
+
+def test_a_batch_of_another_tokenizer_is_refused() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"])
+    batch.tokens = batch.tokens[:, :, :2]
+    with pytest.raises(HMAError, match=r"frames of shape \(2, 4\) where the model takes \(4, 4\)"):
+        model(batch)
+
+
+def test_mup_keeps_logits_level_over_width() -> None:
+    spread = []
+    for width in (64, 256):
+        torch.manual_seed(0)
+        model = HMA(small_config(width=width, base_width=64, mup=True)).eval()
+        model.add_embodiment(ARM)
+        torch.nn.init.constant_(model.token_readout.linear.weight, 0.1)
+        batch = small_batch(model.config, ["arm"])
+        with torch.no_grad():
+            features = model.token_readout(torch.ones(width))
+        spread.append(features.mean().item())
+        assert torch.isfinite(model(batch, "forward", _seed()).loss)
+    assert spread[0] == pytest.approx(spread[1], rel=1e-4)

@@ -1,0 +1,166 @@
+"""Stems and trunk: normalisation, causality, positions, conditioning."""
+
+import pytest
+import torch
+
+from hma_data.errors import HMAError
+from hma_model.config import ActionSpace
+from hma_model.model import HMA
+from hma_model.stem import Normalizer
+from hma_model.trunk import rotary_angles, rotate, rotate_qkv
+from tests.model.network_parts import ARM, HAND, small_batch, small_model
+
+LAYOUTS = [
+    {"conditioning": ("modulation",)},
+    {"conditioning": ("concat", "modulation"), "action_tokens": 3, "modulation_out": "embodiment"},
+    {"conditioning": ("add",), "time_position": "learned"},
+    {"conditioning": ("cross_attention",), "qk_norm": True},
+    {"conditioning": ("modulation",), "shared_modulation": True, "action_alignment": "current", "mup": True},
+]
+
+
+def _logits(model: HMA, batch: object) -> torch.Tensor:
+    with torch.no_grad():
+        return model.video_logits(batch.tokens, batch.actions, batch.embodiment)  # type: ignore[attr-defined]
+
+
+def test_normalised_actions_have_unit_variance_and_come_back() -> None:
+    actions = torch.randn(500, 6) * torch.tensor([2.0, 0.5, 1.0] * 2) + torch.tensor([1.0, -2.0, 0.5] * 2)
+    normalizer = Normalizer(ARM)
+    values = normalizer(actions).unflatten(-1, (2, 3))
+    assert (
+        values[..., :2].mean((0, 1)).abs().max() < 0.1 and (values[..., :2].std((0, 1)) - 1).abs().max() < 0.1
+    )
+    assert torch.equal(values[..., 2], actions.unflatten(-1, (2, 3))[..., 2])  # not to be normalised
+    assert torch.allclose(normalizer.undo(normalizer(actions)), actions, atol=1e-6)
+
+
+def test_dims_that_never_vary_become_zero_and_come_back_as_their_mean() -> None:
+    normalizer = Normalizer(HAND)
+    assert normalizer(torch.tensor([[1.0, 3.0], [2.0, 4.0]]))[:, 1].tolist() == [0.0, 0.0]
+    assert normalizer.undo(torch.zeros(1, 2)).tolist() == [[0.0, 3.0]]
+
+
+def test_float32_rounding_of_a_constant_is_no_variance() -> None:
+    space = ActionSpace("x", 1, 1, (1000.1,), (3e-5,), (True,))
+    assert Normalizer(space)(torch.tensor([[1000.2]])).item() == 0
+
+
+def test_statistics_stay_float32_when_the_model_is_cast() -> None:
+    model = small_model().to(torch.bfloat16)
+    assert model.stem("arm").normalizer.mean.dtype == torch.float32
+    assert model.stem("arm").input.weight.dtype == torch.bfloat16
+    batch = small_batch(model.config, ["arm"])
+    assert _logits(model, batch).dtype == torch.float32
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_later_frames_and_actions_change_nothing_before_them(layout: dict) -> None:
+    model = small_model(**layout)
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    before = _logits(model, batch)
+    other = small_batch(model.config, ["arm", "hand.v1"], seed=1)
+    k = 3
+    batch.tokens[:, k:] = other.tokens[:, k:]
+    first = k - (model.config.action_alignment == "previous")  # of the chunks in force from frame k on
+    batch.actions[:, first:] = other.actions[:, first:]
+    after = _logits(model, batch)
+    assert torch.equal(before[:, :k], after[:, :k])
+    assert (before[:, k:] - after[:, k:]).abs().amax((2, 3, 4, 5)).min() > 1e-4
+
+
+def test_a_chunk_first_acts_on_the_frame_after_it() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"])
+    before = _logits(model, batch)
+    batch.actions[:, 2] += 1
+    change = (_logits(model, batch) - before).abs().amax((0, 2, 3, 4, 5))
+    assert change[:3].max() == 0 and change[3] > 1e-4
+
+
+def test_current_alignment_acts_on_the_frame_itself() -> None:
+    model = small_model(action_alignment="current")
+    batch = small_batch(model.config, ["arm"])
+    before = _logits(model, batch)
+    batch.actions[:, 2] += 1
+    change = (_logits(model, batch) - before).abs().amax((0, 2, 3, 4, 5))
+    assert change[:2].max() == 0 and change[2] > 1e-4
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_mixed_batch_equals_separate_batches(layout: dict) -> None:
+    model = small_model(**layout)
+    names = ["arm", "hand.v1", "arm", "hand.v1"]
+    batch = small_batch(model.config, names)
+    mixed = _logits(model, batch)
+    for name, space in (("arm", ARM), ("hand.v1", HAND)):
+        rows = [i for i, n in enumerate(names) if n == name]
+        with torch.no_grad():
+            alone = model.video_logits(batch.tokens[rows], batch.actions[rows, :, : space.chunk_dim], name)
+        assert (mixed[rows] - alone).abs().max() < 1e-5
+
+
+def test_rotary_scores_depend_on_the_distance_alone() -> None:
+    config = small_model().config
+    q, k = torch.randn(1, 1, 8), torch.randn(1, 1, 8)
+
+    def score(at: int, to: int) -> torch.Tensor:
+        positions = torch.tensor([at, to])
+        angles = [tuple(a[i : i + 1] for a in rotary_angles(config, positions)) for i in (0, 1)]
+        return (rotate(q, angles[0]) * rotate(k, angles[1])).sum()
+
+    assert torch.allclose(score(3, 1), score(103, 101), atol=1e-4)
+    assert not torch.allclose(score(3, 1), score(3, 2), atol=1e-3)
+
+
+def test_the_fast_rotation_equals_the_plain_one() -> None:
+    qkv = torch.randn(2, 5, 3, 4, 8)
+    angles = rotary_angles(small_model().config, torch.arange(5))
+    fast, plain = rotate_qkv(qkv, angles), rotate_qkv(qkv.double(), angles)
+    assert all(torch.allclose(a.double(), b, atol=1e-6) for a, b in zip(fast, plain))
+
+
+def test_a_window_longer_than_the_configured_sees_only_its_length_back() -> None:
+    model = small_model(layers=1)
+    batch = small_batch(model.config, ["arm"], frames=8)
+    before = _logits(model, batch)
+    batch.tokens[:, 0] = (batch.tokens[:, 0] + 1) % model.config.vocab_size
+    change = (_logits(model, batch) - before).abs().amax((0, 2, 3, 4, 5))
+    assert change[4] > 0 and change[5:].max() == 0
+
+
+def test_learned_positions_refuse_a_longer_window() -> None:
+    model = small_model(time_position="learned")
+    batch = small_batch(model.config, ["arm"], frames=6)
+    with pytest.raises(HMAError, match="6 frames where the learned positions end at 5"):
+        _logits(model, batch)
+
+
+def test_absent_actions_can_skip_conditioning_altogether() -> None:
+    model = small_model(conditioning=("concat", "modulation"), absent_action="skip")
+    batch = small_batch(model.config, ["arm"])
+    with torch.no_grad():
+        one = model.video_logits(batch.tokens, None, "arm")
+        assert torch.equal(one, model.video_logits(batch.tokens, None, "hand.v1"))
+
+
+def test_absent_chunks_are_not_read() -> None:
+    model = small_model()
+    batch = small_batch(model.config, ["arm"])
+    batch.action_mask[:, 1:3] = False
+    with torch.no_grad():
+        one = model.video_logits(batch.tokens, batch.actions, "arm", batch.action_mask)
+        batch.actions[:, 1:3] = float("nan")
+        two = model.video_logits(batch.tokens, batch.actions, "arm", batch.action_mask)
+    assert torch.equal(one, two)
+
+
+def test_checkpointed_blocks_give_the_same_gradients() -> None:
+    grads = []
+    for recompute in (False, True):
+        model = small_model().train()
+        model.trunk.checkpointing = recompute
+        out = model(small_batch(model.config, ["arm"]), "forward", torch.Generator().manual_seed(0))
+        out.loss.backward()
+        grads.append(model.trunk.blocks[0].mlp.fc1.weight.grad)
+    assert torch.allclose(*grads, atol=1e-7)
