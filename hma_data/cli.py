@@ -48,7 +48,10 @@ def inspect(
     ] = None,
     json: Json = False,
 ) -> None:
-    """What is in a recording. Example: hma inspect ./demo.hdf5"""
+    """What is in a recording.
+
+    Example: hma inspect ./demo.hdf5
+    """
     from hma_data.inspect import inspect_recording
 
     report = inspect_recording(uri, embodiment)
@@ -116,6 +119,9 @@ def convert(
     camera: Annotated[
         list[str] | None, typer.Option("--camera", help="Camera to keep; repeat for more.")
     ] = None,
+    shard_frames: Annotated[
+        int | None, typer.Option("--shard-frames", min=1, help="About so many a shard.")
+    ] = None,
     val_fraction: Annotated[
         float, typer.Option("--val-fraction", help="Share of episodes for validation.")
     ] = 0.05,
@@ -140,7 +146,7 @@ def convert(
     from hma_data.tokenizers.base import get_tokenizer
 
     robot = find(embodiment)
-    settings = Settings(frames.value, tuple(camera or ()), val_fraction, seed, limit)
+    settings = Settings(frames.value, tuple(camera or ()), val_fraction, seed, limit, shard_frames)
     if dry_run:
         plan, uri = plan_conversion(
             robot, source, get_tokenizer(tokenizer, weights=weights, device=device), settings
@@ -216,7 +222,10 @@ def _report_conversion(summary: Any, max_quarantine: float, json: bool) -> None:
 
 @shards_app.command("info")
 def shards_info(folder: Annotated[Path, typer.Argument(help="A shard set.")], json: Json = False) -> None:
-    """Totals of a shard set. Example: hma shards info shards/my_arm"""
+    """Totals of a shard set.
+
+    Example: hma shards info shards/my_arm
+    """
     from hma_data.shards.reader import ShardSet
 
     manifest = ShardSet(folder).manifest
@@ -256,7 +265,10 @@ def shards_info(folder: Annotated[Path, typer.Argument(help="A shard set.")], js
 def shards_verify(
     folders: Annotated[list[Path], typer.Argument(help="Shard sets.")], json: Json = False
 ) -> None:
-    """Every hash, row count and invariant. Example: hma shards verify shards/my_arm"""
+    """Every hash, row count and invariant.
+
+    Example: hma shards verify shards/my_arm
+    """
     from hma_data.shards.verify import verify
 
     found = {str(folder): verify(folder) for folder in folders}
@@ -302,7 +314,10 @@ def mixture(
     plot: Annotated[Path | None, typer.Option("--plot", help="PNG or SVG to draw.")] = None,
     json: Json = False,
 ) -> None:
-    """How often each embodiment is drawn. Example: hma mixture shards/a shards/b --plot mixture.png"""
+    """How often each embodiment is drawn.
+
+    Example: hma mixture shards/a shards/b --plot mixture.png
+    """
     from hma_data.loader import open_sets
     from hma_data.mixture import Mixture
     from hma_data.windows import WindowIndex
@@ -339,7 +354,10 @@ def mixture(
 
 @tokenizer_app.command("list")
 def tokenizer_list(json: Json = False) -> None:
-    """Names that --tokenizer takes. Example: hma tokenizer list"""
+    """Names that --tokenizer takes.
+
+    Example: hma tokenizer list
+    """
     from hma_data.tokenizers.base import TOKENIZERS, get_tokenizer
 
     rows = [get_tokenizer(name).spec for name in TOKENIZERS]

@@ -13,7 +13,10 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 @registry_app.command("list")
 def registry_list(json: Json = False) -> None:
-    """Every embodiment that an id finds. Example: hma registry list"""
+    """Every embodiment that an id finds.
+
+    Example: hma registry list
+    """
     from hma_data.embodiment import Embodiment, registry_files
 
     found: dict[str, Embodiment] = {}
@@ -70,7 +73,10 @@ def embodiment_facts(embodiment: Any) -> dict[str, Any]:
 def registry_show(
     id: Annotated[str, typer.Argument(help="Registry id, or a YAML file.")], json: Json = False
 ) -> None:
-    """One embodiment and what follows from it. Example: hma registry show pusht_fast"""
+    """One embodiment and what follows from it.
+
+    Example: hma registry show pusht_fast
+    """
     from hma_data.embodiment import find
 
     embodiment = find(id)
@@ -90,7 +96,10 @@ def registry_validate(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Every problem of every YAML, listed at once. Example: hma registry validate my_robot.yaml"""
+    """Every problem of every YAML, listed at once.
+
+    Example: hma registry validate my_robot.yaml
+    """
     from hma_data.embodiment import ID_PATTERN, problems, registry_files
     from hma_data.errors import HMAError, RegistryError
     from hma_data.yaml_io import read_yaml
@@ -126,7 +135,10 @@ def registry_validate(
 
 @registry_app.command("schema")
 def registry_schema() -> None:
-    """The JSON Schema of a registry YAML. Example: hma registry schema > embodiment.schema.json"""
+    """The JSON Schema of a registry YAML.
+
+    Example: hma registry schema > embodiment.schema.json
+    """
     from hma_data.embodiment import schema
 
     print_json(schema())

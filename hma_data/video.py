@@ -43,10 +43,10 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
     """
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
-    width, height = _png_size(buffer)
+    width, height = claimed_size(bytes(buffer[:65536]))
     if width * height > MAX_PIXELS:
-        raise EpisodeError(where, f"a picture claims {width}×{height} pixels")
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        raise EpisodeError(where, f"a picture claims {width}×{height} pixels, more than {MAX_PIXELS:,}")
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         picture = cv2.imdecode(buffer, flags) if len(buffer) else None
     except cv2.error as fault:
@@ -55,14 +55,20 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
         ) from fault
     if picture is None:
         raise EpisodeError(where, f"a picture of {len(buffer)} bytes cannot be decoded")
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    return picture
 
 
-def _png_size(buffer: NDArray[np.uint8]) -> tuple[int, int]:
-    head = bytes(buffer[:24])
-    if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
-        return 0, 0
-    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+def claimed_size(head: bytes) -> tuple[int, int]:
+    """Width and height that a PNG's or JPEG's first bytes claim; (0, 0) for anything else."""
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
+        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    at = 2
+    while head[:2] == b"\xff\xd8" and at + 9 <= len(head) and head[at] == 0xFF:
+        marker = head[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            return int.from_bytes(head[at + 7 : at + 9], "big"), int.from_bytes(head[at + 5 : at + 7], "big")
+        at += 2 + (0 if marker == 0xFF else int.from_bytes(head[at + 2 : at + 4], "big"))
+    return 0, 0
 
 
 def prepare(frames: Images, camera: Camera, size: int, resize_filter: Filter = "area") -> Images:

@@ -23,7 +23,7 @@ def real_data() -> Path:
 
 
 class BlockTokenizer:
-    """A tokenizer for tests: 8×8 blocks of a 64-pixel picture, 4 bits a colour channel; fast and exact on flat blocks."""
+    """A tokenizer for tests: 8×8 blocks of a 64-pixel picture, 4 bits a colour; exact on flat blocks."""
 
     spec = TokenizerSpec("block", 1, "discrete", 64, (8, 8), 4096, (64, 64), dtype="uint16")
 

@@ -166,7 +166,8 @@ def detect(uri: str) -> str:
 def _is_bag(path: Path) -> bool:
     magic = first_bytes(path, 16)
     known = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3")
-    return path.suffix in (".bag", ".mcap", ".db3") or magic.startswith(known)
+    endings = (".bag", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+    return path.name.endswith(endings) or magic.startswith(known)
 
 
 def local_path(uri: str) -> Path:
@@ -217,17 +218,23 @@ def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArr
     Raises:
         EpisodeError: a width, a length or a dtype does not fit.
     """
-    return np.concatenate(
-        [component_values(part, piece, where) for part, piece in zip(vector.components, pieces, strict=True)],
-        axis=1,
-    )
+    parts = [
+        component_values(part, piece, where) for part, piece in zip(vector.components, pieces, strict=True)
+    ]
+    lengths = {part.key: len(values) for part, values in zip(vector.components, parts, strict=True)}
+    if len(set(lengths.values())) > 1:
+        said = ", ".join(f"{key} {length}" for key, length in lengths.items())
+        raise EpisodeError(where, f"its components differ in length: {said}")
+    return np.concatenate(parts, axis=1)
 
 
 def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.float32]:
     """One component's (T, dims) float32; see `compose`."""
     if piece.dtype == object or piece.dtype.kind not in "fiub":
         raise EpisodeError(where, f"{part.key} holds {piece.dtype}, not numbers")
-    values = piece.reshape(len(piece), -1) if piece.ndim != 2 else piece
+    if piece.ndim < 1 or not len(piece):
+        raise EpisodeError(where, f"{part.key} holds no values over time (shape {piece.shape})")
+    values = piece.reshape(len(piece), -1)
     width = values.shape[1]
     if part.slice:
         if part.slice[1] > width:
@@ -244,4 +251,5 @@ def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.f
             "correct dims or give slice in the YAML",
         )
     values = values.astype(np.float64) * np.asarray(part.sign) + np.asarray(part.offset)
-    return values.astype(np.float32)
+    with np.errstate(over="ignore"):  # what float32 cannot hold is refused as not finite by align
+        return values.astype(np.float32)

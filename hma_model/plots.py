@@ -1,0 +1,76 @@
+"""Plots of training and rollouts as SVG: axes with units, told apart by dash and marker as well as colour."""
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+STYLES = ("-", "--", "-.", ":")
+MARKERS = ("o", "s", "^", "D")
+
+
+def loss_curve(
+    training: Sequence[tuple[int, float]], validation: Sequence[tuple[int, float]], baseline: float | None
+) -> bytes:
+    """Training loss (thin, and its running mean), validation loss, and the baseline that looks at nothing.
+
+    Args:
+        training, validation: (step, nats a token).
+        baseline: nats a token; None leaves it out.
+    """
+    figure, axes = _axes("training step", "loss, nats a token")
+    if training:
+        steps, losses = np.array(training, float).T
+        axes.plot(steps, losses, color=COLOURS[0], alpha=0.25, lw=0.8)
+        width = max(1, len(losses) // 30)
+        smooth = np.convolve(losses, np.ones(width) / width, "valid")
+        axes.plot(steps[width - 1 :], smooth, color=COLOURS[0], lw=1.8, label="training (masked tokens)")
+    if validation:
+        steps, losses = np.array(validation, float).T
+        axes.plot(steps, losses, "s--", color=COLOURS[1], ms=5, label="validation (whole frames masked)")
+    if baseline is not None:
+        axes.axhline(baseline, color="#555555", ls=":", label="baseline: token frequencies alone")
+    axes.legend(frameon=False, fontsize=9)
+    return _svg(figure)
+
+
+def psnr_over_horizon(curves: Mapping[str, Sequence[float]], seconds_per_frame: float) -> bytes:
+    """PSNR of each predicted frame.
+
+    Args:
+        curves: name -> dB by frame after the prompt.
+        seconds_per_frame: of the model's grid.
+    """
+    figure, axes = _axes("seconds after the prompt", "PSNR, dB")
+    for i, (name, values) in enumerate(curves.items()):
+        time = seconds_per_frame * np.arange(1, len(values) + 1)
+        axes.plot(time, values, color=COLOURS[i], ls=STYLES[i], marker=MARKERS[i], ms=5, label=name)
+    axes.legend(frameon=False, fontsize=9)
+    return _svg(figure)
+
+
+def _axes(x: str, y: str) -> "tuple[Figure, Axes]":
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _svg(figure: "Figure") -> bytes:
+    import matplotlib
+
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "hma", "svg.fonttype": "path"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()

@@ -1,0 +1,225 @@
+"""The command line: exit codes, one-line errors, JSON, and that light verbs stay light."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import pytest
+
+from tests.conftest import ARM_YAML, write_toy
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def hma(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run the command as a user would."""
+    return subprocess.run(
+        [sys.executable, "-m", "hma_model.cli", *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+
+
+def fails(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
+    """One line on stderr that says all of `words`, no traceback, and the exit code."""
+    assert done.returncode == code, done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in errors[0]
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    """A recording and its YAML; the YAML's path."""
+    write_toy(tmp_path / "toy.hdf5", [14, 15, 16])
+    path = tmp_path / "toy_arm.yaml"
+    path.write_text(ARM_YAML)
+    return path
+
+
+def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
+    shown = hma("--help")
+    assert shown.returncode == 0
+    verbs = [
+        "demo",
+        "registry",
+        "inspect",
+        "convert",
+        "shards",
+        "mixture",
+        "train",
+        "evaluate",
+        "generate",
+        "hub",
+    ]
+    for verb in verbs:
+        assert verb in shown.stdout
+    for verb in (
+        ["convert"],
+        ["inspect"],
+        ["train"],
+        ["hub", "push"],
+        ["shards", "verify"],
+        ["registry", "infer"],
+    ):
+        assert "Example: hma" in " ".join(hma(*verb, "--help").stdout.replace("│", " ").split())
+
+
+def test_light_verbs_import_nothing_heavy() -> None:
+    code = """
+import sys
+from hma_model.cli import app
+app(["registry", "list", "--json"], standalone_mode=False)
+heavy = {"torch", "cv2", "av", "h5py", "rosbags", "pyarrow", "matplotlib", "numpy"} & set(sys.modules)
+assert not heavy, heavy
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_whole_data_road_on_a_toy_recording(arm: Path, tmp_path: Path) -> None:
+    out = tmp_path / "shards"
+    source = str(tmp_path / "toy.hdf5")
+    made = hma(
+        "convert", "-e", str(arm), "--source", source, "--tokenizer", "fsq-8", "--out", str(out), "--json"
+    )
+    assert made.returncode == 0, made.stderr
+    assert json.loads(made.stdout)["episodes"] == 3
+    again = hma(
+        "convert", "-e", str(arm), "--source", source, "--tokenizer", "fsq-8", "--out", str(out), "--json"
+    )
+    assert json.loads(again.stdout)["shards_made"] == 0
+    assert hma("shards", "verify", str(out)).returncode == 0
+    assert json.loads(hma("shards", "info", str(out), "--json").stdout)["totals"]["frames"] == 45
+    rows = json.loads(hma("mixture", str(out), "--frames", "4", "--json").stdout)["embodiments"]
+    assert rows[0]["probability"] == 1
+    assert hma("shards", "preview", str(out), "--out", str(tmp_path / "seen")).returncode == 0
+    assert (tmp_path / "seen" / "sheet.png").stat().st_size > 1000
+    assert (tmp_path / "seen" / "preview.mp4").stat().st_size > 1000
+
+
+def test_two_workers_write_the_same_bytes_as_one(arm: Path, tmp_path: Path) -> None:
+    write_toy(tmp_path / "many.hdf5", [9] * 8)
+    for workers in ("1", "2"):
+        done = hma(
+            "convert", "-e", str(arm), "--source", str(tmp_path / "many.hdf5"), "--tokenizer", "fsq-8",
+            "--out", str(tmp_path / workers), "--workers", workers, "--shard-frames", "20",
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+    files = {
+        w: {p.relative_to(tmp_path / w): p.read_bytes() for p in (tmp_path / w).rglob("*") if p.is_file()}
+        for w in "12"
+    }
+    assert files["1"] == files["2"]
+    assert sum(path.name.startswith("shard-") for path in files["1"]) == 3
+
+
+def test_infer_writes_a_yaml_whose_questions_validate_lists(arm: Path, tmp_path: Path) -> None:
+    out = tmp_path / "mine.yaml"
+    assert (
+        hma("registry", "infer", str(tmp_path / "toy.hdf5"), "--id", "mine", "--out", str(out)).returncode
+        == 0
+    )
+    asked = hma("registry", "validate", str(out))
+    assert asked.returncode == 1
+    assert "frequency_hz: still TODO" in asked.stdout
+    answers = {"frequency_hz: ": "10", "  space: ": "joint_delta", "kind: ": "simulation", "robot: ": "toy"}
+    lines = []
+    for line in out.read_text().splitlines():
+        key = next((k for k in answers if line.startswith(k) and "TODO" in line), None)
+        lines.append(key + answers[key] if key else line.replace("TODO: who says so?", "me"))
+    out.write_text("\n".join(lines))
+    assert hma("registry", "validate", str(out)).returncode == 0, out.read_text()
+    assert (
+        hma("convert", "-e", str(out), "--out", str(tmp_path / "o"), "--tokenizer", "fsq-8").returncode == 0
+    )
+    fails(
+        hma("registry", "infer", str(tmp_path / "toy.hdf5"), "--id", "mine", "--out", str(out)), 1, "exists"
+    )
+
+
+# -- bad input: one clear line each
+
+
+def test_wrong_usage_is_exit_code_two() -> None:
+    fails(hma("inspect"), 2, "Missing argument")
+    fails(hma("convert", "--nonsense"), 2, "--nonsense")
+    fails(hma("registry", "infer", str(ROOT), "--id", "Not An Id"), 2, "Not An Id")
+
+
+def test_an_unknown_embodiment_names_near_ones() -> None:
+    fails(hma("convert", "-e", "pusht_fats", "--out", "/nonexistent/o"), 1, "pusht_fast", "registry list")
+
+
+def test_a_wrong_yaml_lists_every_problem(arm: Path, tmp_path: Path) -> None:
+    arm.write_text(ARM_YAML.replace("frequency_hz: 10", "frequency_hz: -3").replace("kind:", "kinds:"))
+    done = hma(
+        "convert", "-e", str(arm), "--source", str(tmp_path / "toy.hdf5"), "--out", str(tmp_path / "o")
+    )
+    fails(done, 1, str(arm), "frequency_hz", "-3", "kinds: unknown key, did you mean 'kind'")
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_missing_recording_and_a_folder_of_nothing(arm: Path, tmp_path: Path) -> None:
+    out = str(tmp_path / "o")
+    fails(hma("convert", "-e", str(arm), "--source", str(tmp_path / "no.hdf5"), "--out", out), 1, "no.hdf5")
+    (tmp_path / "empty folder").mkdir()
+    fails(hma("inspect", str(tmp_path / "empty folder")), 1, "holds no files")
+
+
+def test_a_truncated_hdf5(arm: Path, tmp_path: Path) -> None:
+    toy = tmp_path / "toy.hdf5"
+    toy.write_bytes(toy.read_bytes()[: toy.stat().st_size // 2])
+    fails(hma("convert", "-e", str(arm), "--source", str(toy), "--out", str(tmp_path / "o")), 1, "toy.hdf5")
+    assert not (tmp_path / "o").exists()
+
+
+def test_an_action_of_the_wrong_width(arm: Path, tmp_path: Path) -> None:
+    arm.write_text(ARM_YAML.replace("dims: 3, names: [a, b, c]", "dims: 5"))
+    source, out = str(tmp_path / "toy.hdf5"), tmp_path / "o"
+    done = hma("convert", "-e", str(arm), "--source", source, "--tokenizer", "fsq-8", "--out", str(out))
+    assert done.returncode == 1
+    assert "3 values, the embodiment says 5" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_missing_key_names_what_is_there(arm: Path, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "toy.hdf5", "a") as file:
+        for name in file["data"]:
+            file.move(f"data/{name}/obs/image", f"data/{name}/obs/picture")
+    done = hma(
+        "convert", "-e", str(arm), "--source", str(tmp_path / "toy.hdf5"), "--tokenizer", "fsq-8",
+        "--out", str(tmp_path / "o"),
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "obs/image" in done.stderr
+    assert "obs/picture" in done.stderr
+
+
+def test_a_folder_of_another_embodiment_is_left_alone(arm: Path, tmp_path: Path) -> None:
+    arguments = ["--source", str(tmp_path / "toy.hdf5"), "--tokenizer", "fsq-8", "--out", str(tmp_path / "o")]
+    assert hma("convert", "-e", str(arm), *arguments).returncode == 0
+    other = tmp_path / "other.yaml"
+    other.write_text(ARM_YAML.replace("toy_arm", "other_arm"))
+    fails(hma("convert", "-e", str(other), *arguments), 1, "toy_arm there, other_arm now", "--overwrite")
+    arguments[3] = "fsq-16"
+    fails(hma("convert", "-e", str(arm), *arguments), 1, "fsq-8", "fsq-16")
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    assert "Traceback" in hma("inspect", str(tmp_path / "no"), "--debug").stderr
+
+
+def test_not_a_shard_set(tmp_path: Path) -> None:
+    fails(hma("shards", "info", str(tmp_path)), 1, "manifest.json")
+    done = hma("shards", "verify", str(tmp_path))
+    assert done.returncode == 1
+    fails(hma("mixture", str(tmp_path / "none")), 1, "not a folder")
