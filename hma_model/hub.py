@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hma_model.model import HMA
 
 Content = Path | bytes
+_FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
 
 
@@ -166,12 +167,25 @@ def _pull(
     return folder, wanted
 
 
-def list_embodiments(source: str | Path, revision: str | None = None) -> dict[str, dict[str, Any]]:
-    """The card of every embodiment published there, by id."""
-    store = open_store(source, revision)
-    files = store.files()
-    _config(store, files)
-    return {name: _card(store, name) for name in _ids(files)}
+def list_embodiments(source: str | Path, revision: str | None = None) -> list[dict[str, Any]]:
+    """What is published there, a row an embodiment: ids, action, rate, figures, licence, bytes."""
+    rows = []
+    for name, facts in describe(source, revision)["embodiments"].items():
+        card = facts["card"]
+        metrics = card.get("metrics") or {}
+        rows.append(
+            {
+                "embodiment": name,
+                "robot": card.get("robot"),
+                "action_dim": card.get("action_dim"),
+                "hz": card.get("effective_hz"),
+                "stride": card.get("stride"),
+                **{key: metrics.get(key) for key in _FIGURES},
+                "licence": card.get("license"),
+                "bytes": facts["bytes"],
+            }
+        )
+    return rows
 
 
 def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:

@@ -70,6 +70,10 @@ class Recipe(_Settings):
     model: dict[str, Any] = Field({}, description="fields of HMAConfig")
     objectives: dict[str, Number] = Field({"forward": 1.0}, description="how often each is drawn")
 
+    readout_bias: Literal["frequencies", "zero"] = Field(
+        "frequencies", description="what the token readout begins with: the training tokens' log frequencies"
+    )
+
     steps: Count = Field(1000, ge=1)
     lr: Number = Field(3e-4, gt=0)
     lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")

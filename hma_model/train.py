@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +27,13 @@ from hma_data.shards.reader import ShardSet
 from hma_model import checkpoint as checkpoints
 from hma_model.checkpoint import Checkpoint, action_stats, training_checkpoints
 from hma_model.config import ActionSpace
-from hma_model.evaluate import Means, unconditional_baseline, validation_losses, windows
+from hma_model.evaluate import (
+    Means,
+    digit_frequencies,
+    unconditional_baseline,
+    validation_losses,
+    windows,
+)
 from hma_model.files import remove_partial, to_json
 from hma_model.metrics import perplexity
 from hma_model.model import HMA
@@ -106,6 +113,8 @@ def train(
     with own_folder(folder), torch.random.fork_rng(devices=cuda):
         run = Run(recipe, folder, device)
         noted = run.resume(force)
+        if not run.step:
+            run.begin()
         with RunLog(folder, recipe.steps, run.step, show) as log, stop_on_signals() as stop:
             for text in noted + run.remarks():
                 log.note(text)
@@ -169,6 +178,19 @@ class Run:
         return (
             [f"no validation windows of {self.recipe.frames} frames: {', '.join(missing)}"] if missing else []
         )
+
+    @torch.no_grad()
+    def begin(self) -> None:
+        """Give the readout the log frequencies of the training tokens, so that no step is spent on them."""
+        if self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete":
+            return
+        shares = [
+            [p * digit for digit in digit_frequencies(shards)]
+            for p, shards in zip(self.data.mixture.p, self.sets.values())
+        ]
+        bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
+        own = self.model.token_readout.linear.bias
+        own.copy_(torch.from_numpy(bias).to(own))
 
     # -- a step
 

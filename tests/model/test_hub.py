@@ -43,6 +43,10 @@ def target(request, tmp_path: Path):
         fsspec.filesystem("memory").store.clear()
 
 
+def published(target) -> list[str]:
+    return [row["embodiment"] for row in hub.list_embodiments(target)]
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
@@ -85,7 +89,7 @@ def test_what_is_pushed_and_pulled_is_the_same(source, target, tmp_path):
 
 def test_one_embodiment_is_pushed_alone(source, target):
     hub.push(source, target, ["hand"])
-    assert list(hub.list_embodiments(target)) == ["hand"]
+    assert published(target) == ["hand"]
 
 
 def test_training_state_is_not_published(source, tmp_path):
@@ -238,7 +242,7 @@ def test_strange_files_in_a_hub_are_never_pulled(source, tmp_path):
     (tmp_path / "hub/embodiments/..evil").mkdir()
     (tmp_path / "hub/embodiments/..evil/card.json").write_text("{}")
     pulled = hub.pull(tmp_path / "hub", out=tmp_path / "pulled")
-    assert not list(pulled.rglob("*.pkl")) and sorted(hub.list_embodiments(tmp_path / "hub")) == [
+    assert not list(pulled.rglob("*.pkl")) and published(tmp_path / "hub") == [
         "arm",
         "hand",
     ]
@@ -272,7 +276,7 @@ def test_a_push_cut_before_the_card_leaves_nothing_listed(source, tmp_path, monk
     monkeypatch.setattr(FolderStore, "_rename", cut)
     with pytest.raises(HubError):
         hub.push(source, tmp_path / "hub", ["hand"])
-    assert list(hub.list_embodiments(tmp_path / "hub")) == ["arm"]
+    assert published(tmp_path / "hub") == ["arm"]
     monkeypatch.setattr(FolderStore, "_rename", plain)
     hub.push(source, tmp_path / "hub", ["hand"])
     checkpoint.load(tmp_path / "hub")
@@ -314,10 +318,20 @@ def test_what_is_published_is_described(source, target):
     json.dumps(facts)
 
 
+def test_the_list_has_a_row_for_each_embodiment_with_the_same_columns(source, target):
+    hub.push(source, target)
+    rows = hub.list_embodiments(target)
+    assert [(row["embodiment"], row["action_dim"], row["val_loss"]) for row in rows] == [
+        ("arm", 2, 1.5),
+        ("hand", 3, 1.5),
+    ]
+    assert len({tuple(row) for row in rows}) == 1
+
+
 def test_a_loaded_model_is_pushed_with_what_it_was_loaded_with(source, target):
     model = HMA.from_pretrained(str(source))
     model.push_to_hub(target, embodiments=["arm"])
-    card = hub.list_embodiments(target)["arm"]
+    card = hub.describe(target)["embodiments"]["arm"]["card"]
     assert card["robot"] == "an arm" and card["metrics"] == {"val_loss": 1.5}
 
 

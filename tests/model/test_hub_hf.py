@@ -120,7 +120,7 @@ def test_a_push_between_is_taken_in(repository, source):
     hub.push(source, REPO, ["arm"])
     page = repository.commits[-1]["README.md"]
     assert b"| `arm` |" in page and b"| `hand` |" in page
-    assert sorted(hub.list_embodiments(REPO)) == ["arm", "hand"]
+    assert [row["embodiment"] for row in hub.list_embodiments(REPO)] == ["arm", "hand"]
 
 
 def test_two_first_pushes_of_different_trunks_leave_one(repository, source, tmp_path):
