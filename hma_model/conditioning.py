@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
-from hma_model.trunk import Clock, Conditioning
+from hma_model.trunk import Conditioning, rows_at
 
 if TYPE_CHECKING:
     from hma_model.model import HMA
@@ -107,21 +107,21 @@ def unknown(model: "HMA", groups: Groups, frames: int) -> Slots:
     )
 
 
-def condition(model: "HMA", slots: Slots | None, groups: Groups, clock: Clock) -> Conditioning:
+def condition(model: "HMA", slots: Slots | None, groups: Groups, positions: Tensor) -> Conditioning:
     """What the trunk is conditioned on, for the samples as `groups` sorts them.
 
     Args:
         model: whose stems and modulation are used, once per embodiment.
         slots: in the batch's order; None for no actions at all.
         groups: the batch's embodiments.
-        clock: the frames' times.
+        positions: (T,) int64, the frames' times.
     """
     if slots is None:
         if model.config.absent_action == "skip":
             return Conditioning()
-        slots = unknown(model, groups, len(clock.positions))
+        slots = unknown(model, groups, len(positions))
     chunks, known = groups.sort(slots.chunks), groups.sort(slots.known).unsqueeze(-1)
-    absent = clock.rows(model.trunk.absent)
+    absent = rows_at(model.trunk.absent, positions)
     embeddings, modulations, outs = [], [], []
     for name, span in groups.spans():
         stem = model.stem(name)

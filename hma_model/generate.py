@@ -21,7 +21,7 @@ from hma_model.conditioning import Groups, Slots, condition
 from hma_model.embed import patchify, unpatchify
 from hma_model.masking import masked_after
 from hma_model.model import HMA
-from hma_model.trunk import Clock, Conditioning, window_clock
+from hma_model.trunk import Conditioning, window_clock
 from hma_model.unmask import Decoding, PatchFrame, TokenFrame
 
 
@@ -105,8 +105,9 @@ class Rollout:
         for step in range(self.decoding.steps):
             count = left - masked_after(step, self.decoding.steps, tokens)
             if count > 0:
-                features, clock = self._features(frame, conditioning, first=left == tokens)
-                frame.unmask(self.model.readout, features[:, :tokens], clock, count)  # type: ignore[arg-type]
+                features, position = self._features(frame, conditioning, first=left == tokens)
+                own = features[:, :tokens]
+                frame.unmask(self.model.readout, own, position, count)  # type: ignore[arg-type]
                 left -= count
         self._append(frame.values)
         return self._show(frame.values)
@@ -115,8 +116,8 @@ class Rollout:
 
     def _features(
         self, frame: TokenFrame | PatchFrame, conditioning: Conditioning, first: bool
-    ) -> tuple[Tensor, Clock]:
-        """The new frame's features (B, N, D) and its clock."""
+    ) -> tuple[Tensor, Tensor]:
+        """The new frame's features (B, N, D) and its time (1,)."""
         fresh = self.fresh if first or not self.caching else 0
         x = self._embed(frame, fresh)
         if not self.caching:
@@ -126,7 +127,7 @@ class Rollout:
             clock = self._cache().clock(self.time - fresh, fresh + 1)
             part = conditioning if first else conditioning.last()
             features = self.model.trunk(x, part, clock, self._cache().layers)
-        return features[:, -1], clock.last()
+        return features[:, -1], clock.positions[-1:]
 
     def _embed(self, frame: TokenFrame | PatchFrame, fresh: int) -> Tensor:
         """The frames not in the cache yet, and the new one (B, fresh + 1, S, D)."""
@@ -155,8 +156,7 @@ class Rollout:
         start = self.slots.known.shape[1] - frames
         slots = Slots(self.slots.chunks[:, start:], self.slots.known[:, start:])
         positions = torch.arange(self.time + 1 - frames, self.time + 1, device=self.model.device)
-        clock = Clock(positions, positions, (positions, positions))
-        return condition(self.model, None if self._skips() else slots, self.sorted, clock)
+        return condition(self.model, None if self._skips() else slots, self.sorted, positions)
 
     def _skips(self) -> bool:
         return self.passive and self.config.absent_action == "skip"

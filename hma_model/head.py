@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.diffusion import DiffusionHead
-from hma_model.trunk import Clock
+from hma_model.trunk import rows_at
 
 
 class TokenReadout(nn.Module):
@@ -61,9 +61,9 @@ class LatentReadout(nn.Module):
         nn.init.normal_(self.proj.weight, std=config.width**-0.5)
         nn.init.zeros_(self.proj.bias)
 
-    def forward(self, features: Tensor, clock: Clock) -> Tensor:
-        """(B, T, S, D) -> (B, T, S, D)."""
-        return self.norm(self.proj(features)) + clock.rows(self.position)
+    def forward(self, features: Tensor, positions: Tensor) -> Tensor:
+        """(B, T, S, D) of frames at the times (T,) -> (B, T, S, D)."""
+        return self.norm(self.proj(features)) + rows_at(self.position, positions)
 
 
 class ActionHead(nn.Module):

@@ -228,7 +228,9 @@ class HMA(nn.Module):
         conditioning = self._condition(actions, action_mask, groups, clock)
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
         x = self.embed_patches(groups.sort(patches), groups.sort(pixels))
-        conditions = self.latent_readout(self.video_features(self.trunk(x, conditioning, clock)), clock)
+        conditions = self.latent_readout(
+            self.video_features(self.trunk(x, conditioning, clock)), clock.positions
+        )
         return groups.unsort(conditions).unflatten(2, self.config.token_grid)
 
     @torch.no_grad()
@@ -260,7 +262,7 @@ class HMA(nn.Module):
         slots = unknown(self, groups, count)
         if actions is not None:
             slots = align(self.config, actions, action_mask, count)
-        conditioning = condition(self, slots, groups, clock)
+        conditioning = condition(self, slots, groups, clock.positions)
         if frames.is_floating_point():
             patches = patchify(frames.float() * self.config.latent_scale, self.config.patch)
             x = self.embed_patches(groups.sort(patches), torch.zeros_like(patches[..., :1], dtype=torch.bool))
@@ -279,8 +281,9 @@ class HMA(nn.Module):
         self, actions: Tensor | None, known: Tensor | None, groups: Groups, clock: Clock
     ) -> Conditioning:
         if actions is None:
-            return condition(self, None, groups, clock)
-        return condition(self, align(self.config, actions, known, len(clock.positions)), groups, clock)
+            return condition(self, None, groups, clock.positions)
+        slots = align(self.config, actions, known, len(clock.positions))
+        return condition(self, slots, groups, clock.positions)
 
     def _predict(
         self, pooled: Tensor, embodiment: str, readout: str, generator: torch.Generator | None

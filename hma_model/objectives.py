@@ -76,7 +76,7 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     slots = None
     if objective != "passive":
         slots = align(config, batch.actions, batch.action_mask & ~dropped, count)
-    conditioning = condition(model, slots, groups, clock)
+    conditioning = condition(model, slots, groups, clock.positions)
     x = _embed(model, frames, video, groups, generator)
     features = model.trunk(x, conditioning, clock)
 
@@ -86,7 +86,7 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
         action_loss, per_sample = _action_loss(model, features, batch, dropped, objective, groups, generator)
     if objective in ("forward", "passive", "full"):
         own = model.video_features(features)
-        predictors = own if config.kind == "discrete" else model.latent_readout(own, clock)
+        predictors = own if config.kind == "discrete" else model.latent_readout(own, clock.positions)
         video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
         if config.kind == "discrete" and not model.training:
             scores = model.token_readout.split(model.token_readout(own.detach()))

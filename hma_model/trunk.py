@@ -60,15 +60,6 @@ class Clock:
     causal: bool = False
     slots: Tensor | None = None
 
-    def rows(self, table: Tensor) -> Tensor:
-        """The frames' rows of a table over absolute times, or the only row of one that has no times."""
-        return table if table.shape[0] == 1 else table[self.positions]
-
-    def last(self) -> "Clock":
-        """Of the last frame alone, without a cache."""
-        cos, sin = self.rotary
-        return Clock(self.positions[-1:], self.allowed[-1:], (cos[-1:], sin[-1:]))
-
 
 @dataclass
 class LayerCache:
@@ -81,6 +72,11 @@ class LayerCache:
 
     time: Tensor
     action: Tensor | None = None
+
+
+def rows_at(table: Tensor, positions: Tensor) -> Tensor:
+    """The rows of a table over absolute times, or the only row of one that has no times."""
+    return table if table.shape[0] == 1 else table[positions]
 
 
 def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]:
@@ -315,7 +311,7 @@ class Trunk(nn.Module):
         if embedding is not None and self.config.appended_tokens:
             copies = embedding.unsqueeze(2).expand(-1, -1, self.config.appended_tokens, -1)
             x = torch.cat([x, copies.to(x.dtype)], dim=2)
-        return x + clock.rows(self.position)[:, : x.shape[2]]
+        return x + rows_at(self.position, clock.positions)[:, : x.shape[2]]
 
 
 def initialize(trunk: Trunk, config: HMAConfig) -> None:

@@ -14,7 +14,6 @@ from torch import Tensor
 from hma_model.embed import from_digits
 from hma_model.head import LatentReadout, TokenReadout
 from hma_model.masking import uniform
-from hma_model.trunk import Clock
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,8 @@ class TokenFrame:
         self.values, self.mask_id, self.decoding = values, mask_id, decoding
         self.rank = uniform(values.shape, decoding.generator, values.device)
 
-    def unmask(self, readout: TokenReadout, features: Tensor, clock: Clock, count: int) -> None:
-        """Predict from the frame's features (B, S, D), and keep `count` more tokens a sample."""
+    def unmask(self, readout: TokenReadout, features: Tensor, position: Tensor, count: int) -> None:
+        """Predict from the frame's features (B, S, D) at its time (1,), and keep `count` more tokens."""
         masked = self.values == self.mask_id
         if self.decoding.order == "random":
             chosen = _top(self.rank, masked, count)
@@ -84,10 +83,10 @@ class PatchFrame:
         self.masked = torch.ones(values.shape[:2], dtype=torch.bool, device=values.device)
         self.rank = uniform(values.shape[:2], decoding.generator, values.device)
 
-    def unmask(self, readout: LatentReadout, features: Tensor, clock: Clock, count: int) -> None:
-        """Draw `count` more patches a sample from the frame's features (B, S, D)."""
+    def unmask(self, readout: LatentReadout, features: Tensor, position: Tensor, count: int) -> None:
+        """Draw `count` more patches from the frame's features (B, S, D) at its time (1,)."""
         chosen = _top(self.rank, self.masked, count)
-        conditions = _gather(readout(features.unsqueeze(1), clock).squeeze(1), chosen)
+        conditions = _gather(readout(features.unsqueeze(1), position).squeeze(1), chosen)
         way = self.decoding
         patches = readout.diffusion.sample(
             conditions.flatten(0, 1), way.sample_steps, way.temperature, way.generator
