@@ -1,4 +1,4 @@
-"""The data verbs of `hma`: registry (in cli_registry), inspect, convert, shards, mixture, tokenizer.
+"""The data verbs of `hma`: inspect, convert, shards, mixture; registry and tokenizer in modules of their own.
 
 Only what is light is imported here; each verb imports what it needs.
 """
@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import typer
 
 from hma_data.cli_registry import registry_app
+from hma_data.cli_tokenizer import tokenizer_app
 from hma_data.console import human_bytes, human_seconds, print_json, print_table, progress
 
 shards_app = typer.Typer(no_args_is_help=True, help="Look at shard sets and verify them.")
-tokenizer_app = typer.Typer(no_args_is_help=True, help="Train and measure tokenizers.")
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 EmbodimentOption = Annotated[str, typer.Option("--embodiment", "-e", help="Registry id, or a YAML file.")]
@@ -346,35 +346,4 @@ def mixture(
         print_table(
             ["embodiment", "windows", "episodes too short", "proportional", f"p at τ = {temperature:g}"],
             [list(r.values()) for r in rows],
-        )
-
-
-# -- tokenizer
-
-
-@tokenizer_app.command("list")
-def tokenizer_list(json: Json = False) -> None:
-    """Names that --tokenizer takes.
-
-    Example: hma tokenizer list
-    """
-    from hma_data.tokenizers.base import TOKENIZERS, get_tokenizer
-
-    rows = [get_tokenizer(name).spec for name in TOKENIZERS]
-    if json:
-        print_json([spec.to_json() for spec in rows])
-    else:
-        print_table(
-            ["name", "kind", "picture", "grid", "vocabulary", "weights"],
-            [
-                [
-                    s.name,
-                    s.kind,
-                    f"{s.image_size}²",
-                    f"{s.grid[0]}×{s.grid[1]}",
-                    s.vocab_size,
-                    s.weights_sha256[:12] or None,
-                ]
-                for s in rows
-            ],
         )

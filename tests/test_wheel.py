@@ -25,7 +25,12 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def hma(site: Path, where: Path, *arguments: str) -> str:
-    code = "import sys, hma_data; assert sys.argv.pop(1) in hma_data.__file__; from hma_model.cli import main; main()"
+    code = """
+import sys, hma_data
+assert sys.argv.pop(1) in hma_data.__file__
+from hma_model.cli import main
+main()
+"""
     done = subprocess.run(
         [sys.executable, "-P", "-c", code, str(site), *arguments],
         cwd=where,

@@ -234,7 +234,7 @@ def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.f
         raise EpisodeError(where, f"{part.key} holds {piece.dtype}, not numbers")
     if piece.ndim < 1 or not len(piece):
         raise EpisodeError(where, f"{part.key} holds no values over time (shape {piece.shape})")
-    values = piece.reshape(len(piece), -1)
+    values: NDArray[Any] = piece.reshape(len(piece), -1)
     width = values.shape[1]
     if part.slice:
         if part.slice[1] > width:
