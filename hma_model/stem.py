@@ -74,7 +74,7 @@ class Modulation(nn.Module):
         layers, width = config.layers, config.width
         self.weight_in = nn.Parameter(torch.randn(layers, width, width) / math.sqrt(width))
         self.bias_in = nn.Parameter(torch.zeros(layers, 1, width))
-        self.weight = nn.Parameter(torch.randn(layers, width, 2 * width) * 0.5 / math.sqrt(width))
+        self.weight = nn.Parameter(torch.randn(layers, width, 2 * width) / math.sqrt(width))
         self.bias = nn.Parameter(torch.zeros(layers, 1, 2 * width))
         self.out_weight: nn.Parameter | None = None
         self.out_bias: nn.Parameter | None = None
