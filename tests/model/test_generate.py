@@ -47,9 +47,9 @@ def test_the_cache_changes_nothing(layout: str, prompt: int, actions: bool) -> N
 
 @pytest.mark.parametrize("layout", ["rotary", "released"])
 def test_the_cache_changes_no_latents(layout: str) -> None:
-    model = small_model(kind="continuous", **LAYOUTS[layout])
+    model = small_model(kind="continuous", diffusion_clip=1.0, **LAYOUTS[layout])
     for parameter in model.latent_readout.diffusion.parameters():
-        parameter.data *= 0.3  # a random head with many steps would enlarge rounding
+        parameter.data *= 0.1  # the noisiest level divides by almost nothing, which would enlarge rounding
     cached, plain = (_rollout(model, cache, 2, 6, unmask_steps=3, temperature=0.5) for cache in (True, False))
     assert (cached - plain).abs().max() < 1e-4
 
