@@ -66,6 +66,10 @@ class RecipeError(HMAError):
     """A recipe or an override of it is not valid."""
 
 
+class TrainingError(HMAError):
+    """Training cannot go on."""
+
+
 class CheckpointError(HMAError):
     """A checkpoint is damaged, or does not fit what is asked of it."""
 

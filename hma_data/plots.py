@@ -41,6 +41,6 @@ def plot_mixture(mixture: Mixture, temperature: float, path: Path) -> None:
     axes.set_xlim(0, min(1.0, 1.25 * max(mixture.p.max(), proportional.max())))
     axes.set_xlabel("probability of a sample")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
     with atomic_path(path) as part:
         figure.savefig(part, format=path.suffix.lstrip(".") or "png", dpi=150)

@@ -30,6 +30,8 @@ hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, 
 
 def main() -> None:
     """Run a command; errors become one line on stderr and an exit code."""
+    # Threads that spin at a barrier starve each other on a busy machine: steps took ten times as long.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is first imported
     debug = "--debug" in sys.argv or bool(os.environ.get("HMA_DEBUG"))
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     try:

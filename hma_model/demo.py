@@ -6,6 +6,7 @@ model has not seen, and reported on one page. Nothing is downloaded. Run again i
 goes on where it was cut.
 """
 
+import json
 import platform
 import sys
 import time
@@ -32,6 +33,7 @@ from hma_data.windows import WindowIndex
 ROBOTS = ("pusht_fast", "pusht_slow")
 TOKENIZER = "fsq-8"
 TAU = 3.0
+TIMINGS = "timings.json"
 
 
 @dataclass
@@ -67,7 +69,15 @@ class Demo:
         print(f"[{number}/6] {name}", file=sys.stderr, flush=True)
         begun = time.monotonic()
         yield
-        self.seconds[name] = time.monotonic() - begun
+        self.took(name, time.monotonic() - begun)
+
+    def took(self, name: str, seconds: float) -> None:
+        """Note a stage's time; a run that goes on keeps what an earlier one needed for it."""
+        path = self.out / TIMINGS
+        known = json.loads(path.read_text()) if path.is_file() else {}
+        known[name] = max(seconds, known.get(name, 0.0))
+        self.seconds[name] = known[name]
+        write_atomic(path, json.dumps(known))
 
 
 def demo(out: Path, *, episodes: int = 24, steps: int | None = None, seed: int = 0) -> Path:
@@ -98,11 +108,11 @@ def demo(out: Path, *, episodes: int = 24, steps: int | None = None, seed: int =
         train_both(made, steps, seed)
     with made.stage(5, "publish and pull"):
         publish(made)
-    with made.stage(6, "roll out and report"):
-        from hma_model.demo_report import write_report
-
+    with made.stage(6, "roll out"):
         evaluate_pulled(made)
-        return write_report(made)
+    from hma_model.demo_report import write_report
+
+    return write_report(made)
 
 
 def find_robot(robot: str) -> Embodiment:
@@ -208,7 +218,7 @@ def evaluate_pulled(made: Demo) -> None:
 
 
 def _refuse_foreign(out: Path) -> None:
-    ours = {"recordings", "shards", "run", "hub", "pulled", "report.html"}
+    ours = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS}
     if out.is_dir():
         foreign = sorted(item.name for item in out.iterdir() if item.name not in ours)
         if foreign:
@@ -235,5 +245,5 @@ def save_page(made: Demo, html: str) -> Path:
     path = made.out / "report.html"
     write_atomic(path, html)
     total = human_seconds(sum(made.seconds.values()))
-    print(f"  {path} ({human_bytes(len(html))}, {total} so far)", flush=True)
+    print(f"  {path} ({human_bytes(len(html))}), {total} in all", flush=True)
     return path

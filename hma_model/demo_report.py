@@ -1,7 +1,6 @@
 """The page that ends `hma demo`."""
 
 import sys
-import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -45,13 +44,11 @@ def write_report(made: "Demo") -> Path:
     """Write `out`/report.html from what the demo has made."""
     from hma_model.demo import machine, save_page
 
-    begun = time.monotonic()
-    total = sum(made.seconds.values())
     page = Page(
         "HMA Toolkit: two robots, one world model",
         f"Recorded, tokenized, trained, published and rolled out by hma demo on {machine()}.",
     )
-    _headline(page, made, total)
+    _headline(page, made)
     _robots(page, made)
     _reconstructions(page, made)
     _mixture(page, made)
@@ -64,11 +61,10 @@ def write_report(made: "Demo") -> Path:
     page.commands(OWN_DATA)
     page.section("This report")
     page.commands(" ".join(["hma", *sys.argv[1:]]))
-    made.seconds["write the report"] = time.monotonic() - begun
     return save_page(made, page.html())
 
 
-def _headline(page: Page, made: "Demo", total: float) -> None:
+def _headline(page: Page, made: "Demo") -> None:
     result = made.training
     frames = sum(
         split["frames"] for shards in made.sets.values() for split in shards.manifest.splits.values()
@@ -83,7 +79,7 @@ def _headline(page: Page, made: "Demo", total: float) -> None:
     tiles += [
         (f"{gain:+.1f} dB", "last frame: true over shuffled actions"),
         (f"{result.step:,}", "training steps"),
-        (human_seconds(total), "from recording to rollout"),
+        (human_seconds(sum(made.seconds.values())), "from recording to rollout"),
     ]
     page.figures(tiles)
 
@@ -201,6 +197,7 @@ def _rollouts(page: Page, made: "Demo") -> None:
     names = [
         "robot",
         "loss",
+        "with other actions",
         "baseline",
         "perplexity",
         "PSNR dB",
@@ -212,7 +209,7 @@ def _rollouts(page: Page, made: "Demo") -> None:
     rows = [
         [
             robot,
-            *(found[key] for key in ("loss", "baseline_loss", "perplexity")),
+            *(found[key] for key in ("loss", "shuffled_loss", "baseline_loss", "perplexity")),
             found["true"]["psnr"],
             *(found[key]["psnr_last"] for key in ("true", "shuffled", "copy")),
             found["true"]["ssim"],

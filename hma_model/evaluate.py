@@ -289,7 +289,8 @@ def evaluate(
             to hold the rollouts against; by default they are held against the decoded true tokens.
 
     Returns:
-        `loss` (nats a token), `baseline_loss`, `perplexity`, `accuracy` (discrete), and for rollouts with the
+        `loss` (nats a token), and of discrete models `shuffled_loss` (given another window's actions),
+        `baseline_loss`, `perplexity` and `accuracy`; and for rollouts with the
         `true` actions, with `shuffled` ones and for `copy`, the last frame of the prompt repeated: `psnr` and
         `ssim` over the horizon, `psnr_last`, `psnr_by_frame`. `psnr_action_gain_last` is true less shuffled.
 
@@ -338,8 +339,13 @@ def _losses(
     if model.config.kind == "continuous":
         return {"loss": losses.mean()}
     baseline = unconditional_baseline([shards], windows(shards, split, frames, count, batch_size))
+    other = (
+        replace(batch, actions=shuffled_actions(batch))
+        for batch in windows(shards, split, frames, count, batch_size)
+    )
     return {
         "loss": losses.mean(),
+        "shuffled_loss": masked_val_loss(model, other),
         "baseline_loss": baseline.mean(),
         "perplexity": perplexity(losses.mean()),
         "accuracy": accuracy.mean(),

@@ -109,7 +109,6 @@ def _usage(name: str, cards: Mapping[str, Any]) -> str:
         "```sh\n"
         f"hma hub pull {name} --embodiment {example} --out model\n"
         "hma generate model SHARDS --out rollout.mp4\n"
-        "hma finetune --from model --data SHARDS        # a stem and head for another robot\n"
         "```\n\n"
         "`actions[:, k]` is the chunk of commands from frame k up to frame k + 1, in the units of the "
         "embodiment's `embodiment.yaml`; the model normalises by itself."

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hma_data.errors import CheckpointError, HMAError, RecipeError, UsageError
+from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
 from hma_data.files import write_atomic
 from hma_data.loader import Batch, MixtureDataset, WindowDataset, open_sets
 from hma_data.shards.reader import ShardSet
@@ -44,10 +44,6 @@ from hma_model.runlog import RunLog, read_metrics
 from hma_model.runtime import ENVIRONMENT, RECIPE, choose_device, environment, own_folder, stop_on_signals
 
 NAMED = 4  # windows named in an error
-
-
-class TrainingError(HMAError):
-    """Training cannot go on."""
 
 
 @dataclass(frozen=True)

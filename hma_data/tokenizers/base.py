@@ -62,7 +62,9 @@ class TokenizerSpec:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "TokenizerSpec":
         """The spec that `to_json` wrote."""
-        return cls(**{**values, "grid": tuple(values["grid"]), "factored": tuple(values.get("factored") or ())})
+        return cls(
+            **{**values, "grid": tuple(values["grid"]), "factored": tuple(values.get("factored") or ())}
+        )
 
     @property
     def digest(self) -> str:

@@ -246,7 +246,7 @@ def test_registry_describes_the_robot(robot: str, fast: h5py.File, slow: list[Pa
             for field in fields:
                 value = getattr(value, field)
             assert isinstance(value, float) and part.dims == 1
-    assert min(lengths) >= 12 * embodiment.stride
+    assert min(lengths) >= 8 * embodiment.stride
 
 
 def test_progress_counts_episodes(tmp_path: Path) -> None:

@@ -13,7 +13,14 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, UsageError
+from hma_data.errors import (
+    CheckpointError,
+    OutputError,
+    RecipeError,
+    ShardError,
+    TrainingError,
+    UsageError,
+)
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import checkpoint
 from hma_model.model import HMA
@@ -21,7 +28,7 @@ from hma_model.recipe import Recipe, make_recipe
 from hma_model.resume import seed_for
 from hma_model.runlog import read_metrics
 from hma_model.runtime import own_folder
-from hma_model.train import TrainingError, train
+from hma_model.train import train
 from tests.model.shards import make_shards
 
 TINY = {
