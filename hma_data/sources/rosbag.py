@@ -105,15 +105,17 @@ class _Reading:
         actions = self._columns(embodiment.action.components)
         states = self._columns(embodiment.state.components if embodiment.state else ())
         self._scan(self._instruction_field())
+        notes = self._bag.notes()
         return Episode(
             id=self._id,
             streams={camera.name: self._stream(camera) for camera in embodiment.cameras},
             actions=tuple(self._signal(column) for column in actions),
             states=tuple(self._signal(column) for column in states),
             rate_stamped=False,
-            instruction=self._instruction,
+            instruction=self._instruction or notes.get("instruction", ""),
+            success={"true": True, "false": False}.get(notes.get("success", "").lower()),
             source=self._where,
-            metadata={"clocks": self._clocks()},
+            metadata={"clocks": self._clocks(), "notes": notes},
         )
 
     def _track(self, topic: str) -> Track:

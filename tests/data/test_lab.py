@@ -16,12 +16,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from hma_data.embodiment import Embodiment
+from hma_data.embodiment import Embodiment, find
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
 from hma_data.lab.pusht import SLOW_LOOK, Arena, record_pusht
 from hma_data.shipped import shipped
+from hma_data.sources.base import open_source
 
 EPISODES = 5
 
@@ -294,3 +295,15 @@ def test_missing_gym_pusht_says_how_to_install_it(tmp_path: Path, monkeypatch: p
     with pytest.raises(MissingDependencyError, match="pip install 'gym-pusht"):
         record("pusht_fast", tmp_path, 1)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_bags_tell_success(tmp_path: Path) -> None:
+    folder = record("pusht_slow", tmp_path, 5, seed=0)
+    robot, source = find("pusht_slow"), open_source("rosbag")
+    told = [source.read(str(folder), name, robot).success for name in source.episode_ids(str(folder))]
+    written = []
+    for path in sorted(folder.glob("*.mcap")):
+        with path.open("rb") as file:
+            notes = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
+        written.append(notes["episode"]["success"] == "true")
+    assert told == written

@@ -72,6 +72,14 @@ class Bag:
             self._files = [_container(self._plain(path)) for path in self._paths]
         return self._files
 
+    def notes(self) -> dict[str, str]:
+        """What MCAP metadata records say of it; empty for the other kinds."""
+        found: dict[str, str] = {}
+        for file in self.files():
+            if isinstance(file, McapFile):
+                found |= file.notes()
+        return found
+
     def counts(self) -> Counter[Channel]:
         """Messages of each channel, from indexes where there are any."""
         if any(path.suffix == ".zstd" for path in self._paths):

@@ -27,6 +27,8 @@ from hma_data.sources.bags.container import (
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS, DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B, 0x0F
+METADATA = 0x0C
+NOTE_BYTES = 1 << 20  # a metadata record of more is not a note about the episode
 FRAME = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 FOOTER_SIZE = FRAME.size + 20
@@ -64,6 +66,20 @@ class McapFile:
                     record = _message(memoryview(read_exact(file, length)), (LOOSE, at), declared)
                     if topics is None or record.channel.topic in topics:
                         yield record
+
+    def notes(self) -> dict[str, str]:
+        """All entries of the file's metadata records (MCAP specification, opcode 0x0C); later ones win."""
+        found: dict[str, str] = {}
+        with reading(self.path), self.path.open("rb") as file:
+            for opcode, _, length in _frames(file, len(MAGIC), self._data_end(file)):
+                if opcode == METADATA and length <= NOTE_BYTES:
+                    fields = Fields(read_exact(file, length))
+                    fields.text()  # the record's name
+                    entries = Fields(fields.block())
+                    while entries:
+                        key = entries.text()
+                        found[key] = entries.text()
+        return found
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
         """See Container."""
