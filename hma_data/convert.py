@@ -10,6 +10,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import shutil
 import sys
 import time
@@ -33,6 +34,7 @@ from hma_data.errors import (
     OutputError,
     RegistryError,
     ShardError,
+    SourceError,
     TokenizerError,
 )
 from hma_data.files import remove_parts
@@ -143,7 +145,8 @@ def convert(
 
     Raises:
         OutputError: `out` holds something else, or another job is writing it.
-        HMAError: the source, the embodiment or the tokenizer cannot be used.
+        SourceError: the recording cannot be read, or not one of its episodes can be used.
+        HMAError: the embodiment or the tokenizer cannot be used.
     """
     begun = time.monotonic()
     opened = (
@@ -167,7 +170,12 @@ def convert(
         for _ in run(todo, MakeWork(job, ready), min(workers, len(todo)), _Counter(progress, on_progress)):
             on_progress(progress)
         manifest = _finish(out, plan, embodiment, opened, uri, bool(todo))
-    reasons = _reasons(out)
+        reasons = _reasons(out)
+        if not any(split["episodes"] for split in manifest.splits.values()):
+            clear(out)
+            worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
+            told = "; ".join(f"{count} × {reason}" for reason, count in worst)
+            raise SourceError(uri, f"gave no usable episode, so nothing was written: {told}")
     too_many = manifest.quarantined > max_quarantine * plan.episodes
     seconds = time.monotonic() - begun
     return Summary(out, manifest, len(done), len(todo), seconds, reasons, too_many)
@@ -276,7 +284,9 @@ def _reasons(out: Path) -> dict[str, int]:
     reasons: dict[str, int] = {}
     for line in (out / "quarantine.jsonl").read_text().splitlines():
         item = json.loads(line)
-        text = f"{item['type']}: {item['message'].replace(item['id'], '<episode>')}"
+        text = f"{item['type']}: {item['message']}"
+        if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
+            text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
         reasons[text] = reasons.get(text, 0) + 1
     return reasons
 

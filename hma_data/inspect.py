@@ -7,8 +7,10 @@ import numpy as np
 
 from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment, find
-from hma_data.errors import HMAError
+from hma_data.errors import HMAError, SourceError
 from hma_data.sources.base import detect, open_source
+
+TRIED = 20  # episodes looked at for one that can be read
 
 
 def inspect_recording(uri: str, embodiment: str | None = None) -> dict[str, Any]:
@@ -36,11 +38,16 @@ def _check(report: dict[str, Any], uri: str, robot: Embodiment) -> None:
     wanted = [camera.key for camera in robot.cameras] + [part.key for part in robot.action.components]
     source = open_source(robot.source.format)
     report["embodiment"] = {"embodiment": f"{robot.id}, {robot.action_dim} action dims"}
-    try:
-        first = source.episode_ids(uri)[0]
-        clip = to_clip(source.read(uri, first, robot), robot)
-        pictures = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))
-    except (HMAError, IndexError) as fault:
+    faults: list[HMAError] = []
+    for first in source.episode_ids(uri)[:TRIED]:
+        try:
+            clip = to_clip(source.read(uri, first, robot), robot)
+            pictures = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))
+            break
+        except HMAError as fault:
+            faults.append(fault)
+    else:
+        first_fault = faults[0] if faults else SourceError(uri, "has no episodes")
         near = [
             get_close_matches(key, known, n=2)
             for key in wanted
@@ -51,8 +58,12 @@ def _check(report: dict[str, Any], uri: str, robot: Embodiment) -> None:
             if any(near)
             else ""
         )
-        report["problems"].append(f"{robot.id} does not fit: {fault}{hint}")
+        report["problems"].append(f"{robot.id} does not fit: {first_fault}{hint}")
         return
+    if faults:
+        report["problems"].append(
+            f"{len(faults)} of the first {len(faults) + 1} episodes cannot be used: {faults[0]}"
+        )
     intervals = np.diff(clip.timestamps)
     measured = 1 / float(np.median(intervals)) if len(intervals) and np.median(intervals) > 0 else None
     facts = {

@@ -204,9 +204,9 @@ def test_an_action_of_the_wrong_width_is_one_clear_reason(toy_arm, tmp_path, blo
     wide = Embodiment.from_yaml(
         toy_arm.to_yaml().replace("dims: 3", "dims: 4").replace("  - c\n", "  - c\n    - d\n")
     )
-    summary = run(wide, tmp_path / "toy.hdf5", tmp_path / "out", block_tokenizer)
-    assert summary.too_many
-    assert "has 3 values, the embodiment says 4" in next(iter(summary.reasons))
+    with pytest.raises(SourceError, match="2 × .*has 3 values, the embodiment says 4"):
+        run(wide, tmp_path / "toy.hdf5", tmp_path / "out", block_tokenizer)
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_rate_is_refused_with_how_to_give_it(
