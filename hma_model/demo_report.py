@@ -180,8 +180,8 @@ def _rollouts(page: Page, made: "Demo") -> None:
     page.section(
         "Rollouts on held-out episodes",
         "The model, pulled from the hub for one robot alone, sees the first frames and the actions, and goes "
-        "on from its own predictions. With another window's actions it should do worse: the loss shows "
-        "that soon, PSNR only after longer training, because the disc covers few pixels.",
+        "on from its own predictions. With another window's actions it should do worse: the loss "
+        "shows it, PSNR after so short a training hardly, because the disc covers few pixels.",
     )
     for robot, shards in made.sets.items():
         film = _film(made, shards)

@@ -18,11 +18,11 @@ body { margin:0 auto; max-width:1080px; padding:2rem 1.25rem 4rem; background:va
   color:var(--ink); font:16px/1.55 system-ui, sans-serif }
 h1 { font-size:1.9rem; margin:0 0 .3rem } h2 { font-size:1.25rem; margin:2.6rem 0 .4rem }
 p { max-width:48rem } .soft, figcaption, th { color:var(--soft) } a { color:var(--accent) }
-.figures { display:grid; grid-template-columns:repeat(auto-fit, minmax(150px, 1fr)); gap:.75rem;
+.figures { display:grid; grid-template-columns:repeat(auto-fit, minmax(160px, 1fr)); gap:.75rem;
   margin:1.4rem 0 }
 .figures div { background:var(--card); border:1px solid var(--line); border-radius:10px;
   padding:.7rem .9rem }
-.figures b { display:block; font-size:1.45rem; font-variant-numeric:tabular-nums }
+.figures b { display:block; font-size:1.3rem; white-space:nowrap; font-variant-numeric:tabular-nums }
 .figures span { color:var(--soft); font-size:.86rem }
 .scroll { overflow-x:auto }
 table { border-collapse:collapse; margin:.6rem 0; font-variant-numeric:tabular-nums }
