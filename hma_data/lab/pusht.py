@@ -168,7 +168,7 @@ def _environment() -> tuple[Any, Any]:
             from pygame import Color
     except ImportError as fault:
         raise MissingDependencyError(
-            "gym-pusht", f"cannot be imported: {fault}", "pip install 'gym-pusht>=0.1.6'"
+            "gym-pusht", f"cannot be imported: {fault}", "pip install 'gym-pusht>=0.1.8'"
         ) from fault
     return PushTEnv, Color
 
