@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -54,7 +55,13 @@ def _no_bool(value: Any) -> Any:
     return value
 
 
-Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
+def _no_minus_zero(value: float) -> float:
+    return value + 0.0  # -0.0 equals 0.0 but prints and hashes apart
+
+
+Number = Annotated[
+    float, BeforeValidator(_no_bool), Field(allow_inf_nan=False), AfterValidator(_no_minus_zero)
+]
 Count = Annotated[int, BeforeValidator(_no_bool)]
 
 
