@@ -45,6 +45,7 @@ Space = Literal[
 Representation = Literal[
     "euler_xyz", "quaternion_xyzw", "quaternion_wxyz", "axis_angle", "rotation_6d", "rotation_matrix"
 ]
+Gripper = Literal["open_is_high", "open_is_low", "opening_is_high", "closing_is_high"]
 Method = Literal["nearest", "hold", "interpolate"]
 Format = Literal["rlds", "hdf5", "rosbag", "lerobot", "hands"]
 
@@ -88,7 +89,9 @@ class Component(_Model):
     offset: Number | tuple[Number, ...] = 0.0
     range: tuple[Number, Number] | None = None
     representation: Representation | None = None
-    gripper: Literal["open_is_high", "open_is_low"] | None = None
+    gripper: Gripper | None = Field(
+        None, description="which way it opens; opening_ and closing_is_high are of commands that move it a bit"
+    )
     stamp: Literal["header", "receive"] | None = None
 
     @model_validator(mode="after")
@@ -140,6 +143,9 @@ class Camera(_Model):
 
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.-]+$")
     key: str = Field(min_length=1)
+    size: tuple[Count, Count] | None = Field(
+        None, description="[height, width] of the recorded picture in pixels; states a fact, changes nothing"
+    )
     color: Literal["rgb", "bgr"] = "rgb"
     resize: Literal["short_side_crop", "letterbox", "stretch"] = "short_side_crop"
     rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
@@ -147,6 +153,13 @@ class Camera(_Model):
         None, description="[x, y, width, height] in source pixels"
     )
     stamp: Literal["header", "receive"] | None = None
+
+    @field_validator("size")
+    @classmethod
+    def _size_positive(cls, size: tuple[int, int] | None) -> tuple[int, int] | None:
+        if size and min(size) < 1:
+            raise ValueError(f"size {list(size)} must be [height >= 1, width >= 1]")
+        return size
 
     @field_validator("crop")
     @classmethod
@@ -301,11 +314,10 @@ class Embodiment(_Model):
             mode="json", exclude={"description", "robot", "license", "provenance", "notes", "stats_key"}
         )
         content["source"] = {key: content["source"][key] for key in ("format", "instruction", "layout")}
-        for name in (
-            "target_hz",
-            "stride_override",
-        ):  # the stride acts when windows are drawn, not in the shards
+        for name in ("target_hz", "stride_override"):  # they act when windows are drawn, not in the shards
             content.pop(name)
+        for camera in content["cameras"]:
+            camera.pop("size")
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     # -- YAML
