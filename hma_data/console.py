@@ -24,9 +24,16 @@ def print_json(values: Any) -> None:
     print(json.dumps(values, indent=1, ensure_ascii=False, default=str))
 
 
+MANY_ROWS = 500  # laying out more than this with rich takes seconds
+
+
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "") -> None:
     """A table to standard output; numbers to the right; full width when it is not a terminal."""
+    if len(rows) > MANY_ROWS:
+        _print_columns(columns, rows)
+        return
     from rich.box import SIMPLE
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(*columns, title=title or None, title_justify="left", box=SIMPLE, pad_edge=False)
@@ -34,7 +41,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
         if all(isinstance(row[i], int | float) for row in rows):
             column.justify = "right"
     for row in rows:
-        table.add_row(*(_cell(value) for value in row))
+        table.add_row(*(escape(_cell(value)) for value in row))
     stdout().print(table)
 
 
@@ -47,16 +54,21 @@ def stdout() -> Any:
     )
 
 
-def _cell(value: Any) -> str:
-    from rich.markup import escape
+def _print_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    cells = [list(columns), *([_cell(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
+
+def _cell(value: Any) -> str:
     if value is None:
         return "-"
     if isinstance(value, float):
         return f"{value:,.4g}" if abs(value) < 1e4 else f"{value:,.0f}"
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
-    return escape(str(value))
+    return str(value)
 
 
 def human_bytes(count: float) -> str:

@@ -11,24 +11,16 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from hma_data.errors import RegistryError
-from hma_data.shipped import shipped
+from hma_data.registry import file_id, registry_files, registry_folders
+from hma_data.spec import Action, Camera, Component, Count, Number, SourceSpec, SpecModel, Sync, Vector
 from hma_data.yaml_io import parse_yaml, read_yaml, write_yaml
 
 if TYPE_CHECKING:
@@ -38,163 +30,8 @@ if TYPE_CHECKING:
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
 TODO = "TODO"
 
-Space = Literal[
-    "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",
-    "hand_2d", "hand_3d", "mixed",
-]  # fmt: skip
-Representation = Literal[
-    "euler_xyz", "quaternion_xyzw", "quaternion_wxyz", "axis_angle", "rotation_6d", "rotation_matrix"
-]
-Gripper = Literal["open_is_high", "open_is_low", "opening_is_high", "closing_is_high"]
-Method = Literal["nearest", "hold", "interpolate"]
-Format = Literal["rlds", "hdf5", "rosbag", "lerobot", "hands"]
 
-
-def _no_bool(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise ValueError("must be a number, not true or false")
-    return value
-
-
-def _no_minus_zero(value: float) -> float:
-    return value + 0.0  # -0.0 equals 0.0 but prints and hashes apart
-
-
-Number = Annotated[
-    float, BeforeValidator(_no_bool), Field(allow_inf_nan=False), AfterValidator(_no_minus_zero)
-]
-Count = Annotated[int, BeforeValidator(_no_bool)]
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, arbitrary_types_allowed=False)
-
-
-class Component(_Model):
-    """A piece of the action (or state) vector.
-
-    `sign` and `offset` change values (value * sign + offset); `range` and `representation`
-    state conventions and change nothing.
-    """
-
-    key: str = Field(min_length=1, description="where the values are: a path or a topic field, by format")
-    dims: Count = Field(ge=1, le=4096, description="how many values it gives")
-    slice: tuple[Count, Count] | None = Field(None, description="[from, to) of the vector found at key")
-    names: tuple[str, ...] | None = Field(
-        None, description="one a value; selects by name where messages have names"
-    )
-    unit: str | None = None
-    normalize: bool = True
-    sign: Number | tuple[Number, ...] = 1.0
-    offset: Number | tuple[Number, ...] = 0.0
-    range: tuple[Number, Number] | None = None
-    representation: Representation | None = None
-    gripper: Gripper | None = Field(
-        None, description="which way it opens; opening_ and closing_is_high are of commands that move it a bit"
-    )
-    stamp: Literal["header", "receive"] | None = None
-
-    @model_validator(mode="after")
-    def _widths(self) -> Self:
-        if self.slice and not 0 <= self.slice[0] < self.slice[1]:
-            raise ValueError(f"slice {list(self.slice)} must be [from, to) with 0 <= from < to")
-        if self.slice and self.slice[1] - self.slice[0] != self.dims:
-            raise ValueError(
-                f"slice {list(self.slice)} has {self.slice[1] - self.slice[0]} values, dims says {self.dims}"
-            )
-        if self.names and len(self.names) != self.dims:
-            raise ValueError(f"{len(self.names)} names for {self.dims} dims")
-        for label in ("sign", "offset"):
-            value = getattr(self, label)
-            if isinstance(value, tuple) and len(value) != self.dims:
-                raise ValueError(f"{label} has {len(value)} values for {self.dims} dims")
-        if self.range and self.range[0] >= self.range[1]:
-            raise ValueError(f"range {list(self.range)} must rise")
-        return self
-
-
-class Vector(_Model):
-    """The components of an action or state, in the vector's order."""
-
-    components: tuple[Component, ...] = Field(min_length=1)
-
-    @property
-    def dims(self) -> int:
-        """Width of the whole vector."""
-        return sum(component.dims for component in self.components)
-
-    def names(self) -> list[str]:
-        """A name for each value; made from the key where the YAML gives none."""
-        return [
-            name
-            for part in self.components
-            for name in (part.names or [f"{part.key}.{i}" for i in range(part.dims)])
-        ]
-
-
-class Action(Vector):
-    """What the robot is told to do at each step."""
-
-    space: Space
-
-
-class Camera(_Model):
-    """A camera stream and how its pictures are brought to a square."""
-
-    name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.-]+$")
-    key: str = Field(min_length=1)
-    size: tuple[Count, Count] | None = Field(
-        None, description="[height, width] of the recorded picture in pixels; states a fact, changes nothing"
-    )
-    color: Literal["rgb", "bgr"] = "rgb"
-    resize: Literal["short_side_crop", "letterbox", "stretch"] = "short_side_crop"
-    rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
-    crop: tuple[Count, Count, Count, Count] | None = Field(
-        None, description="[x, y, width, height] in source pixels"
-    )
-    stamp: Literal["header", "receive"] | None = None
-
-    @field_validator("size")
-    @classmethod
-    def _size_positive(cls, size: tuple[int, int] | None) -> tuple[int, int] | None:
-        if size and min(size) < 1:
-            raise ValueError(f"size {list(size)} must be [height >= 1, width >= 1]")
-        return size
-
-    @field_validator("crop")
-    @classmethod
-    def _crop_positive(cls, crop: tuple[int, int, int, int] | None) -> tuple[int, int, int, int] | None:
-        if crop and (min(crop[:2]) < 0 or min(crop[2:]) < 1):
-            raise ValueError(f"crop {list(crop)} must be [x >= 0, y >= 0, width >= 1, height >= 1]")
-        return crop
-
-
-class Sync(_Model):
-    """How streams of different rates meet: on the primary camera's frames, or on a fixed grid."""
-
-    primary: str | None = Field(None, description="the camera whose frames are the grid; default the first")
-    rate_hz: Number | None = Field(
-        None, gt=0, le=100_000, description="a fixed grid instead of a camera's frames"
-    )
-    images: Method = "nearest"
-    actions: Method = "hold"
-    states: Method = "interpolate"
-    max_skew_ms: Number | None = Field(None, gt=0, description="an episode moved by more is refused")
-    stamp: Literal["header", "receive"] = "header"
-
-
-class SourceSpec(_Model):
-    """Where the recordings are and how they are laid out."""
-
-    format: Format
-    uri: str | None = None
-    split: str | None = Field(None, description="the source's own split to read")
-    episodes: Count | None = Field(None, ge=1, description="how many there are, as published")
-    instruction: str | None = Field(None, description="key of the language instruction")
-    layout: dict[str, str] | None = Field(None, description="by format: keys of a generic layout")
-
-
-class Embodiment(_Model):
+class Embodiment(SpecModel):
     """A robot as one dataset recorded it. Frozen; made from YAML by `load` or `find`."""
 
     id: str
@@ -259,11 +96,14 @@ class Embodiment(_Model):
             return self.sync.rate_hz
         if isinstance(self.frequency_hz, float):
             return self.frequency_hz
+        said = self.provenance.get("frequency_hz")
         raise RegistryError(
             f"embodiment {self.id}: frequency_hz",
-            f"is {'unknown' if self.frequency_hz == 'unknown' else 'null'}, so no stride can be derived",
-            "set frequency_hz to the recording's control rate in the YAML"
-            + ("" if self.frequency_hz == "unknown" else ", or state stride"),
+            "is unknown: nobody states the rate of this recording" + (f" ({said})" if said else "")
+            if self.frequency_hz == "unknown"
+            else "is null and sync.rate_hz is not set, so there is no rate of the grid",
+            f"set frequency_hz in a copy of the YAML (hma registry show {self.id} > {self.id}.yaml), "
+            "or give hma convert --frequency-hz HZ",
         )
 
     @property
@@ -353,18 +193,40 @@ class Embodiment(_Model):
         return cls.model_validate(values)
 
 
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong with a YAML: where in it, what, the value met, and what is allowed there."""
+
+    path: str
+    fault: str
+    value: str | None = None
+    allowed: str | None = None
+
+    def __str__(self) -> str:
+        text = f"{self.path}: {self.fault}" if self.path else self.fault
+        if self.value is not None:
+            text += f" (is {self.value})"
+        return text + (f"; allowed: {self.allowed}" if self.allowed else "")
+
+
 def problems(values: Any) -> list[str]:
     """Everything wrong with the plain values of a YAML, one line each; empty when it is valid."""
+    return [str(problem) for problem in find_problems(values)]
+
+
+def find_problems(values: Any) -> list[Problem]:
+    """Everything wrong with the plain values of a YAML."""
     if not isinstance(values, dict):
-        return [f"must be a mapping, is {type(values).__name__}"]
-    found = [f"{path}: still {TODO}: {text}" for path, text in todos(values)]
+        return [Problem("", f"must be a mapping, is {type(values).__name__}")]
+    questions = todos(values)
+    found = [Problem(path, f"still {TODO}: {text}") for path, text in questions]
     try:
         Embodiment.model_validate(values)
     except ValidationError as fault:
-        open_paths = {path for path, _ in todos(values)}
+        asked = {path for path, _ in questions}
         for item in fault.errors(include_url=False):
             path = _yaml_path(item["loc"], values, missing=item["type"] == "missing")
-            if path not in open_paths and not _follows_from_another(item):
+            if path not in asked and not _follows_from_another(item):
                 found.append(_problem(path, item))
     return list(dict.fromkeys(found))
 
@@ -402,25 +264,41 @@ def _follows_from_another(item: Any) -> bool:
     return item["type"] == "too_short" and bool(item["input"])
 
 
-def _problem(path: str, item: Any) -> str:
+def _problem(path: str, item: Any) -> Problem:
     value = item.get("input")
-    message = item["msg"].removeprefix("Value error, ")
-    if item["type"] == "missing":
-        return f"{path}: is missing"
-    if item["type"] == "extra_forbidden":
-        from difflib import get_close_matches
+    kind, context = item["type"], item.get("ctx", {})
+    if kind == "missing":
+        return Problem(path, "is missing")
+    if kind == "extra_forbidden":
+        return _unknown_key(path)
+    shown = None if isinstance(value, dict) else repr(value)
+    if shown and len(shown) > 60:
+        shown = shown[:57] + "..."
+    if kind == "literal_error":
+        return Problem(path, "is not one of the words that are allowed", shown, context["expected"])
+    return Problem(path, item["msg"].removeprefix("Value error, "), shown)
 
-        key = path.rsplit(".", 1)[-1]
-        near = get_close_matches(key, _known_keys(), n=1)
-        return f"{path}: unknown key" + (f", did you mean {near[0]!r}?" if near else "")
-    shown = repr(value)
-    shown = shown if len(shown) <= 60 else shown[:57] + "..."
-    return f"{path or 'the file'}: {message}" + ("" if isinstance(value, dict) else f" (is {shown})")
+
+def _unknown_key(path: str) -> Problem:
+    from difflib import get_close_matches
+
+    place = re.sub(r"\[\d+\]", "", path).split(".")
+    known = _KEYS_AT.get(".".join(place[:-1]), Embodiment)
+    keys = [field.alias or name for name, field in known.model_fields.items()]
+    near = get_close_matches(place[-1], keys, n=1)
+    hint = f", did you mean {near[0]!r}?" if near else ""
+    return Problem(path, f"unknown key{hint}", allowed=", ".join(keys))
 
 
-def _known_keys() -> list[str]:
-    models: list[type[_Model]] = [Embodiment, Action, Vector, Component, Camera, Sync, SourceSpec]
-    return [field.alias or name for model in models for name, field in model.model_fields.items()]
+_KEYS_AT: dict[str, type[SpecModel]] = {
+    "action": Action,
+    "action.components": Component,
+    "state": Vector,
+    "state.components": Component,
+    "cameras": Camera,
+    "sync": Sync,
+    "source": SourceSpec,
+}
 
 
 def schema() -> dict[str, Any]:
@@ -434,22 +312,6 @@ def schema() -> dict[str, Any]:
 # -- where embodiments are found
 
 
-def registry_folders(beside: Path | None = None) -> list[Path]:
-    """Folders searched for an id, first wins: ./registry, $HMA_REGISTRY, beside a checkpoint, shipped."""
-    folders = [Path("registry")]
-    folders += [Path(entry) for entry in os.environ.get("HMA_REGISTRY", "").split(os.pathsep) if entry]
-    if beside:
-        folders.append(beside / "embodiments")
-    folders.append(shipped("registry"))
-    return list(dict.fromkeys(folder.resolve() for folder in folders if folder.is_dir()))
-
-
-def registry_files(folders: list[Path] | None = None) -> Iterator[Path]:
-    """Every YAML of the registry, in search order."""
-    for folder in registry_folders() if folders is None else folders:
-        yield from sorted(path for path in folder.rglob("*.y*ml") if path.suffix in (".yaml", ".yml"))
-
-
 def find(name_or_path: str, beside: Path | None = None) -> Embodiment:
     """The embodiment of that id, or of that YAML file.
 
@@ -460,7 +322,7 @@ def find(name_or_path: str, beside: Path | None = None) -> Embodiment:
         return Embodiment.load(name_or_path)
     folders = registry_folders(beside)
     for folder in folders:
-        paths = [path for path in registry_files([folder]) if _file_id(path) == name_or_path]
+        paths = [path for path in registry_files([folder]) if file_id(path) == name_or_path]
         if len(paths) > 1:
             raise RegistryError(paths[1], f"has the id of {paths[0]}", "remove or rename one")
         if paths:
@@ -472,15 +334,10 @@ def find(name_or_path: str, beside: Path | None = None) -> Embodiment:
             return embodiment
     from difflib import get_close_matches
 
-    near = get_close_matches(name_or_path, [_file_id(path) for path in registry_files(folders)], n=3)
+    near = get_close_matches(name_or_path, [file_id(path) for path in registry_files(folders)], n=3)
     hint = f"did you mean {', '.join(near)}? " if near else ""
     raise RegistryError(
         f"embodiment {name_or_path!r}",
         f"is not in {', '.join(map(str, folders)) or 'any registry folder'}",
         f"{hint}give a YAML file's path, or set HMA_REGISTRY; hma registry list shows all",
     )
-
-
-def _file_id(path: Path) -> str:
-    """The id a registry file is found by; a checkpoint keeps each in a folder of its own."""
-    return path.parent.name if path.stem == "embodiment" else path.stem

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.embodiment import Camera
 from hma_data.errors import EpisodeError, MissingDependencyError
+from hma_data.spec import Camera
 
 Images = NDArray[np.uint8]
 Filter = Literal["area", "linear"]

@@ -16,9 +16,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.embodiment import Embodiment, Vector
+from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.spec import Vector
 
 FORMATS = {
     "rlds": "hma_data.sources.rlds",

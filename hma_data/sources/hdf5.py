@@ -23,12 +23,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.embodiment import Embodiment, Vector
+from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Signal, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.base import EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hdf5_file import OpenFiles, child, dataset, explained, member, numbers, rows, text, walk
 from hma_data.sources.hdf5_layout import WHOLE_FILE, Place, Places, episodes_pattern
+from hma_data.spec import Vector
 from hma_data.video import MAX_PIXELS, Images, decode_image
 
 _TEXT_KEYS = ("language_instruction", "instruction", "lang", "task_description", "task")

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.align import nearest
-from hma_data.embodiment import Camera, Embodiment, Vector
+from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Signal, Stream, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.base import EpisodeRef, Inspection, KeyInfo, compose, file_fingerprint
 from hma_data.sources.lerobot_meta import Folder, Metadata, Span, episode_name
 from hma_data.sources.lerobot_rows import Rows, StillPictures, rows_of
 from hma_data.sources.video_file import VideoFile, frame_table
+from hma_data.spec import Camera, Vector
 from hma_data.video import Images
 
 RATE_TOLERANCE = 0.01  # of the rate

@@ -12,7 +12,7 @@ import hashlib
 import logging
 import math
 
-from hma_data.embodiment import Component, Embodiment, Vector
+from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Pictures, Signal, rate_times
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import EpisodeRef, Inspection, compose
@@ -33,6 +33,7 @@ from hma_data.sources.rlds_steps import (
 from hma_data.sources.tf_example import Example
 from hma_data.sources.tfds_folder import Folder, Shard, episode_id, open_folder
 from hma_data.sources.tfrecord import framing, read_record
+from hma_data.spec import Component, Vector
 
 SAMPLED_SHARDS = 16  # whose first record is read to estimate lengths
 INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20

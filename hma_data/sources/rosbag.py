@@ -8,7 +8,7 @@ with the size of a bag. Streams keep their own clocks; `align` brings them toget
 from collections import Counter
 from pathlib import Path
 
-from hma_data.embodiment import Camera, Component, Embodiment
+from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Signal, Stream
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag, find_bags
@@ -20,6 +20,7 @@ from hma_data.sources.bags.report import report
 from hma_data.sources.bags.streams import camera_stream
 from hma_data.sources.bags.track import Track
 from hma_data.sources.base import EpisodeRef, Inspection, component_values, local_path
+from hma_data.spec import Camera, Component
 
 
 def open() -> "RosbagSource":

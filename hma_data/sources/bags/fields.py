@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.embodiment import Component
 from hma_data.episode import Floats
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.messages import child, field_names, is_list, numbers
+from hma_data.spec import Component
 
 STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\]")
 Step = str | int | slice
