@@ -116,6 +116,10 @@ def convert(
     frames: Annotated[
         Frames, typer.Option("--frames", help="All rows, or the model's grid only.")
     ] = Frames.all,
+    frequency_hz: Annotated[
+        float | None,
+        typer.Option("--frequency-hz", help="The recording's rate, where the YAML's is unknown."),
+    ] = None,
     camera: Annotated[
         list[str] | None, typer.Option("--camera", help="Camera to keep; repeat for more.")
     ] = None,
@@ -146,6 +150,8 @@ def convert(
     from hma_data.tokenizers.base import get_tokenizer
 
     robot = find(embodiment)
+    if frequency_hz is not None:
+        robot = robot.with_rate(frequency_hz)
     settings = Settings(frames.value, tuple(camera or ()), val_fraction, seed, limit, shard_frames)
     if dry_run:
         plan, uri = plan_conversion(

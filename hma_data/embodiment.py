@@ -106,6 +106,20 @@ class Embodiment(SpecModel):
             "or give hma convert --frequency-hz HZ",
         )
 
+    def with_rate(self, hz: float) -> "Embodiment":
+        """The same with its unknown rate filled in, as a shard set made so will state it.
+
+        Raises:
+            RegistryError: the YAML states another rate, or `hz` is none.
+        """
+        where = f"embodiment {self.id}: frequency_hz"
+        if self.frequency_hz not in ("unknown", hz):
+            raise RegistryError(
+                where, f"is {self.frequency_hz}, not {hz:g}", "correct it in a copy of the YAML"
+            )
+        provenance = self.provenance | {"frequency_hz": "given at the conversion"}
+        return Embodiment.from_values(self.to_dict() | {"frequency_hz": hz, "provenance": provenance}, where)
+
     @property
     def stride(self) -> int:
         """Recorded steps a frame of the model's grid: max(1, round half up of rate / target)."""
