@@ -47,19 +47,39 @@ class EpisodeRef:
 
 
 @dataclass(frozen=True)
+class TopicInfo:
+    """The topic a key of a bag is in, as the messages were.
+
+    Attributes:
+        name: of the topic.
+        type: of its messages.
+        gap_ms: the longest interval between two of them; None for fewer than two.
+        delay_ms: median from header stamp to receipt; None where messages carry no time.
+        goes_back: whether header stamps go back in time.
+    """
+
+    name: str
+    type: str
+    gap_ms: float | None = None
+    delay_ms: float | None = None
+    goes_back: bool = False
+
+
+@dataclass(frozen=True)
 class KeyInfo:
     """One key of a recording: what `hma inspect` lists.
 
     Attributes:
         key: as an embodiment's YAML would name it.
         kind: camera, vector, text or other.
-        shape: of one sample, pictures (H, W, 3).
+        shape: of one sample, pictures (H, W, 3); (H, W, 1) where they are recorded in grey.
         dtype: as recorded.
         hz: measured or stated rate; None when unknown.
         names: of the values, where the recording has them.
         codec: of pictures: jpeg, png, raw, av1, h264.
         count: samples seen (of one episode, or of the whole recording when it is a topic).
         jitter_ms: standard deviation of the intervals.
+        topic: of bags.
     """
 
     key: str
@@ -71,6 +91,7 @@ class KeyInfo:
     codec: str | None = None
     count: int | None = None
     jitter_ms: float | None = None
+    topic: TopicInfo | None = None
 
 
 @dataclass(frozen=True)

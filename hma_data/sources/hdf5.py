@@ -32,7 +32,7 @@ from hma_data.sources.hdf5_layout import WHOLE_FILE, Place, Places, episodes_pat
 from hma_data.spec import Vector
 from hma_data.video import MAX_PIXELS, Images, decode_image
 
-_TEXT_KEYS = ("language_instruction", "instruction", "lang", "task_description", "task")
+TEXT_KEYS = ("language_instruction", "instruction", "lang", "task_description", "task")
 _SPLITS = {"train": "train", "valid": "val"}
 
 
@@ -259,7 +259,7 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
     if key:
         return text(member(group, key, where)[()])
     for holder in (group, group.parent, group.file):
-        for name in _TEXT_KEYS:
+        for name in TEXT_KEYS:
             if name in holder.attrs and (found := text(holder.attrs[name])):
                 return found
         said = _json(holder, "problem_info").get("language_instruction", "")

@@ -313,13 +313,25 @@ def _features(found: Any, where: object) -> dict[str, Feature]:
 
 
 def _names(found: Any, count: int) -> tuple[str, ...] | None:
-    """Names of a vector's values; recorders nest them in lists or under `motors`, `axes`, …"""
+    """Names of a vector's values; recorders nest them in lists, or by `motors`, `left`, …, or number them."""
     if isinstance(found, dict):
-        found = list(found.values())
-    while isinstance(found, list) and len(found) == 1 and isinstance(found[0], list):
-        found = found[0]
-    names = tuple(found) if isinstance(found, list) else ()
-    return names if len(names) == count and all(isinstance(name, str) for name in names) else None
+        if sorted(map(str, found.values())) == sorted(map(str, range(count))):  # {"x": 0, "gripper": 1}
+            return tuple(str(name) for name in sorted(found, key=lambda name: int(found[name])))
+        groups = {name: _flat(inner) for name, inner in found.items()}
+        names = [name for inner in groups.values() for name in inner]
+        if len(set(names)) < len(names):  # both arms name their joints alike
+            names = [f"{group}_{name}" for group, inner in groups.items() for name in inner]
+    else:
+        names = _flat(found)
+    return tuple(names) if len(names) == count else None
+
+
+def _flat(found: Any, depth: int = 0) -> list[str]:
+    """The texts of a list of lists; empty where there is anything else in it."""
+    if isinstance(found, str):
+        return [found]
+    inner = [_flat(item, depth + 1) for item in found] if isinstance(found, list) and depth < 8 else []
+    return [name for names in inner for name in names] if all(inner) else []
 
 
 def _splits(found: Any) -> dict[str, range]:

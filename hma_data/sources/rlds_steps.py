@@ -203,6 +203,8 @@ def key_info(steps: Steps, key: str) -> KeyInfo:
     try:
         if is_camera(feature):
             kind, shape, codec = "camera", steps.decoder(key)(0).shape, _codec(steps, key)
+            if feature.shape[-1:] == (1,):
+                shape = (*shape[:2], 1)
         elif feature.kind == "text":
             kind = "text"
         elif feature.kind == "number":

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.messages import child, field_names
+from hma_data.sources.facts import one_channel
 from hma_data.video import MAX_PIXELS, Images, decode_image, opencv
 
 RAW, STILL, VIDEO = "raw", "still", "video"
@@ -63,6 +64,13 @@ def picture(message: Any, kind: str, where: str) -> Images:
         return decode_image(payload(message), where)
     except (KeyError, TypeError, ValueError) as fault:
         raise EpisodeError(where, f"a message is not a picture: {fault!r}") from fault
+
+
+def is_grey(message: Any, kind: str) -> bool:
+    """Whether a raw or still picture that can be read has one channel."""
+    if kind == RAW:
+        return str(child(message, "encoding")).lower() in ("mono8", "8uc1")
+    return kind == STILL and one_channel(payload(message))
 
 
 def payload(message: Any) -> bytes:

@@ -5,7 +5,7 @@ to a limit.
 """
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,10 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.messages import child, decode, field_names, is_list, is_message, numbers
-from hma_data.sources.bags.pictures import VIDEO, codec, picture_kind
+from hma_data.sources.bags.pictures import VIDEO, codec, is_grey, picture_kind
 from hma_data.sources.bags.streams import camera_stream
 from hma_data.sources.bags.track import Track
-from hma_data.sources.base import Inspection, KeyInfo
+from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
 
 MAX_BYTES = 1 << 30  # of messages measured
 MAX_MESSAGES = 300_000
@@ -30,13 +30,21 @@ PAUSE, PAUSE_S = 10, 0.5  # median intervals, and seconds
 
 @dataclass
 class _Topic:
-    """A topic while it is measured."""
+    """A topic while it is measured; `sample` is its first message, or that which names most joints."""
 
     track: Track
     count: int = 0
-    first: Any = None
+    sample: Any = None
+    named: int = 0
     fault: str = ""
     problems: list[str] = field(default_factory=list)
+
+    def look_at(self, message: Any) -> None:
+        """Two publishers of one JointState topic name different joints."""
+        named = child(message, "name") if "name" in field_names(message) else ""
+        count = len(named) if is_list(named) else 0
+        if self.sample is None or count > self.named:
+            self.sample, self.named = message, count
 
 
 def report(uri: str, root: Path, bags: dict[str, Path]) -> Inspection:
@@ -88,6 +96,7 @@ def _inspection(
         frames=sum(lengths) if cameras and not faults else None,
         lengths=lengths[:MAX_LENGTHS],
         hz=cameras[0].hz if cameras else None,
+        robot=bag.notes().get("robot") or None,
         problems=(*faults, *(line for topic in topics.values() for line in topic.problems)),
         facts=facts,
     )
@@ -109,7 +118,7 @@ def _measure(bag: Bag) -> tuple[dict[str, _Topic], bool]:
         try:
             message = None if topic.fault else decode(record.channel, record.data, str(bag.path))
             topic.track.add(record.channel, record.log_ns, place, message)
-            topic.first = message if topic.first is None else topic.first
+            topic.look_at(message)
         except EpisodeError as fault:
             topic.fault = fault.fault
             topic.track.add(record.channel, record.log_ns, place, None)
@@ -164,28 +173,42 @@ def _rate(times: Floats) -> tuple[float | None, float | None]:
 def _keys(bag: Bag, topic: _Topic) -> list[KeyInfo]:
     if not len(topic.track):
         return [KeyInfo(topic.track.topic, "other", (), "", count=0)]
-    hz, jitter_ms = _rate(_times(topic))
+    times = _times(topic)
+    hz, jitter_ms = _rate(times)
     stated = topic.track.channels[0]
     kind = picture_kind(stated.type)
     found: list[KeyInfo] = []
     if not topic.fault:
-        found = [_camera(bag, topic, kind)] if kind else _values(topic.track.topic, topic.first)
+        found = [_camera(bag, topic, kind)] if kind else _values(topic.track.topic, topic.sample)
     found = found or [KeyInfo(topic.track.topic, "other", (), stated.type or stated.encoding)]
-    return [
-        KeyInfo(key.key, key.kind, key.shape, key.dtype, hz, key.names, key.codec, topic.count, jitter_ms)
-        for key in found
-    ]
+    about = _about(topic, times, stated.type or stated.encoding)
+    return [replace(key, hz=hz, count=topic.count, jitter_ms=jitter_ms, topic=about) for key in found]
+
+
+def _about(topic: _Topic, times: Floats, kind: str) -> TopicInfo:
+    track, steps = topic.track, np.diff(times)
+    delay_ms = None
+    if track.stamped and not topic.fault:
+        delay_ms = float(np.median(track.seconds("receive") - track.seconds("header")) * 1e3)
+    return TopicInfo(
+        track.topic,
+        kind,
+        gap_ms=float(steps.max() * 1e3) if len(steps) else None,
+        delay_ms=delay_ms,
+        goes_back=bool(len(steps) and steps.min() < 0),
+    )
 
 
 def _camera(bag: Bag, topic: _Topic, kind: str) -> KeyInfo:
     name = topic.track.topic
     try:
-        shape: tuple[int, ...] = camera_stream(bag, topic.track, "receive").frames([0]).shape[1:]
+        height, width = camera_stream(bag, topic.track, "receive").frames([0]).shape[1:3]
     except EpisodeError as fault:
         topic.problems.append(f"{name}: {fault.fault}")
         return KeyInfo(name, "other", (), topic.track.channels[0].type)
-    stored = topic.track.codec if kind == VIDEO else codec(topic.first, kind)
-    return KeyInfo(name, "camera", shape, "uint8", codec=stored)
+    stored = topic.track.codec if kind == VIDEO else codec(topic.sample, kind)
+    channels = 1 if is_grey(topic.sample, kind) else 3
+    return KeyInfo(name, "camera", (height, width, channels), "uint8", codec=stored)
 
 
 def _values(key: str, value: Any) -> list[KeyInfo]:
@@ -202,7 +225,19 @@ def _values(key: str, value: Any) -> list[KeyInfo]:
         for name in names
         if name not in ("header", "stamp", "timestamp")
         for found in _named(_values(f"{key}.{name}", child(value, name)), value, name)
-    ]
+    ] + _trajectory(key, value, names)
+
+
+def _trajectory(key: str, value: Any, names: list[str]) -> list[KeyInfo]:
+    """The first point of a JointTrajectory, the one in force when it is sent."""
+    points: Any = child(value, "points") if {"points", "joint_names"} <= set(names) else ()
+    if not is_list(points) or not len(points) or not is_message(points[0]):
+        return []
+    stated = child(value, "joint_names")
+    labels = tuple(map(str, stated)) if is_list(stated) else ()
+    found = _values(f"{key}.points[0]", points[0])
+    fits = [bool(labels) and item.shape == (len(labels),) for item in found]
+    return [replace(item, names=labels) if fit else item for item, fit in zip(found, fits, strict=True)]
 
 
 def _named(found: list[KeyInfo], owner: Any, name: str) -> list[KeyInfo]:
@@ -210,8 +245,7 @@ def _named(found: list[KeyInfo], owner: Any, name: str) -> list[KeyInfo]:
     labels = child(owner, "name") if "name" in field_names(owner) and name != "name" else ()
     if len(found) != 1 or not is_list(labels) or found[0].shape != (len(labels),) or not len(labels):
         return found
-    key = found[0]
-    return [KeyInfo(key.key, key.kind, key.shape, key.dtype, names=tuple(str(label) for label in labels))]
+    return [replace(found[0], names=tuple(map(str, labels)))]
 
 
 def _vector(key: str, value: Any) -> list[KeyInfo]:

@@ -1,0 +1,41 @@
+"""What the first bytes of a picture, and a column of times, tell of a recording; for `inspect`."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+HEAD = 65536  # bytes in which a JPEG's start of frame is looked for
+UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # times since 1970 from, seconds a unit
+STEPS_S = (1e-4, 5.0)  # between samples of a recording
+
+
+def one_channel(data: bytes) -> bool:
+    """Whether a JPEG or PNG is grey, by its header."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return data[25:26] in (b"\0", b"\4")
+    at, head = 2, data[:HEAD]
+    while head[:2] == b"\xff\xd8" and at + 10 <= len(head) and head[at] == 0xFF:
+        marker = head[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            return head[at + 9] == 1
+        at += 2 + (0 if marker == 0xFF else int.from_bytes(head[at + 2 : at + 4], "big"))
+    return False
+
+
+def seconds_a_unit(values: NDArray[Any]) -> float | None:
+    """What one unit of a column of times is in seconds, by size and steps; None where it is not clear.
+
+    Args:
+        values: (T,) as recorded.
+    """
+    times = np.asarray(values, np.float64).reshape(-1)
+    steps = np.diff(times)
+    if len(times) < 3 or not np.isfinite(times).all() or steps.min() < 0 or not steps.max() > 0:
+        return None
+    step = float(np.median(steps))
+    for least, unit in UNITS:
+        if times[0] >= least:
+            return unit if STEPS_S[0] <= step * unit <= STEPS_S[1] else None
+    counted = np.array_equal(times, np.round(times))  # frame numbers, or times in another unit
+    return 1.0 if not counted and STEPS_S[0] <= step <= STEPS_S[1] else None
