@@ -75,14 +75,20 @@ def _shared_index(episode: Episode, embodiment: Embodiment) -> Clip:
         )
     times = episode.streams[embodiment.primary_camera.name].timestamps
     _check_times(episode.id, embodiment.primary_camera.name, times)
-    index = np.arange(len(times))
+    shift = embodiment.sync.action_shift
+    index = np.arange(max(0, -shift), len(times) - max(0, shift))
+    if not len(index):
+        raise EpisodeError(episode.id, f"has {len(times)} frames, sync.action_shift is {shift}")
     return Clip(
         episode=episode,
-        timestamps=times - times[0],
-        actions=_join(episode.actions),
-        states=_join(episode.states) if episode.states else None,
+        timestamps=times[index] - times[index[0]],
+        actions=_join(episode.actions)[index + shift],
+        states=_join(episode.states)[index] if episode.states else None,
         frame_indices=dict.fromkeys(episode.streams, index),
-        skew_ms={name: np.abs(stream.timestamps - times) * 1e3 for name, stream in episode.streams.items()},
+        skew_ms={
+            name: np.abs(stream.timestamps - times)[index] * 1e3 for name, stream in episode.streams.items()
+        },
+        trimmed=abs(shift),
     )
 
 

@@ -29,6 +29,17 @@ if TYPE_CHECKING:
 
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
 TODO = "TODO"
+# What decides the content of shards. target_hz and stride act later, when windows are drawn.
+_DECIDES: Any = {
+    "id": True,
+    "kind": True,
+    "frequency_hz": True,
+    "action": True,
+    "state": True,
+    "cameras": {"__all__": {"name", "key", "color", "resize", "rotate", "flip", "crop", "stamp"}},
+    "sync": True,
+    "source": {"format", "instruction", "layout"},
+}
 
 
 class Embodiment(SpecModel):
@@ -75,6 +86,10 @@ class Embodiment(SpecModel):
         if self.sync.primary and self.sync.primary not in names:
             raise ValueError(
                 f"sync.primary {self.sync.primary!r} is not a camera; cameras: {', '.join(names)}"
+            )
+        if self.sync.action_shift and self.source.format == "rosbag":
+            raise ValueError(
+                "sync.action_shift counts steps, and messages of a bag have times instead of steps"
             )
         return self
 
@@ -164,15 +179,9 @@ class Embodiment(SpecModel):
     @cached_property
     def digest(self) -> str:
         """Sixteen hex digits over what decides the shards' content (not texts, nor the place of the data)."""
-        content = self.model_dump(
-            mode="json", exclude={"description", "robot", "license", "provenance", "notes", "stats_key"}
-        )
-        content["source"] = {key: content["source"][key] for key in ("format", "instruction", "layout")}
-        for name in ("target_hz", "stride_override"):  # they act when windows are drawn, not in the shards
-            content.pop(name)
-        for camera in content["cameras"]:
-            camera.pop("size")
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+        content = self.model_dump(mode="json", exclude_defaults=True, include=_DECIDES)
+        hashed = json.dumps(content, sort_keys=True)
+        return hashlib.sha256(hashed.encode()).hexdigest()[:16]
 
     # -- YAML
 

@@ -129,6 +129,9 @@ class Camera(SpecModel):
     color: Literal["rgb", "bgr"] = "rgb"
     resize: Literal["short_side_crop", "letterbox", "stretch"] = "short_side_crop"
     rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
+    flip: Literal["vertical", "horizontal"] | None = Field(
+        None, description="vertical: rows are stored bottom to top; before rotate"
+    )
     crop: tuple[Count, Count, Count, Count] | None = Field(
         None, description="[x, y, width, height] in source pixels"
     )
@@ -160,6 +163,12 @@ class Sync(SpecModel):
     actions: Method = "hold"
     states: Method = "interpolate"
     max_skew_ms: Number | None = Field(None, gt=0, description="an episode moved by more is refused")
+    action_shift: Count = Field(
+        0,
+        ge=-100,
+        le=100,
+        description="steps: the command of frame t is recorded at t + action_shift; not in bags",
+    )
     stamp: Literal["header", "receive"] = "header"
 
 

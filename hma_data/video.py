@@ -72,9 +72,11 @@ def claimed_size(head: bytes) -> tuple[int, int]:
 
 
 def prepare(frames: Images, camera: Camera, size: int, resize_filter: Filter = "area") -> Images:
-    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, rotation, crop, resize as its YAML says."""
+    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, flip, rotation, crop, resize as its YAML says."""
     if camera.color == "bgr":
         frames = frames[..., ::-1]
+    if camera.flip:
+        frames = np.flip(frames, axis=1 if camera.flip == "vertical" else 2)
     if camera.rotate:
         frames = np.rot90(frames, k=-camera.rotate // 90, axes=(1, 2))
     if camera.crop:
