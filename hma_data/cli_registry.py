@@ -18,7 +18,7 @@ LISTED = {  # column -> fact
     "kind": "kind",
     "robot": "robot",
     "dims": "action_dim",
-    "Hz": "frequency_hz",
+    "Hz": "rate_hz",
     "stride": "stride",
     "effective Hz": "effective_hz",
     "source": "format",
@@ -97,6 +97,9 @@ def _rate_is(rate: float | str | None, wanted: str) -> bool:
 
 def _print_list(rows: list[dict[str, Any]]) -> None:
     cells = [[row[fact] for fact in LISTED.values()] for row in rows]
+    for row, shown in zip(rows, cells, strict=True):
+        if row["rate_hz"] is None:  # the word tells more than a blank
+            shown[list(LISTED).index("Hz")] = row["frequency_hz"]
     print_table(list(LISTED), [[", ".join(v) if isinstance(v, list) else v for v in row] for row in cells])
     print(f"{len(rows)} embodiments")
 

@@ -37,9 +37,12 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
     from rich.table import Table
 
     table = Table(*columns, title=title or None, title_justify="left", box=SIMPLE, pad_edge=False)
+    table.columns[0].overflow = "fold"  # what is typed into the next command is never cut short
+    table.columns[0].min_width = min(32, max((len(str(row[0])) for row in rows), default=0))
     for i, column in enumerate(table.columns):
-        if all(isinstance(row[i], int | float) for row in rows):
-            column.justify = "right"
+        values = [row[i] for row in rows]
+        if any(isinstance(value, int | float) for value in values) and not any(map(_is_word, values)):
+            column.justify, column.no_wrap = "right", True
     for row in rows:
         table.add_row(*(escape(_cell(value)) for value in row))
     stdout().print(table)
@@ -52,6 +55,10 @@ def stdout() -> Any:
     return Console(
         width=None if sys.stdout.isatty() else 200, soft_wrap=not sys.stdout.isatty(), highlight=False
     )
+
+
+def _is_word(value: Any) -> bool:
+    return isinstance(value, str) and value != "unknown"
 
 
 def _print_columns(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -126,7 +126,7 @@ def facts(embodiment: Any) -> dict[str, Any]:
         "frequency_hz": embodiment.frequency_hz,
         "target_hz": embodiment.target_hz,
     }
-    for name in ("stride", "effective_hz", "chunk_dim"):
+    for name in ("rate_hz", "stride", "effective_hz", "chunk_dim"):
         try:
             found[name] = getattr(embodiment, name)
         except RegistryError:

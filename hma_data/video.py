@@ -72,7 +72,7 @@ def claimed_size(head: bytes) -> tuple[int, int]:
 
 
 def prepare(frames: Images, camera: Camera, size: int, resize_filter: Filter = "area") -> Images:
-    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, flip, rotation, crop, resize as its YAML says."""
+    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, flip, rotation, crop, resize by its YAML."""
     if camera.color == "bgr":
         frames = frames[..., ::-1]
     if camera.flip:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hma_data.align import hold, interpolate, nearest, to_clip
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Clip, Episode, Pictures, Signal
-from hma_data.errors import AlignmentError, EpisodeError
+from hma_data.errors import AlignmentError, EpisodeError, RegistryError
 
 QUICK = settings(max_examples=150, deadline=None)
 TICK = 1 / 64  # a binary fraction: sums and differences of times are exact, ties are ties
@@ -222,6 +222,28 @@ def test_a_held_command_ends_with_its_stream_where_a_limit_is_set() -> None:
 def test_streams_that_never_overlap_are_told_with_their_times() -> None:
     with pytest.raises(AlignmentError, match=r"never run together: .*action/0 100\.000 to 101\.900"):
         to_clip(episode(STEADY, STEADY, STEADY + 100, STEADY, STEADY), embodiment())
+
+
+@pytest.mark.parametrize("shift", [-2, 0, 1, 3])
+def test_a_shifted_action_stands_beside_the_frame_it_was_issued_at(shift: int) -> None:
+    ticks = np.arange(6) / 10
+    counted = Signal(ticks, np.arange(6, dtype=np.float32)[:, None])
+    picture = Pictures(ticks, lambda i: np.full((2, 2, 3), i, np.uint8))
+    robot = embodiment().model_dump(mode="json", exclude_defaults=True, by_alias=True)
+    robot |= {"source": {"format": "hdf5"}, "sync": {"action_shift": shift}, "state": None}
+    names = [camera["name"] for camera in robot["cameras"]]
+    run = Episode("e", dict.fromkeys(names, picture), (counted,), (), True)
+    clip = to_clip(run, Embodiment.from_values(robot, "shifted"))
+    shown = clip.frames_at(names[0], np.arange(len(clip)))[:, 0, 0, 0]
+    assert len(clip) == 6 - abs(shift) and clip.trimmed == abs(shift) and clip.timestamps[0] == 0
+    np.testing.assert_array_equal(clip.actions[:, 0], shown.astype(int) + shift)
+
+
+def test_a_shift_in_steps_of_a_bag_is_refused() -> None:
+    with pytest.raises(RegistryError, match="action_shift counts steps"):
+        Embodiment.from_values(
+            {**embodiment().to_dict(), "sync": {"action_shift": 1}, "source": {"format": "rosbag"}}, "bag"
+        )
 
 
 def test_time_that_goes_back_is_told_with_the_place() -> None:

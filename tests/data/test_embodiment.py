@@ -163,6 +163,17 @@ def test_an_unknown_rate_has_no_stride_and_says_how_to_give_it(hz: Any, said: st
         _ = arm("frequency_hz", hz).stride
 
 
+def test_a_rate_that_nobody_stated_can_be_given_and_a_stated_one_not_changed() -> None:
+    given = arm("frequency_hz", "unknown").with_rate(15)
+    assert (given.frequency_hz, given.stride) == (15, 8)
+    assert given.provenance["frequency_hz"] == "given at the conversion"
+    assert arm("frequency_hz", 5).with_rate(5).digest == arm("frequency_hz", 5).digest
+    with pytest.raises(RegistryError, match="is 5.0, not 15"):
+        arm("frequency_hz", 5).with_rate(15)
+    with pytest.raises(RegistryError, match="between 0 and"):
+        arm("frequency_hz", "unknown").with_rate(-1)
+
+
 def test_the_digest_ignores_texts_and_places_but_not_keys() -> None:
     same = [("notes", "n"), ("license", "MIT"), ("source.uri", "gs://x"), ("target_hz", 3), ("stride", 4)]
     other = [("frequency_hz", 6), ("cameras.0.key", "k"), ("action.components.0.sign", -1)]

@@ -1,8 +1,10 @@
-"""Frames by index out of video files, against decoding the whole file in order."""
+"""Frames by index out of video files, against decoding the whole file in order; pictures made square."""
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -12,6 +14,8 @@ from hypothesis import strategies as st
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.video_file import VideoFile, frame_table
+from hma_data.spec import Camera
+from hma_data.video import prepare
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
 
 LENGTH = 40
@@ -185,3 +189,35 @@ def test_a_real_video_strided_equals_decoding_in_order(real_data: Path, name: st
 def test_pictures_survive_their_codec(video: Path) -> None:
     off = np.abs(VideoFile(video).frames([7])[0].astype(int) - picture(7))
     assert np.median(off) <= 1
+
+
+# -- a camera's YAML
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, lambda p: p),
+        ({"color": "bgr"}, lambda p: p[:, :, ::-1]),
+        ({"rotate": 90}, lambda p: np.stack([p[::-1, i] for i in range(p.shape[1])])),  # clockwise
+        ({"rotate": 180}, lambda p: p[::-1, ::-1]),
+        ({"rotate": 270}, lambda p: np.stack([p[:, -1 - i] for i in range(p.shape[1])])),
+        ({"flip": "vertical"}, lambda p: p[::-1]),
+        ({"flip": "horizontal"}, lambda p: p[:, ::-1]),
+        ({"flip": "vertical", "rotate": 180}, lambda p: p[:, ::-1]),
+        ({"crop": [2, 1, 4, 4]}, lambda p: p[1:5, 2:6]),
+    ],
+)
+def test_pictures_are_turned_and_cropped_as_the_yaml_says(
+    changes: dict[str, Any], expected: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    picture = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
+    camera = Camera.model_validate({"name": "c", "key": "k", **changes})
+    wanted = expected(picture)
+    np.testing.assert_array_equal(prepare(picture[None], camera, len(wanted))[0], wanted)
+
+
+def test_a_crop_that_leaves_the_picture_is_refused() -> None:
+    camera = Camera(name="c", key="k", crop=(4, 0, 8, 8))
+    with pytest.raises(EpisodeError, match=r"crop \[4, 0, 8, 8\] leaves the picture of 8×8"):
+        prepare(np.zeros((1, 8, 8, 3), np.uint8), camera, 8)
