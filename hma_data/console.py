@@ -38,7 +38,6 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
 
     table = Table(*columns, title=title or None, title_justify="left", box=SIMPLE, pad_edge=False)
     table.columns[0].overflow = "fold"  # what is typed into the next command is never cut short
-    table.columns[0].min_width = min(32, max((len(str(row[0])) for row in rows), default=0))
     for i, column in enumerate(table.columns):
         values = [row[i] for row in rows]
         if any(isinstance(value, int | float) for value in values) and not any(map(_is_word, values)):

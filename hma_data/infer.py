@@ -1,24 +1,25 @@
 """Write the YAML of a new robot from one of its recordings.
 
 What the recording states is filled in; what it cannot know stands as `TODO: question`, and
-`hma registry validate` lists those until they are answered.
+`hma registry validate` lists those until they are answered. Which keys are taken is decided in
+`infer_choices` and, for bags, in `infer_topics`.
 """
 
+import math
 import re
-from typing import Any
+from typing import Any, get_args
 
 from hma_data.embodiment import ID_PATTERN, TODO
 from hma_data.errors import SourceError, UsageError
+from hma_data.infer_choices import Choice, actions, camera_names, cameras, instruction, likely, states
+from hma_data.infer_space import names_of, space_of
+from hma_data.infer_text import yaml_text
+from hma_data.infer_words import dims, is_gripper, shown, vectors
 from hma_data.sources.base import Inspection, KeyInfo, detect, open_source
-from hma_data.yaml_io import write_yaml
+from hma_data.spec import Space
 
-_ACTION = re.compile(r"action|command|cmd|target|control", re.IGNORECASE)
-_STATE = re.compile(r"state|qpos|proprio|joint|eef|agent_pos|robot0", re.IGNORECASE)
-_WRIST = re.compile(r"wrist|hand|gripper", re.IGNORECASE)
-_GENERIC = re.compile(r"compressed|image|image_raw|images|color|rgb|obs|observations?", re.IGNORECASE)
-_NOT_ACTION = re.compile(
-    r"image|depth|reward|discount|is_(first|last|terminal)|language|embedding", re.IGNORECASE
-)
+HIGHEST_HZ = 100_000  # of a rate in a YAML
+MEASURED_TO = 5e-4  # of a rate; what time stamps leave open comes on top
 
 
 def infer(uri: str, embodiment_id: str) -> str:
@@ -28,113 +29,237 @@ def infer(uri: str, embodiment_id: str) -> str:
         UsageError: not an id.
         SourceError: the recording cannot be read, or has no camera or nothing that could be an action.
     """
-    if not ID_PATTERN.fullmatch(embodiment_id):
+    if not ID_PATTERN.fullmatch(embodiment_id) or ".." in embodiment_id:
         raise UsageError(
             "--id", f"{embodiment_id!r} is not an id", "use a-z 0-9 _ - . and begin with a letter or digit"
         )
-    name = detect(uri)
-    found = open_source(name).inspect(uri)
-    cameras = [
-        key for key in found.keys if key.kind == "camera" and len(key.shape) == 3 and key.shape[2] == 3
-    ]
-    vectors = [key for key in found.keys if key.kind == "vector" and not _NOT_ACTION.search(key.key)]
-    actions = _actions(vectors, name)
-    if not cameras:
-        raise SourceError(uri, "has no colour camera", "hma inspect lists its keys")
-    if not actions:
-        listed = ", ".join(key.key for key in vectors) or "none"
-        raise SourceError(uri, "has nothing that looks like an action", f"its vectors: {listed}")
-    states = _states([key for key in vectors if key not in actions])
-    return _text(found, uri, embodiment_id, cameras, actions, states)
+    return from_inspection(open_source(detect(uri)).inspect(uri), embodiment_id)
 
 
-def _actions(vectors: list[KeyInfo], source: str) -> list[KeyInfo]:
-    """Keys that name an action; the plainest of them when one holds the whole vector."""
-    named = [
-        key
-        for key in vectors
-        if _ACTION.search(key.key) and not re.search(r"observation|/obs/|^obs/", key.key)
-    ]
-    whole = [key for key in named if _last(key.key) in ("action", "actions")]
-    if whole:
-        return whole[:1]
-    if source == "rosbag":
-        return named[:1]
-    return named
+def from_inspection(found: Inspection, embodiment_id: str) -> str:
+    """See `infer`."""
+    draft = _Draft(found)
+    text = yaml_text(draft.values(embodiment_id))
+    where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
+    return f"# Inferred from {where}; answer every {TODO}, then: hma registry validate FILE\n{text}"
 
 
-def _states(vectors: list[KeyInfo]) -> list[KeyInfo]:
-    """Keys that name the robot's own state; a simulator's raw state only where nothing better is recorded."""
-    named = [key for key in vectors if _STATE.search(key.key) and not _ACTION.search(key.key)]
-    return [key for key in named if key.key != "states"] or named
+class _Draft:
+    """What is taken from one inspection.
+
+    Raises:
+        SourceError: no camera, or nothing that could be an action.
+    """
+
+    def __init__(self, found: Inspection) -> None:
+        self.found = found
+        self.bag = found.format == "rosbag"
+        self.seen = cameras(found.keys)
+        if not self.seen.keys:
+            raise _no_camera(found)
+        numbers = vectors(found.keys)
+        if found.format == "hdf5":
+            numbers = self._of_one_length(numbers)
+        self.action, self.states = self._bag_choice(numbers) if self.bag else self._step_choice(numbers)
+        if not self.action.keys:
+            raise _no_action(found, self.seen.keys)
+        self.hz = self.seen.keys[0].hz or found.hz if self.bag else found.hz
+        if self.hz is not None and not 0 < self.hz <= HIGHEST_HZ:
+            self.hz = None
+
+    def _of_one_length(self, numbers: list[KeyInfo]) -> list[KeyInfo]:
+        """Rows that go with the pictures, one by one: HDF5 has also other arrays."""
+        lengths = [key.count for key in self.seen.keys]
+        length = max(set(lengths), key=lengths.count)
+        self.seen = Choice(tuple(key for key in self.seen.keys if key.count == length), self.seen.question)
+        return [key for key in numbers if key.count == length]
+
+    @staticmethod
+    def _step_choice(numbers: list[KeyInfo]) -> tuple[Choice, tuple[KeyInfo, ...]]:
+        action = actions(numbers)
+        action = action if action.keys else likely(numbers)
+        return action, states(numbers, action.keys)
+
+    @staticmethod
+    def _bag_choice(numbers: list[KeyInfo]) -> tuple[Choice, tuple[KeyInfo, ...]]:
+        from hma_data import infer_topics
+
+        action = infer_topics.actions(numbers)
+        return action, infer_topics.states(numbers, action.keys)
+
+    # -- the YAML
+
+    def values(self, embodiment_id: str) -> dict[str, Any]:
+        """Plain values in the order of the registry's YAMLs."""
+        found = self.found
+        name = found.facts.get("dataset") or found.uri.rstrip("/").rsplit("/", 1)[-1]
+        values: dict[str, Any] = {
+            "id": embodiment_id,
+            "description": f"{found.robot or 'robot'} as recorded in {name}",
+            "robot": found.robot or f"{TODO}: which robot is it?",
+            "kind": "simulation" if found.facts.get("simulator") else f"{TODO}: real, simulation or human?",
+            "frequency_hz": self._rate() or f"{TODO}: at how many Hz were actions recorded?",
+            "target_hz": 2,
+            "action": {
+                "space": space_of(self.action.keys, found.facts)
+                or f"{TODO}: one of {_listed(get_args(Space))}?",
+                "components": [self._component(key) for key in self.action.keys],
+            },
+        }
+        if self.states:
+            values["state"] = {"components": [_named(key, key.names) for key in self.states]}
+        values["cameras"] = self._cameras()
+        if self.bag:
+            values["sync"] = self._sync(values["cameras"][0]["name"])
+        values["source"] = self._source()
+        values["provenance"] = self._provenance()
+        unused = self._unused()
+        return values | ({"notes": f"recorded and not used: {unused}"} if unused else {})
+
+    def _rate(self) -> float | int | None:
+        """29.97 stays; 9.97 of stamps that jitter so much that it may be 10 becomes 10."""
+        if self.hz is None:
+            return None
+        camera = self.seen.keys[0]
+        doubt = 0.0  # of the median interval of jittering stamps, relative
+        if self.bag and camera.jitter_ms and camera.count:
+            doubt = 2.5 * camera.jitter_ms * self.hz / 1e3 / math.sqrt(camera.count)
+        whole = round(self.hz)
+        tolerance = MEASURED_TO + (min(doubt, 0.02) if doubt == doubt else 0.0)
+        return whole if whole and abs(self.hz / whole - 1) < tolerance else round(self.hz, 3) or None
+
+    def _component(self, key: KeyInfo) -> dict[str, Any]:
+        component = _named(key, key.names or names_of(key, self.found.facts))
+        switch = key.dtype == "bool" or (is_gripper(key.key) and not self.bag)  # bags: in metres, or 0 to 255
+        return component | ({"normalize": False} if component["dims"] == 1 and switch else {})
+
+    def _cameras(self) -> list[dict[str, Any]]:
+        doubtful = "layout" in self.found.facts and "simulator" not in self.found.facts
+        listed = []
+        for name, key in zip(camera_names(self.seen.keys), self.seen.keys, strict=True):
+            camera: dict[str, Any] = {
+                "name": name,
+                "key": key.key,
+                "size": [int(side) for side in key.shape[:2]],
+            }
+            if doubtful:
+                camera["color"] = f"{TODO}: rgb or bgr? arrays that went through OpenCV are often bgr"
+            listed.append(camera)
+        return listed
+
+    def _sync(self, primary: str) -> dict[str, Any]:
+        from hma_data.infer_topics import max_skew_ms, needs_receive_times
+
+        sync = {"primary": primary, "images": "nearest", "actions": "hold", "states": "interpolate"}
+        skew = max_skew_ms(list(self.seen.keys[1:]), self.action.keys, self.states)
+        late = needs_receive_times(self._used())
+        return sync | ({"max_skew_ms": skew} if skew else {}) | ({"stamp": "receive"} if late else {})
+
+    def _used(self) -> list[KeyInfo]:
+        return [*self.seen.keys, *self.action.keys, *self.states]
+
+    def _source(self) -> dict[str, Any]:
+        found = self.found
+        source: dict[str, Any] = {
+            "format": found.format,
+            "uri": found.uri,
+            "episodes": max(found.episodes, 1),
+        }
+        said = self._instruction()
+        times = found.facts.get("timestamps")
+        source |= {"instruction": said} if said else {}
+        return source | ({"layout": {"timestamps": times}} if times else {})
+
+    def _instruction(self) -> str | None:
+        facts = self.found.facts
+        if self.found.format == "lerobot":
+            return "task" if facts.get("tasks", "0") != "0" else None
+        outside = [
+            key
+            for key in facts.get("episode keys", "").split(", ")
+            if re.search(r"(^|/)(natural_)?language_instruction$", key)
+        ]
+        return instruction(self.found.keys) or facts.get("instruction") or next(iter(outside), None)
+
+    def _provenance(self) -> dict[str, str]:
+        said = {"frequency_hz": self._rate_from() if self.hz else f"{TODO}: who says so?"}
+        if self.action.question:
+            said["action"] = f"{TODO}: {self.action.question}"
+        if self.seen.question:
+            said["cameras"] = f"{TODO}: {self.seen.question}"
+        if self.bag:
+            from hma_data.infer_topics import MARGIN, about, needs_receive_times
+
+            gaps = [f"{topic.name} {topic.gap_ms:.0f} ms" for topic in about(self._used()) if topic.gap_ms]
+            if gaps:
+                said["max_skew_ms"] = f"{MARGIN:g} times the longest intervals, measured: {shown(gaps)}"
+            late = needs_receive_times(self._used())
+            if late:
+                said["stamp"] = late
+        return said
+
+    def _rate_from(self) -> str:
+        found = self.found
+        if found.format == "lerobot":
+            return "fps of the recording's meta/info.json"
+        if not self.bag:
+            return found.facts.get("rate") or "the recording"
+        camera = self.seen.keys[0]
+        rates = [
+            f"{_hz(key)} of {key.key}" for key in dict.fromkeys([*self.action.keys, *self.states]) if key.hz
+        ]
+        beside = f"; beside it {shown(rates)}" if rates else ""
+        return f"measured: pictures of {camera.key} come at {_hz(camera)}{beside}"
+
+    def _unused(self) -> str:
+        used = {key.key for key in self._used()} | {self._instruction()}
+        left = [
+            key
+            for key in self.found.keys
+            if key.key not in used and key.kind in ("camera", "vector", "other")
+        ]
+        return shown([key.key for key in left if key.key], 20)
 
 
-def _last(key: str) -> str:
-    return re.split(r"[/.]", key)[-1]
+def _hz(key: KeyInfo) -> str:
+    jitter = f" (jitter {key.jitter_ms:.3g} ms)" if key.jitter_ms is not None else ""
+    return f"{key.hz:.4g} Hz{jitter}"
 
 
-def _text(
-    found: Inspection,
-    uri: str,
-    embodiment_id: str,
-    cameras: list[KeyInfo],
-    actions: list[KeyInfo],
-    states: list[KeyInfo],
-) -> str:
-    rate = found.hz or next((camera.hz for camera in cameras if camera.hz), None)
-    ordered = sorted(cameras, key=lambda camera: bool(_WRIST.search(camera.key)))
-    values: dict[str, Any] = {
-        "id": embodiment_id,
-        "description": f"{found.robot or 'robot'} as recorded in {uri.rstrip('/').rsplit('/', 1)[-1]}",
-        "robot": found.robot or f"{TODO}: which robot is it?",
-        "kind": f"{TODO}: real, simulation or human?",
-        "frequency_hz": _rounded(rate) if rate else f"{TODO}: at how many Hz were actions recorded?",
-        "target_hz": 2,
-        "action": {
-            "space": f"{TODO}: joint_position, joint_velocity, joint_delta, eef_pose, eef_delta, "
-            "base_velocity or mixed?",
-            "components": [_component(key) for key in actions],
-        },
-    }
-    if states:
-        values["state"] = {"components": [_component(key) for key in states]}
-    values["cameras"] = [
-        {"name": name, "key": camera.key}
-        for name, camera in zip(_camera_names(ordered), ordered, strict=True)
-    ]
-    if found.format == "rosbag":
-        primary = values["cameras"][0]["name"]
-        values["sync"] = {"primary": primary, "images": "nearest", "actions": "hold", "states": "interpolate"}
-    values["source"] = {"format": found.format, "uri": uri, "episodes": max(found.episodes, 1)}
-    values["provenance"] = {
-        "frequency_hz": "the recording's metadata or time stamps" if rate else f"{TODO}: who says so?"
-    }
-    return (
-        f"# Inferred from {uri}; answer every {TODO}, then: hma registry validate FILE\n{write_yaml(values)}"
+def _named(key: KeyInfo, names: tuple[str, ...] | None) -> dict[str, Any]:
+    """A component; names where there is one for each value."""
+    count = dims(key)
+    told = names if names and len(names) == count and len(set(names)) == count else None
+    return {"key": key.key, "dims": count} | ({"names": list(told)} if told else {})
+
+
+def _listed(allowed: tuple[str, ...]) -> str:
+    return f"{', '.join(allowed[:-1])} or {allowed[-1]}"
+
+
+def _no_camera(found: Inspection) -> SourceError:
+    pictures = [f"{key.key} {key.shape}" for key in found.keys if key.kind == "camera"]
+    others = [key.key for key in found.keys if key.kind != "camera"]
+    there = f"; its pictures, {shown(pictures)}, look like depth, masks or features" if pictures else ""
+    return SourceError(
+        shown([found.uri]),
+        f"has no colour camera{there}; it has {shown(others) or 'no other keys'}",
+        "record a camera with it, or render one; hma inspect lists every key",
     )
 
 
-def _component(key: KeyInfo) -> dict[str, Any]:
-    dims = 1
-    for side in key.shape:
-        dims *= side
-    component: dict[str, Any] = {"key": key.key, "dims": dims}
-    if key.names and len(key.names) == dims and len(set(key.names)) == dims:
-        component["names"] = list(key.names)
-    return component
-
-
-def _camera_names(cameras: list[KeyInfo]) -> list[str]:
-    """Short names that stay apart: the last telling word of the key, or the whole key."""
-    words = [[word for word in re.split(r"[/.]", camera.key) if word] for camera in cameras]
-    telling = [[word for word in group if not _GENERIC.fullmatch(word)] for group in words]
-    names = [re.sub(r"[^A-Za-z0-9_-]+", "_", (told or ["camera"])[-1]).strip("_") for told in telling]
-    if len(set(names)) < len(names):
-        names = [re.sub(r"[^A-Za-z0-9_.-]+", "_", camera.key).strip("_.") for camera in cameras]
-    return names
-
-
-def _rounded(rate: float) -> float | int:
-    """29.97 stays, 9.9996 of jittering stamps becomes 10."""
-    whole = round(rate)
-    return whole if whole and abs(rate / whole - 1) < 5e-4 else round(rate, 3)
+def _no_action(found: Inspection, pictures: tuple[KeyInfo, ...]) -> SourceError:
+    length = pictures[0].count if pictures else None
+    numbers = [
+        f"{key.key} ({key.count} rows)" if found.format == "hdf5" and key.count != length else key.key
+        for key in found.keys
+        if key.kind == "vector"
+    ]
+    camera = shown((key.key for key in pictures), 4) + (
+        f" of {length} rows" if found.format == "hdf5" else ""
+    )
+    return SourceError(
+        shown([found.uri]),
+        f"has the camera {camera} but nothing that could be an action; its numbers: {shown(numbers) or 'none'}",
+        "record the robot's commands or joint states with it; hma inspect lists every key",
+    )
