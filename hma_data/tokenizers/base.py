@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import TokenizerError
+from hma_data.tokenizers.catalog import CATALOG
 
 # name -> (module, keyword arguments of its `load`)
 TOKENIZERS: dict[str, tuple[str, dict[str, Any]]] = {
-    "fsq-16": ("hma_data.tokenizers.fsq", {"image_size": 256}),
-    "fsq-8": ("hma_data.tokenizers.fsq", {"image_size": 128}),
-    "raw": ("hma_data.tokenizers.raw", {}),
+    name: (entry.module, dict(entry.arguments)) for name, entry in CATALOG.items()
 }
 
 
