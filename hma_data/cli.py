@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hma_data.cli_bench import bench
 from hma_data.cli_registry import registry_app
 from hma_data.cli_tokenizer import tokenizer_app
 from hma_data.console import human_bytes, human_seconds, print_json, print_table, progress
@@ -36,6 +37,7 @@ def mount(app: typer.Typer) -> None:
     app.add_typer(shards_app, name="shards")
     app.command("mixture")(mixture)
     app.add_typer(tokenizer_app, name="tokenizer")
+    app.command("bench")(bench)
 
 
 # -- recordings

@@ -1,0 +1,101 @@
+"""Benchmarks: `hma bench NAME [key=value …]`, one module each.
+
+A module of a benchmark states `ABOUT` (a line), `DEFAULTS` (its settings) and
+`run(settings) -> results`: one mapping for each case, with what differs and the figures, each named with
+its unit (`frames_per_second`, `peak_rss_mib`). Input is generated; nothing is downloaded.
+"""
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+
+from hma_data.errors import UsageError
+
+BENCHES: dict[str, str] = {}  # name -> module; hma_model adds its own
+
+
+class Bench(Protocol):
+    """What a module of a benchmark has."""
+
+    ABOUT: str
+    DEFAULTS: dict[str, Any]
+
+    def run(self, settings: dict[str, Any]) -> list[dict[str, Any]]:
+        """Measure; `settings` are DEFAULTS with what was asked for."""
+        ...
+
+
+def load(name: str) -> Bench:
+    """The benchmark of that name.
+
+    Raises:
+        UsageError: there is none.
+    """
+    if name not in BENCHES:
+        raise UsageError(
+            f"benchmark {name!r}", "there is none of that name", f"known: {', '.join(sorted(BENCHES))}"
+        )
+    bench: Any = import_module(BENCHES[name])
+    return bench
+
+
+def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """DEFAULTS with `key=value` words, each value of its default's type.
+
+    Raises:
+        UsageError: no such setting, or a value that is not of its type.
+    """
+    from hma_data.yaml_io import parse_yaml
+
+    settings = dict(bench.DEFAULTS)
+    for word in overrides:
+        key, given, text = word.partition("=")
+        if not given or key not in settings:
+            raise UsageError(f"bench {name}: {word}", "is not a setting", f"settings: {', '.join(settings)}")
+        value = parse_yaml(text, f"bench {name}: {key}", UsageError)
+        kind = type(settings[key])
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind and settings[key] is not None:
+            raise UsageError(f"bench {name}: {word}", f"must be {kind.__name__}, like {settings[key]!r}")
+        settings[key] = value
+    return settings
+
+
+def report(name: str, settings: dict[str, Any], results: list[dict[str, Any]]) -> dict[str, Any]:
+    """What `--json` prints."""
+    return {"bench": name, "machine": machine(), "settings": settings, "results": results}
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "processor": _processor(),
+        "cores": cores,
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "system": platform.platform(terse=True),
+        "python": platform.python_version(),
+        "load_average": round(os.getloadavg()[0], 2),
+        "date": time.strftime("%Y-%m-%d"),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def peak_rss_mib() -> float:
+    """The most memory this process has held, in MiB."""
+    import resource
+
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
