@@ -260,6 +260,6 @@ def _no_action(found: Inspection, pictures: tuple[KeyInfo, ...]) -> SourceError:
     )
     return SourceError(
         shown([found.uri]),
-        f"has the camera {camera} but nothing that could be an action; its numbers: {shown(numbers) or 'none'}",
+        f"has the camera {camera} but nothing that could be an action; numbers: {shown(numbers) or 'none'}",
         "record the robot's commands or joint states with it; hma inspect lists every key",
     )

@@ -1,0 +1,253 @@
+"""Which keys of a recording are cameras, actions, states and words, judged by their names and shapes.
+
+A choice that the names do not settle carries a question, which ends as a TODO in the YAML. Bags are
+judged by topics, in `infer_topics`.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from hma_data.infer_words import (
+    BASE,
+    CARTESIAN,
+    JOINT,
+    MEASURED,
+    MOTION,
+    PLACE,
+    ROTATION,
+    SIDES,
+    STATES,
+    is_gripper,
+    is_next,
+    is_observed,
+    is_whole_state,
+    last,
+    natural,
+    shown,
+    snake,
+    strength,
+    words,
+)
+from hma_data.sources.base import KeyInfo
+
+MIN_SIDE, MAX_RATIO = 8, 8  # of a camera's picture
+_NOT_CAMERA = re.compile(
+    r"(^|_)(depth|disparity|masks?|seg|segmentation|semantic|instance|infra|infrared|ir|thermal|labels?|"
+    r"normals?|flow|heatmap|features?|embedding|goal|tactile|gelsight)(_|$)"
+)
+_WRIST = re.compile(r"wrist|gripper|eye_?in_?hand|(^|[^a-z])(hand|eih)([^a-z]|$)", re.IGNORECASE)
+_THIRD = re.compile(r"primary|main|static|agent|front|top|high|exterior|scene|third|head|over", re.IGNORECASE)
+_TWIN = re.compile(r"/(compressed|theora|ffmpeg|h264|zstd)$")
+_PICTURE = re.compile(
+    r"compressed|images?|img|raw|colou?r|rgba?|obs|observations?|rect|video|data|theora|ffmpeg|pixels"
+)
+_INSTRUCTION = ("instruction", "instructions", "language", "task", "prompt", "goal", "command")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Keys taken for one purpose, and what is to be asked about them."""
+
+    keys: tuple[KeyInfo, ...] = ()
+    question: str = ""
+
+
+# -- cameras
+
+
+def cameras(keys: Iterable[KeyInfo]) -> Choice:
+    """Colour cameras, third-person before wrist; grey ones, with a question, where there is no colour."""
+    usable = [key for key in keys if _is_camera(key)]
+    colour = _one_of_twins([key for key in usable if key.shape[2] == 3])
+    grey = _one_of_twins([key for key in usable if key.shape[2] == 1])
+    ordered = tuple(sorted(colour or grey, key=lambda key: (_rank(key.key), natural(key.key))))
+    asked = "only grey pictures are recorded; are these cameras, not depth or masks?"
+    return Choice(ordered, asked if grey and not colour else "")
+
+
+def _is_camera(key: KeyInfo) -> bool:
+    if key.kind != "camera" or len(key.shape) != 3 or key.shape[2] not in (1, 3) or not key.key:
+        return False
+    short, long = sorted(key.shape[:2])
+    named_so = _NOT_CAMERA.search(snake(key.key)) or is_next(key.key)
+    return short >= MIN_SIDE and long <= MAX_RATIO * short and not named_so
+
+
+def _one_of_twins(found: list[KeyInfo]) -> list[KeyInfo]:
+    """Of a raw and a compressed topic of one camera the fuller; raw where they are about equally full."""
+    groups: dict[str, list[KeyInfo]] = defaultdict(list)
+    for key in found:
+        groups[_TWIN.sub("", key.key)].append(key)
+    fullest = {name: max(key.count or 0 for key in group) for name, group in groups.items()}
+    return [
+        max(group, key=lambda key: ((key.count or 0) >= 0.9 * fullest[name], key.codec == "raw"))
+        for name, group in groups.items()
+    ]
+
+
+def _rank(key: str) -> int:
+    if _WRIST.search(key):
+        return 2
+    return 0 if _THIRD.search(key) or not _is_telling(last(key)) else 1
+
+
+def _is_telling(part: str) -> bool:
+    """Whether a part of a camera's key says more than that it is a picture."""
+    return any(not _PICTURE.fullmatch(word) for word in words(part))
+
+
+def camera_names(found: Iterable[KeyInfo]) -> list[str]:
+    """Short names that stay apart: the last telling part of the key, all of it, or numbers."""
+    keys = [key.key for key in found]
+    for name in (_short_name, _plain):
+        names = [name(key) for key in keys]
+        if len(set(names)) == len(names):
+            return names
+    return [f"camera_{i}" for i in range(len(keys))]
+
+
+def _short_name(key: str) -> str:
+    telling = [part for part in re.split(r"[/.]", key) if _is_telling(part)]
+    if not telling:
+        number = re.search(r"\d", last(key))
+        return _plain(last(key)) if number else "primary"
+    name = re.sub(
+        r"^robot0_|(_|\b)(image|rgb|color|img|raw)(_|\b)(?!\d)", "_", telling[-1], flags=re.IGNORECASE
+    )
+    return _plain(name)[:40]
+
+
+def _plain(key: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", key).strip("_-")[:100] or "camera"
+
+
+# -- actions of recordings made of steps
+
+
+def actions(found: list[KeyInfo]) -> Choice:
+    """The action among the vectors of RLDS, HDF5 or LeRobot; empty when nothing is called so."""
+    outside = [key for key in found if not is_observed(key.key)]
+    whole = [key for key in outside if last(key.key).lower() in ("action", "actions")]
+    if whole:
+        chosen = min(whole, key=lambda key: len(re.split(r"[/.]", key.key)))
+        return Choice((chosen,), _asked((chosen,), [key for key in outside if _is_beside(key, chosen)]))
+    group = [key for key in outside if re.match(r"(actions?|action_dict)[/.]", key.key, re.IGNORECASE)]
+    group = [key for key in group if "robot_state" not in snake(key.key)]
+    if group:
+        parts = ordered_parts(group)
+        return Choice(parts, _asked(parts, [key for key in group if key not in parts]))
+    for pool in (outside, found):
+        named = [key for key in pool if strength(words(key.key)) and not MEASURED & set(words(key.key))]
+        if named:
+            return _called_otherwise(named, found)
+    return Choice()
+
+
+def _is_beside(key: KeyInfo, chosen: KeyInfo) -> bool:
+    """Another action: of base or gripper beside the arm's, or another encoding in the same group."""
+    said = set(words(key.key))
+    if key == chosen or not said & {"action", "actions"} or "dict" in said:
+        return False
+    group = chosen.key[: -len(last(chosen.key))]
+    same_group = bool(group) and key.key.startswith(group)
+    return same_group or is_gripper(key.key) or bool(said & (BASE | SIDES))
+
+
+def _called_otherwise(named: list[KeyInfo], found: list[KeyInfo]) -> Choice:
+    """Keys that are called commands in other words than action."""
+    strongest = max(strength(words(key.key)) for key in named)
+    chosen = [key for key in named if strength(words(key.key)) == strongest]
+    if all(is_gripper(key.key) for key in chosen):  # the arm is moved by something
+        chosen += [key for key in found if MOTION & set(words(key.key)) and not is_observed(key.key)]
+    parts = ordered_parts(chosen)
+    return Choice(parts, question(parts, [key for key in found if key not in parts]))
+
+
+def ordered_parts(parts: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
+    """Each quantity once; translations or joints, then rotations, base, and the gripper last."""
+    return tuple(sorted(_each_once(list(parts)), key=_place))
+
+
+def _each_once(parts: list[KeyInfo]) -> list[KeyInfo]:
+    """Without second encodings of one command: velocities beside positions, poses beside joints."""
+
+    def what(key: KeyInfo) -> frozenset[str]:
+        return frozenset(words(key.key)) - PLACE - MOTION
+
+    placed = {what(key) for key in parts if PLACE & set(words(key.key))}
+    parts = [key for key in parts if not (MOTION & set(words(key.key)) and what(key) in placed)]
+    arms = [key for key in parts if not is_gripper(key.key)]
+    poses = [key for key in arms if CARTESIAN & set(words(key.key))]
+    if poses and any(JOINT & set(words(key.key)) for key in arms):
+        parts = [key for key in parts if key not in poses]
+    return parts
+
+
+def _place(key: KeyInfo) -> int:
+    said = set(words(last(key.key)))
+    if is_gripper(key.key):
+        return 3
+    return 2 if said & BASE else 1 if said & ROTATION else 0
+
+
+def _asked(chosen: Iterable[KeyInfo], others: list[KeyInfo]) -> str:
+    return question(chosen, others) if others else ""
+
+
+def question(chosen: Iterable[KeyInfo], others: Iterable[KeyInfo]) -> str:
+    """What `validate` reports of an action that was chosen among several."""
+    more = shown(key.key for key in others)
+    return f"is {shown(key.key for key in chosen)} the command{f'; also recorded: {more}' if more else ''}?"
+
+
+# -- states and words
+
+
+def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
+    """The robot's own state: one key that says it is all of it, else every position of the robot's."""
+    taken = list(taken)
+    named = [key for key in found if key not in taken and _is_state(key)]
+    named = [key for key in named if is_observed(key.key)] or named
+    whole = [key for key in named if is_whole_state(key.key)]
+    if whole:
+        return (whole[0],)
+    names = {snake(last(key.key)) for key in named}
+    if "ee_states" in names:  # LIBERO repeats its parts
+        named = [key for key in named if snake(last(key.key)) not in ("ee_pos", "ee_ori")]
+    return tuple([key for key in named if snake(last(key.key)) != "states"] or named)
+
+
+def _is_state(key: KeyInfo) -> bool:
+    said = set(words(key.key))
+    if not key.dtype.startswith("float") or strength(said) or said & MOTION:
+        return False
+    return bool(said & STATES) or is_whole_state(key.key)
+
+
+def likely(found: list[KeyInfo]) -> Choice:
+    """What might be an action where nothing says so: the robot's own position, else any float vector."""
+    own = states(found, ())
+    joints = [key for key in own if JOINT & set(words(key.key))]
+    chosen = tuple((joints or list(own) or [key for key in found if key.dtype.startswith("float")])[:1])
+    if not chosen:
+        return Choice()
+    others = shown(key.key for key in found if key not in chosen)
+    asked = f"no command is recorded by such a name; may {shown([chosen[0].key])}, as measured, stand for it"
+    return Choice(chosen, asked + (f", or which of {others} is it?" if others else "?"))
+
+
+def instruction(keys: Iterable[KeyInfo]) -> str | None:
+    """The key of the language instruction."""
+    ranked = []
+    for key in keys:
+        said = words(key.key)
+        rank = next((i for i, name in enumerate(_INSTRUCTION) if name in said), None)
+        spelled = key.kind == "text" or (
+            snake(last(key.key)) == "instruction" and key.dtype.startswith("int")
+        )
+        if key.key and rank is not None and spelled and not is_next(key.key):
+            second = bool({"embedding", "id", "type", "structured"} & set(said))
+            ranked.append((second, rank, len(key.key), key.key))
+    return min(ranked)[3] if ranked else None
