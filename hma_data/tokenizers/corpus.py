@@ -24,6 +24,7 @@ from hma_data.errors import RecipeError
 Picture = NDArray[np.uint8]
 VIDEOS = {".mp4", ".avi", ".mkv", ".webm", ".gif"}
 LARGEST, SMALLEST = 768, 48  # short side of what is kept, pixels
+SHARES, SHARE_ODDS = ((0.42, 0.6), (0.3, 1.0), (1.0, 1.0)), (0.45, 0.35, 0.2)  # of a picture's short side
 
 
 class FileSource(BaseModel):
@@ -250,7 +251,9 @@ def _crop(levels: list[Picture], side: int, rng: np.random.Generator) -> Picture
     import cv2
 
     short = min(levels[0].shape[:2])
-    share = math.exp(rng.uniform(math.log(0.3), 0)) if rng.random() < 0.9 else 1.0
+    # A crop of 128 holds half a side of a frame at 256², and the whole side of one at 128².
+    low, high = SHARES[int(rng.choice(len(SHARES), p=SHARE_ODDS))]
+    share = math.exp(rng.uniform(math.log(low), math.log(high)))
     wanted = max(short * share, side / 3)
     level = max((n for n, p in enumerate(levels) if min(p.shape[:2]) * share >= side), default=0)
     picture = levels[level]
@@ -278,17 +281,17 @@ def _recolour(crop: Picture, rng: np.random.Generator) -> NDArray[np.float32]:
 
     x = crop.astype(np.float32) / 255.0
     if rng.random() < 0.15:
-        x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.6))
-    if rng.random() < 0.7:
-        x = x ** np.float32(math.exp(rng.normal(0, 0.25)))
+        x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.4))
+    if rng.random() < 0.5:
+        x = x ** np.float32(math.exp(rng.normal(0, 0.2)))
         grey = x.mean(axis=2, keepdims=True)
-        x = grey + (x - grey) * np.float32(math.exp(rng.normal(-0.1, 0.4)))
-        cast = np.exp(rng.normal(0, 0.08, 3)).astype(np.float32)
-        x = (x - 0.5) * np.float32(math.exp(rng.normal(0, 0.2))) * cast + np.float32(
-            0.5 + rng.normal(0, 0.08)
+        x = grey + (x - grey) * np.float32(math.exp(rng.normal(-0.1, 0.3)))
+        cast = np.exp(rng.normal(0, 0.06, 3)).astype(np.float32)
+        x = (x - 0.5) * np.float32(math.exp(rng.normal(0, 0.15))) * cast + np.float32(
+            0.5 + rng.normal(0, 0.06)
         )
-    if rng.random() < 0.15:
+    if rng.random() < 0.06:
         x = x[:, :, rng.permutation(3)]
-    if rng.random() < 0.1:
-        x = x + rng.normal(0, rng.uniform(0.005, 0.03), x.shape).astype(np.float32)
+    if rng.random() < 0.05:
+        x = x + rng.normal(0, rng.uniform(0.004, 0.02), x.shape).astype(np.float32)
     return np.clip(x, 0, 1) * np.float32(2) - np.float32(1)

@@ -18,6 +18,7 @@ from torch.nn import functional
 
 PATCH = 8
 STRIDE = 16
+FORMAT = "hma-fsq-1"
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,8 @@ class Block(nn.Module):
         return x + self.second(functional.silu(self.first(x)))
 
 
-def _blocks(width: int, hidden: int, count: int) -> nn.Sequential:
+def stack(width: int, hidden: int, count: int) -> nn.Sequential:
+    """`count` residual blocks in a row."""
     return nn.Sequential(*(Block(width, hidden) for _ in range(count)))
 
 
@@ -163,9 +165,9 @@ class Encoder(nn.Module):
         low, high = config.width
         at8, at16 = config.encoder_blocks
         self.stem = nn.Conv2d(3 * PATCH**2, low, 3, padding=1)
-        self.at8 = _blocks(low, config.hidden, at8)
+        self.at8 = stack(low, config.hidden, at8)
         self.down = nn.Conv2d(low * 4, high, 1)
-        self.at16 = _blocks(high, config.hidden, at16)
+        self.at16 = stack(high, config.hidden, at16)
         self.head = nn.Conv2d(high, config.channels, 1)
         self.linear = nn.Conv2d(3, config.channels, STRIDE, stride=STRIDE)
 
@@ -184,11 +186,11 @@ class Decoder(nn.Module):
         at16, at8, at4 = config.decoder_blocks
         fine = config.fine_width
         self.stem = nn.Conv2d(config.channels, high, 3, padding=1)
-        self.at16 = _blocks(high, config.hidden, at16)
+        self.at16 = stack(high, config.hidden, at16)
         self.up8 = nn.Conv2d(high, low * 4, 1)
-        self.at8 = _blocks(low, config.hidden, at8)
+        self.at8 = stack(low, config.hidden, at8)
         self.up4 = nn.Conv2d(low, fine * 4, 1)
-        self.at4 = _blocks(fine, fine, at4)
+        self.at4 = stack(fine, fine, at4)
         self.head = nn.Conv2d(fine, 48, 3, padding=1)
         self.linear = nn.Conv2d(config.channels, 3 * STRIDE**2, 1)
 
@@ -203,6 +205,9 @@ class Decoder(nn.Module):
 class FsqAutoencoder(nn.Module):
     """`encoder`, `quantizer`, `decoder`; `forward` is the training pass."""
 
+    stride = STRIDE
+    linear_gain = 1.7  # least-squares estimate of z as 1.7 u, from u = erf(z/√2), z standard normal
+
     def __init__(self, config: FsqConfig) -> None:
         super().__init__()
         self.config = config
@@ -210,7 +215,10 @@ class FsqAutoencoder(nn.Module):
         self.quantizer = Quantizer(config)
         self.decoder = Decoder(config)
 
-    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, 3, S, S) in [-1, 1] -> (reconstruction of the same shape, latents (B, C, h, w))."""
+    def forward(self, pixels: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """(B, 3, S, S) in [-1, 1] -> (reconstruction of the same shape, latents (B, C, h, w)).
+
+        Nothing here is random: `generator` is for networks that add noise.
+        """
         latents = self.encoder(pixels)
         return self.decoder(self.quantizer(latents)), latents

@@ -26,10 +26,16 @@ def orthogonal(matrix: Tensor) -> Tensor:
 
 
 class Muon(torch.optim.Optimizer):
-    """For weights of two dimensions or more; `lr` is the spectral norm of a step (× √(rows/columns))."""
+    """For weights of two dimensions or more; `lr` is the spectral norm of a step (× √(rows/columns)).
 
-    def __init__(self, params: Iterable[Tensor], lr: float, momentum: float = 0.95) -> None:
-        super().__init__(params, {"lr": lr, "momentum": momentum})
+    Without `decay` nothing holds the weights' norm in a network without normalisation: it is bounded
+    by 1/decay, as each step shrinks the weights by lr·decay.
+    """
+
+    def __init__(
+        self, params: Iterable[Tensor], lr: float, momentum: float = 0.95, decay: float = 0.0
+    ) -> None:
+        super().__init__(params, {"lr": lr, "momentum": momentum, "decay": decay})
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
@@ -47,4 +53,5 @@ class Muon(torch.optim.Optimizer):
         ahead = grad.lerp(state["momentum"], group["momentum"])
         flat = ahead.reshape(len(ahead), -1)
         update = orthogonal(flat) * max(1.0, flat.shape[0] / flat.shape[1]) ** 0.5
+        parameter.mul_(1 - group["lr"] * group["decay"])
         parameter.add_(update.view(parameter.shape), alpha=-group["lr"])

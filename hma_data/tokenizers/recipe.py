@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from hma_data.errors import RecipeError
 from hma_data.tokenizers.corpus import DrawnSource, FileSource, PushtSource
 from hma_data.tokenizers.fsq_network import STRIDE, FsqConfig
+from hma_data.tokenizers.vae_network import VaeConfig
 from hma_data.yaml_io import read_yaml
 
 
@@ -20,7 +21,7 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class NetworkRecipe(_Strict):
+class FsqRecipe(_Strict):
     """`FsqConfig` as a recipe says it."""
 
     levels: list[list[int]]
@@ -31,13 +32,34 @@ class NetworkRecipe(_Strict):
     fine_width: int
 
     @model_validator(mode="after")
-    def _is_a_network(self) -> "NetworkRecipe":
+    def _is_a_network(self) -> "FsqRecipe":
         self.config()
         return self
 
     def config(self) -> FsqConfig:
         """The network's shape."""
         return FsqConfig.from_json(self.model_dump())
+
+
+class VaeRecipe(_Strict):
+    """`VaeConfig` as a recipe says it; the scale of the latents is measured, not said."""
+
+    channels: int
+    width: int
+    hidden: int
+    encoder_blocks: int
+    decoder_blocks: tuple[int, int]
+    fine_width: int
+    noise: float
+
+    @model_validator(mode="after")
+    def _is_a_network(self) -> "VaeRecipe":
+        self.config()
+        return self
+
+    def config(self) -> VaeConfig:
+        """The network's shape."""
+        return VaeConfig.from_json(self.model_dump())
 
 
 class TrainingRecipe(_Strict):
@@ -48,6 +70,7 @@ class TrainingRecipe(_Strict):
         batch, crop: crops a step, and their side in pixels, a multiple of 16.
         learning_rate: the highest, of Muon (matrices) in units of the spectral norm.
         adam_learning_rate: the highest, of Adam (biases, first and last layers).
+        weight_decay: of Muon's matrices; their spectral norms stay below its inverse.
         warmup_steps: of linear rise at the start.
         decay_steps: of linear fall at the end; in between the rate is constant, so a run that is
             given more steps later goes on as if it had been meant so.
@@ -60,6 +83,7 @@ class TrainingRecipe(_Strict):
     crop: int = Field(gt=0, multiple_of=STRIDE)
     learning_rate: float = Field(gt=0)
     adam_learning_rate: float = Field(gt=0)
+    weight_decay: float = Field(ge=0, default=0.0)
     warmup_steps: int = Field(ge=0, default=100)
     decay_steps: int = Field(ge=0, default=0)
     ema: float = Field(ge=0, lt=1, default=0.998)
@@ -87,7 +111,7 @@ class TokenizerRecipe(_Strict):
     name: str
     seed: int = Field(ge=0)
     corpus: str
-    network: NetworkRecipe
+    network: FsqRecipe | VaeRecipe
     training: TrainingRecipe
     loss: LossRecipe
     sources: list[FileSource | PushtSource | DrawnSource] = Field(min_length=1)

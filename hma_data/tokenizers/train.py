@@ -1,9 +1,9 @@
-"""Train the embedded tokenizer from a recipe.
+"""Train an embedded tokenizer from a recipe.
 
     train(Path("recipes/tokenizer/fsq.yaml"), Path("fsq.safetensors"), {"corpus": "/data/corpus"})
 
 The loss is what can be had without a pretrained network: squared and absolute error, gradients at
-several scales, and SSIM. Before the first step the network is the best linear code of 16×16 patches
+several scales, and SSIM. Before the first step the network is the best linear code of patches
 (their principal components); the rest starts at zero and learns what is left. A weights' file is
 written now and then, and the state of the run beside it: running it again goes on.
 
@@ -11,8 +11,10 @@ B crops, S side of a crop, C latent channels.
 """
 
 import math
+import platform
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +27,16 @@ from torch.nn import functional
 from hma_data.errors import RecipeError
 from hma_data.files import write_atomic
 from hma_data.tokenizers.corpus import Pool, draw_batch, load_pools
+from hma_data.tokenizers.embedded import save_weights
 from hma_data.tokenizers.eval import ssim_map
-from hma_data.tokenizers.fsq import save_weights
-from hma_data.tokenizers.fsq_network import STRIDE, FsqAutoencoder
+from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig
 from hma_data.tokenizers.muon import Muon
 from hma_data.tokenizers.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
+from hma_data.tokenizers.vae_network import FORMAT as VAE_FORMAT
+from hma_data.tokenizers.vae_network import VaeAutoencoder, VaeConfig
+
+START, END = 2**32 - 1, 2**32 - 2  # numbers of the batches that start and measure a network
+Autoencoder = FsqAutoencoder | VaeAutoencoder
 
 
 def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
@@ -61,41 +68,46 @@ def _gradient_loss(made: Tensor, true: Tensor) -> Tensor:
     return total / 3
 
 
-def start_linear(network: FsqAutoencoder, crops: Tensor) -> None:
+def start_linear(network: Autoencoder, crops: Tensor) -> None:
     """Set the linear paths to the principal components of the crops' patches, whitened and turned.
 
     Args:
         crops: (B, 3, S, S) in [-1, 1].
     """
-    channels = network.config.channels
-    patches = functional.unfold(crops, STRIDE, stride=STRIDE).transpose(1, 2).flatten(0, 1).double()
+    encoder, decoder, stride = network.encoder, network.decoder, network.stride
+    channels = encoder.linear.out_channels
+    patches = functional.unfold(crops, stride, stride=stride).transpose(1, 2).flatten(0, 1).double()
     mean = patches.mean(0)
     _, values, basis = torch.linalg.svd(patches - mean, full_matrices=False)
     scale = values[:channels, None] / math.sqrt(len(patches))
     whiten = basis[:channels] / scale
     # Turned at random, so that every channel carries a share of the strong components.
     turn = torch.linalg.qr(torch.randn(channels, channels, dtype=torch.float64))[0]
-    # 1.7 u is the least-squares estimate of z from u = erf(z/√2), z standard normal.
-    back = 1.7 * (turn @ (basis[:channels] * scale)).T
+    back = network.linear_gain * (turn @ (basis[:channels] * scale)).T
     whiten = turn @ whiten
     with torch.no_grad():
-        network.encoder.linear.weight.copy_(whiten.view(channels, 3, STRIDE, STRIDE))
-        network.encoder.linear.bias.copy_(-(whiten @ mean))  # type: ignore[union-attr]
-        network.encoder.head.weight.mul_(0.1)
-        network.decoder.linear.weight.copy_(back[:, :, None, None])
-        network.decoder.linear.bias.copy_(mean)  # type: ignore[union-attr]
-        network.decoder.head.weight.mul_(0.1)
+        encoder.linear.weight.copy_(whiten.view(channels, 3, stride, stride))
+        encoder.linear.bias.copy_(-(whiten @ mean))  # type: ignore[union-attr]
+        encoder.head.weight.mul_(0.1)
+        decoder.linear.weight.copy_(back[:, :, None, None])
+        decoder.linear.bias.copy_(mean)  # type: ignore[union-attr]
+        decoder.head.weight.mul_(0.1)
+
+
+def _autoencoder(recipe: TokenizerRecipe) -> Autoencoder:
+    config = recipe.network.config()
+    return FsqAutoencoder(config) if isinstance(config, FsqConfig) else VaeAutoencoder(config)
 
 
 class Run:
     """A training under way: network, averaged weights, optimizers, and the step it has reached."""
 
     def __init__(self, recipe: TokenizerRecipe, pools: list[Pool]) -> None:
-        self.recipe, self.pools, self.step = recipe, pools, 0
+        self.recipe, self.pools, self.step, self.seconds = recipe, pools, 0, 0.0
         torch.manual_seed(recipe.seed)
-        network = FsqAutoencoder(recipe.network.config())
-        start_linear(network, self.batch(2**32 - 1, 256))
-        self.network: FsqAutoencoder = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        network = _autoencoder(recipe)
+        start_linear(network, self.batch(START, 256))
+        self.network: Autoencoder = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = {name: p.detach().clone() for name, p in self.network.named_parameters()}
         self.optimizers = _optimizers(self.network, recipe.training)
 
@@ -106,11 +118,12 @@ class Run:
 
     def advance(self) -> float:
         """One step; the mean squared error of its crops, pixels in [0, 1]."""
-        training = self.recipe.training
+        training, started = self.recipe.training, time.monotonic()
         for optimizer, highest in zip(self.optimizers, (training.learning_rate, training.adam_learning_rate)):
             optimizer.param_groups[0]["lr"] = highest * training.rate(self.step)
         crops = self.batch(self.step, training.batch)
-        made, latents = self.network(crops)
+        generator = torch.Generator().manual_seed((self.recipe.seed * 1_000_003 + self.step) % 2**63)
+        made, latents = self.network(crops, generator)
         loss, squared = reconstruction_loss(made, crops, self.recipe.loss)
         (loss + 0.01 * _latent_penalty(latents)).backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -122,11 +135,29 @@ class Run:
         with torch.no_grad():
             for name, parameter in self.network.named_parameters():
                 self.average[name].lerp_(parameter, 1 - decay)
+        self.seconds += time.monotonic() - started
         return float(squared)
+
+    def write_weights(self, path: Path, facts: dict[str, Any]) -> None:
+        """Write the averaged weights as a tokenizer's file, with how they came about."""
+        config = self.recipe.network.config()
+        if isinstance(config, FsqConfig):
+            save_weights(path, FORMAT, config, self.average, facts)
+        else:
+            scaled = replace(config, latent_scale=self._latent_scale(config))
+            save_weights(path, VAE_FORMAT, scaled, self.average, facts)
+
+    @torch.no_grad()
+    def _latent_scale(self, config: VaeConfig) -> float:
+        """One by the standard deviation of the averaged encoder's latents over a batch."""
+        network = VaeAutoencoder(config)
+        network.load_state_dict(self.average)
+        return round(1 / float(network.encoder(self.batch(END, 128)).std()), 4)
 
     def save(self, path: Path) -> None:
         """Write what `resume` needs, atomically."""
-        metadata = {"course": self.recipe.course(), "step": str(self.step)}
+        metadata = {"course": self.recipe.course(), "step": str(self.step), "end": self._end()}
+        metadata["seconds"] = str(round(self.seconds, 3))
         tensors = {name: tensor.contiguous() for name, tensor in self._state().items()}
         write_atomic(path, save(tensors, metadata))
 
@@ -151,12 +182,14 @@ class Run:
                 metadata = file.metadata() or {}
                 state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             step = int(metadata.get("step", -1))
-            if metadata.get("course") != self.recipe.course() or not 0 <= step <= self._constant_until():
+            falling = step > self._constant_until()
+            other_end = falling and metadata.get("end") != self._end()
+            if step < 0 or other_end or metadata.get("course") != self.recipe.course():
                 raise RecipeError(path, "is the state of a training with other settings", remedy)
             self._restore(state)
         except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as fault:
             raise RecipeError(path, f"is no state of a training: {fault!s:.120}", remedy) from fault
-        self.step = step
+        self.step, self.seconds = step, float(metadata.get("seconds", 0))
 
     def _restore(self, state: dict[str, Tensor]) -> None:
         with torch.no_grad():
@@ -175,15 +208,19 @@ class Run:
     def _constant_until(self) -> int:
         return self.recipe.training.steps - self.recipe.training.decay_steps
 
+    def _end(self) -> str:
+        """Steps and decay: what a run whose rate already falls may no longer change."""
+        return f"{self.recipe.training.steps}-{self.recipe.training.decay_steps}"
 
-def _optimizers(network: FsqAutoencoder, recipe: TrainingRecipe) -> list[torch.optim.Optimizer]:
+
+def _optimizers(network: Autoencoder, recipe: TrainingRecipe) -> list[torch.optim.Optimizer]:
     matrices: list[nn.Parameter] = []
     others: list[nn.Parameter] = []
     for name, parameter in network.named_parameters():
         inner = ".at" in name or ".down" in name or ".up" in name
         (matrices if inner and parameter.ndim == 4 else others).append(parameter)
     return [
-        Muon(matrices, lr=recipe.learning_rate),
+        Muon(matrices, lr=recipe.learning_rate, decay=recipe.weight_decay),
         torch.optim.Adam(others, lr=recipe.adam_learning_rate, betas=(0.9, 0.99)),
     ]
 
@@ -213,7 +250,8 @@ def train(
         report_every: steps between reports.
 
     Returns:
-        what the file's metadata says: recipe and corpus digests, steps, training PSNR.
+        what the file's metadata says: recipe and corpus digests, seed, steps, training PSNR, seconds
+        and machine.
 
     Raises:
         RecipeError: the recipe is not valid, its corpus is not there, or the state beside `out`
@@ -232,17 +270,30 @@ def train(
         "recipe_sha256": recipe.digest(),
         "corpus_sha256": corpus_sha256,
         "seed": recipe.seed,
+        "machine": f"{platform.machine()}, {recipe.training.threads} thread, torch {torch.__version__}",
     }
-    started, errors = time.monotonic(), []
-    while run.step < recipe.training.steps:
-        errors.append(run.advance())
-        if run.step % report_every == 0 or run.step == recipe.training.steps:
-            psnr = round(-10 * math.log10(sum(errors) / len(errors)), 2)
-            facts |= {"steps": run.step, "train_psnr_db": psnr}
-            report(f"step {run.step}: training PSNR {psnr} dB, {time.monotonic() - started:.0f} s")
-            errors.clear()
-            save_weights(out, recipe.network.config(), run.average, facts)
-            if run.step <= recipe.training.steps - recipe.training.decay_steps:
-                run.save(state)
+    # Far below zero the slope of silu is a denormal number; with those a step takes seven times as long.
+    torch.set_flush_denormal(True)
+    try:
+        _advance(run, out, facts, report, report_every)
+    finally:
+        torch.set_flush_denormal(False)
     state.unlink(missing_ok=True)
     return facts
+
+
+def _advance(
+    run: Run, out: Path, facts: dict[str, Any], report: Callable[[str], None], report_every: int
+) -> None:
+    """Take all the steps; now and then write weights and state, and report."""
+    errors: list[float] = []
+    steps = run.recipe.training.steps
+    while run.step < steps:
+        errors.append(run.advance())
+        if run.step % report_every == 0 or run.step == steps:
+            psnr = round(-10 * math.log10(sum(errors) / len(errors)), 2)
+            facts |= {"steps": run.step, "train_psnr_db": psnr, "seconds": round(run.seconds)}
+            errors.clear()
+            run.write_weights(out, facts)
+            run.save(out.with_name(out.name + ".state"))
+            report(f"step {run.step}: training PSNR {psnr} dB, {run.seconds:.0f} s")

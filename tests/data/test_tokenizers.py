@@ -12,9 +12,10 @@ from hma_data.errors import RecipeError, TokenizerError
 from hma_data.shipped import shipped
 from hma_data.tokenizers.base import TOKENIZERS, Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.corpus import DrawnSource, draw_batch, draw_scene, load_pools
+from hma_data.tokenizers.embedded import read_weights, save_weights
 from hma_data.tokenizers.eval import CodebookUse, evaluate, psnr_db, read_frames, ssim, to_markdown
-from hma_data.tokenizers.fsq import WEIGHTS, FsqTokenizer, read_weights, save_weights
-from hma_data.tokenizers.fsq_network import FsqAutoencoder, FsqConfig, Quantizer
+from hma_data.tokenizers.fsq import WEIGHTS, FsqTokenizer
+from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig, Quantizer
 from hma_data.tokenizers.muon import orthogonal
 from hma_data.tokenizers.recipe import load_recipe
 from hma_data.tokenizers.train import train
@@ -242,7 +243,7 @@ def test_weights_of_another_architecture_are_refused(tmp_path):
 )
 def test_weights_whose_config_lies_are_refused(tmp_path, change):
     path = tmp_path / "lying.safetensors"
-    config, tensors, _ = read_weights(WEIGHTS)
+    config, tensors, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
     values = json.dumps(config.to_json() | change)
     save_file(tensors, path, {"format": "hma-fsq-1", "config": values})
     with pytest.raises(TokenizerError, match=r"fit the network|describes no network"):
@@ -251,7 +252,7 @@ def test_weights_whose_config_lies_are_refused(tmp_path, change):
 
 def test_other_weights_are_another_tokenizer(tmp_path, fsq8):
     path = tmp_path / "small.safetensors"
-    save_weights(path, SMALL, dict(FsqAutoencoder(SMALL).named_parameters()), {})
+    save_weights(path, FORMAT, SMALL, dict(FsqAutoencoder(SMALL).named_parameters()), {})
     other = get_tokenizer("fsq-8", weights=str(path))
     assert other.spec.digest != fsq8.spec.digest
     assert other.encode(scenes(2, 128)).shape == (2, 8, 8)
@@ -268,7 +269,7 @@ def test_weights_say_how_they_were_trained():
 
 
 def test_weights_hold_nothing_but_the_network():
-    config, _, _ = read_weights(WEIGHTS)
+    config, _, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
     expected = {name: tuple(p.shape) for name, p in FsqAutoencoder(config).named_parameters()}
     assert {name: tuple(t.shape) for name, t in load_file(WEIGHTS).items()} == expected
 
@@ -423,7 +424,7 @@ def test_crops_depend_on_seed_and_step_alone(tmp_path):
 
 
 def test_the_shipped_recipe_is_valid_and_makes_the_shipped_network():
-    config, _, _ = read_weights(WEIGHTS)
+    config, _, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
     assert load_recipe(RECIPE).network.config() == config
 
 
