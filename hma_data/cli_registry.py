@@ -101,7 +101,7 @@ def _print_list(rows: list[dict[str, Any]]) -> None:
         if row["rate_hz"] is None:  # the word tells more than a blank
             shown[list(LISTED).index("Hz")] = row["frequency_hz"]
     print_table(list(LISTED), [[", ".join(v) if isinstance(v, list) else v for v in row] for row in cells])
-    print(f"{len(rows)} embodiments")
+    print(f"{len(rows):,} embodiment{'s' if len(rows) != 1 else ''}")
 
 
 @registry_app.command("show")
