@@ -15,7 +15,9 @@ from typing import Any, Protocol
 
 from hma_data.errors import UsageError
 
-BENCHES: dict[str, str] = {}  # name -> module; hma_model adds its own
+BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
+    "registry": "hma_data.bench.registry",
+}
 
 
 class Bench(Protocol):

@@ -1,0 +1,58 @@
+"""How long commands take that look at every YAML of a large registry, with nothing cached and with all of it."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ABOUT = "registry list over many generated YAMLs: seconds of the whole command"
+DEFAULTS: dict[str, Any] = {"embodiments": 10_000, "runs": 3}
+
+_YAML = """id: {id}
+description: A generated arm for measuring
+robot: arm {id}
+kind: simulation
+frequency_hz: {hz}
+action:
+  space: eef_delta
+  components:
+    - {{key: actions, slice: [0, 3], dims: 3, names: [dx, dy, dz], unit: m}}
+    - {{key: actions, slice: [3, 6], dims: 3, names: [drx, dry, drz], unit: rad, representation: axis_angle}}
+    - {{key: actions, slice: [6, 7], dims: 1, names: [gripper], normalize: false, gripper: open_is_low}}
+state: {{components: [{{key: obs/joint_pos, dims: 7, unit: rad}}]}}
+cameras:
+  - {{name: front, key: obs/front_image, size: [480, 640]}}
+  - {{name: wrist, key: obs/wrist_image, size: [480, 640]}}
+source: {{format: hdf5, uri: data/{id}.hdf5, episodes: 10}}
+provenance: {{frequency_hz: generated, action: generated}}
+"""
+
+
+def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Cold, then warm: a new process each, as a user starts it."""
+    with tempfile.TemporaryDirectory() as folder:
+        registry = Path(folder) / "registry"
+        for i in range(settings["embodiments"]):
+            place = registry / f"group_{i // 500}"
+            place.mkdir(parents=True, exist_ok=True)
+            (place / f"arm_{i}.yaml").write_text(_YAML.format(id=f"arm_{i}", hz=1 + i % 50))
+        environment = {**os.environ, "HMA_CACHE": f"{folder}/cache", "HMA_REGISTRY": str(registry)}
+        results = []
+        for words in (["list", "--json"], ["list"], ["validate"], ["show", "arm_7"]):
+            seconds = [_seconds(words, folder, environment) for _ in range(settings["runs"] + 1)]
+            cold = seconds[0] if words == ["list", "--json"] else None
+            warm = round(min(seconds[1:]), 3)
+            results.append(
+                {"command": f"registry {' '.join(words)}", "cold_seconds": cold, "warm_seconds": warm}
+            )
+        return results
+
+
+def _seconds(words: list[str], folder: str, environment: dict[str, str]) -> float:
+    start = time.perf_counter()
+    command = [sys.executable, "-m", "hma_model.cli", "registry", *words]
+    subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+    return round(time.perf_counter() - start, 3)
