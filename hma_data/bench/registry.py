@@ -1,4 +1,4 @@
-"""How long commands take that look at every YAML of a large registry, with nothing cached and with all of it."""
+"""How long commands take that look at every YAML of a large registry, nothing cached and all of it cached."""
 
 import os
 import subprocess
