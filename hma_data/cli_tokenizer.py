@@ -1,11 +1,11 @@
 """`hma tokenizer`: list, train and measure tokenizers."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from hma_data.console import print_json, print_table
+from hma_data.console import human_bytes, print_json, print_table
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -13,30 +13,29 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 @tokenizer_app.command("list")
 def tokenizer_list(json: Json = False) -> None:
-    """Names that --tokenizer takes.
+    """Names that --tokenizer takes: what is usable here, what is downloaded, sizes, licences.
 
     Example: hma tokenizer list
     """
-    from hma_data.tokenizers.base import TOKENIZERS, get_tokenizer
+    from hma_data.tokenizers.catalog import CATALOG
 
-    rows = [get_tokenizer(name).spec for name in TOKENIZERS]
     if json:
-        print_json([spec.to_json() for spec in rows])
-    else:
-        print_table(
-            ["name", "kind", "picture", "grid", "vocabulary", "weights"],
-            [
-                [
-                    s.name,
-                    s.kind,
-                    f"{s.image_size}²",
-                    f"{s.grid[0]}×{s.grid[1]}",
-                    s.vocab_size,
-                    s.weights_sha256[:12] or None,
-                ]
-                for s in rows
-            ],
-        )
+        print_json([entry.to_json() for entry in CATALOG.values()])
+        return
+    rows = [
+        [
+            entry.name,
+            entry.kind,
+            f"{entry.image_size}²",
+            f"{entry.grid[0]}×{entry.grid[1]}",
+            entry.state(),
+            f"{entry.weights}, {human_bytes(entry.size())}" if entry.size() else entry.weights,
+            entry.licence,
+            entry.description,
+        ]
+        for entry in CATALOG.values()
+    ]
+    print_table(["name", "kind", "picture", "grid", "here", "weights", "licence", "what it is"], rows)
 
 
 @tokenizer_app.command("train")
@@ -68,26 +67,71 @@ def tokenizer_train(
 @tokenizer_app.command("eval")
 def tokenizer_eval(
     tokenizer: Annotated[str, typer.Argument(help="Name of the tokenizer.")],
-    data: Annotated[list[Path], typer.Argument(help="Pictures, videos, or folders of them.")],
+    data: Annotated[
+        list[Path], typer.Argument(help="Pictures, videos, folders of them, recordings, shard sets.")
+    ],
+    embodiment: Annotated[
+        str | None, typer.Option("--embodiment", "-e", help="DATA are recordings of this robot: id or YAML.")
+    ] = None,
     weights: Annotated[str | None, typer.Option("--weights", help="Its weights, if not the usual.")] = None,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Taken from each video, evenly.")] = 64,
+    frames: Annotated[
+        int, typer.Option("--frames", min=1, help="Taken from each video or episode, evenly.")
+    ] = 64,
+    lpips: Annotated[
+        bool | None,
+        typer.Option("--lpips/--no-lpips", help="LPIPS; default: where nothing needs downloading."),
+    ] = None,
+    worst: Annotated[int, typer.Option("--worst", min=0, help="Worst frames to draw with --out.")] = 6,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for eval.md, eval.json, worst.png.")
+    ] = None,
     device: Annotated[str, typer.Option("--device", help="cpu, cuda, mps.")] = "cpu",
     json: Json = False,
 ) -> None:
-    """PSNR, SSIM, use of the vocabulary, bits and speed.
+    """PSNR, SSIM, LPIPS, use of the vocabulary, bits, speed, and the worst frames.
 
-    Example: hma tokenizer eval fsq-16 ./videos
+    Example: hma tokenizer eval fsq-16 ./videos --out eval
     """
+    from hma_data.embodiment import find
     from hma_data.tokenizers.base import get_tokenizer
-    from hma_data.tokenizers.eval import evaluate, read_frames, to_markdown
+    from hma_data.tokenizers.eval import evaluate
+    from hma_data.tokenizers.frames import frames_of
+    from hma_data.tokenizers.report import to_markdown, without_frames, write_report
 
+    robot = find(embodiment) if embodiment else None
     opened = get_tokenizer(tokenizer, weights=weights, device=device)
-    size, resize_filter = opened.spec.image_size, opened.spec.resize_filter
-    found = {
-        str(path): evaluate(opened, read_frames(path, size, frames=frames, resize_filter=resize_filter))
-        for path in data
-    }
+    perceptual, missing = _perceptual(lpips, device)
+    found = {}
+    for path in data:
+        chosen = frames_of(path, opened.spec, embodiment=robot, frames=frames, on_skip=_skipped)
+        found[str(path)] = evaluate(opened, chosen, worst=worst if out else 0, perceptual=perceptual)
+    plain = {name: without_frames(result) for name, result in found.items()}
     if json:
-        print_json(found)
+        print_json(plain)
     else:
-        print(to_markdown(found), end="")
+        print(to_markdown(plain), end="")
+    if missing:
+        typer.echo(missing, err=True)
+    if out:
+        title = f"{tokenizer}, weights {opened.spec.weights_sha256[:12] or 'none'}"
+        paths = write_report(out, title, found, [missing] if missing else [])
+        typer.echo(f"wrote {', '.join(map(str, paths))}", err=True)
+
+
+def _skipped(text: str) -> None:
+    typer.echo(f"left out: {text}", err=True)
+
+
+def _perceptual(wanted: bool | None, device: str) -> tuple[Any, str]:
+    """What measures LPIPS, or None and why not; what is asked for and missing is an error."""
+    from hma_data.errors import MissingDependencyError
+    from hma_data.tokenizers.perceptual import open_lpips
+
+    if wanted is False:
+        return None, ""
+    try:
+        return open_lpips(download=wanted is True, device=device), ""
+    except MissingDependencyError as fault:
+        if wanted:
+            raise
+        return None, f"not measured: {fault}"

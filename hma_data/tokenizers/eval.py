@@ -1,6 +1,6 @@
 """How good a tokenizer is: what a round trip loses, what its ids use, what it costs.
 
-    evaluate(get_tokenizer("fsq-16"), read_frames(Path("video.mp4"), 256))
+    evaluate(get_tokenizer("fsq-16"), hma_data.tokenizers.frames.read_frames(Path("video.mp4"), 256))
 
 N frames, S side, h·w grid, D digits. PSNR and SSIM (Wang et al. 2004: grey, Gaussian of 11 taps,
 sigma 1.5) are means over frames of pixels in [0, 1].
@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,11 +20,9 @@ from torch import Tensor
 
 from hma_data.errors import TokenizerError
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
-from hma_data.tokenizers.corpus import VIDEOS, read_pictures
-from hma_data.video import resize
+from hma_data.tokenizers.perceptual import Perceptual
 
 Frames = NDArray[np.uint8]
-PICTURES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
 BATCH = 32
 GREY = (0.299, 0.587, 0.114)
 
@@ -111,35 +108,67 @@ def bits_per_frame(spec: TokenizerSpec) -> float:
     return cells * (spec.channels or 1) * np.dtype(spec.dtype).itemsize * 8.0
 
 
+class LatentMoments:
+    """Mean and spread of continuous latents, as a model sees them (times `latent_scale`)."""
+
+    def __init__(self, spec: TokenizerSpec) -> None:
+        self.scale, self.count, self.total, self.squares = spec.latent_scale, 0, 0.0, 0.0
+
+    def add(self, latents: NDArray[Any]) -> None:
+        """Count (N, c, h, w) latents."""
+        scaled = latents.astype(np.float64) * self.scale
+        self.count += scaled.size
+        self.total += float(scaled.sum())
+        self.squares += float(np.square(scaled).sum())
+
+    def result(self) -> dict[str, Any]:
+        """Mean and standard deviation over everything."""
+        mean = self.total / self.count
+        deviation = math.sqrt(max(0.0, self.squares / self.count - mean**2))
+        return {"latent_mean_scaled": round(mean, 4), "latent_std_scaled": round(deviation, 4)}
+
+
 @dataclass
 class _Totals:
-    use: CodebookUse
+    use: CodebookUse | LatentMoments
     psnr: list[float] = field(default_factory=list)
     ssim: list[float] = field(default_factory=list)
+    lpips: list[float] = field(default_factory=list)
     encode_s: float = 0.0
     decode_s: float = 0.0
     worst: list[tuple[float, int, Frames, Frames]] = field(default_factory=list)
 
 
-def evaluate(tokenizer: Tokenizer, frames_iter: Iterable[Frames], *, worst: int = 0) -> dict[str, Any]:
+def evaluate(
+    tokenizer: Tokenizer,
+    frames_iter: Iterable[Frames],
+    *,
+    worst: int = 0,
+    perceptual: Perceptual | None = None,
+) -> dict[str, Any]:
     """Send frames through a tokenizer and measure.
 
     Args:
         tokenizer: what to measure.
         frames_iter: frames (S, S, 3), or batches of them (n, S, S, 3), uint8.
         worst: how many of the frames with the lowest PSNR to return as `worst_frames`.
+        perceptual: measures LPIPS, see `hma_data.tokenizers.perceptual`.
 
     Returns:
         frames, psnr_db (mean over frames, lossless frames counted as 99), psnr_db_min, ssim, bits_per_frame,
-        encode_frames_per_second, decode_frames_per_second; for discrete tokenizers also the fields of
-        `CodebookUse.result`; `worst_frames`, a list of (psnr, index, frame, made), when asked for.
+        encode_frames_per_second, decode_frames_per_second (resizing not counted); `lpips` where it is
+        measured; the fields of `CodebookUse.result` or `LatentMoments.result`; `worst_frames`, a list of
+        (psnr, index, frame, made), when asked for.
 
     Raises:
         TokenizerError: no frame, or frames that do not fit.
     """
-    totals = _Totals(CodebookUse(tokenizer.spec))
+    discrete = tokenizer.spec.kind == "discrete"
+    totals = _Totals(CodebookUse(tokenizer.spec) if discrete else LatentMoments(tokenizer.spec))
     for batch in _batches(frames_iter):
-        _measure(tokenizer, batch, totals, worst)
+        if not totals.psnr:
+            tokenizer.decode(tokenizer.encode(batch[:1]))  # the first pass sets kernels up
+        _measure(tokenizer, batch, totals, worst, perceptual)
     if not totals.psnr:
         raise TokenizerError(tokenizer.spec.name, "was given no frame to measure")
     count = len(totals.psnr)
@@ -154,8 +183,9 @@ def evaluate(tokenizer: Tokenizer, frames_iter: Iterable[Frames], *, worst: int 
         "encode_frames_per_second": round(count / totals.encode_s, 1),
         "decode_frames_per_second": round(count / totals.decode_s, 1),
     }
-    if tokenizer.spec.kind == "discrete":
-        result |= totals.use.result()
+    result |= totals.use.result()
+    if totals.lpips:
+        result["lpips"] = round(float(np.mean(totals.lpips)), 4)
     if worst:
         lowest_first = sorted(totals.worst, key=_order, reverse=True)
         result["worst_frames"] = [(-value, index, true, made) for value, index, true, made in lowest_first]
@@ -178,15 +208,16 @@ def _batches(frames_iter: Iterable[Frames]) -> Iterator[Frames]:
         yield np.stack(waiting)
 
 
-def _measure(tokenizer: Tokenizer, batch: Frames, totals: _Totals, worst: int) -> None:
+def _measure(
+    tokenizer: Tokenizer, batch: Frames, totals: _Totals, worst: int, perceptual: Perceptual | None
+) -> None:
     started = time.perf_counter()
     tokens = tokenizer.encode(batch)
     between = time.perf_counter()
     made = tokenizer.decode(tokens)
     totals.encode_s += between - started
     totals.decode_s += time.perf_counter() - between
-    if tokenizer.spec.kind == "discrete":
-        totals.use.add(tokens)
+    totals.use.add(tokens)
     psnr = np.minimum(psnr_db(batch, made), 99.0)
     for i, value in enumerate(psnr):
         if worst:
@@ -196,43 +227,5 @@ def _measure(tokenizer: Tokenizer, batch: Frames, totals: _Totals, worst: int) -
                 heapq.heappop(totals.worst)
     totals.psnr.extend(psnr.tolist())
     totals.ssim.extend(ssim(batch, made).tolist())
-
-
-def read_frames(path: Path, size: int, *, frames: int = 64, resize_filter: Any = "area") -> Iterator[Frames]:
-    """Frames (size, size, 3) of a picture, a video, or every picture and video below a folder.
-
-    Args:
-        frames: taken from each video, evenly.
-
-    Raises:
-        TokenizerError: there is no picture and no video.
-    """
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    found = False
-    for file in files:
-        if file.suffix.lower() not in VIDEOS | PICTURES or not file.is_file():
-            continue
-        for picture in read_pictures(file, frames):
-            found = True
-            yield resize(picture[None], size, "short_side_crop", resize_filter)[0]
-    if not found:
-        raise TokenizerError(path, "holds no picture and no video", "name a file or folder of png, jpg, mp4")
-
-
-def to_markdown(results: dict[str, dict[str, Any]]) -> str:
-    """A table, one row a set of frames: name -> what `evaluate` returned."""
-    columns = {
-        "frames": lambda r: str(r["frames"]),
-        "PSNR dB": lambda r: f"{r['psnr_db']:.2f}",
-        "lowest dB": lambda r: f"{r['psnr_db_min']:.2f}",
-        "SSIM": lambda r: f"{r['ssim']:.3f}",
-        "digits used": lambda r: ", ".join(f"{100 * use:.0f} %" for use in r.get("digit_use", [])) or "–",
-        "entropy bits/token": lambda r: f"{r.get('entropy_bits_per_token', math.nan):.2f}",
-        "bits/frame": lambda r: f"{r['bits_per_frame']:.0f}",
-        "encode frames/s": lambda r: f"{r['encode_frames_per_second']:.0f}",
-        "decode frames/s": lambda r: f"{r['decode_frames_per_second']:.0f}",
-    }
-    lines = ["| of | " + " | ".join(columns) + " |", "|" + " --- |" * (len(columns) + 1)]
-    for name, result in results.items():
-        lines.append(f"| {name} | " + " | ".join(text(result) for text in columns.values()) + " |")
-    return "\n".join(lines) + "\n"
+    if perceptual is not None:
+        totals.lpips.extend(perceptual(batch, made).tolist())

@@ -13,11 +13,13 @@ from hma_data.shipped import shipped
 from hma_data.tokenizers.base import TOKENIZERS, Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.corpus import DrawnSource, draw_batch, draw_scene, load_pools
 from hma_data.tokenizers.embedded import read_weights, save_weights
-from hma_data.tokenizers.eval import CodebookUse, evaluate, psnr_db, read_frames, ssim, to_markdown
+from hma_data.tokenizers.eval import CodebookUse, evaluate, psnr_db, ssim
+from hma_data.tokenizers.frames import read_frames
 from hma_data.tokenizers.fsq import WEIGHTS, FsqTokenizer
 from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig, Quantizer
 from hma_data.tokenizers.muon import orthogonal
 from hma_data.tokenizers.recipe import load_recipe
+from hma_data.tokenizers.report import to_markdown
 from hma_data.tokenizers.train import train
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"

@@ -1,0 +1,123 @@
+"""Frames to measure a tokenizer on: out of pictures, videos, recordings and shard sets' sources.
+
+S side of the square that the tokenizer takes. All frames are uint8 RGB (S, S, 3).
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import EpisodeError, SourceError, TokenizerError
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers.corpus import VIDEOS, read_pictures
+from hma_data.video import Filter, prepare, resize
+
+if TYPE_CHECKING:
+    from hma_data.embodiment import Embodiment
+
+Frame = NDArray[np.uint8]
+PICTURES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
+EPISODES = 16  # of a recording, evenly
+
+
+def read_frames(
+    path: Path, size: int, *, frames: int = 64, resize_filter: Filter = "area"
+) -> Iterator[Frame]:
+    """Frames of a picture, a video, or every picture and video below a folder.
+
+    Args:
+        frames: taken from each video, evenly.
+
+    Raises:
+        TokenizerError: there is no picture and no video.
+    """
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    found = False
+    for file in files:
+        if file.suffix.lower() not in VIDEOS | PICTURES or not file.is_file():
+            continue
+        for picture in _pictures(file, frames):
+            found = True
+            yield resize(picture[None], size, "short_side_crop", resize_filter)[0]
+    if not found:
+        raise TokenizerError(
+            path,
+            "holds no picture and no video",
+            "name a file or folder of png, jpg, mp4; a recording needs --embodiment",
+        )
+
+
+def _pictures(file: Path, frames: int) -> Iterator[Frame]:
+    from av.error import FFmpegError
+
+    try:
+        yield from read_pictures(file, frames)
+    except FFmpegError as fault:
+        raise TokenizerError(file, f"is no video that can be decoded: {fault.strerror}") from fault
+
+
+def recording_frames(
+    embodiment: "Embodiment",
+    uri: str,
+    spec: TokenizerSpec,
+    *,
+    frames: int = 64,
+    on_skip: Callable[[str], None] = lambda text: None,
+) -> Iterator[Frame]:
+    """Frames of a recording as a conversion would tokenize them: every camera, by the robot's YAML.
+
+    Args:
+        frames: taken from each of up to 16 episodes, evenly.
+        on_skip: told of an episode that cannot be read.
+
+    Raises:
+        SourceError: the recording cannot be read, or none of those episodes can.
+    """
+    from hma_data.sources.base import open_source
+
+    source = open_source(embodiment.source.format)
+    ids = source.episode_ids(uri)
+    found, fault = False, "it holds no episode"
+    for index in np.unique(np.linspace(0, len(ids) - 1, min(EPISODES, len(ids))).astype(int)):
+        try:
+            episode = source.read(uri, ids[index], embodiment)
+            for camera in embodiment.cameras:
+                stream = episode.streams[camera.name]
+                count = len(stream.timestamps)
+                for at in np.unique(np.linspace(0, count - 1, min(frames, count)).astype(int)):
+                    yield prepare(stream.frames([at]), camera, spec.image_size, spec.resize_filter)[0]
+                    found = True
+        except (EpisodeError, SourceError) as problem:
+            fault = str(problem)
+            on_skip(fault)
+    if not found:
+        raise SourceError(uri, f"gave no frame: {fault}")
+
+
+def frames_of(
+    path: Path,
+    spec: TokenizerSpec,
+    *,
+    embodiment: "Embodiment | None" = None,
+    frames: int = 64,
+    on_skip: Callable[[str], None] = lambda text: None,
+) -> Iterator[Frame]:
+    """Frames of whatever lies at `path`: with an embodiment a recording, else a shard set's source,
+    pictures or videos.
+
+    Raises:
+        TokenizerError: nothing there can be measured.
+        SourceError: the recording cannot be read.
+    """
+    from hma_data.shards.manifest import MANIFEST, Manifest
+
+    uri = str(path)
+    if embodiment is None and (path / MANIFEST).is_file():
+        manifest = Manifest.load(path)
+        embodiment, uri = manifest.embodiment, manifest.source
+    if embodiment is not None:
+        return recording_frames(embodiment, uri, spec, frames=frames, on_skip=on_skip)
+    return read_frames(path, spec.image_size, frames=frames, resize_filter=spec.resize_filter)
