@@ -33,6 +33,7 @@ def mount(app: typer.Typer) -> None:
     """Add every data verb to the command."""
     app.add_typer(registry_app, name="registry")
     app.command("inspect")(inspect)
+    app.command("doctor")(doctor)
     app.command("convert")(convert)
     app.add_typer(shards_app, name="shards")
     app.command("mixture")(mixture)
@@ -97,6 +98,41 @@ def _print_inspection(report: dict[str, Any]) -> None:
         print(f"{name}: {value}")
     for problem in report["problems"]:
         print(f"problem: {problem}")
+
+
+class Severity(StrEnum):
+    info = "info"
+    warn = "warn"
+    error = "error"
+
+
+def doctor(
+    target: Annotated[str, typer.Argument(help="A recording, or the folder of a shard set.")],
+    embodiment: Annotated[
+        str | None, typer.Option("--embodiment", "-e", help="Look into the episodes as this robot's.")
+    ] = None,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="How many are looked into.")] = 20,
+    fail_on: Annotated[
+        Severity, typer.Option("--fail-on", help="Exit with 1 from this severity on.")
+    ] = Severity.error,
+    json: Json = False,
+) -> None:
+    """Health checks: what of a recording or shard set will hurt training.
+
+    Example: hma doctor ./demo.hdf5 -e my_arm.yaml --fail-on warn
+    """
+    from hma_data.doctor import SEVERITIES, examine
+
+    found = examine(target, embodiment, episodes)
+    if json:
+        print_json({"target": target, "findings": [finding.to_json() for finding in found]})
+    else:
+        for finding in found:
+            remedy = f" — {finding.remedy}" if finding.remedy else ""
+            print(f"{finding.severity:5} {finding.check}: {finding.message}{remedy}")
+        print(f"{target}: {sum(finding.severity != 'info' for finding in found)} findings")
+    worst = max((SEVERITIES.index(finding.severity) for finding in found), default=-1)
+    raise typer.Exit(1 if worst >= SEVERITIES.index(fail_on.value) else 0)
 
 
 def convert(

@@ -1,0 +1,129 @@
+"""hma doctor: each defect is found by its check, and a sound recording gives none."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from hma_data.convert import convert
+from hma_data.doctor import Finding, examine
+from tests.conftest import ARM_YAML
+
+LENGTHS = (40, 45, 50)
+
+
+def sound(file: h5py.File) -> None:
+    """Episodes without a fault: moving pictures in all colours, actions that vary."""
+    draw = np.random.default_rng(0)
+    for i, length in enumerate(LENGTHS):
+        demo = file.create_group(f"data/demo_{i}")
+        demo["actions"] = draw.normal(size=(length, 3)).astype(np.float32)
+        for camera in ("image", "side"):
+            demo[f"obs/{camera}"] = draw.integers(0, 256, (length, 16, 16, 3), np.uint8)
+
+
+def set_all(key: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[h5py.File], None]:
+    """Change one dataset of every episode."""
+
+    def apply(file: h5py.File) -> None:
+        for demo in file["data"].values():
+            values = change(demo[key][:])
+            del demo[key]
+            demo[key] = values
+
+    return apply
+
+
+def examined(tmp_path: Path, damage: Callable[[h5py.File], None], yaml: str = ARM_YAML) -> list[Finding]:
+    with h5py.File(tmp_path / "toy.hdf5", "w") as file:
+        sound(file)
+        damage(file)
+    (tmp_path / "toy_arm.yaml").write_text(yaml)
+    return examine(str(tmp_path / "toy.hdf5"), str(tmp_path / "toy_arm.yaml"))
+
+
+def still(pictures: np.ndarray) -> np.ndarray:
+    return np.repeat(pictures[:1], len(pictures), axis=0)
+
+
+def blue(pictures: np.ndarray) -> np.ndarray:
+    return (pictures * np.array([0.2, 0.5, 1])).astype(np.uint8)
+
+
+def wild(actions: np.ndarray) -> np.ndarray:
+    actions[:, 1] = 0.001 * actions[:, 1]
+    actions[3, 1] = 1e4
+    return np.concatenate([actions] * 40)[: len(actions)]
+
+
+def test_a_sound_recording_has_no_finding(tmp_path: Path) -> None:
+    assert examined(tmp_path, lambda file: None) == []
+
+
+@pytest.mark.parametrize(
+    ("damage", "check", "severity"),
+    [
+        (set_all("obs/image", still), "still", "warn"),
+        (set_all("obs/image", np.zeros_like), "blank", "warn"),
+        (set_all("obs/image", blue), "colour", "info"),
+        (set_all("obs/side", lambda pictures: pictures[:-1]), "usable", "error"),
+        (set_all("actions", lambda actions: actions * [1, 0, 1]), "constant", "warn"),
+        (set_all("actions", lambda actions: np.full_like(actions, np.nan)), "usable", "error"),
+    ],
+)
+def test_a_defect_is_found_by_its_check(
+    tmp_path: Path, damage: Callable[[h5py.File], None], check: str, severity: str
+) -> None:
+    found = examined(tmp_path, damage)
+    assert (check, severity) in {(finding.check, finding.severity) for finding in found}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "check"),
+    [
+        ("dims: 3", "dims: 3, range: [-0.1, 0.1]", "range"),
+        ("key: obs/image", "key: obs/image, size: [480, 640]", "size"),
+        ("target_hz: 5", "target_hz: 1", "length"),
+    ],
+)
+def test_what_the_yaml_states_is_held_against_the_episodes(
+    tmp_path: Path, old: str, new: str, check: str
+) -> None:
+    assert check in {
+        finding.check for finding in examined(tmp_path, lambda file: None, ARM_YAML.replace(old, new))
+    }
+
+
+def test_degrees_stated_as_radians_are_noticed(tmp_path: Path) -> None:
+    in_degrees = set_all("actions", lambda actions: actions * 90)
+    found = examined(tmp_path, in_degrees, ARM_YAML.replace("dims: 3", "dims: 3, unit: rad"))
+    assert "are these degrees?" in {finding.remedy for finding in found}
+
+
+def test_the_worst_comes_first(tmp_path: Path) -> None:
+    def damage(file: h5py.File) -> None:
+        del file["data/demo_1/actions"]
+        set_all("obs/image", blue)(file)
+
+    order = [finding.severity for finding in examined(tmp_path, damage)]
+    assert order == sorted(order, key=["error", "warn", "info"].index) and len(set(order)) > 1
+
+
+def test_an_unreadable_recording_is_one_error(tmp_path: Path) -> None:
+    (tmp_path / "no.hdf5").write_bytes(b"nothing")
+    (finding,) = examine(str(tmp_path / "no.hdf5"))
+    assert (finding.check, finding.severity) == ("readable", "error")
+
+
+def test_a_shard_set_with_changed_bytes_is_an_error(
+    tmp_path, toy_arm, toy_recording, block_tokenizer
+) -> None:
+    convert(toy_arm, str(toy_recording), block_tokenizer, tmp_path / "shards")
+    assert not [finding for finding in examine(str(tmp_path / "shards")) if finding.severity == "error"]
+    shard = next((tmp_path / "shards" / "train").iterdir())
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    assert examine(str(tmp_path / "shards"))[0].check == "integrity"
