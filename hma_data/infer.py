@@ -7,6 +7,7 @@ What the recording states is filled in; what it cannot know stands as `TODO: que
 
 import math
 import re
+from dataclasses import replace
 from typing import Any, get_args
 
 from hma_data.embodiment import ID_PATTERN, TODO
@@ -38,10 +39,15 @@ def infer(uri: str, embodiment_id: str) -> str:
 
 def from_inspection(found: Inspection, embodiment_id: str) -> str:
     """See `infer`."""
-    draft = _Draft(found)
-    text = yaml_text(draft.values(embodiment_id))
+    readable = replace(found, keys=tuple(key for key in found.keys if _is_text(key.key)))
+    text = yaml_text(_Draft(readable).values(embodiment_id))
     where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
     return f"# Inferred from {where}; answer every {TODO}, then: hma registry validate FILE\n{text}"
+
+
+def _is_text(text: str) -> bool:
+    """False for bytes that no YAML can hold, as file formats let them through."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 class _Draft:
@@ -111,6 +117,8 @@ class _Draft:
         values["cameras"] = self._cameras()
         if self.bag:
             values["sync"] = self._sync(values["cameras"][0]["name"])
+        elif self.action.measured:
+            values["sync"] = {"action_shift": 1}
         values["source"] = self._source()
         values["provenance"] = self._provenance()
         unused = self._unused()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from hma_data.infer_words import (
     BASE,
     CARTESIAN,
+    GIVEN,
     JOINT,
     MEASURED,
     MOTION,
@@ -48,10 +49,15 @@ _INSTRUCTION = ("instruction", "instructions", "language", "task", "prompt", "go
 
 @dataclass(frozen=True)
 class Choice:
-    """Keys taken for one purpose, and what is to be asked about them."""
+    """Keys taken for one purpose, and what is to be asked about them.
+
+    Attributes:
+        measured: whether they are no commands, but what was measured a step after each.
+    """
 
     keys: tuple[KeyInfo, ...] = ()
     question: str = ""
+    measured: bool = False
 
 
 # -- cameras
@@ -101,8 +107,9 @@ def _is_telling(part: str) -> bool:
 def camera_names(found: Iterable[KeyInfo]) -> list[str]:
     """Short names that stay apart: the last telling part of the key, all of it, or numbers."""
     keys = [key.key for key in found]
+    wrists = [key for key in keys if _rank(key) == 2]
     for name in (_short_name, _plain):
-        names = [name(key) for key in keys]
+        names = ["wrist" if [key] == wrists else name(key) for key in keys]
         if len(set(names)) == len(names):
             return names
     return [f"camera_{i}" for i in range(len(keys))]
@@ -113,10 +120,8 @@ def _short_name(key: str) -> str:
     if not telling:
         number = re.search(r"\d", last(key))
         return _plain(last(key)) if number else "primary"
-    name = re.sub(
-        r"^robot0_|(_|\b)(image|rgb|color|img|raw)(_|\b)(?!\d)", "_", telling[-1], flags=re.IGNORECASE
-    )
-    return _plain(name)[:40]
+    said = [word for word in re.split(r"[_-]", telling[-1]) if not _PICTURE.fullmatch(word.lower())]
+    return _plain("_".join(said).removeprefix("robot0_"))[:40]
 
 
 def _plain(key: str) -> str:
@@ -136,8 +141,12 @@ def actions(found: list[KeyInfo]) -> Choice:
     group = [key for key in outside if re.match(r"(actions?|action_dict)[/.]", key.key, re.IGNORECASE)]
     group = [key for key in group if "robot_state" not in snake(key.key)]
     if group:
-        parts = ordered_parts(group)
-        return Choice(parts, _asked(parts, [key for key in group if key not in parts]))
+        moved = [key for key in group if not (key.constant and BASE & set(words(key.key)))]
+        parts = ordered_parts(moved or group)
+        asked = _asked(parts, [key for key in group if key not in parts and key in moved])
+        still = shown(key.key for key in group if moved and key not in moved)
+        moves = f"{still} never changes in the episode looked at and is left out; does it in others?"
+        return Choice(parts, " ".join([asked, moves] if asked and still else [moves if still else asked]))
     for pool in (outside, found):
         named = [key for key in pool if strength(words(key.key)) and not MEASURED & set(words(key.key))]
         if named:
@@ -216,14 +225,18 @@ def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...
     names = {snake(last(key.key)) for key in named}
     if "ee_states" in names:  # LIBERO repeats its parts
         named = [key for key in named if snake(last(key.key)) not in ("ee_pos", "ee_ori")]
-    return tuple([key for key in named if snake(last(key.key)) != "states"] or named)
+    own = [key for key in named if snake(last(key.key)) != "states"] or named  # those are the simulator's
+    return tuple(sorted(own, key=_place))
 
 
 def _is_state(key: KeyInfo) -> bool:
     said = set(words(key.key))
-    if not key.dtype.startswith("float") or strength(said) or said & MOTION:
+    grips = is_gripper(key.key)
+    if not key.dtype.startswith("float") and not (grips and key.dtype == "bool"):
         return False
-    return bool(said & STATES) or is_whole_state(key.key)
+    if strength(said) or said & (MOTION | GIVEN):
+        return False
+    return grips or bool(said & (STATES | ROTATION)) or is_whole_state(key.key)
 
 
 def likely(found: list[KeyInfo]) -> Choice:
@@ -234,8 +247,9 @@ def likely(found: list[KeyInfo]) -> Choice:
     if not chosen:
         return Choice()
     others = shown(key.key for key in found if key not in chosen)
-    asked = f"no command is recorded by such a name; may {shown([chosen[0].key])}, as measured, stand for it"
-    return Choice(chosen, asked + (f", or which of {others} is it?" if others else "?"))
+    when = ", as measured a step later," if own else ""
+    asked = f"no key is called a command; may {shown([chosen[0].key])}{when} stand for it"
+    return Choice(chosen, asked + (f", or which of {others} is it?" if others else "?"), measured=bool(own))
 
 
 def instruction(keys: Iterable[KeyInfo]) -> str | None:

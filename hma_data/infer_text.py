@@ -6,6 +6,7 @@ from typing import Any
 import yaml
 
 LINE = 110
+_HALVES = re.compile(r"[\ud800-\udfff]")
 _BREAKS = re.compile(r"[\n\r\x85\u2028\u2029]")
 
 
@@ -17,6 +18,7 @@ class _Dumper(yaml.SafeDumper):
 
 def _text(dumper: _Dumper, value: str) -> yaml.Node:
     """On one line, whatever it holds."""
+    value = _HALVES.sub("?", value)  # of surrogate pairs: no text
     style = '"' if _BREAKS.search(value) else None
     return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 

@@ -153,6 +153,6 @@ def max_skew_ms(cameras: list[KeyInfo], actions: Iterable[KeyInfo], states: Iter
     gaps = [gap for gap in held if gap] + [gap / 2 for gap in near if gap]
     if not gaps or not max(gaps) < 1e9:
         return None
-    wanted = max(gaps) * MARGIN
+    wanted = max(gaps) * MARGIN - 0.01  # 40 ms by differences of large stamps is 40.0001
     step = 5 if wanted < 100 else 50 if wanted < 1000 else 500
     return int(-(-wanted // step) * step)

@@ -21,6 +21,7 @@ NOISE = _set("""
     feature features latent latents rosout diagnostics clock log parameter tf marker markers map scan cloud
     pointcloud color colour pad padding next acceleration accelerations acc error errors duration status
     feedback result event events environment noise
+    time
 """)
 _COMMANDS = (
     (5, _set("action actions command commands commanded cmd cmds cmdvel")),
@@ -39,6 +40,7 @@ BASE = _set("base displacement torso waist head body chassis wheel wheels")
 ROTATION = _set("rotation rot quat quaternion orientation euler rpy axis angular")
 JOINT = _set("joint joints qpos")
 CARTESIAN = _set("cartesian eef ee tcp end")
+GIVEN = _set("go start src box delta")  # poses that are given, not measured
 SIDES = _set("left right l r")
 _GRIPPER = _set("gripper grippers grip closedness close closed open finger fingers")
 _WHOLE_STATE = re.compile(r"(robot_)?(state|proprio|proprioception|obs)|qpos|agent_pos")

@@ -80,6 +80,7 @@ class KeyInfo:
         count: samples seen (of one episode, or of the whole recording when it is a topic).
         jitter_ms: standard deviation of the intervals.
         topic: of bags.
+        constant: whether a vector never changes in the episode looked at; of bags and LeRobot not looked at.
     """
 
     key: str
@@ -92,6 +93,7 @@ class KeyInfo:
     count: int | None = None
     jitter_ms: float | None = None
     topic: TopicInfo | None = None
+    constant: bool = False
 
 
 @dataclass(frozen=True)

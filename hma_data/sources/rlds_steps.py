@@ -199,7 +199,7 @@ def key_info(steps: Steps, key: str) -> KeyInfo:
     """One key as this episode holds it."""
     feature = steps.features[key]
     shape = tuple(size or 0 for size in (*feature.nesting[1:], *feature.shape))
-    kind, codec = "other", None
+    kind, codec, constant = "other", None, False
     try:
         if is_camera(feature):
             kind, shape, codec = "camera", steps.decoder(key)(0).shape, _codec(steps, key)
@@ -208,11 +208,13 @@ def key_info(steps: Steps, key: str) -> KeyInfo:
         elif feature.kind == "text":
             kind = "text"
         elif feature.kind == "number":
-            shape = steps.numbers(key).shape[1:]
+            values = steps.numbers(key)
+            shape = values.shape[1:]
+            constant = len(values) > 1 and bool((values == values[0]).all())
             kind = "vector" if math.prod(shape) <= MAX_VECTOR else "other"
     except EpisodeError as fault:
         log.warning("%s", fault)  # listed as features.json states it
-    return KeyInfo(key, kind, shape, feature.dtype, codec=codec, count=steps.count)
+    return KeyInfo(key, kind, shape, feature.dtype, codec=codec, count=steps.count, constant=constant)
 
 
 def _codec(steps: Steps, key: str) -> str:

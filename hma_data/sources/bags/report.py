@@ -220,12 +220,13 @@ def _values(key: str, value: Any) -> list[KeyInfo]:
     names = field_names(value)
     if names and all(_is_number(child(value, name)) for name in names):
         return [KeyInfo(key, "vector", (len(names),), "float64", names=tuple(names))]
-    return [
+    trajectory = _trajectory(key, value, names)
+    return trajectory + [
         found
         for name in names
-        if name not in ("header", "stamp", "timestamp")
+        if name not in ("header", "stamp", "timestamp") and not (trajectory and name == "points")
         for found in _named(_values(f"{key}.{name}", child(value, name)), value, name)
-    ] + _trajectory(key, value, names)
+    ]
 
 
 def _trajectory(key: str, value: Any, names: list[str]) -> list[KeyInfo]:
