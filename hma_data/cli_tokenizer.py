@@ -101,25 +101,24 @@ def tokenizer_eval(
     robot = find(embodiment) if embodiment else None
     opened = get_tokenizer(tokenizer, weights=weights, device=device)
     perceptual, missing = _perceptual(lpips, device)
-    found = {}
+    found, skipped = {}, list[str]()
     for path in data:
-        chosen = frames_of(path, opened.spec, embodiment=robot, frames=frames, on_skip=_skipped)
+        chosen = frames_of(path, opened.spec, embodiment=robot, frames=frames, on_skip=skipped.append)
         found[str(path)] = evaluate(opened, chosen, worst=worst if out else 0, perceptual=perceptual)
+    notes = [missing] if missing else []
+    if skipped:
+        notes.append(f"{len(skipped)} episodes could not be read, the first: {skipped[0]}")
     plain = {name: without_frames(result) for name, result in found.items()}
     if json:
         print_json(plain)
     else:
         print(to_markdown(plain), end="")
-    if missing:
-        typer.echo(missing, err=True)
+    for note in notes:
+        typer.echo(note, err=True)
     if out:
         title = f"{tokenizer}, weights {opened.spec.weights_sha256[:12] or 'none'}"
-        paths = write_report(out, title, found, [missing] if missing else [])
+        paths = write_report(out, title, found, notes)
         typer.echo(f"wrote {', '.join(map(str, paths))}", err=True)
-
-
-def _skipped(text: str) -> None:
-    typer.echo(f"left out: {text}", err=True)
 
 
 def _perceptual(wanted: bool | None, device: str) -> tuple[Any, str]:

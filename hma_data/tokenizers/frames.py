@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError, TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.corpus import VIDEOS, read_pictures
@@ -71,30 +72,39 @@ def recording_frames(
 
     Args:
         frames: taken from each of up to 16 episodes, evenly.
-        on_skip: told of an episode that cannot be read.
+        on_skip: told of an episode that cannot be read; another takes its place.
 
     Raises:
-        SourceError: the recording cannot be read, or none of those episodes can.
+        SourceError: the recording cannot be read, or not one of its episodes can.
     """
     from hma_data.sources.base import open_source
 
     source = open_source(embodiment.source.format)
     ids = source.episode_ids(uri)
-    found, fault = False, "it holds no episode"
-    for index in np.unique(np.linspace(0, len(ids) - 1, min(EPISODES, len(ids))).astype(int)):
+    spread = np.unique(np.linspace(0, len(ids) - 1, min(EPISODES, len(ids))).astype(int)).tolist()
+    others = [index for index in range(len(ids)) if index not in set(spread)]
+    read, fault = 0, "it holds no episode"
+    for index in spread + others:
+        if read == EPISODES:
+            return
         try:
-            episode = source.read(uri, ids[index], embodiment)
-            for camera in embodiment.cameras:
-                stream = episode.streams[camera.name]
-                count = len(stream.timestamps)
-                for at in np.unique(np.linspace(0, count - 1, min(frames, count)).astype(int)):
-                    yield prepare(stream.frames([at]), camera, spec.image_size, spec.resize_filter)[0]
-                    found = True
+            yield from _episode_frames(source.read(uri, ids[index], embodiment), embodiment, spec, frames)
+            read += 1
         except (EpisodeError, SourceError) as problem:
             fault = str(problem)
             on_skip(fault)
-    if not found:
+    if not read:
         raise SourceError(uri, f"gave no frame: {fault}")
+
+
+def _episode_frames(
+    episode: Episode, embodiment: "Embodiment", spec: TokenizerSpec, frames: int
+) -> Iterator[Frame]:
+    for camera in embodiment.cameras:
+        stream = episode.streams[camera.name]
+        count = len(stream.timestamps)
+        for at in np.unique(np.linspace(0, count - 1, min(frames, count)).astype(int)):
+            yield prepare(stream.frames([at]), camera, spec.image_size, spec.resize_filter)[0]
 
 
 def frames_of(

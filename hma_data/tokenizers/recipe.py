@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hma_data.errors import RecipeError
@@ -72,8 +73,9 @@ class TrainingRecipe(_Strict):
         adam_learning_rate: the highest, of Adam (biases, first and last layers).
         weight_decay: of Muon's matrices; their spectral norms stay below its inverse.
         warmup_steps: of linear rise at the start.
-        decay_steps: of linear fall at the end; in between the rate is constant, so a run that is
-            given more steps later goes on as if it had been meant so.
+        fall: (step, share of the highest rate), in order: the rate is constant up to the first, linear
+            between them, and the last is (steps, 0). A run under way can be given another future,
+            shorter or longer, and goes on as if it had been meant so.
         ema: decay of the averaged weights, which are the ones kept.
         threads: of torch; the result depends on it in the last bits only.
     """
@@ -85,14 +87,28 @@ class TrainingRecipe(_Strict):
     adam_learning_rate: float = Field(gt=0)
     weight_decay: float = Field(ge=0, default=0.0)
     warmup_steps: int = Field(ge=0, default=100)
-    decay_steps: int = Field(ge=0, default=0)
+    fall: list[tuple[int, float]] = Field(default_factory=list)
     ema: float = Field(ge=0, lt=1, default=0.998)
     threads: int = Field(gt=0, default=1)
+
+    @model_validator(mode="after")
+    def _falls_to_the_end(self) -> "TrainingRecipe":
+        steps = [step for step, _ in self.fall]
+        if not self.fall:
+            return self
+        if sorted(set(steps)) != steps or min(steps) < 0 or self.fall[0][1] != 1:
+            raise ValueError("fall must begin with share 1, at ascending steps")
+        if self.fall[-1] != (self.steps, 0) or not all(0 <= share <= 1 for _, share in self.fall):
+            raise ValueError(f"fall must end with [{self.steps}, 0], shares within 0..1")
+        return self
 
     def rate(self, step: int) -> float:
         """Share of the highest learning rate at a step, counted from 0."""
         rise = min(1.0, (step + 1) / max(1, self.warmup_steps))
-        return min(rise, (self.steps - step) / max(1, self.decay_steps), 1.0)
+        if not self.fall:
+            return rise
+        steps, shares = [point[0] for point in self.fall], [point[1] for point in self.fall]
+        return min(rise, float(np.interp(step, steps, shares)))
 
 
 class LossRecipe(_Strict):
@@ -121,9 +137,9 @@ class TokenizerRecipe(_Strict):
         return _digest(self.model_dump(mode="json", exclude={"corpus"}))
 
     def course(self) -> str:
-        """SHA-256 over what decides the steps before the decay: runs of the same course can go on."""
+        """SHA-256 over all but the rates: with the same past of those too, a run can go on."""
         values = self.model_dump(mode="json", exclude={"corpus"})
-        for key in ("steps", "decay_steps", "threads"):
+        for key in ("steps", "fall", "threads"):
             values["training"].pop(key)
         return _digest(values)
 

@@ -10,6 +10,7 @@ written now and then, and the state of the run beside it: running it again goes 
 B crops, S side of a crop, C latent channels.
 """
 
+import hashlib
 import math
 import platform
 import time
@@ -156,7 +157,8 @@ class Run:
 
     def save(self, path: Path) -> None:
         """Write what `resume` needs, atomically."""
-        metadata = {"course": self.recipe.course(), "step": str(self.step), "end": self._end()}
+        metadata = {"course": self.recipe.course(), "step": str(self.step)}
+        metadata["rates"] = self._past_rates(self.step)
         metadata["seconds"] = str(round(self.seconds, 3))
         tensors = {name: tensor.contiguous() for name, tensor in self._state().items()}
         write_atomic(path, save(tensors, metadata))
@@ -182,9 +184,8 @@ class Run:
                 metadata = file.metadata() or {}
                 state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             step = int(metadata.get("step", -1))
-            falling = step > self._constant_until()
-            other_end = falling and metadata.get("end") != self._end()
-            if step < 0 or other_end or metadata.get("course") != self.recipe.course():
+            same = metadata.get("course") == self.recipe.course()
+            if step < 0 or not same or metadata.get("rates") != self._past_rates(step):
                 raise RecipeError(path, "is the state of a training with other settings", remedy)
             self._restore(state)
         except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as fault:
@@ -205,12 +206,10 @@ class Run:
             groups = optimizer.state_dict()["param_groups"]
             optimizer.load_state_dict({"state": moments, "param_groups": groups})
 
-    def _constant_until(self) -> int:
-        return self.recipe.training.steps - self.recipe.training.decay_steps
-
-    def _end(self) -> str:
-        """Steps and decay: what a run whose rate already falls may no longer change."""
-        return f"{self.recipe.training.steps}-{self.recipe.training.decay_steps}"
+    def _past_rates(self, step: int) -> str:
+        """Digest of the rates of all steps before this one."""
+        rates = [round(self.recipe.training.rate(past), 9) for past in range(step)]
+        return hashlib.sha256(repr(rates).encode()).hexdigest()
 
 
 def _optimizers(network: Autoencoder, recipe: TrainingRecipe) -> list[torch.optim.Optimizer]:

@@ -1,0 +1,235 @@
+"""Measuring and listing tokenizers: which frames are taken, what is reported, what is missing."""
+
+import json
+import sys
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from hma_data.align import to_clip
+from hma_data.cli_tokenizer import tokenizer_app
+from hma_data.convert import convert
+from hma_data.embodiment import Embodiment
+from hma_data.errors import MissingDependencyError, SourceError
+from hma_data.sheets import write_png
+from hma_data.sources.base import open_source
+from hma_data.tokenizers import perceptual
+from hma_data.tokenizers.base import TOKENIZERS, get_tokenizer
+from hma_data.tokenizers.catalog import CATALOG, EMBEDDED, Entry
+from hma_data.tokenizers.corpus import draw_scene
+from hma_data.tokenizers.eval import LatentMoments, evaluate
+from hma_data.tokenizers.frames import frames_of
+from hma_data.tokenizers.perceptual import open_lpips
+from hma_data.tokenizers.report import to_markdown, write_report
+from hma_data.video import prepare
+from tests.conftest import ARM_YAML, write_toy
+
+RUNNER = CliRunner()
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """A folder of three drawn pictures."""
+    rng = np.random.default_rng(3)
+    for index in range(3):
+        write_png(tmp_path / "pictures" / f"{index}.png", draw_scene(rng, 160))
+    return tmp_path / "pictures"
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> tuple[Embodiment, Path]:
+    """A robot of two cameras, and a recording of three episodes."""
+    write_toy(tmp_path / "toy.hdf5", [14, 15, 16])
+    path = tmp_path / "toy_arm.yaml"
+    path.write_text(ARM_YAML)
+    return Embodiment.load(path), tmp_path / "toy.hdf5"
+
+
+# -- frames
+
+
+def test_a_recording_gives_every_camera_as_a_conversion_would(arm, block_tokenizer):
+    robot, path = arm
+    found = list(frames_of(path, block_tokenizer.spec, embodiment=robot, frames=2))
+    source = open_source("hdf5")
+    expected = []
+    for name in source.episode_ids(str(path)):
+        clip = to_clip(source.read(str(path), name, robot), robot)
+        for camera in robot.cameras:
+            raw = clip.frames_at(camera.name, np.array([0, len(clip) - 1]))
+            expected.append(prepare(raw, camera, 64, "area"))
+    assert np.array_equal(np.stack(found), np.concatenate(expected))
+
+
+def test_a_shard_set_is_measured_on_what_it_was_made_of(arm, block_tokenizer, tmp_path):
+    robot, path = arm
+    convert(robot, str(path), block_tokenizer, tmp_path / "shards")
+    spec = block_tokenizer.spec
+    from_shards = list(frames_of(tmp_path / "shards", spec, frames=3))
+    assert np.array_equal(from_shards, list(frames_of(path, spec, embodiment=robot, frames=3)))
+
+
+def test_an_episode_that_cannot_be_read_is_told_and_replaced(arm, block_tokenizer, monkeypatch):
+    robot, path = arm
+    monkeypatch.setattr("hma_data.tokenizers.frames.EPISODES", 1)
+    source = open_source("hdf5")
+    read = source.read
+
+    def broken(uri, episode, embodiment):
+        if episode == source.episode_ids(uri)[0]:
+            raise SourceError(episode, "is broken")
+        return read(uri, episode, embodiment)
+
+    monkeypatch.setattr(source, "read", broken)
+    monkeypatch.setattr("hma_data.sources.base.open_source", lambda name: source)
+    told: list[str] = []
+    frames = list(frames_of(path, block_tokenizer.spec, embodiment=robot, frames=2, on_skip=told.append))
+    assert len(frames) == 4 and "is broken" in told[0]
+
+
+# -- measures
+
+
+def test_moments_of_latents_are_those_of_all_batches_together():
+    spec = get_tokenizer("raw").spec
+    moments, rng = LatentMoments(spec), np.random.default_rng(0)
+    parts = [rng.integers(0, 256, (count, 3, 4, 4)).astype(np.uint8) for count in (1, 5)]
+    for part in parts:
+        moments.add(part)
+    whole = np.concatenate(parts) / 255
+    assert moments.result() == {
+        "latent_mean_scaled": pytest.approx(whole.mean(), abs=1e-4),
+        "latent_std_scaled": pytest.approx(whole.std(), abs=1e-4),
+    }
+
+
+def test_without_its_package_lpips_is_named_with_the_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    with pytest.raises(MissingDependencyError, match="pip install lpips"):
+        open_lpips(download=True)
+
+
+class _Distance(torch.nn.Module):
+    """Stands for LPIPS: the mean of what it is given, in its shapes."""
+
+    def __init__(self, net: str, verbose: bool) -> None:
+        super().__init__()
+
+    def forward(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+        assert first.shape[1] == 3 and first.min() == -1 and second.max() == 1
+        return (second - first).mean(dim=(1, 2, 3), keepdim=True)
+
+
+@pytest.fixture
+def lpips(monkeypatch, tmp_path) -> Path:
+    """A package of that name; the folder where its backbone would lie."""
+    module = ModuleType("lpips")
+    module.__spec__ = ModuleSpec("lpips", None)
+    module.LPIPS = _Distance  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "lpips", module)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    return tmp_path / "checkpoints"
+
+
+def test_lpips_is_not_downloaded_unasked(lpips):
+    with pytest.raises(MissingDependencyError, match="--lpips downloads"):
+        open_lpips(download=False)
+    lpips.mkdir()
+    (lpips / perceptual.BACKBONE).touch()
+    assert callable(open_lpips(download=False))
+
+
+def test_lpips_is_given_pixels_from_minus_one_to_one(lpips):
+    black, white = np.zeros((2, 8, 8, 3), np.uint8), np.full((2, 8, 8, 3), 255, np.uint8)
+    assert open_lpips(download=True)(black, white).tolist() == [2.0, 2.0]
+
+
+def test_lpips_is_reported_as_the_mean_over_frames(block_tokenizer):
+    frames = np.zeros((3, 64, 64, 3), np.uint8)
+    result = evaluate(block_tokenizer, frames, perceptual=lambda true, made: np.array([0.0, 0.5, 1.0]))
+    assert result["lpips"] == 0.5
+    assert "| 0.500 |" in to_markdown({"x": result})
+
+
+def test_a_report_holds_table_numbers_and_the_worst_frames(tmp_path, block_tokenizer):
+    frames = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3)).astype(np.uint8)
+    result = evaluate(block_tokenizer, frames, worst=2)
+    paths = write_report(tmp_path, "block", {"noise": result}, ["a note"])
+    assert sorted(path.name for path in paths) == ["eval.json", "eval.md", "worst.png"]
+    text = (tmp_path / "eval.md").read_text()
+    assert text.startswith("# block") and "| noise | 3 |" in text and "a note" in text
+    assert json.loads((tmp_path / "eval.json").read_text())["noise"]["frames"] == 3
+
+
+# -- command
+
+
+def test_eval_prints_json_and_writes_a_report(pictures, tmp_path):
+    done = RUNNER.invoke(
+        tokenizer_app,
+        ["eval", "fsq-8", str(pictures), "--json", "--no-lpips", "--out", str(tmp_path / "out")],
+    )
+    assert done.exit_code == 0, done.output
+    printed = json.loads(done.stdout)
+    assert printed == json.loads((tmp_path / "out" / "eval.json").read_text())
+    assert printed[str(pictures)]["frames"] == 3
+
+
+def test_eval_measures_a_recording_by_its_robot(arm, tmp_path):
+    robot = str(arm[1].with_name("toy_arm.yaml"))
+    done = RUNNER.invoke(
+        tokenizer_app, ["eval", "fsq-8", str(arm[1]), "-e", robot, "--frames", "1", "--json", "--no-lpips"]
+    )
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)[str(arm[1])]["frames"] == 6
+
+
+# -- catalogue
+
+
+def test_the_catalogue_is_what_get_tokenizer_knows():
+    assert set(CATALOG) == set(TOKENIZERS)
+    for name, entry in CATALOG.items():
+        assert entry.name == name and entry.licence and entry.description
+
+
+@pytest.mark.parametrize("name", [name for name, entry in CATALOG.items() if entry.weights == "embedded"])
+def test_the_catalogue_says_what_the_embedded_tokenizers_are(name):
+    entry, spec = CATALOG[name], get_tokenizer(name).spec
+    assert (entry.kind, entry.image_size, entry.grid) == (spec.kind, spec.image_size, spec.grid)
+    assert entry.size() == (EMBEDDED / entry.file).stat().st_size
+    assert entry.state() == "ready"
+
+
+def test_embedded_weights_take_at_most_twelve_megabytes():
+    assert sum(path.stat().st_size for path in EMBEDDED.iterdir()) <= 12_000_000
+
+
+def _entry(weights, **values) -> Entry:
+    return Entry("x", "discrete", 8, (1, 1), "a test", weights, "json", **values)
+
+
+def test_the_state_says_what_is_in_the_way(monkeypatch):
+    assert _entry("none").state() == "ready"
+    assert _entry("path").state() == "needs --weights PATH"
+    lacking = _entry("none", imports=("torch", "no_such_module"), extra="pip install no-such")
+    assert lacking.state() == "needs no_such_module: pip install no-such"
+    assert lacking.to_json()["usable"] is False
+    entry = _entry("download", repo="a/b", file="w.safetensors", bytes=5)
+    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *args, **kwargs: None)
+    assert entry.state() == "downloads on first use" and entry.size() == 5
+    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *args, **kwargs: "/cache/w")
+    assert entry.state() == "ready"
+
+
+def test_the_list_names_every_tokenizer_with_its_state():
+    done = RUNNER.invoke(tokenizer_app, ["list", "--json"])
+    listed = {item["name"]: item for item in json.loads(done.stdout)}
+    assert set(listed) == set(CATALOG)
+    assert listed["fsq-16"]["usable"] and listed["fsq-16"]["bytes"] > 1_000_000
+    assert all({"state", "licence", "bytes", "grid"} <= set(item) for item in listed.values())
