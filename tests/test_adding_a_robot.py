@@ -13,7 +13,8 @@ from tests.data.bag_files import make_recording, write_ros2
 from tests.data.videos import make_v3
 from tests.test_cli import hma
 
-TINY = ["frames=3", "batch_size=2", "steps=2", "warmup=1", "model.layers=1", "model.width=32", "model.heads=2"]
+TINY = ["frames=3", "batch_size=2", "steps=2", "warmup=1"]
+TINY += ["model.layers=1", "model.width=32", "model.heads=2"]
 
 
 def hdf5_arm(folder: Path) -> Path:
@@ -80,9 +81,9 @@ def answer(path: Path) -> None:
             values[key] = value
     if values["action"]["space"].startswith("TODO"):
         values["action"]["space"] = "mixed"
-    values["provenance"] = {key: "the person who recorded it" for key in values.get("provenance", {})}
+    values["provenance"] = dict.fromkeys(values.get("provenance", {}), "the person who recorded it")
     for section in ("action", "state"):
         for part in values.get(section, {}).get("components", []):
-            for key in [key for key, value in part.items() if str(value).startswith("TODO")]:
+            for key in [key for key in part if str(part[key]).startswith("TODO")]:
                 del part[key]
     path.write_text(yaml.safe_dump(values, sort_keys=False))
