@@ -10,6 +10,7 @@ import re
 from dataclasses import replace
 from typing import Any, get_args
 
+from hma_data import infer_topics
 from hma_data.embodiment import ID_PATTERN, TODO
 from hma_data.errors import SourceError, UsageError
 from hma_data.infer_choices import Choice, actions, camera_names, cameras, instruction, likely, states
@@ -69,7 +70,7 @@ class _Draft:
         self.action, self.states = self._bag_choice(numbers) if self.bag else self._step_choice(numbers)
         if not self.action.keys:
             raise _no_action(found, self.seen.keys)
-        self.hz = self.seen.keys[0].hz or found.hz if self.bag else found.hz
+        self.hz = self.seen.keys[0].hz if self.bag else found.hz
         if self.hz is not None and not 0 < self.hz <= HIGHEST_HZ:
             self.hz = None
 
@@ -86,10 +87,9 @@ class _Draft:
         action = action if action.keys else likely(numbers)
         return action, states(numbers, action.keys)
 
-    @staticmethod
-    def _bag_choice(numbers: list[KeyInfo]) -> tuple[Choice, tuple[KeyInfo, ...]]:
-        from hma_data import infer_topics
-
+    def _bag_choice(self, numbers: list[KeyInfo]) -> tuple[Choice, tuple[KeyInfo, ...]]:
+        running = tuple(key for key in self.seen.keys if infer_topics.runs(key))
+        self.seen = Choice(running or self.seen.keys, self.seen.question)
         action = infer_topics.actions(numbers)
         return action, infer_topics.states(numbers, action.keys)
 
@@ -156,11 +156,9 @@ class _Draft:
         return listed
 
     def _sync(self, primary: str) -> dict[str, Any]:
-        from hma_data.infer_topics import max_skew_ms, needs_receive_times
-
         sync = {"primary": primary, "images": "nearest", "actions": "hold", "states": "interpolate"}
-        skew = max_skew_ms(list(self.seen.keys[1:]), self.action.keys, self.states)
-        late = needs_receive_times(self._used())
+        skew = infer_topics.max_skew_ms(list(self.seen.keys[1:]), self.action.keys, self.states)
+        late = infer_topics.needs_receive_times(self._used())
         return sync | ({"max_skew_ms": skew} if skew else {}) | ({"stamp": "receive"} if late else {})
 
     def _used(self) -> list[KeyInfo]:
@@ -196,15 +194,16 @@ class _Draft:
         if self.seen.question:
             said["cameras"] = f"{TODO}: {self.seen.question}"
         if self.bag:
-            from hma_data.infer_topics import MARGIN, about, needs_receive_times
-
-            gaps = [f"{topic.name} {topic.gap_ms:.0f} ms" for topic in about(self._used()) if topic.gap_ms]
-            if gaps:
-                said["max_skew_ms"] = f"{MARGIN:g} times the longest intervals, measured: {shown(gaps)}"
-            late = needs_receive_times(self._used())
-            if late:
-                said["stamp"] = late
+            said |= self._clocks()
         return said
+
+    def _clocks(self) -> dict[str, str]:
+        """Where a bag's max_skew_ms and stamp are from."""
+        topics = infer_topics.about(self._used())
+        gaps = shown(f"{topic.name} {topic.gap_ms:.0f} ms" for topic in topics if topic.gap_ms)
+        late = infer_topics.needs_receive_times(self._used())
+        skew = f"{infer_topics.MARGIN:g} times the longest interval held; intervals, measured: {gaps}"
+        return ({"max_skew_ms": skew} if gaps else {}) | ({"stamp": late} if late else {})
 
     def _rate_from(self) -> str:
         found = self.found
@@ -213,24 +212,23 @@ class _Draft:
         if not self.bag:
             return found.facts.get("rate") or "the recording"
         camera = self.seen.keys[0]
-        rates = [
-            f"{_hz(key)} of {key.key}" for key in dict.fromkeys([*self.action.keys, *self.states]) if key.hz
-        ]
+        moved = [key for key in (*self.action.keys, *self.states) if key.hz]
+        rates = dict.fromkeys(f"{key.topic.name if key.topic else key.key} {_hz(key)}" for key in moved)
         beside = f"; beside it {shown(rates)}" if rates else ""
-        return f"measured: pictures of {camera.key} come at {_hz(camera)}{beside}"
+        return f"measured: {camera.key} {_hz(camera)}{beside}"
 
     def _unused(self) -> str:
         used = {key.key for key in self._used()} | {self._instruction()}
         left = [
             key
             for key in self.found.keys
-            if key.key not in used and key.kind in ("camera", "vector", "other")
+            if key.key not in used and key.kind != "text" and not key.key.endswith(".layout.data_offset")
         ]
         return shown([key.key for key in left if key.key], 20)
 
 
 def _hz(key: KeyInfo) -> str:
-    jitter = f" (jitter {key.jitter_ms:.3g} ms)" if key.jitter_ms is not None else ""
+    jitter = f" with a jitter of {key.jitter_ms:.1f} ms" if key.jitter_ms is not None else ""
     return f"{key.hz:.4g} Hz{jitter}"
 
 

@@ -225,7 +225,7 @@ def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...
     names = {snake(last(key.key)) for key in named}
     if "ee_states" in names:  # LIBERO repeats its parts
         named = [key for key in named if snake(last(key.key)) not in ("ee_pos", "ee_ori")]
-    own = [key for key in named if snake(last(key.key)) != "states"] or named  # those are the simulator's
+    own = [key for key in named if is_observed(key.key) or snake(last(key.key)) != "states"]  # a simulator's
     return tuple(sorted(own, key=_place))
 
 

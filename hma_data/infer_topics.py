@@ -23,6 +23,7 @@ _COMMAND_TYPE = re.compile(r"(Twist|JointTrajectory|Command|Cmd|Ackermann|Joy)[A
 _NEVER = re.compile(r"(^|/)(rosout|parameter_events|clock|diagnostics|_action)(/|$)|_service_event$")
 SLOWEST_HZ = 1.0  # a topic that ticks slower is no stream of commands or states
 CLOCKS_APART_MS = 1000.0  # header stamps that differ so much between topics are not of one clock
+WEAK = 1  # how clearly a topic called goal, control or joy commands
 MARGIN = 1.5  # over the longest interval measured
 
 Topic = tuple[KeyInfo, ...]
@@ -32,9 +33,14 @@ def topics(found: Iterable[KeyInfo]) -> list[Topic]:
     """The vectors of each topic that ticks."""
     groups: dict[str, list[KeyInfo]] = defaultdict(list)
     for key in found:
-        if key.topic and not _NEVER.search(key.topic.name) and (key.hz is None or key.hz >= SLOWEST_HZ):
+        if key.topic and not _NEVER.search(key.topic.name) and (key.hz is None or runs(key)):
             groups[key.topic.name].append(key)
     return [tuple(group) for group in groups.values()]
+
+
+def runs(key: KeyInfo) -> bool:
+    """Whether its topic is a stream, not a message now and then."""
+    return key.hz is not None and key.hz >= SLOWEST_HZ
 
 
 def actions(found: list[KeyInfo]) -> Choice:
@@ -51,6 +57,10 @@ def actions(found: list[KeyInfo]) -> Choice:
     ordered = sorted(distinct, key=lambda topic: (is_gripper(_name(topic)), _name(topic)))
     keys = tuple(key for topic in ordered for key in commanded_fields(topic))
     others = [topic[0] for _, topic in commanding if topic not in distinct]
+    (clear, ticks, *_), _ = commanding[0]
+    if clear <= WEAK or not ticks:
+        others += [key for key in found if key not in keys and key not in others]
+        return Choice(keys, question(keys, others))
     return Choice(keys, question(keys, others) if others else "")
 
 
@@ -150,9 +160,9 @@ def max_skew_ms(cameras: list[KeyInfo], actions: Iterable[KeyInfo], states: Iter
     """
     held = [topic.gap_ms for topic in about(actions)]
     near = [topic.gap_ms for topic in about([*cameras, *states])]
-    gaps = [gap for gap in held if gap] + [gap / 2 for gap in near if gap]
+    gaps = [gap for gap in held if gap and gap > 0] + [gap / 2 for gap in near if gap and gap > 0]
     if not gaps or not max(gaps) < 1e9:
         return None
     wanted = max(gaps) * MARGIN - 0.01  # 40 ms by differences of large stamps is 40.0001
     step = 5 if wanted < 100 else 50 if wanted < 1000 else 500
-    return int(-(-wanted // step) * step)
+    return max(int(-(-wanted // step) * step), step)

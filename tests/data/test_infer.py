@@ -10,77 +10,17 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import Stores, get_typestore
 
 from hma_data.align import to_clip
-from hma_data.embodiment import TODO, Embodiment, find, problems, todos
-from hma_data.episode import Clip
-from hma_data.errors import HMAError, SourceError, UsageError
+from hma_data.embodiment import Embodiment, find, problems
+from hma_data.errors import SourceError, UsageError
 from hma_data.infer import from_inspection, infer
-from hma_data.sources.base import Inspection, KeyInfo, TopicInfo, open_source
+from hma_data.sources.base import Inspection, KeyInfo, open_source
 from hma_data.yaml_io import parse_yaml
 from tests.data import rlds_files
-from tests.data.bag_files import KINDS, START_NS, Recording
+from tests.data.inferring import H, T, W, answered, first_clip, inferred, keys, numbers, pictures, questions
 from tests.data.rlds_files import TEXT, features_dict, image, png, tensor
 from tests.data.videos import CAMERA, STILL, make_v2, make_v3
-
-T, H, W = 12, 24, 32
-ANSWERS = {"robot": "arm", "kind": "real", "frequency_hz": 10, "space": "mixed", "color": "rgb"}
-
-
-def inferred(path: Path) -> dict[str, Any]:
-    """The values of the YAML, whose only problems are questions."""
-    values = parse_yaml(infer(str(path), "mine"), "inferred")
-    assert all("still TODO" in problem for problem in problems(values)), problems(values)
-    return dict(values)
-
-
-def questions(values: dict[str, Any]) -> dict[str, str]:
-    return dict(todos(values))
-
-
-def answered(values: Any) -> Any:
-    """With every question answered."""
-    if isinstance(values, dict):
-        return {key: _answer(key, value) for key, value in values.items()}
-    return [answered(value) for value in values] if isinstance(values, list) else values
-
-
-def _answer(key: str, value: Any) -> Any:
-    asked = isinstance(value, str) and value.startswith(TODO)
-    if key == "provenance":
-        return dict.fromkeys(value, "the one who recorded it")
-    return ANSWERS.get(key, "the one who recorded it") if asked else answered(value)
-
-
-def first_clip(path: Path, values: dict[str, Any]) -> Clip:
-    """The first episode as the answered YAML reads it, all of it finite and of the size it states."""
-    robot = Embodiment.from_values(answered(values), "inferred")
-    source = open_source(robot.source.format)
-    clip = to_clip(source.read(str(path), source.episode_ids(str(path))[0], robot), robot)
-    assert clip.actions.shape[1] == robot.action_dim and np.isfinite(clip.actions).all()
-    for camera in robot.cameras:
-        assert clip.frames_at(camera.name, np.arange(1)).shape[1:3] == camera.size
-    return clip
-
-
-def keys(values: dict[str, Any], section: str) -> list[str]:
-    found = values[section] if section == "cameras" else values[section]["components"]
-    return [item["key"] for item in found]
-
-
-def pictures(seed: int = 0, length: int = T) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (length, H, W, 3), dtype=np.uint8)
-
-
-def numbers(*shape: int) -> np.ndarray:
-    return np.random.default_rng(len(shape)).normal(size=shape)
-
 
 # -- RLDS
 
@@ -320,6 +260,19 @@ def test_aloha_asks_for_colours_and_for_the_base(tmp_path: Path, compressed: boo
     np.testing.assert_array_equal(first_clip(path, values).actions, numbers(T, 14).astype(np.float32))
 
 
+def test_a_simulators_state_is_not_the_robots(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "run.hdf5", "w") as file:
+        demo = file.create_group("data/demo_0")
+        demo.attrs["model_file"] = "panda.xml"
+        demo["images/front"], demo["states"] = pictures(), numbers(T, 40)
+        demo["joint_velocities"], demo["gripper_actuations"] = numbers(T, 7), numbers(T, 1)
+    values = inferred(tmp_path / "run.hdf5")
+    assert "state" not in values and values["kind"] == "simulation"
+    assert keys(values, "action") == ["joint_velocities", "gripper_actuations"]
+    assert values["action"]["space"] == "joint_velocity"
+    first_clip(tmp_path / "run.hdf5", values)
+
+
 def test_a_simulated_aloha_has_no_doubt_about_colours(tmp_path: Path) -> None:
     values = inferred(aloha(tmp_path / "aloha", False, sim=True))
     assert values["kind"] == "simulation" and "color" not in values["cameras"][0]
@@ -442,224 +395,6 @@ def test_lerobot_depth_and_grey_features_are_left_out(tmp_path: Path) -> None:
     assert keys(inferred(path), "cameras") == [CAMERA]
 
 
-# -- bags
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_bag(bags: dict[str, Path], recording: Recording, kind: str) -> None:
-    values = inferred(bags[kind])
-    assert keys(values, "action") == ["/command.data"] and keys(values, "state") == ["/joint_states.position"]
-    assert values["state"]["components"][0]["names"] == ["shoulder", "elbow", "wrist"]
-    assert values["cameras"] == [{"name": "image", "key": "/cam/image.raw", "size": [24, 32]}] or (
-        values["cameras"][0]["key"] == "/cam/image.raw"
-    )
-    assert values["frequency_hz"] == 10 and "25 Hz" in values["provenance"]["frequency_hz"]
-    assert values["sync"]["max_skew_ms"] == 60
-    clip = first_clip(bags[kind], values)
-    held = np.searchsorted(recording.command_ns, recording.picture_ns, side="right") - 1
-    np.testing.assert_allclose(clip.actions, recording.commands[held][: len(clip)], rtol=1e-6)
-
-
-Message = tuple[str, Callable[[Any, int], Any]]  # its type, and (typestore, ns) -> message
-
-
-def header(store: Any, ns: int) -> Any:
-    stamp = store.types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
-    kind = store.types["std_msgs/msg/Header"]
-    return kind(stamp=stamp, frame_id="", **({"seq": 0} if "seq" in kind.__dataclass_fields__ else {}))
-
-
-def picture_of(encoding: str = "rgb8", shift_ns: int = 0) -> Message:
-    def make(store: Any, ns: int) -> Any:
-        shot = pictures(1, 1)[0] if encoding == "rgb8" else pictures(1, 1)[0, ..., 0]
-        about = (header(store, ns + shift_ns), H, W, encoding, 0, shot[0].nbytes, shot.reshape(-1))
-        return store.types["sensor_msgs/msg/Image"](*about)
-
-    return "sensor_msgs/msg/Image", make
-
-
-def compressed_of() -> Message:
-    def make(store: Any, ns: int) -> Any:
-        data = np.frombuffer(png(pictures(1, 1)[0]), np.uint8)
-        return store.types["sensor_msgs/msg/CompressedImage"](header(store, ns), "png", data)
-
-    return "sensor_msgs/msg/CompressedImage", make
-
-
-def joints_of(*names: str) -> Message:
-    def make(store: Any, ns: int) -> Any:
-        values = np.arange(len(names)) + ns % 7
-        kind = store.types["sensor_msgs/msg/JointState"]
-        return kind(header(store, ns), list(names), values * 1.0, values * 0.5, values * 0.1)
-
-    return "sensor_msgs/msg/JointState", make
-
-
-def twist() -> Message:
-    def make(store: Any, ns: int) -> Any:
-        vector = store.types["geometry_msgs/msg/Vector3"]
-        return store.types["geometry_msgs/msg/Twist"](vector(0.1, 0.0, 0.0), vector(0.0, 0.0, 0.2))
-
-    return "geometry_msgs/msg/Twist", make
-
-
-def pose() -> Message:
-    def make(store: Any, ns: int) -> Any:
-        point = store.types["geometry_msgs/msg/Point"](0.1, 0.2, 0.3)
-        turn = store.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-        inner = store.types["geometry_msgs/msg/Pose"](point, turn)
-        return store.types["geometry_msgs/msg/PoseStamped"](header(store, ns), inner)
-
-    return "geometry_msgs/msg/PoseStamped", make
-
-
-def floats(count: int) -> Message:
-    def make(store: Any, ns: int) -> Any:
-        layout = store.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
-        return store.types["std_msgs/msg/Float64MultiArray"](layout, np.arange(count) * 1.0)
-
-    return "std_msgs/msg/Float64MultiArray", make
-
-
-def trajectory() -> Message:
-    def make(store: Any, ns: int) -> Any:
-        none = np.zeros(0)
-        later = store.types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
-        point = store.types["trajectory_msgs/msg/JointTrajectoryPoint"](np.ones(2), none, none, none, later)
-        kind = store.types["trajectory_msgs/msg/JointTrajectory"]
-        return kind(header(store, ns), ["a", "b"], [point])
-
-    return "trajectory_msgs/msg/JointTrajectory", make
-
-
-def bag(
-    path: Path, topics: dict[str, tuple[Message, float]], form: str = "ros2", seconds: float = 1.0
-) -> Path:
-    """A bag of those topics, each at its rate."""
-    store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
-    writer: Any = Ros1Writer(path) if form == "ros1" else None
-    plugin = StoragePlugin.SQLITE3 if form == "sqlite" else StoragePlugin.MCAP
-    writer = writer or Ros2Writer(path, version=9, storage_plugin=plugin)
-    serialize = store.serialize_ros1 if form == "ros1" else store.serialize_cdr
-    sent: list[tuple[int, str]] = []
-    for topic, (_, hz) in topics.items():
-        sent += [(START_NS + round(i * 1e9 / hz), topic) for i in range(max(1, round(seconds * hz)))]
-    with writer:
-        lines = {
-            topic: writer.add_connection(topic, kind, typestore=store)
-            for topic, ((kind, _), _) in topics.items()
-        }
-        for ns, topic in sorted(sent):
-            kind, make = topics[topic][0]
-            writer.write(lines[topic], ns, serialize(make(store, ns), kind))
-    return path
-
-
-@pytest.mark.parametrize("form", ["ros1", "sqlite", "mcap"])
-def test_both_arms_and_their_grippers_form_the_action(tmp_path: Path, form: str) -> None:
-    path = bag(
-        tmp_path / ("run.bag" if form == "ros1" else "run"),
-        {
-            "/cam_wrist/image_raw": (picture_of(), 30),
-            "/cam_high/image_raw": (picture_of(), 30),
-            "/cam_high/image_raw/compressed": (compressed_of(), 30),
-            "/cam_high/depth/image_raw": (picture_of("16UC1"), 30),
-            "/cam_high/infra1/image_raw": (picture_of("mono8"), 30),
-            "/left_arm/command": (joints_of("l1", "l2"), 50),
-            "/right_arm/command": (joints_of("r1", "r2"), 50),
-            "/left_gripper/command": (floats(1), 10),
-            "/left_arm/joint_states": (joints_of("l1", "l2"), 100),
-            "/right_arm/joint_states": (joints_of("r1", "r2"), 100),
-            "/ee_pose": (pose(), 50),
-        },
-        form,
-    )
-    values = inferred(path)
-    assert [(c["name"], c["key"]) for c in values["cameras"]] == [
-        ("cam_high", "/cam_high/image_raw"),
-        ("wrist", "/cam_wrist/image_raw"),
-    ]
-    assert keys(values, "action") == [
-        "/left_arm/command.position",
-        "/right_arm/command.position",
-        "/left_gripper/command.data",
-    ]
-    assert values["action"]["components"][1]["names"] == ["r1", "r2"]
-    assert values["action"]["space"] == "joint_position"
-    assert keys(values, "state") == [
-        "/ee_pose.pose.position",
-        "/ee_pose.pose.orientation",
-        "/left_arm/joint_states.position",
-        "/right_arm/joint_states.position",
-    ]
-    assert values["frequency_hz"] == 30 and values["sync"]["max_skew_ms"] == 150
-    assert questions(values).keys() == {"robot", "kind"}
-    assert first_clip(path, values).actions.shape[1] == 5
-
-
-def test_several_commands_are_a_question_that_names_the_others(tmp_path: Path) -> None:
-    path = bag(
-        tmp_path / "run",
-        {
-            "/camera/color/image_raw": (picture_of(), 15),
-            "/cmd_vel": (twist(), 10),
-            "/desired_pose": (pose(), 10),
-            "/joint_states": (joints_of("a"), 20),
-        },
-    )
-    values = inferred(path)
-    assert keys(values, "action") == ["/cmd_vel.linear", "/cmd_vel.angular"]
-    assert values["action"]["space"] == "base_velocity"
-    assert "/desired_pose.pose.position" in questions(values)["provenance.action"]
-    assert keys(values, "state") == ["/joint_states.position"]
-    first_clip(path, values)
-
-
-def test_a_leader_commands_and_its_follower_is_the_state(tmp_path: Path) -> None:
-    topics = {
-        "/image": (picture_of(), 10),
-        "/follower/joint_states": (joints_of("a", "b"), 30),
-        "/leader/joint_states": (joints_of("a", "b"), 30),
-    }
-    values = inferred(bag(tmp_path / "run", topics))
-    assert keys(values, "action") == ["/leader/joint_states.position"]
-    assert keys(values, "state") == ["/follower/joint_states.position"]
-    assert "provenance.action" not in questions(values)
-
-
-def test_a_trajectory_commands_by_its_first_point(tmp_path: Path) -> None:
-    topics = {"/image": (picture_of(), 10), "/arm_controller/joint_trajectory": (trajectory(), 10)}
-    path = bag(tmp_path / "run", topics)
-    values = inferred(path)
-    assert values["action"]["components"] == [
-        {"key": "/arm_controller/joint_trajectory.points[0].positions", "dims": 2, "names": ["a", "b"]}
-    ]
-    assert values["action"]["space"] == "joint_position"
-    assert (first_clip(path, values).actions == 1).all()
-
-
-def test_without_a_commanding_topic_joint_states_are_proposed(tmp_path: Path) -> None:
-    topics = {"/image": (picture_of(), 10), "/joint_states": (joints_of("a", "b"), 50), "/pose": (pose(), 10)}
-    path = bag(tmp_path / "run", topics)
-    values = inferred(path)
-    assert keys(values, "action") == ["/joint_states.position"]
-    assert "no topic commands the robot" in questions(values)["provenance.action"]
-    first_clip(path, values)
-
-
-def test_stamps_of_another_clock_make_it_receive_times(tmp_path: Path) -> None:
-    topics = {"/image": (picture_of(shift_ns=-(10**13)), 10), "/cmd_vel": (twist(), 20)}
-    path = bag(tmp_path / "run", topics)
-    values = inferred(path)
-    assert values["sync"]["stamp"] == "receive" and "apart" in values["provenance"]["stamp"]
-    assert len(first_clip(path, values)) == 10
-
-
-def test_a_rate_is_whole_where_jitter_hides_the_difference(tmp_path: Path) -> None:
-    path = bag(tmp_path / "run", {"/image": (picture_of(), 29.97), "/cmd_vel": (twist(), 10)}, seconds=2)
-    assert inferred(path)["frequency_hz"] == 29.97
-
-
 # -- real recordings
 
 
@@ -741,54 +476,3 @@ def test_grey_cameras_are_taken_with_a_question_where_there_is_no_colour() -> No
     found = Inspection("rlds", "d", 1, (grey, KeyInfo("action", "vector", (3,), "float32")))
     values = parse_yaml(from_inspection(found, "mine"), "d")
     assert "grey" in questions(values)["provenance.cameras"]
-
-
-HOSTILE = [
-    "action", "a: b", "'", '"', "x\n---\ny", "#", "- ", "{a}", "[", "&x", "*x", "!!int 3", "null", "1e3",
-    "TODO", "~", "\ud800", "é/状态", "\x00", "\x85", "\u2028", "\ufeff", "action/" + "long" * 3000, "%", "@",
-    "yes", "action/pos", "obs/image", "/cmd_vel.linear", "observation/state", "/cam/image/compressed",
-]  # fmt: skip
-NASTY = st.one_of(st.sampled_from(HOSTILE), st.text(max_size=30))
-RATES = st.one_of(st.none(), st.floats())
-KEYS = st.builds(
-    KeyInfo,
-    key=NASTY,
-    kind=st.sampled_from(["camera", "vector", "text", "other"]),
-    shape=st.lists(st.integers(-1, 5000), max_size=4).map(tuple)
-    | st.sampled_from([(64, 64, 3), (64, 64, 1), (7,), ()]),
-    dtype=st.sampled_from(["float32", "float64", "int64", "bool", "uint8", ""]),
-    hz=RATES,
-    names=st.none() | st.lists(NASTY, max_size=8).map(tuple),
-    codec=st.sampled_from([None, "raw", "jpeg"]),
-    count=st.none() | st.integers(0, 100),
-    jitter_ms=RATES,
-    topic=st.none()
-    | st.builds(TopicInfo, NASTY, NASTY, gap_ms=RATES, delay_ms=RATES, goes_back=st.booleans()),
-    constant=st.booleans(),
-)
-FACTS = ["dataset", "simulator", "controller", "layout", "instruction", "timestamps", "rate", "tasks"]
-
-
-@settings(max_examples=300, deadline=None)
-@given(
-    found=st.builds(
-        Inspection,
-        format=st.sampled_from(["rlds", "hdf5", "rosbag", "lerobot"]),
-        uri=NASTY,
-        episodes=st.integers(0, 10),
-        keys=st.lists(KEYS, max_size=8).map(tuple),
-        hz=RATES,
-        robot=st.none() | NASTY,
-        facts=st.dictionaries(st.sampled_from([*FACTS, "episode keys"]), NASTY, max_size=4),
-    )
-)
-def test_whatever_is_inspected_gives_a_yaml_with_questions_alone_or_one_line(found: Inspection) -> None:
-    try:
-        text = from_inspection(found, "mine")
-    except HMAError as fault:
-        assert "\n" not in str(fault)
-        return
-    values = parse_yaml(text, "inferred")
-    assert [problem for problem in problems(values) if "still TODO" not in problem] == []
-    assert {part["key"] for part in values["action"]["components"]} <= {key.key for key in found.keys}
-    assert text.encode("utf-8")

@@ -1,0 +1,159 @@
+"""Infer on bags: which topics command, which measure, which see, and on what clock."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.data.bag_files import KINDS, Recording
+from tests.data.inferring import (
+    bag,
+    compressed_of,
+    first_clip,
+    floats,
+    inferred,
+    joints_of,
+    keys,
+    picture_of,
+    pose,
+    questions,
+    trajectory,
+    twist,
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_bag(bags: dict[str, Path], recording: Recording, kind: str) -> None:
+    values = inferred(bags[kind])
+    assert keys(values, "action") == ["/command.data"] and keys(values, "state") == ["/joint_states.position"]
+    assert values["state"]["components"][0]["names"] == ["shoulder", "elbow", "wrist"]
+    assert values["cameras"] == [{"name": "image", "key": "/cam/image.raw", "size": [24, 32]}] or (
+        values["cameras"][0]["key"] == "/cam/image.raw"
+    )
+    assert values["frequency_hz"] == 10 and "25 Hz" in values["provenance"]["frequency_hz"]
+    assert values["sync"]["max_skew_ms"] == 60
+    clip = first_clip(bags[kind], values)
+    held = np.searchsorted(recording.command_ns, recording.picture_ns, side="right") - 1
+    np.testing.assert_allclose(clip.actions, recording.commands[held][: len(clip)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("form", ["ros1", "sqlite", "mcap"])
+def test_both_arms_and_their_grippers_form_the_action(tmp_path: Path, form: str) -> None:
+    path = bag(
+        tmp_path / ("run.bag" if form == "ros1" else "run"),
+        {
+            "/cam_wrist/image_raw": (picture_of(), 30),
+            "/cam_high/image_raw": (picture_of(), 30),
+            "/cam_high/image_raw/compressed": (compressed_of(), 30),
+            "/cam_high/depth/image_raw": (picture_of("16UC1"), 30),
+            "/cam_high/infra1/image_raw": (picture_of("mono8"), 30),
+            "/left_arm/command": (joints_of("l1", "l2"), 50),
+            "/right_arm/command": (joints_of("r1", "r2"), 50),
+            "/left_gripper/command": (floats(1), 10),
+            "/left_arm/joint_states": (joints_of("l1", "l2"), 100),
+            "/right_arm/joint_states": (joints_of("r1", "r2"), 100),
+            "/ee_pose": (pose(), 50),
+        },
+        form,
+    )
+    values = inferred(path)
+    assert [(c["name"], c["key"]) for c in values["cameras"]] == [
+        ("cam_high", "/cam_high/image_raw"),
+        ("wrist", "/cam_wrist/image_raw"),
+    ]
+    assert keys(values, "action") == [
+        "/left_arm/command.position",
+        "/right_arm/command.position",
+        "/left_gripper/command.data",
+    ]
+    assert values["action"]["components"][1]["names"] == ["r1", "r2"]
+    assert values["action"]["space"] == "joint_position"
+    assert keys(values, "state") == [
+        "/ee_pose.pose.position",
+        "/ee_pose.pose.orientation",
+        "/left_arm/joint_states.position",
+        "/right_arm/joint_states.position",
+    ]
+    assert values["frequency_hz"] == 30 and values["sync"]["max_skew_ms"] == 150
+    assert questions(values).keys() == {"robot", "kind"}
+    assert first_clip(path, values).actions.shape[1] == 5
+
+
+def test_several_commands_are_a_question_that_names_the_others(tmp_path: Path) -> None:
+    path = bag(
+        tmp_path / "run",
+        {
+            "/camera/color/image_raw": (picture_of(), 15),
+            "/cmd_vel": (twist(), 10),
+            "/desired_pose": (pose(), 10),
+            "/joint_states": (joints_of("a"), 20),
+        },
+    )
+    values = inferred(path)
+    assert keys(values, "action") == ["/cmd_vel.linear", "/cmd_vel.angular"]
+    assert values["action"]["space"] == "base_velocity"
+    assert "/desired_pose.pose.position" in questions(values)["provenance.action"]
+    assert keys(values, "state") == ["/joint_states.position"]
+    first_clip(path, values)
+
+
+def test_a_goal_sent_once_or_twice_is_doubted(tmp_path: Path) -> None:
+    topics = {"/image": (picture_of(), 10), "/goal_pose": (pose(), 1), "/arm_data": (floats(4), 20)}
+    values = inferred(bag(tmp_path / "run", topics, seconds=2))
+    assert "/arm_data.data" in questions(values)["provenance.action"]
+
+
+def test_a_picture_taken_once_is_no_camera(tmp_path: Path) -> None:
+    topics = {
+        "/calib/image": (picture_of(), 1),
+        "/front/image": (picture_of(), 10),
+        "/cmd_vel": (twist(), 10),
+    }
+    path = bag(tmp_path / "run", topics)
+    values = inferred(path)
+    assert keys(values, "cameras") == ["/front/image"] and len(first_clip(path, values)) == 10
+
+
+def test_a_leader_commands_and_its_follower_is_the_state(tmp_path: Path) -> None:
+    topics = {
+        "/image": (picture_of(), 10),
+        "/follower/joint_states": (joints_of("a", "b"), 30),
+        "/leader/joint_states": (joints_of("a", "b"), 30),
+    }
+    values = inferred(bag(tmp_path / "run", topics))
+    assert keys(values, "action") == ["/leader/joint_states.position"]
+    assert keys(values, "state") == ["/follower/joint_states.position"]
+    assert "provenance.action" not in questions(values)
+
+
+def test_a_trajectory_commands_by_its_first_point(tmp_path: Path) -> None:
+    topics = {"/image": (picture_of(), 10), "/arm_controller/joint_trajectory": (trajectory(), 10)}
+    path = bag(tmp_path / "run", topics)
+    values = inferred(path)
+    assert values["action"]["components"] == [
+        {"key": "/arm_controller/joint_trajectory.points[0].positions", "dims": 2, "names": ["a", "b"]}
+    ]
+    assert values["action"]["space"] == "joint_position"
+    assert (first_clip(path, values).actions == 1).all()
+
+
+def test_without_a_commanding_topic_joint_states_are_proposed(tmp_path: Path) -> None:
+    topics = {"/image": (picture_of(), 10), "/joint_states": (joints_of("a", "b"), 50), "/pose": (pose(), 10)}
+    path = bag(tmp_path / "run", topics)
+    values = inferred(path)
+    assert keys(values, "action") == ["/joint_states.position"]
+    assert "no topic commands the robot" in questions(values)["provenance.action"]
+    first_clip(path, values)
+
+
+def test_stamps_of_another_clock_make_it_receive_times(tmp_path: Path) -> None:
+    topics = {"/image": (picture_of(shift_ns=-(10**13)), 10), "/cmd_vel": (twist(), 20)}
+    path = bag(tmp_path / "run", topics)
+    values = inferred(path)
+    assert values["sync"]["stamp"] == "receive" and "apart" in values["provenance"]["stamp"]
+    assert len(first_clip(path, values)) == 10
+
+
+def test_a_rate_is_whole_where_jitter_hides_the_difference(tmp_path: Path) -> None:
+    path = bag(tmp_path / "run", {"/image": (picture_of(), 29.97), "/cmd_vel": (twist(), 10)}, seconds=2)
+    assert inferred(path)["frequency_hz"] == 29.97
