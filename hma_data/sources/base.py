@@ -26,7 +26,11 @@ FORMATS = {
     "hdf5": "hma_data.sources.hdf5",
     "rosbag": "hma_data.sources.rosbag",
     "lerobot": "hma_data.sources.lerobot",
+    "hands": "hma_data.sources.hands",
 }
+VIDEO_SUFFIXES = (
+    ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".ogv", ".flv", ".gif",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,7 @@ class Inspection:
     """What is in a recording, without an embodiment.
 
     Attributes:
-        format: rlds, hdf5, rosbag or lerobot.
+        format: rlds, hdf5, rosbag, lerobot or hands.
         episodes: how many.
         frames: in all, None when it would need a full read.
         lengths: of the first episodes (at most 1,000).
@@ -179,11 +183,13 @@ def detect(uri: str) -> str:
             return "rosbag"
         if item.suffix in (".h5", ".hdf5", ".hdf") or first_bytes(item, 8) == b"\x89HDF\r\n\x1a\n":
             return "hdf5"
+    if any(item.suffix.lower() in VIDEO_SUFFIXES for item in files):
+        return "hands"
     raise SourceError(
         uri,
         "is not a recording of a known format" if files else "holds no files",
         "expected RLDS (features.json, *.tfrecord*), HDF5, a ROS bag or MCAP, "
-        "or a LeRobotDataset (meta/info.json)",
+        "a LeRobotDataset (meta/info.json), or videos of hands",
     )
 
 
