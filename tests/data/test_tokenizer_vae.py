@@ -1,0 +1,185 @@
+"""The embedded continuous tokenizer: its latents, its file, its training."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hma_data.errors import TokenizerError
+from hma_data.shipped import shipped
+from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.corpus import draw_scene
+from hma_data.tokenizers.embedded import read_weights, save_weights
+from hma_data.tokenizers.eval import evaluate, psnr_db
+from hma_data.tokenizers.fsq import WEIGHTS as FSQ_WEIGHTS
+from hma_data.tokenizers.recipe import load_recipe
+from hma_data.tokenizers.train import train
+from hma_data.tokenizers.vae import WEIGHTS, VaeTokenizer
+from hma_data.tokenizers.vae_network import FORMAT, VaeAutoencoder, VaeConfig
+
+RECIPE = shipped("recipes") / "tokenizer" / "vae.yaml"
+SMALL = VaeConfig(width=8, hidden=8, encoder_blocks=1, decoder_blocks=(1, 1), fine_width=4)
+
+
+@pytest.fixture(scope="module")
+def vae() -> VaeTokenizer:
+    tokenizer = get_tokenizer("vae-8")
+    assert isinstance(tokenizer, VaeTokenizer)
+    return tokenizer
+
+
+@pytest.fixture(scope="module")
+def frames() -> np.ndarray:
+    rng = np.random.default_rng(6)
+    return np.stack([draw_scene(rng, 256) for _ in range(9)])
+
+
+def test_its_latents_are_four_channels_at_an_eighth(vae):
+    spec = vae.spec
+    assert (spec.kind, spec.channels, spec.grid, spec.dtype) == ("continuous", 4, (32, 32), "float16")
+
+
+def test_scaled_latents_have_about_unit_variance(vae, frames):
+    scaled = vae.encode(frames).astype(np.float64) * vae.spec.latent_scale
+    assert 0.6 < scaled.std() < 1.6 and abs(scaled.mean()) < 0.5
+
+
+def test_near_latents_decode_to_near_pictures(vae, frames):
+    latents = vae.encode(frames)
+    noise = np.random.default_rng(0).normal(0, 0.05, latents.shape)
+    plain, moved = vae.decode(latents), vae.decode((latents + noise).astype(np.float16))
+    assert psnr_db(plain, moved).mean() > 30
+
+
+@pytest.mark.parametrize("sizes", [(1,) * 9, (3, 3, 3), (8, 1)])
+def test_a_frame_has_the_same_latents_in_any_batch(vae, frames, sizes):
+    ends = np.cumsum(sizes)
+    parts = [vae.encode(frames[end - n : end]) for n, end in zip(sizes, ends)]
+    assert np.array_equal(np.concatenate(parts), vae.encode(frames))
+
+
+def test_a_frame_has_the_same_latents_with_any_number_of_threads(vae, frames):
+    before = torch.get_num_threads()
+    try:
+        made = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            made.append(vae.encode(frames[:4]))
+    finally:
+        torch.set_num_threads(before)
+    assert np.array_equal(made[0], made[1])
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 16, 16), (1, 3, 32, 32), (4, 32, 32)])
+def test_latents_of_another_shape_are_refused(vae, shape):
+    with pytest.raises(TokenizerError, match="decodes"):
+        vae.decode(np.zeros(shape, np.float16))
+
+
+def test_weights_of_the_discrete_tokenizer_are_refused():
+    with pytest.raises(TokenizerError, match=r"no hma-vae-1 weights \(format 'hma-fsq-1'\)"):
+        get_tokenizer("vae-8", weights=str(FSQ_WEIGHTS))
+
+
+@pytest.mark.parametrize(
+    "change", [{"width": 64}, {"decoder_blocks": [1]}, {"noise": float("nan")}, {"latent_scale": 0}]
+)
+def test_weights_whose_config_lies_are_refused(tmp_path, change):
+    from safetensors.torch import save_file
+
+    config, tensors, _ = read_weights(WEIGHTS, FORMAT, VaeConfig)
+    path = tmp_path / "lying.safetensors"
+    save_file(tensors, path, {"format": FORMAT, "config": json.dumps(config.to_json() | change)})
+    with pytest.raises(TokenizerError, match=r"fit the network|describes no network"):
+        get_tokenizer("vae-8", weights=str(path))
+
+
+def test_the_scale_belongs_to_the_spec(tmp_path):
+    digests = set()
+    for scale in (1.0, 0.5):
+        config = VaeConfig(**{**SMALL.to_json(), "decoder_blocks": (1, 1), "latent_scale": scale})
+        torch.manual_seed(0)
+        path = tmp_path / f"{scale}.safetensors"
+        save_weights(path, FORMAT, config, dict(VaeAutoencoder(config).named_parameters()), {})
+        tokenizer = get_tokenizer("vae-8", weights=str(path))
+        assert tokenizer.spec.latent_scale == scale
+        digests.add(tokenizer.spec.digest)
+    assert len(digests) == 2
+
+
+def _recipe(folder: Path) -> Path:
+    network = {key: value for key, value in SMALL.to_json().items() if key != "latent_scale"}
+    values = {
+        "job": "tokenizer",
+        "name": "small",
+        "seed": 1,
+        "corpus": str(folder),
+        "network": network,
+        "training": {
+            "steps": 8,
+            "batch": 4,
+            "crop": 32,
+            "learning_rate": 0.02,
+            "adam_learning_rate": 0.001,
+            "weight_decay": 0.1,
+            "warmup_steps": 2,
+            "fall": [[2, 1], [8, 0]],
+        },
+        "loss": {"l2": 10.0, "l1": 0.3, "gradient": 0.3, "ssim": 0.05},
+        "sources": [{"kind": "drawn", "pictures": 6}],
+    }
+    path = folder / "recipe.yaml"
+    path.write_text(json.dumps(values))
+    return path
+
+
+def test_training_measures_the_scale_of_the_latents(tmp_path):
+    recipe = _recipe(tmp_path)
+    train(recipe, tmp_path / "w", report=lambda _: None)
+    config, _, _ = read_weights(tmp_path / "w", FORMAT, VaeConfig)
+    assert config.latent_scale != 1.0
+    result = evaluate(
+        get_tokenizer("vae-8", weights=str(tmp_path / "w")),
+        [np.stack([draw_scene(np.random.default_rng(1), 256)])],
+    )
+    assert 0.3 < result["latent_std_scaled"] < 3
+
+
+def test_a_training_stopped_while_its_rate_falls_goes_on_with_the_same_noise(tmp_path):
+    recipe = _recipe(tmp_path)
+    train(recipe, tmp_path / "whole", report=lambda _: None)
+
+    class Stopped(Exception):
+        pass
+
+    def stop(line: str) -> None:
+        if line.startswith("step 5"):
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        train(recipe, tmp_path / "parts", report=stop, report_every=1)
+    train(recipe, tmp_path / "parts", report=lambda _: None)
+    whole, parts = (read_weights(tmp_path / name, FORMAT, VaeConfig)[1] for name in ("whole", "parts"))
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_the_shipped_weights_are_of_the_shipped_recipe():
+    from safetensors import safe_open
+
+    with safe_open(WEIGHTS, "pt") as file:
+        facts = json.loads(file.metadata()["training"])
+    recipe = load_recipe(RECIPE)
+    assert facts["recipe_sha256"] == recipe.digest()
+    assert (facts["steps"], facts["seed"]) == (recipe.training.steps, recipe.seed)
+    assert facts["seconds"] > 0 and facts["machine"]
+
+
+@pytest.mark.real
+def test_real_robot_frames_come_back_as_promised(real_data, vae):
+    from hma_data.tokenizers.frames import read_frames
+
+    video = sorted((real_data / "lerobot" / "g1_v21" / "videos").rglob("*.mp4"))[0]
+    result = evaluate(vae, read_frames(video, 256, frames=4))
+    assert result["psnr_db"] >= 30 and result["ssim"] >= 0.92
