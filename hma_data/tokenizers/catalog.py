@@ -30,7 +30,8 @@ class Entry:
         licence: SPDX id or name of the weights' licence, or of the code where there are no weights.
         file: the weights' file, inside the package or inside `repo`.
         bytes: of a download; an embedded file is measured.
-        repo, revision: of the hub, when weights are downloaded.
+        repo, revision, repo_type: of the hub, when weights are downloaded.
+        sha256: of the download, where it is known; another file is refused.
         imports: modules that must be importable.
         extra: the command that installs them; empty where the plain dependencies do.
     """
@@ -48,6 +49,8 @@ class Entry:
     bytes: int | None = None
     repo: str = ""
     revision: str = ""
+    repo_type: Literal["model", "dataset"] = "model"
+    sha256: str = ""
     imports: tuple[str, ...] = ("torch",)
     extra: str = ""
 
@@ -67,7 +70,9 @@ class Entry:
             return False
         from huggingface_hub import try_to_load_from_cache
 
-        found = try_to_load_from_cache(self.repo, self.file, revision=self.revision or None)
+        found = try_to_load_from_cache(
+            self.repo, self.file, revision=self.revision or None, repo_type=self.repo_type
+        )
         return isinstance(found, str)
 
     def state(self) -> str:
@@ -118,15 +123,85 @@ _ROWS = (
         file="fsq.safetensors",
     ),
     Entry(
-        "vae-8",
+        "magvit2",
+        "discrete",
+        256,
+        (16, 16),
+        "the paper's: Open-MAGVIT2 as 1X tuned it to robot video, 18 bits a token",
+        "download",
+        "hma_data.tokenizers.magvit2",
+        repo="1x-technologies/worldmodel",
+        repo_type="dataset",
+        file="magvit2.ckpt",
+        revision="94b418de3ad6efe100495a45ce82d5d870df6265",
+    ),
+    Entry(
+        "svd-vae",
         "continuous",
         256,
         (32, 32),
-        "continuous without a download: 4 channels at 1/8 of the side, fast on a CPU",
-        "embedded",
-        "hma_data.tokenizers.vae",
-        {"image_size": 256},
-        file="vae.safetensors",
+        "the paper's continuous one: Stable Video Diffusion's autoencoder, 4 channels",
+        "download",
+        "hma_data.tokenizers.svd_vae",
+        licence="Stability AI Community License",
+        repo="stabilityai/stable-video-diffusion-img2vid",
+        file="vae/diffusion_pytorch_model.safetensors",
+        bytes=391_000_000,
+        revision="9cf024d5bfa8f56622af86c884f26a52f6676f2e",
+        imports=("torch", "diffusers"),
+        extra="pip install diffusers",
+    ),
+    Entry(
+        "taesd",
+        "continuous",
+        256,
+        (32, 32),
+        "the latents of Stable Diffusion 1 and 2 by a tiny network, 4 channels",
+        "download",
+        "hma_data.tokenizers.taesd",
+        {"channels": 4},
+        licence="MIT",
+        repo="madebyollin/taesd",
+        file="diffusion_pytorch_model.safetensors",
+        bytes=9_793_292,
+        revision="614f76814bbe30edbe2e627ace1c2234c81a2c0e",
+        sha256="db169d69145ec4ff064e49d99c95fa05d3eb04ee453de35824a6d0f325513549",
+    ),
+    Entry(
+        "taef2",
+        "continuous",
+        256,
+        (32, 32),
+        "the latents of FLUX.2 by a tiny network, 32 channels: finer pictures, eight times the data",
+        "download",
+        "hma_data.tokenizers.taesd",
+        {"channels": 32},
+        licence="MIT",
+        repo="madebyollin/taef2",
+        file="taef2.safetensors",
+        bytes=10_000_000,
+        revision="bd244ebfe4398c84fbf312a2f1c868c676b500e3",
+        sha256="701d31c0ecbef3b609fe236e2e3a65ffb17f3a94237acdd771e8ea3194df557a",
+    ),
+    Entry(
+        "cosmos-di16",
+        "discrete",
+        256,
+        (16, 16),
+        "NVIDIA Cosmos, discrete: 64,000 ids; TorchScript files that the user trusts and names",
+        "path",
+        "hma_data.tokenizers.cosmos",
+        licence="NVIDIA Open Model License",
+    ),
+    Entry(
+        "cosmos-ci16",
+        "continuous",
+        256,
+        (16, 16),
+        "NVIDIA Cosmos, continuous: 16 channels; TorchScript files that the user trusts and names",
+        "path",
+        "hma_data.tokenizers.cosmos",
+        licence="NVIDIA Open Model License",
     ),
     Entry(
         "raw",

@@ -1,0 +1,210 @@
+"""The network of Open-MAGVIT2: a convolutional autoencoder whose latents are reduced to their signs.
+
+Parameter names are those of the released checkpoints, so that they load as they are. The first
+checkpoints (1X's among them) have a plain decoder; the later ones normalise the decoder's stages anew
+by the mean and spread of the code (`adaptive`). Lookup-free quantisation: Yu et al. 2024.
+
+B pictures, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+GROUPS, EPS = 32, 1e-6
+
+
+@dataclass(frozen=True)
+class Magvit2Config:
+    """The network's shape.
+
+    Attributes:
+        base: channels at the picture's own size.
+        z: channels of the code, bits of a token.
+        mult: channels of each level as multiples of `base`; each level but the last halves the side.
+        res_blocks: residual blocks a level.
+        adaptive: the decoder has adaptive group norms.
+    """
+
+    base: int = 128
+    z: int = 18
+    mult: tuple[int, ...] = (1, 1, 2, 2, 4)
+    res_blocks: int = 2
+    adaptive: bool = False
+
+    def __post_init__(self) -> None:
+        if self.base < 1 or self.base % GROUPS:
+            raise ValueError(f"the base width must be a multiple of {GROUPS}, got {self.base}")
+        if not 1 <= self.z <= 31:
+            raise ValueError(f"the code must have 1 to 31 channels, got {self.z}")
+        if not 1 <= len(self.mult) <= 8 or min(self.mult) < 1 or self.res_blocks < 1:
+            raise ValueError(f"got levels {self.mult} of {self.res_blocks} residual blocks")
+
+    @property
+    def stride(self) -> int:
+        """Pixels a token, along each side."""
+        return 2 ** (len(self.mult) - 1)
+
+    @property
+    def factored(self) -> tuple[int, ...]:
+        """Two digits, low first, as equal as z allows; one where z is 1."""
+        return (2 ** (self.z - self.z // 2), 2 ** (self.z // 2)) if self.z > 1 else (2,)
+
+
+def _norm(width: int) -> nn.GroupNorm:
+    return nn.GroupNorm(GROUPS, width, eps=EPS)
+
+
+class ResBlock(nn.Module):
+    """x + conv2(silu(norm2(conv1(silu(norm1(x)))))), 3×3 and without bias.
+
+    Where the widths differ, x goes past through a 1×1 convolution.
+    """
+
+    def __init__(self, before: int, after: int) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = _norm(before), _norm(after)
+        self.conv1 = nn.Conv2d(before, after, 3, padding=1, bias=False)
+        self.conv2 = nn.Conv2d(after, after, 3, padding=1, bias=False)
+        self.nin_shortcut = None if before == after else nn.Conv2d(before, after, 1, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.conv1(functional.silu(self.norm1(x)))
+        h = self.conv2(functional.silu(self.norm2(h)))
+        return h + (x if self.nin_shortcut is None else self.nin_shortcut(x))
+
+
+def _blocks(before: int, after: int, count: int) -> nn.ModuleList:
+    return nn.ModuleList(ResBlock(before if i == 0 else after, after) for i in range(count))
+
+
+def _run(blocks: Iterable[nn.Module], x: Tensor) -> Tensor:
+    for block in blocks:
+        x = block(x)
+    return x
+
+
+class DownLevel(nn.Module):
+    """Residual blocks, then half the side by a strided convolution, but on the last level."""
+
+    def __init__(self, before: int, after: int, count: int, last: bool) -> None:
+        super().__init__()
+        self.block = _blocks(before, after, count)
+        self.downsample = None if last else nn.Conv2d(after, after, 3, stride=2, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = _run(self.block, x)
+        return x if self.downsample is None else self.downsample(x)
+
+
+class Upsample(nn.Module):
+    """Four times the channels by a 3×3 convolution, laid out as 2×2 pixels, the channel varying fastest."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(width, 4 * width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        batch, width, height, side = x.shape
+        cells = self.conv1(x).view(batch, 2, 2, width, height, side)
+        return cells.permute(0, 3, 4, 1, 5, 2).reshape(batch, width, 2 * height, 2 * side)
+
+
+class UpLevel(nn.Module):
+    """Residual blocks, then twice the side, but on the finest level."""
+
+    def __init__(self, before: int, after: int, count: int, finest: bool) -> None:
+        super().__init__()
+        self.block = _blocks(before, after, count)
+        self.upsample = None if finest else Upsample(after)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = _run(self.block, x)
+        return x if self.upsample is None else self.upsample(x)
+
+
+class AdaptiveNorm(nn.Module):
+    """Group norm whose scale comes from the code's spread over the picture, and its shift from the mean."""
+
+    def __init__(self, z: int, width: int) -> None:
+        super().__init__()
+        self.gamma, self.beta = nn.Linear(z, width), nn.Linear(z, width)
+
+    def forward(self, x: Tensor, codes: Tensor) -> Tensor:
+        flat = codes.flatten(2)
+        scale = self.gamma((flat.var(dim=2) + EPS).sqrt())
+        shift = self.beta(flat.mean(dim=2))
+        return functional.group_norm(x, GROUPS, eps=EPS) * scale[:, :, None, None] + shift[:, :, None, None]
+
+
+class Encoder(nn.Module):
+    """(B, 3, S, S) pixels -> (B, z, h, h), whose signs are the code."""
+
+    def __init__(self, config: Magvit2Config) -> None:
+        super().__init__()
+        widths = [config.base * m for m in (1, *config.mult)]
+        last = len(config.mult) - 1
+        self.conv_in = nn.Conv2d(3, config.base, 3, padding=1, bias=False)
+        self.down = nn.ModuleList(
+            DownLevel(widths[i], widths[i + 1], config.res_blocks, i == last) for i in range(last + 1)
+        )
+        self.mid_block = _blocks(widths[-1], widths[-1], config.res_blocks)
+        self.norm_out = _norm(widths[-1])
+        self.conv_out = nn.Conv2d(widths[-1], config.z, 1)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        x = _run(self.mid_block, _run(self.down, self.conv_in(pixels)))
+        return self.conv_out(functional.silu(self.norm_out(x)))
+
+
+class Decoder(nn.Module):
+    """(B, z, h, h) codes of -1 and 1 -> (B, 3, S, S) pixels, about [-1, 1]."""
+
+    def __init__(self, config: Magvit2Config) -> None:
+        super().__init__()
+        after = [config.base * m for m in config.mult]
+        before = [*after[1:], after[-1]]  # of a level, which is reached from the coarser one
+        levels = range(len(after))
+        self.conv_in = nn.Conv2d(config.z, after[-1], 3, padding=1)
+        self.mid_block = _blocks(after[-1], after[-1], config.res_blocks)
+        self.up = nn.ModuleList(UpLevel(before[i], after[i], config.res_blocks, i == 0) for i in levels)
+        norms = (AdaptiveNorm(config.z, before[i]) for i in levels if config.adaptive)
+        self.adaptive = nn.ModuleList(norms)
+        self.norm_out = _norm(after[0])
+        self.conv_out = nn.Conv2d(after[0], 3, 3, padding=1)
+
+    def forward(self, codes: Tensor) -> Tensor:
+        x = _run(self.mid_block, self.conv_in(codes))
+        for i in reversed(range(len(self.up))):
+            if self.adaptive:
+                x = self.adaptive[i](x, codes)
+            x = self.up[i](x)
+        return self.conv_out(functional.silu(self.norm_out(x)))
+
+
+class Magvit2(nn.Module):
+    """`encoder`, `decoder`, and the quantiser between them, which has no parameters.
+
+    A channel above zero is a 1. Bit c of an id is channel c, the lowest first: the order in which the
+    paper's release stores ids (its `flip`), the reverse of upstream's.
+    """
+
+    def __init__(self, config: Magvit2Config) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = Encoder(config)
+        self.decoder = Decoder(config)
+
+    def to_ids(self, latents: Tensor) -> Tensor:
+        """(B, z, h, w) -> (B, h, w) int64 ids."""
+        bits = (latents > 0).to(torch.int64)
+        weights = 2 ** torch.arange(self.config.z, device=latents.device)
+        return (bits * weights.view(1, -1, 1, 1)).sum(1)
+
+    def from_ids(self, ids: Tensor) -> Tensor:
+        """(B, h, w) int64 ids -> (B, z, h, w) float32 codes of -1 and 1."""
+        shifts = torch.arange(self.config.z, device=ids.device).view(1, -1, 1, 1)
+        return ((ids.unsqueeze(1) >> shifts) & 1).float() * 2 - 1

@@ -1,0 +1,168 @@
+"""A tokenizer around any network: batches of a fixed size, device, number formats.
+
+A kernel may sum in another order when the batch has another size or more threads share the work, and
+the last bits of a latent decide its sign or its rounding. So frames go through in batches of one size,
+the last one padded, and on a CPU each frame is encoded by one thread, several frames at a time: the
+same frame then gives the same tokens whatever the batch, the worker or the number of cores.
+float32 on a CPU; bfloat16 and channels-last on CUDA.
+
+B pictures of a batch, S side, c channels, h·w grid. Pixels inside are (B, 3, S, S) in [-1, 1].
+"""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hma_data.errors import TokenizerError
+from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
+
+Step = Callable[[Tensor], Tensor]
+
+
+class NetworkTokenizer:
+    """See `hma_data.tokenizers.base.Tokenizer`.
+
+    Attributes:
+        spec: what decides the tokens.
+        network: torch module with `encoder` and `decoder`, in evaluation mode.
+        batch: frames a pass through the network.
+    """
+
+    def __init__(
+        self, spec: TokenizerSpec, network: nn.Module, device: torch.device, encode: Step, decode: Step
+    ) -> None:
+        """
+        Args:
+            network: placed on `device` here.
+            encode: pixels (B, 3, S, S) -> int64 ids (B, h, w), or latents (B, c, h, w).
+            decode: the same back to pixels.
+        """
+        cuda = device.type == "cuda"
+        self.spec, self.device = spec, device
+        self.dtype = torch.bfloat16 if cuda else torch.float32
+        self.batch = 32 if cuda else 8 if device.type == "mps" else 1
+        self.network = network.eval().requires_grad_(False).to(device)
+        self._format = torch.channels_last if cuda else torch.contiguous_format
+        if cuda:
+            network.to(self.dtype)
+            for parameter in network.parameters():
+                if parameter.ndim == 4:
+                    parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+        self._encode, self._decode = encode, decode
+
+    def encode(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+        """(N, S, S, 3) uint8 RGB -> (N, h, w) ids, or (N, c, h, w) float16 latents.
+
+        Raises:
+            TokenizerError: frames of another shape or dtype, or what the network makes cannot be stored.
+        """
+        check_frames(frames, self.spec)
+        cells = self.spec.grid if self.spec.kind == "discrete" else (self.spec.channels or 0, *self.spec.grid)
+        tokens = np.empty((len(frames), *cells), self.spec.dtype)
+        parts = [frames[start : start + self.batch] for start in range(0, len(frames), self.batch)]
+        if self.device.type != "cpu":
+            self._fill(tokens, map(self._encode_batch, parts))
+        elif parts:
+            with _single_threads(len(parts)) as pool:
+                self._fill(tokens, pool.map(self._encode_batch, parts))
+        return tokens
+
+    @torch.inference_mode()
+    def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+        """Up to a batch of frames, encoded and checked."""
+        pixels = self._padded(frames).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
+        pixels = pixels.to(self.dtype).contiguous(memory_format=self._format)
+        return self._storable(self._encode(pixels)[: len(frames)])
+
+    def _fill(self, tokens: NDArray[Any], batches: Iterator[NDArray[Any]]) -> None:
+        for index, made in enumerate(batches):
+            tokens[index * self.batch : (index + 1) * self.batch] = made
+
+    @torch.inference_mode()
+    def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+        """What `encode` gives -> (N, S, S, 3) uint8 RGB.
+
+        Raises:
+            TokenizerError: another grid or dtype, ids outside the vocabulary, latents that are not finite.
+        """
+        check_tokens(tokens, self.spec)
+        discrete = self.spec.kind == "discrete"
+        if not discrete and not (np.issubdtype(tokens.dtype, np.floating) and np.isfinite(tokens).all()):
+            raise TokenizerError(
+                self.spec.name, f"decodes finite float latents, was given {tokens.dtype}", "see encode"
+            )
+        size = self.spec.image_size
+        frames = np.empty((len(tokens), size, size, 3), np.uint8)
+        for start in range(0, len(tokens), self.batch):
+            part = tokens[start : start + self.batch].astype(np.int64 if discrete else np.float32)
+            values = self._padded(part)
+            pixels = self._decode(values if discrete else values.to(self.dtype)).float()
+            whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
+            made = whole.permute(0, 2, 3, 1).cpu().numpy()
+            frames[start : start + self.batch] = made[: len(frames) - start]
+        return frames
+
+    def _storable(self, made: Tensor) -> NDArray[Any]:
+        """Ids or latents as an array, checked to fit what the spec stores."""
+        if self.spec.kind == "discrete":
+            ids = made.cpu().numpy()
+            if ids.size and (ids.min() < 0 or ids.max() >= (self.spec.vocab_size or 0)):
+                fault = f"its network made id {ids.max()}, the vocabulary ends at {self.spec.vocab_size}"
+                raise TokenizerError(self.spec.name, fault, "name the weights of this tokenizer")
+            return ids
+        latents = made.float().cpu().numpy()
+        if not np.abs(latents).max(initial=0) <= np.finfo(np.float16).max:
+            raise TokenizerError(
+                self.spec.name, "its network made latents that float16 cannot hold", "name other weights"
+            )
+        return latents
+
+    def _padded(self, part: NDArray[Any]) -> Tensor:
+        """The part on the device, repeated up to a whole batch."""
+        if len(part) < self.batch:
+            part = np.resize(part, (self.batch, *part.shape[1:]))
+        return torch.from_numpy(part.copy()).to(self.device)  # torch takes no negative strides
+
+
+@contextmanager
+def _single_threads(tasks: int) -> Iterator[ThreadPoolExecutor]:
+    """A pool as wide as torch may use threads, each of which computes alone."""
+    threads = torch.get_num_threads()
+    try:
+        with ThreadPoolExecutor(min(threads, tasks), initializer=lambda: torch.set_num_threads(1)) as pool:
+            yield pool
+    finally:
+        # The number is each thread's own, but new threads start with the last one that was set.
+        torch.set_num_threads(threads)
+
+
+def open_device(name: str, device: str) -> torch.device:
+    """The torch device of that name, tried.
+
+    Raises:
+        TokenizerError: there is none here.
+    """
+    try:
+        place = torch.device(device)
+        torch.empty(1, device=place)
+    except (RuntimeError, AssertionError) as fault:
+        reason = str(fault).splitlines()[0]
+        raise TokenizerError(name, f"cannot run on device {device!r}: {reason}", "use cpu") from fault
+    return place
+
+
+def grid_of(size: int, stride: int, where: object) -> tuple[int, int]:
+    """(h, w) of a square picture cut into cells of `stride` pixels.
+
+    Raises:
+        TokenizerError: they do not fit.
+    """
+    if stride < 1 or size % stride:
+        raise TokenizerError(where, f"makes cells of {stride} pixels, which do not tile {size}")
+    return size // stride, size // stride

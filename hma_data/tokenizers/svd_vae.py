@@ -1,0 +1,128 @@
+"""`svd-vae`: the autoencoder of Stable Video Diffusion, the paper's continuous tokenizer.
+
+256×256 pictures, 4×32×32 latents: the mean of the posterior, stored unscaled as float16; a model
+multiplies them by `latent_scale` (0.18215). Frames are coded one by one, so the decoder, which looks
+over time, is given films of one frame. The network is diffusers' `AutoencoderKLTemporalDecoder`.
+"""
+
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+
+from hma_data.errors import MissingDependencyError, TokenizerError
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers.checkpoints import (
+    digest_of,
+    fill,
+    find_weights,
+    numbers,
+    one_file,
+    read_config,
+    read_tensors,
+    shapes_of,
+)
+from hma_data.tokenizers.network import NetworkTokenizer, grid_of, open_device
+
+VERSION = 1
+IMAGE_SIZE = 256
+LATENT_SCALE = 0.18215
+WHAT = "an AutoencoderKLTemporalDecoder"
+FILES = (
+    "diffusion_pytorch_model.safetensors",
+    "diffusion_pytorch_model.fp16.safetensors",
+    "vae/diffusion_pytorch_model.safetensors",
+    "vae/diffusion_pytorch_model.fp16.safetensors",
+    "diffusion_pytorch_model.bin",
+)
+
+
+def derive_config(tensors: Mapping[str, Tensor], where: object) -> dict[str, Any]:
+    """Arguments of diffusers' class, from the shapes of the weights.
+
+    Raises:
+        TokenizerError: they are no such network's.
+    """
+    with shapes_of(where, WHAT):
+        levels = numbers(tensors, "encoder.down_blocks.")
+        widths = [tensors[f"encoder.down_blocks.{i}.resnets.0.conv1.weight"].shape[0] for i in levels]
+        if not widths or any(width < 1 or width % 32 for width in widths):
+            raise ValueError(f"widths {widths} are no multiples of 32")
+        if "decoder.time_conv_out.weight" not in tensors:
+            raise KeyError("decoder.time_conv_out.weight")
+        return {
+            "down_block_types": ("DownEncoderBlock2D",) * len(widths),
+            "block_out_channels": tuple(widths),
+            "layers_per_block": len(numbers(tensors, "encoder.down_blocks.0.resnets.")),
+            "latent_channels": tensors["quant_conv.weight"].shape[0] // 2,
+        }
+
+
+def _diffusers() -> Any:
+    try:
+        return import_module("diffusers")
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "svd-vae", f"needs diffusers: {fault}", "pip install diffusers"
+        ) from fault
+
+
+def read_network(path: Path) -> nn.Module:
+    """The network of a weights' file.
+
+    Raises:
+        MissingDependencyError: diffusers is not installed.
+        TokenizerError: the file cannot be read, or holds another network.
+    """
+    diffusers = _diffusers()
+    tensors = read_tensors(path)
+    arguments = derive_config(tensors, path)
+    with shapes_of(path, WHAT):
+        network: nn.Module = diffusers.AutoencoderKLTemporalDecoder(**arguments)
+    fill(network, tensors, path)
+    return network
+
+
+def _scale(stated: Mapping[str, Any], where: object) -> float:
+    scale = stated.get("scaling_factor", LATENT_SCALE)
+    if not isinstance(scale, int | float) or not 0 < scale < 1e6:
+        raise TokenizerError(where, f"its config.json says scaling_factor {scale!r}, which is no scale")
+    return float(scale)
+
+
+def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
+    """The tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+
+    Args:
+        weights: a file, a folder as diffusers writes it, or `hf://…`; None takes them from the hub.
+
+    Raises:
+        MissingDependencyError: diffusers is not installed.
+        TokenizerError: the weights cannot be had or used, or there is no such device.
+    """
+    place = open_device(name, device)
+    _diffusers()  # before anything is downloaded
+    path = one_file(find_weights(name, weights), FILES, name)
+    network: Any = read_network(path)
+    channels = network.config.latent_channels
+    spec = TokenizerSpec(
+        name=name,
+        version=VERSION,
+        kind="continuous",
+        image_size=IMAGE_SIZE,
+        grid=grid_of(IMAGE_SIZE, 2 ** (len(network.config.block_out_channels) - 1), path),
+        channels=channels,
+        latent_scale=_scale(read_config(path.parent), path.parent),
+        dtype="float16",
+        weights_sha256=digest_of([path]),
+    )
+
+    def encode(pixels: Tensor) -> Tensor:
+        return network.encode(pixels).latent_dist.mean
+
+    def decode(latents: Tensor) -> Tensor:
+        return network.decode(latents, num_frames=1).sample
+
+    return NetworkTokenizer(spec, network, place, encode, decode)
