@@ -54,7 +54,9 @@ def find_weights(name: str, weights: str | None) -> Path:
         return path
     if folder := os.environ.get(FOLDER):
         home = Path(folder).expanduser()
-        for path in (*(home / f"{name}{suffix}" for suffix in SUFFIXES), home / name):
+        stems = (name, f"{name}_{HALVES[0]}")
+        files = (home / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES)
+        for path in (*files, home / name):
             if path.exists():
                 return path
     entry = CATALOG[name]

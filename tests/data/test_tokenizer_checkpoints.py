@@ -16,7 +16,7 @@ from hma_data.errors import TokenizerError
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG
 from hma_data.tokenizers.checkpoints import digest_of, find_weights, read_config, read_tensors
-from tests.data.tokenizer_files import frames, magvit2_state, write_magvit2, write_tiny_whole
+from tests.data.tokenizer_files import frames, magvit2_state, write_magvit2, write_tiny_pair, write_tiny_whole
 
 # -- files that mean harm or are damaged
 
@@ -120,6 +120,8 @@ def test_a_folder_of_weights_is_searched_by_the_tokenizers_name(tmp_path, monkey
     monkeypatch.setenv("HMA_WEIGHTS", str(tmp_path))
     assert get_tokenizer("taesd").spec.weights_sha256 == digest_of([tmp_path / "taesd.safetensors"])
     assert get_tokenizer("magvit2").spec.weights_sha256 == digest_of([tmp_path / "magvit2.ckpt"])
+    write_tiny_pair(tmp_path, "taef2", channels=32)
+    assert get_tokenizer("taef2").spec.channels == 32
 
 
 def test_the_weights_that_were_named_win_over_the_folder(tmp_path, monkeypatch):
