@@ -27,12 +27,12 @@ def inspect_videos(uri: str) -> Inspection:
         except EpisodeError as fault:
             problems.append(str(fault))
     kinds = Counter((each.height, each.width, round(each.hz, 2), each.codec) for each in headers.values())
-    if len(kinds) > 1:
-        said = ", ".join(
-            f"{count} of {w}×{h} at {hz:g} Hz {codec}" for (h, w, hz, codec), count in kinds.items()
-        )
-        problems.append(f"videos differ: {said}")
     facts = {"keys": "each point also with /next (value at the next labelled frame) and /delta"}
+    if len(kinds) > 1:
+        facts["videos"] = ", ".join(
+            f"{count} of {width}×{height} at {hz:g} Hz {codec}"
+            for (height, width, hz, codec), count in kinds.most_common(10)
+        )
     try:
         seen = _hands_in(videos, headers)
         facts |= seen[0]

@@ -24,7 +24,7 @@ from hma_data.sources.hands_runs import SIDES, HandLabels, labels_from_rows
 from hma_data.sources.hands_table import read_columns
 from hma_data.sources.video_file import VideoFile
 
-BATCH = 16  # frames decoded together
+BATCH = 8  # frames decoded together: of 4K pictures 200 MB
 _LEAST = 0.5  # presence of a hand that is written down
 
 
