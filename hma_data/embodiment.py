@@ -20,7 +20,19 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from hma_data.errors import RegistryError
 from hma_data.registry import file_id, registry_files, registry_folders
-from hma_data.spec import Action, Camera, Component, Count, Number, SourceSpec, SpecModel, Sync, Vector
+from hma_data.spec import (
+    Action,
+    Camera,
+    Component,
+    Count,
+    Marker,
+    Number,
+    Segments,
+    SourceSpec,
+    SpecModel,
+    Sync,
+    Vector,
+)
 from hma_data.yaml_io import parse_yaml, read_yaml, write_yaml
 
 if TYPE_CHECKING:
@@ -38,7 +50,7 @@ _DECIDES: Any = {
     "state": True,
     "cameras": {"__all__": {"name", "key", "color", "resize", "rotate", "flip", "crop", "stamp"}},
     "sync": True,
-    "source": {"format", "instruction", "layout"},
+    "source": {"format", "instruction", "layout", "segments"},
 }
 
 
@@ -87,6 +99,10 @@ class Embodiment(SpecModel):
             raise ValueError(
                 f"sync.primary {self.sync.primary!r} is not a camera; cameras: {', '.join(names)}"
             )
+        if self.source.segments and self.source.format != "rosbag":
+            raise ValueError(f"source.segments is of bags, not of {self.source.format}")
+        if self.sync.beyond == "mask" and self.sync.max_skew_ms is None:
+            raise ValueError("sync.beyond: mask needs sync.max_skew_ms, beyond which is masked")
         if self.sync.action_shift and self.source.format == "rosbag":
             raise ValueError(
                 "sync.action_shift counts steps, and messages of a bag have times instead of steps"
@@ -321,6 +337,9 @@ _KEYS_AT: dict[str, type[SpecModel]] = {
     "cameras": Camera,
     "sync": Sync,
     "source": SourceSpec,
+    "source.segments": Segments,
+    "source.segments.start": Marker,
+    "source.segments.stop": Marker,
 }
 
 

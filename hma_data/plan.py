@@ -129,20 +129,20 @@ def make_plan(
 
 
 def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) -> list[str]:
-    """train or val for each episode: the source's own where it has one, else by hash of the id.
+    """train or val for each episode: the source's own where it has one, else by hash of its group's id.
 
-    With two or more episodes and a fraction above zero, at least one is val and at least one train.
+    An episode without a group is one of its own. With two or more groups and a fraction above zero,
+    at least one is val and at least one train.
     """
     if any(ref.split for ref in refs):
         return [ref.split or "train" for ref in refs]
-    draws = [_unit_interval(f"{seed}/{ref.id}") for ref in refs]
-    splits = ["val" if draw < val_fraction else "train" for draw in draws]
-    if len(refs) >= 2 and val_fraction > 0:
-        if "val" not in splits:
-            splits[draws.index(min(draws))] = "val"
-        if "train" not in splits:
-            splits[draws.index(max(draws))] = "train"
-    return splits
+    draws = {ref.group or ref.id: _unit_interval(f"{seed}/{ref.group or ref.id}") for ref in refs}
+    held = {group for group, draw in draws.items() if draw < val_fraction}
+    if len(draws) >= 2 and val_fraction > 0:
+        held = held or {min(draws, key=lambda group: draws[group])}
+        if len(held) == len(draws):
+            held.remove(max(draws, key=lambda group: draws[group]))
+    return ["val" if (ref.group or ref.id) in held else "train" for ref in refs]
 
 
 def shard_size(frames: int) -> int:

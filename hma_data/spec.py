@@ -162,7 +162,11 @@ class Sync(SpecModel):
     images: Method = "nearest"
     actions: Method = "hold"
     states: Method = "interpolate"
-    max_skew_ms: Number | None = Field(None, gt=0, description="an episode moved by more is refused")
+    max_skew_ms: Number | None = Field(None, gt=0, description="furthest that a sample may be moved")
+    beyond: Literal["refuse", "mask"] = Field(
+        "refuse",
+        description="further than max_skew_ms: refuse the episode, or mask the numbers; pictures refuse",
+    )
     action_shift: Count = Field(
         0,
         ge=-100,
@@ -170,6 +174,40 @@ class Sync(SpecModel):
         description="steps: the command of frame t is recorded at t + action_shift; not in bags",
     )
     stamp: Literal["header", "receive"] = "header"
+
+
+class Marker(SpecModel):
+    """Messages of a bag that begin or end an episode.
+
+    With `equals`, the moments at which the value becomes that one; without, every message.
+    """
+
+    key: str = Field(min_length=1, description="/topic, or /topic.field.path; of a service, its event topic")
+    equals: bool | Number | str | None = None
+
+    @model_validator(mode="after")
+    def _field_of_topic(self) -> Self:
+        if not self.key.startswith("/"):
+            raise ValueError(f"key {self.key!r} must begin with a topic, /topic or /topic.field.path")
+        if self.equals is not None and "." not in self.key:
+            raise ValueError(f"equals needs a field to compare, {self.key} names only a topic")
+        return self
+
+
+class Segments(SpecModel):
+    """Where one bag holds several episodes: what parts them. Several conditions may be given together."""
+
+    gap_s: Number | None = Field(
+        None, gt=0, description="a longer pause of the primary camera parts episodes"
+    )
+    start: Marker | None = Field(None, description="begins an episode, and ends one that runs")
+    stop: Marker | None = Field(None, description="ends an episode; without start, the next begins there")
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if self.gap_s is None and self.start is None and self.stop is None:
+            raise ValueError("says nothing: give gap_s, start or stop")
+        return self
 
 
 class SourceSpec(SpecModel):
@@ -181,3 +219,4 @@ class SourceSpec(SpecModel):
     episodes: Count | None = Field(None, ge=1, description="how many there are, as published")
     instruction: str | None = Field(None, description="key of the language instruction")
     layout: dict[str, str] | None = Field(None, description="by format: keys of a generic layout")
+    segments: Segments | None = Field(None, description="of bags: what parts a bag into episodes")

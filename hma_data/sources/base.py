@@ -42,12 +42,14 @@ class EpisodeRef:
         frames: how many it has, or a fair estimate; for planning shards without decoding.
         split: the source's own, "train" or "val"; None where it has none.
         fingerprint: changes when the recording's bytes change (size and sample of content, not time stamps).
+        group: shared by episodes cut from one recording, which belong into one split; its own id where empty.
     """
 
     id: str
     frames: int
     split: str | None = None
     fingerprint: str = ""
+    group: str = ""
 
 
 @dataclass(frozen=True)

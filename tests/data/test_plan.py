@@ -75,3 +75,10 @@ def test_no_episodes_or_two_with_one_id_are_refused(toy_arm: Embodiment) -> None
 def test_an_unknown_camera_is_refused_with_the_known_ones(toy_arm: Embodiment) -> None:
     with pytest.raises(RegistryError, match="top, side"):
         plan(refs(5), toy_arm, Settings(cameras=("wrist",)))
+
+
+def test_episodes_cut_from_one_recording_share_a_split() -> None:
+    cut = [EpisodeRef(f"bag{i // 5}-{i % 5}", 10, group=f"bag{i // 5}") for i in range(100)]
+    splits = choose_splits(cut, 0.3, seed=0)
+    assert all(len(set(splits[start : start + 5])) == 1 for start in range(0, 100, 5))
+    assert set(splits) == {"train", "val"}
