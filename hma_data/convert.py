@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment
-from hma_data.engines.local import Report, Work, run, usable_cores
+from hma_data.engines.base import FIRST, LIMITS, Attempt, Limits, Report, Retry, Step, Work
+from hma_data.engines.local import run, usable_cores
 from hma_data.episode import Clip
 from hma_data.errors import (
     EpisodeError,
@@ -83,6 +84,7 @@ class Progress:
     kept_shards: int = 0
     total_episodes: int = 0
     total_frames: int = 0
+    retries: list[str] = field(default_factory=list)
     started: float = field(default_factory=time.monotonic)
 
 
@@ -124,9 +126,10 @@ def convert(
     out: Path,
     *,
     settings: Settings | None = None,
-    workers: int = 1,
+    workers: int = 0,
     weights: str | None = None,
     device: str = "cpu",
+    limits: Limits = LIMITS,
     max_quarantine: float = 0.01,
     overwrite: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
@@ -136,9 +139,10 @@ def convert(
     Args:
         embodiment: the robot.
         source: URI of the recording; None takes the one in the embodiment's YAML.
-        tokenizer: name, see `get_tokenizer`; or one that is open already, for a single worker.
-        workers: processes.
+        tokenizer: name, see `get_tokenizer`; or one that is open already, for work in this process.
+        workers: processes, which may crash or hang without ending the job; 0 works in this one.
         weights, device: of the tokenizer.
+        limits: when a worker counts as hanging, and how often it may be lost.
         max_quarantine: fraction of episodes that may be refused.
         overwrite: throw away what `out` holds, if it is a shard set.
         on_progress: called after every batch of frames or so.
@@ -166,8 +170,9 @@ def convert(
         on_progress(progress)
 
         job = Job(uri, embodiment, opened.spec.name, weights, device, out.absolute(), plan.facts)
-        ready = opened if min(workers, len(todo)) <= 1 else None
-        for _ in run(todo, MakeWork(job, ready), min(workers, len(todo)), _Counter(progress, on_progress)):
+        processes = workers if isinstance(tokenizer, str) else 0
+        make_work = MakeWork(job, None if processes else opened)
+        for _ in run(todo, make_work, processes, _Counter(progress, on_progress), limits):
             on_progress(progress)
         manifest = _finish(out, plan, embodiment, opened, uri, bool(todo))
         reasons = _reasons(out)
@@ -304,13 +309,26 @@ class Tick:
     bytes: int = 0
 
 
+_COUNTED = ("frames", "episodes", "quarantined", "bytes")
+
+
 class _Counter:
+    """Adds up what units report; what a unit had counted is taken back when it is done again."""
+
     def __init__(self, progress: Progress, on_progress: Callable[[Progress], None]) -> None:
         self._progress, self._on_progress = progress, on_progress
+        self._by_unit: dict[int, list[int]] = {}
 
-    def __call__(self, tick: Tick) -> None:
-        for name in ("frames", "episodes", "quarantined", "bytes"):
-            setattr(self._progress, name, getattr(self._progress, name) + getattr(tick, name))
+    def __call__(self, unit: int, event: Tick | Retry) -> None:
+        mine = self._by_unit.setdefault(unit, [0] * len(_COUNTED))
+        if isinstance(event, Retry):
+            self._progress.retries.append(event.reason)
+            change = [-count for count in mine]
+        else:
+            change = [getattr(event, name) for name in _COUNTED]
+        for i, name in enumerate(_COUNTED):
+            mine[i] += change[i]
+            setattr(self._progress, name, getattr(self._progress, name) + change[i])
         self._on_progress(self._progress)
 
 
@@ -330,14 +348,16 @@ class MakeWork:
                 sys.modules["torch"].set_num_threads(max(1, usable_cores() // workers))
         job = self.job
 
-        def work(unit: ShardUnit, report: Report) -> str:
-            make_shard(job, unit, tokenizer, report)
+        def work(unit: ShardUnit, report: Report, attempt: Attempt) -> str:
+            make_shard(job, unit, tokenizer, report, attempt)
             return unit.name
 
         return work
 
 
-def make_shard(job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report) -> None:
+def make_shard(
+    job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt = FIRST
+) -> None:
     """Read, align, tokenize and write the episodes of one shard."""
     embodiment, strided = job.embodiment, job.facts["frames"] == "strided"
     cameras: list[str] = job.facts["cameras"]
@@ -351,7 +371,9 @@ def make_shard(job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report) 
         stats["state"] = Stats.empty(state_width)
 
     with ShardWriter(job.out / unit.name, schema, tokenizer.spec) as writer:
-        for item in _tokenized(prefetch(_decoded(job, unit, tokenizer)), tokenizer, report):
+        decoded = _decoded(job, unit, tokenizer, report, attempt)
+        ahead = prefetch(decoded) if not attempt.number else decoded  # one at a time shows whose fault it is
+        for item in _tokenized(ahead, tokenizer, report):
             if isinstance(item, Refused):
                 refused.append(item)
                 report(Tick(episodes=1, quarantined=1))
@@ -389,12 +411,18 @@ class _Whole:
     tokens: dict[str, NDArray[Any]]
 
 
-def _decoded(job: Job, unit: ShardUnit, tokenizer: Tokenizer) -> Iterator[_Begin | _Frames | Refused | None]:
+def _decoded(
+    job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt
+) -> Iterator[_Begin | _Frames | Refused | None]:
     """Runs ahead in a thread: per episode a _Begin, its pictures in batches, then None; or a Refused."""
     source = open_source(job.embodiment.source.format)
     spec = tokenizer.spec
     strided = job.facts["frames"] == "strided"
     for index, ref in unit.episodes:
+        if ref.id in attempt.refused:
+            yield Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")
+            continue
+        report(Step(ref.id))
         try:
             clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
             stride = job.embodiment.stride if strided else 1
