@@ -6,71 +6,23 @@ the manifest is derived from footers at the end. An episode that cannot be used 
 quarantine with its reason; the rest goes on.
 """
 
-import errno
-import fcntl
 import json
-import os
 import re
-import shutil
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment
-from hma_data.engines.base import FIRST, LIMITS, Attempt, Limits, Report, Retry, Step, Work
-from hma_data.engines.local import run, usable_cores
-from hma_data.episode import Clip
-from hma_data.errors import (
-    EpisodeError,
-    HMAError,
-    MissingDependencyError,
-    OutputError,
-    RegistryError,
-    ShardError,
-    SourceError,
-    TokenizerError,
-)
-from hma_data.files import remove_parts
-from hma_data.plan import Plan, Settings, ShardUnit, differences, make_plan
-from hma_data.prefetch import prefetch
+from hma_data.engines.base import LIMITS, Limits, Retry
+from hma_data.engines.local import run
+from hma_data.errors import RegistryError, SourceError
+from hma_data.output import clear, finished_shards, locked
+from hma_data.plan import Plan, Settings, make_plan
+from hma_data.shard_work import Job, MakeWork, Tick
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
-from hma_data.shards.schema import EpisodeRow, Footer, Refused, arrow_schema, read_footer
-from hma_data.shards.writer import EpisodeRows, ShardWriter
-from hma_data.sources.base import EpisodeRef, open_source
-from hma_data.stats import Stats
+from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
-from hma_data.video import prepare
-
-BATCH = 32  # frames decoded and tokenized together
-LOCK = ".lock"
-FATAL = (
-    TokenizerError,
-    OutputError,
-    ShardError,
-    RegistryError,
-    MissingDependencyError,
-)  # not one episode's fault
-
-
-@dataclass(frozen=True)
-class Job:
-    """Everything a worker needs to make any shard of a conversion."""
-
-    source: str
-    embodiment: Embodiment
-    tokenizer: str
-    weights: str | None
-    device: str
-    out: Path
-    facts: dict[str, Any]
 
 
 @dataclass
@@ -195,96 +147,6 @@ def _finish(
     return finish(out, names, embodiment, tokenizer.spec, plan.facts, uri)
 
 
-# -- the output folder
-
-
-@contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Only one job writes a folder; the lock goes with the process, however it ends."""
-    made = not out.exists()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        handle = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as fault:
-        raise OutputError(out, f"cannot be written: {fault.strerror}", "choose another --out") from fault
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if not (out / LOCK).exists():  # its last owner deleted it between our two calls
-            raise OSError(errno.EAGAIN, "")
-    except OSError as fault:
-        os.close(handle)
-        if fault.errno not in (errno.EACCES, errno.EAGAIN):
-            raise
-        raise OutputError(
-            out, "is being written by another job", "wait for it, or choose another --out"
-        ) from fault
-    try:
-        yield
-    finally:
-        (out / LOCK).unlink(missing_ok=True)
-        os.close(handle)
-        if made and not any(out.iterdir()):
-            out.rmdir()
-
-
-def clear(out: Path) -> None:
-    """Empty a folder that holds a shard set.
-
-    Raises:
-        OutputError: it holds something else.
-    """
-    _refuse_foreign(out)
-    for item in out.iterdir():
-        if item.name != LOCK:
-            shutil.rmtree(item) if item.is_dir() else item.unlink()
-
-
-OURS = {"train", "val", MANIFEST, EPISODES, "embodiment.yaml", "quarantine.jsonl", LOCK}
-
-
-def _refuse_foreign(out: Path) -> None:
-    foreign = [
-        item.name for item in out.iterdir() if item.name not in OURS and not item.name.endswith(".part")
-    ]
-    if foreign:
-        raise OutputError(
-            out,
-            f"is not a shard set: it holds {', '.join(sorted(foreign)[:3])}",
-            "choose an empty or new --out",
-        )
-
-
-def finished_shards(out: Path, plan: Plan) -> set[str]:
-    """Names of the plan's shards that are there and whole.
-
-    Raises:
-        OutputError: the folder holds another conversion's shards, or something else.
-    """
-    _refuse_foreign(out)
-    remove_parts(out)
-    done: set[str] = set()
-    planned = {unit.name for unit in plan.units}
-    for path in sorted([*out.glob("train/*"), *out.glob("val/*")]):
-        name = path.relative_to(out).as_posix()
-        footer, _ = read_footer(path, str(path))
-        if footer.plan["hash"] != plan.facts["hash"] or name not in planned:
-            raise OutputError(
-                out,
-                f"belongs to another conversion; different: {differences(plan.facts, footer.plan)}",
-                "choose another --out, or --overwrite to start anew",
-            )
-        done.add(name)
-    if not done and (out / MANIFEST).is_file():
-        theirs = Manifest.load(out).plan
-        if theirs["hash"] != plan.facts["hash"]:
-            raise OutputError(
-                out,
-                f"belongs to another conversion; different: {differences(plan.facts, theirs)}",
-                "choose another --out, or --overwrite to start anew",
-            )
-    return done
-
-
 def _reasons(out: Path) -> dict[str, int]:
     reasons: dict[str, int] = {}
     for line in (out / "quarantine.jsonl").read_text().splitlines():
@@ -294,19 +156,6 @@ def _reasons(out: Path) -> dict[str, int]:
             text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
         reasons[text] = reasons.get(text, 0) + 1
     return reasons
-
-
-# -- the work
-
-
-@dataclass(frozen=True)
-class Tick:
-    """What a worker tells the console."""
-
-    frames: int = 0
-    episodes: int = 0
-    quarantined: int = 0
-    bytes: int = 0
 
 
 _COUNTED = ("frames", "episodes", "quarantined", "bytes")
@@ -330,174 +179,3 @@ class _Counter:
             mine[i] += change[i]
             setattr(self._progress, name, getattr(self._progress, name) + change[i])
         self._on_progress(self._progress)
-
-
-@dataclass(frozen=True)
-class MakeWork:
-    """Makes a worker's function; picklable, so that any engine can send it."""
-
-    job: Job
-    tokenizer: Tokenizer | None = None
-
-    def __call__(self, workers: int) -> Work:
-        """Open the tokenizer once for this worker."""
-        tokenizer = self.tokenizer
-        if tokenizer is None:
-            tokenizer = get_tokenizer(self.job.tokenizer, weights=self.job.weights, device=self.job.device)
-            if "torch" in sys.modules:
-                sys.modules["torch"].set_num_threads(max(1, usable_cores() // workers))
-        job = self.job
-
-        def work(unit: ShardUnit, report: Report, attempt: Attempt) -> str:
-            make_shard(job, unit, tokenizer, report, attempt)
-            return unit.name
-
-        return work
-
-
-def make_shard(
-    job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt = FIRST
-) -> None:
-    """Read, align, tokenize and write the episodes of one shard."""
-    embodiment, strided = job.embodiment, job.facts["frames"] == "strided"
-    cameras: list[str] = job.facts["cameras"]
-    width = embodiment.chunk_dim if strided else embodiment.action_dim
-    state_width = embodiment.state.dims if embodiment.state else 0
-    schema = arrow_schema(tokenizer.spec, width, state_width, len(cameras))
-    rows: list[EpisodeRow] = []
-    refused: list[Refused] = []
-    stats = {"action": Stats.empty(embodiment.action_dim)}
-    if state_width:
-        stats["state"] = Stats.empty(state_width)
-
-    with ShardWriter(job.out / unit.name, schema, tokenizer.spec) as writer:
-        decoded = _decoded(job, unit, tokenizer, report, attempt)
-        ahead = prefetch(decoded) if not attempt.number else decoded  # one at a time shows whose fault it is
-        for item in _tokenized(ahead, tokenizer, report):
-            if isinstance(item, Refused):
-                refused.append(item)
-                report(Tick(episodes=1, quarantined=1))
-                continue
-            start = writer.rows
-            for piece in _cut(item, cameras, embodiment.stride if strided else 1):
-                writer.add(piece)
-            stats["action"].merge(Stats.of(item.clip.actions))
-            if item.clip.states is not None:
-                stats["state"].merge(Stats.of(item.clip.states))
-            rows.append(_row(item, unit, start, writer.rows - start, len(cameras)))
-            report(Tick(episodes=1))
-        writer.close(Footer(job.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
-    report(Tick(bytes=(job.out / unit.name).stat().st_size))
-
-
-@dataclass
-class _Begin:
-    index: int
-    ref: EpisodeRef
-    clip: Clip
-
-
-@dataclass
-class _Frames:
-    camera: str
-    frames: NDArray[np.uint8]
-
-
-@dataclass
-class _Whole:
-    index: int
-    ref: EpisodeRef
-    clip: Clip
-    tokens: dict[str, NDArray[Any]]
-
-
-def _decoded(
-    job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt
-) -> Iterator[_Begin | _Frames | Refused | None]:
-    """Runs ahead in a thread: per episode a _Begin, its pictures in batches, then None; or a Refused."""
-    source = open_source(job.embodiment.source.format)
-    spec = tokenizer.spec
-    strided = job.facts["frames"] == "strided"
-    for index, ref in unit.episodes:
-        if ref.id in attempt.refused:
-            yield Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")
-            continue
-        report(Step(ref.id))
-        try:
-            clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
-            stride = job.embodiment.stride if strided else 1
-            if len(clip) < stride:
-                raise EpisodeError(ref.id, f"has {len(clip)} frames, fewer than one stride of {stride}")
-            yield _Begin(index, ref, clip)
-            for name in job.facts["cameras"]:
-                camera = job.embodiment.camera(name)
-                kept = np.arange(0, len(clip) // stride * stride, stride)
-                for start in range(0, len(kept), BATCH):
-                    raw = clip.frames_at(name, kept[start : start + BATCH])
-                    yield _Frames(name, prepare(raw, camera, spec.image_size, spec.resize_filter))
-            yield None
-        except FATAL:
-            raise
-        except MemoryError:
-            raise
-        except Exception as fault:  # whatever one recording does to a decoder must not end the job
-            text = str(fault) if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}"
-            yield Refused(ref.id, type(fault).__name__, text)
-
-
-def _tokenized(
-    items: Iterator[_Begin | _Frames | Refused | None], tokenizer: Tokenizer, report: Report
-) -> Iterator[_Whole | Refused]:
-    begun: _Begin | None = None
-    tokens: dict[str, list[NDArray[Any]]] = {}
-    for item in items:
-        if isinstance(item, Refused):
-            yield item
-        elif isinstance(item, _Begin):
-            begun, tokens = item, {}
-        elif isinstance(item, _Frames):
-            tokens.setdefault(item.camera, []).append(tokenizer.encode(item.frames))
-            report(Tick(frames=len(item.frames)))
-        else:
-            assert begun is not None
-            whole = {camera: np.concatenate(parts) for camera, parts in tokens.items()}
-            yield _Whole(begun.index, begun.ref, begun.clip, whole)
-
-
-def _cut(item: _Whole, cameras: list[str], stride: int) -> Iterator[EpisodeRows]:
-    """The episode's rows, camera after camera; strided rows carry the whole chunk of actions."""
-    clip = item.clip
-    kept = len(clip) // stride
-    for camera in cameras:
-        yield EpisodeRows(
-            episode_index=item.index,
-            timestamps=clip.timestamps[: kept * stride : stride],
-            tokens=item.tokens[camera],
-            actions=clip.actions[: kept * stride].reshape(kept, -1),
-            states=None if clip.states is None else clip.states[: kept * stride : stride],
-            camera=camera,
-        )
-
-
-def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> EpisodeRow:
-    clip = item.clip
-    skew = {name: [float(v) for v in np.percentile(ms, [50, 95, 100])] for name, ms in clip.skew_ms.items()}
-    worst = max(skew.values(), key=lambda values: values[2], default=[0.0, 0.0, 0.0])
-    return EpisodeRow(
-        episode_index=item.index,
-        id=item.ref.id,
-        split=unit.split,
-        shard=unit.name,
-        row_start=start,
-        rows=rows,
-        length=rows // cameras,
-        instruction=clip.episode.instruction,
-        success=clip.episode.success,
-        fingerprint=item.ref.fingerprint,
-        skew_p50_ms=worst[0],
-        skew_p95_ms=worst[1],
-        skew_max_ms=worst[2],
-        skew=json.dumps(skew),
-        trimmed=clip.trimmed,
-        flags="trimmed" if clip.trimmed else "",
-    )
