@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.sources.findings import Finding
 from hma_data.spec import Vector
 
 FORMATS = {
@@ -28,6 +29,7 @@ FORMATS = {
     "lerobot": "hma_data.sources.lerobot",
     "hands": "hma_data.sources.hands",
 }
+SAMPLE = 20  # episodes that inspect looks into
 VIDEO_SUFFIXES = (
     ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".ogv", ".flv", ".gif",
 )  # fmt: skip
@@ -86,7 +88,10 @@ class KeyInfo:
         count: samples seen (of one episode, or of the whole recording when it is a topic).
         jitter_ms: standard deviation of the intervals.
         topic: of bags.
-        constant: whether a vector never changes in the episode looked at; of bags and LeRobot not looked at.
+        constant: whether a vector never changes in the episodes looked at.
+        still: which values of a vector never change in them.
+        low, high: least and greatest finite number met.
+        skew_ms: of a stream with a clock of its own: p50, p95 and max from the first camera's frames.
     """
 
     key: str
@@ -100,6 +105,10 @@ class KeyInfo:
     jitter_ms: float | None = None
     topic: TopicInfo | None = None
     constant: bool = False
+    still: tuple[int, ...] = ()
+    low: float | None = None
+    high: float | None = None
+    skew_ms: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -113,8 +122,10 @@ class Inspection:
         lengths: of the first episodes (at most 1,000).
         keys: each key once.
         robot: as the recording names it.
-        problems: what looks wrong, a sentence each.
         facts: anything else worth a line.
+        looked_at: episodes whose values and pictures were looked at.
+        findings: what the looks found, as they were met.
+        checks: names of the checks that could be made here; those without a finding passed.
     """
 
     format: str
@@ -125,19 +136,26 @@ class Inspection:
     lengths: tuple[int, ...] = ()
     hz: float | None = None
     robot: str | None = None
-    problems: tuple[str, ...] = ()
     facts: dict[str, str] = field(default_factory=dict)
+    looked_at: int = 0
+    findings: tuple[Finding, ...] = ()
+    checks: tuple[str, ...] = ()
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What looks wrong, a sentence each."""
+        return tuple(str(finding) for finding in self.findings if finding.severity != "info")
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for `--json`."""
-        return asdict(self)
+        return asdict(self) | {"problems": list(self.problems)}
 
 
 class Source(Protocol):
     """One recording format."""
 
-    def inspect(self, uri: str) -> Inspection:
-        """What is in the recording."""
+    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+        """What is in the recording; values and pictures of so many episodes are looked at."""
         ...
 
     def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Signal
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.sources.base import EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hands_inspect import inspect_videos
 from hma_data.sources.hands_labels import LabelSet, open_labels
 from hma_data.sources.hands_layout import HandsLayout, Header, Video, header_of, layout_of, videos_of
@@ -68,9 +68,9 @@ class HandsSource:
         self._labels: dict[tuple[str, HandsLayout], LabelSet] = {}
         self._detector: tuple[int, HandsLayout, Any, HandModels] | None = None
 
-    def inspect(self, uri: str) -> Inspection:
+    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
         """The videos, and the hands in a small sample of frames where there are models."""
-        return inspect_videos(uri)
+        return inspect_videos(uri, episodes)
 
     def episode_ids(self, uri: str) -> list[str]:
         """The videos' names; each is the longest run of its video."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError, MissingDependencyError
 from hma_data.sources.base import Inspection, KeyInfo
+from hma_data.sources.findings import Finding
 from hma_data.sources.hands_layout import Header, Video, header_of, videos_of
 from hma_data.sources.hands_models import load_models
 from hma_data.sources.hands_runs import POINTS
@@ -16,7 +17,7 @@ LOOKED_AT, FRAMES = 5, 12  # videos that hands are looked for in, and frames of 
 LISTED = 1_000
 
 
-def inspect_videos(uri: str) -> Inspection:
+def inspect_videos(uri: str, episodes: int) -> Inspection:
     """See HandsSource.inspect."""
     videos = videos_of(uri)
     headers: dict[str, Header] = {}
@@ -58,7 +59,7 @@ def inspect_videos(uri: str) -> Inspection:
         lengths=tuple(lengths[:LISTED]),
         hz=hz,
         robot="human hands",
-        problems=tuple(problems),
+        findings=tuple(Finding("recording", "warn", said) for said in problems),
         facts=facts,
     )
 

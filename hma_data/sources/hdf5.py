@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Signal, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.sources.base import EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hdf5_file import OpenFiles, child, dataset, explained, member, numbers, rows, text, walk
 from hma_data.sources.hdf5_layout import WHOLE_FILE, Place, Places, episodes_pattern
 from hma_data.spec import Vector
@@ -43,11 +43,11 @@ class Hdf5Source:
         self._files = OpenFiles()
         self._places = Places(self._files)
 
-    def inspect(self, uri: str) -> Inspection:
-        """What is in the recording."""
+    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+        """See Source."""
         from hma_data.sources.hdf5_inspect import inspect
 
-        return inspect(uri, self._places, self._files)
+        return inspect(uri, self._places, self._files, episodes)
 
     def episode_ids(self, uri: str) -> list[str]:
         """Their ids, files by name and `demo_2` before `demo_10`."""

@@ -12,6 +12,7 @@ import numpy as np
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.sources.base import Inspection, KeyInfo
 from hma_data.sources.facts import one_channel, seconds_a_unit
+from hma_data.sources.findings import Finding
 from hma_data.sources.hdf5 import TEXT_KEYS, as_rgb, encoded, environment, picture_kind
 from hma_data.sources.hdf5_file import OpenFiles, child, explained, numbers, rows, text, walk
 from hma_data.sources.hdf5_layout import WHOLE_FILE, Place, Places
@@ -28,7 +29,7 @@ _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps
 _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
 
 
-def inspect(uri: str, places: Places, files: OpenFiles) -> Inspection:
+def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspection:
     """See Source.inspect.
 
     Raises:
@@ -74,7 +75,7 @@ def inspect(uri: str, places: Places, files: OpenFiles) -> Inspection:
         lengths=tuple(lengths),
         hz=rate,
         robot=robots if isinstance(robots, str) else ", ".join(map(str, robots)) if robots else None,
-        problems=tuple(problems),
+        findings=tuple(Finding("recording", "warn", said) for said in problems),
         facts={name: fact for name, fact in facts.items() if fact},
     )
 

@@ -15,17 +15,14 @@ import math
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Pictures, Signal, rate_times
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.base import EpisodeRef, Inspection, compose
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.rlds_steps import (
     Steps,
     described,
-    facts,
     instruction,
     is_camera,
-    key_info,
     listed,
     metadata,
-    oddities,
     step_feature,
     success,
     text_feature,
@@ -36,7 +33,6 @@ from hma_data.sources.tfrecord import framing, read_record
 from hma_data.spec import Component, Vector
 
 SAMPLED_SHARDS = 16  # whose first record is read to estimate lengths
-INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20
 
 log = logging.getLogger(__name__)
 
@@ -109,43 +105,15 @@ class RldsSource:
             metadata=metadata(folder, example),
         )
 
-    def inspect(self, uri: str) -> Inspection:
-        """See Source. Reads up to 1,000 episodes or 256 MiB.
+    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+        """See Source.
 
         Raises:
             SourceError: nothing readable there.
         """
-        folder = open_folder(uri)
-        refs = self.index(uri)
-        lengths: list[int] = []
-        problems = list(folder.problems)
-        odd: dict[str, str] = {}
-        first: Steps | None = None
-        budget = INSPECTED_BYTES
-        for ref in refs[:INSPECTED_EPISODES]:
-            if budget < 0:
-                break
-            try:
-                steps = Steps(folder, folder.example(ref.id)[0], ref.id)
-                budget -= steps.example.size
-                lengths.append(steps.count)
-                odd = oddities(steps) | odd
-                first = first or steps
-            except EpisodeError as fault:
-                problems.append(str(fault))
-        if first is None:
-            raise SourceError(uri, f"holds no readable episode: {problems[-1]}", "copy its files again")
-        seen = len(lengths) == len(refs)
-        return Inspection(
-            format="rlds",
-            uri=uri,
-            episodes=len(refs),
-            keys=tuple(key_info(first, key) for key in folder.step_features),
-            frames=sum(lengths) if seen else None,
-            lengths=tuple(lengths),
-            problems=(*problems, *odd.values()),
-            facts=facts(folder),
-        )
+        from hma_data.sources.rlds_inspect import inspect
+
+        return inspect(uri, self.index(uri), episodes)
 
 
 def _refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:

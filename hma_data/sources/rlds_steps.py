@@ -4,7 +4,6 @@ Keys are paths inside a step. T steps, H×W pixels.
 """
 
 import logging
-import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 from functools import cached_property
@@ -14,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episode import Decode
-from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.base import KeyInfo
+from hma_data.errors import SourceError
 from hma_data.sources.tf_example import Example
 from hma_data.sources.tfds_features import Feature, column, column_blobs, scalar, step_count, tensor
 from hma_data.sources.tfds_folder import Folder
@@ -179,69 +177,3 @@ def metadata(folder: Folder, example: Example) -> dict[str, Any]:
         if not name.startswith("steps/")
     }
     return {name: value for name, value in found.items() if value is not None}
-
-
-# -- inspection
-
-
-def facts(folder: Folder) -> dict[str, str]:
-    """What is worth a line about the dataset."""
-    found = {"dataset": folder.name, "version": folder.version}
-    found["splits"] = ", ".join(
-        f"{name} {sum(folder.counted(shard) for shard in shards)}" for name, shards in folder.splits.items()
-    )
-    outside = [name for name in folder.features if not name.startswith("steps/")]
-    found["episode keys"] = ", ".join(outside)
-    return {name: value for name, value in found.items() if value}
-
-
-def key_info(steps: Steps, key: str) -> KeyInfo:
-    """One key as this episode holds it."""
-    feature = steps.features[key]
-    shape = tuple(size or 0 for size in (*feature.nesting[1:], *feature.shape))
-    kind, codec, constant = "other", None, False
-    try:
-        if is_camera(feature):
-            kind, shape, codec = "camera", steps.decoder(key)(0).shape, _codec(steps, key)
-            if feature.shape[-1:] == (1,):
-                shape = (*shape[:2], 1)
-        elif feature.kind == "text":
-            kind = "text"
-        elif feature.kind == "number":
-            values = steps.numbers(key)
-            shape = values.shape[1:]
-            constant = len(values) > 1 and bool((values == values[0]).all())
-            kind = "vector" if math.prod(shape) <= MAX_VECTOR else "other"
-    except EpisodeError as fault:
-        log.warning("%s", fault)  # listed as features.json states it
-    return KeyInfo(key, kind, shape, feature.dtype, codec=codec, count=steps.count, constant=constant)
-
-
-def _codec(steps: Steps, key: str) -> str:
-    """By the first bytes of the first picture; TFDS keeps files as given, whatever features.json states."""
-    if steps.features[key].kind != "picture":
-        return "raw"
-    head = bytes(steps.blobs(key)[0][:8])
-    if head.startswith(b"\xff\xd8"):
-        return "jpeg"
-    return "png" if head.startswith(b"\x89PNG") else steps.features[key].codec or "unknown"
-
-
-def oddities(steps: Steps) -> dict[str, str]:
-    """What looks wrong in an episode that can be read: key -> a sentence."""
-    found = {}
-    for key, feature in steps.features.items():
-        if (
-            feature.kind != "number"
-            or feature.dtype[:5] != "float"
-            or not 0 < (feature.width or 0) <= MAX_VECTOR
-        ):
-            continue
-        try:
-            bad = ~np.isfinite(steps.numbers(key))
-        except EpisodeError as fault:
-            found[key] = str(fault)
-            continue
-        if bad.any():
-            found[key] = f"{steps.name}: {key} is not finite at step {int(np.argwhere(bad)[0, 0])}"
-    return found

@@ -19,7 +19,7 @@ from hma_data.sources.bags.pictures import picture_kind
 from hma_data.sources.bags.report import report
 from hma_data.sources.bags.streams import camera_stream
 from hma_data.sources.bags.track import Track
-from hma_data.sources.base import EpisodeRef, Inspection, component_values, local_path
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values, local_path
 from hma_data.spec import Camera, Component
 
 
@@ -31,9 +31,9 @@ def open() -> "RosbagSource":
 class RosbagSource:
     """See sources.base.Source."""
 
-    def inspect(self, uri: str) -> Inspection:
-        """See Source; measures the first bag that can be read."""
-        return report(uri, local_path(uri), _bags(uri))
+    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+        """See Source."""
+        return report(uri, local_path(uri), _bags(uri), episodes)
 
     def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """See Source. A bag that cannot be read has no frames here; `read` says why."""

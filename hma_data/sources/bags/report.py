@@ -20,6 +20,7 @@ from hma_data.sources.bags.pictures import VIDEO, codec, is_grey, picture_kind
 from hma_data.sources.bags.streams import camera_stream
 from hma_data.sources.bags.track import Track
 from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
+from hma_data.sources.findings import Finding
 
 MAX_BYTES = 1 << 30  # of messages measured
 MAX_MESSAGES = 300_000
@@ -47,7 +48,7 @@ class _Topic:
             self.sample, self.named = message, count
 
 
-def report(uri: str, root: Path, bags: dict[str, Path]) -> Inspection:
+def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspection:
     """The inspection of those bags.
 
     Raises:
@@ -97,7 +98,10 @@ def _inspection(
         lengths=lengths[:MAX_LENGTHS],
         hz=cameras[0].hz if cameras else None,
         robot=bag.notes().get("robot") or None,
-        problems=(*faults, *(line for topic in topics.values() for line in topic.problems)),
+        findings=tuple(
+            Finding("recording", "warn", said)
+            for said in (*faults, *(line for topic in topics.values() for line in topic.problems))
+        ),
         facts=facts,
     )
 
