@@ -3,18 +3,23 @@
 They are written last, so a shard set without a manifest is one whose job has not finished.
 """
 
+import hashlib
 import json
-from dataclasses import asdict, dataclass
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
 from hma_data.files import atomic_path, file_sha256, write_atomic
-from hma_data.shards.schema import SCHEMA_VERSION, Footer, read_footer
+from hma_data.shards.schema import SCHEMA_VERSION, EpisodeRow, Footer, Refused, read_footer
 from hma_data.stats import Stats
 from hma_data.tokenizers.base import TokenizerSpec
 
@@ -24,6 +29,11 @@ MANIFEST, EPISODES, QUARANTINE, EMBODIMENT = (
     "quarantine.jsonl",
     "embodiment.yaml",
 )
+SPLITS = ("train", "val")
+HASHERS = 4  # threads; hashing leaves the interpreter alone
+SHARD_NAME = re.compile(r"(train|val)/shard-([0-9]{5,9})\.parquet")
+_SEAL = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')
+_UNSEALED = "0" * 64
 
 _EPISODE_SCHEMA = pa.schema(
     [
@@ -64,6 +74,15 @@ class ShardFile:
     sha256: str
     row_groups: tuple[int, ...]
 
+    def __post_init__(self) -> None:
+        named = SHARD_NAME.fullmatch(self.path)  # keeps paths inside the folder, whoever wrote the manifest
+        if not named or named[1] != self.split:
+            raise ValueError(f"{self.path!r} is not the name of a shard of split {self.split!r}")
+        if not all(
+            type(n) is int and n >= 0 for n in (self.rows, self.episodes, self.bytes, *self.row_groups)
+        ):
+            raise ValueError(f"{self.path} has counts that are not whole numbers")
+
 
 @dataclass(frozen=True)
 class Manifest:
@@ -76,6 +95,7 @@ class Manifest:
         splits: split -> {episodes, frames, rows, shards}.
         stats: "action", "state" -> summary over train (see Stats.summary).
         quarantined: refused episodes.
+        files: name -> sha256 of the other files of the set.
     """
 
     plan: dict[str, Any]
@@ -86,6 +106,7 @@ class Manifest:
     stats: dict[str, dict[str, Any]]
     quarantined: int
     source: str
+    files: dict[str, str] = field(default_factory=dict)
 
     @property
     def frame_stride(self) -> int:
@@ -113,8 +134,18 @@ class Manifest:
                 "quarantined": self.quarantined,
             },
             "stats": self.stats,
+            "files": self.files,
             "shards": [asdict(shard) for shard in self.shards],
         }
+
+    def to_text(self) -> str:
+        """manifest.json: sealed by the sha256 of its own text with zeros in the seal's place."""
+        values = self.to_json()
+        shards = [f"  {json.dumps(shard)}" for shard in values.pop("shards")]
+        sealed = {"schema_version": values.pop("schema_version"), "manifest_sha256": _UNSEALED, **values}
+        head = json.dumps(sealed, indent=1).removesuffix("\n}")
+        text = head + ',\n "shards": [\n' + ",\n".join(shards) + "\n ]\n}\n"
+        return text.replace(_UNSEALED, hashlib.sha256(text.encode()).hexdigest(), 1)
 
     @classmethod
     def load(cls, folder: Path) -> "Manifest":
@@ -128,7 +159,8 @@ class Manifest:
             raise ShardError(
                 folder,
                 f"has no {MANIFEST}",
-                "its conversion has not finished: run the same hma convert again",
+                "its conversion has not finished: run the same hma convert again; if the manifest was lost, "
+                "hma shards restat writes it anew from the shards",
             )
         try:
             values = json.loads(path.read_bytes())
@@ -147,21 +179,79 @@ class Manifest:
                 splits=values["splits"],
                 stats=values["stats"],
                 quarantined=values["totals"]["quarantined"],
-                source=values["source"],
+                source=str(values["source"]),
+                files=dict(values.get("files", {})),
             )
-        except (KeyError, TypeError, ValueError) as fault:
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as fault:
+            said = f"no {fault}" if isinstance(fault, KeyError) else str(fault)
             raise ShardError(
-                path, f"is damaged: {fault}", "delete it and run the same hma convert again"
+                path, f"is damaged: {said}", f"hma shards restat {folder} writes it anew from the shards"
             ) from fault
+
+
+def seal_problem(text: bytes) -> str:
+    """What is wrong with the seal of a manifest's bytes; empty when it holds."""
+    found = _SEAL.search(text)
+    if not found:
+        return "carries no manifest_sha256"
+    start, end = found.span(1)
+    unsealed = text[:start] + _UNSEALED.encode() + text[end:]
+    if hashlib.sha256(unsealed).hexdigest().encode() != found[1]:
+        return "its bytes changed since it was written (manifest_sha256 differs)"
+    return ""
+
+
+def plan_hash(plan: dict[str, Any]) -> str:
+    """Sixteen hex digits over everything in a plan but its hash."""
+    facts = {key: value for key, value in plan.items() if key != "hash"}
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class Gathered:
+    """What the footers of a set say together; they are added in the manifest's order, and not kept."""
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.stats: dict[str, Stats] = {}
+        self.refused: list[Refused] = []
+        self._tables: list[pa.Table] = []
+
+    def add(self, footer: Footer) -> None:
+        """Take in the next shard's footer."""
+        self._tables.append(_episode_table(footer.episodes, self.source))
+        self.refused += footer.quarantine
+        for name, stats in footer.stats.items():
+            merged = self.stats.setdefault(name, Stats.empty(len(stats.mean)))
+            if footer.split == "train":
+                merged.merge(stats)
+
+    def episodes(self) -> pa.Table:
+        """episodes.parquet, in order of episode_index."""
+        tables = self._tables or [_episode_table((), self.source)]
+        return pa.concat_tables(tables).combine_chunks().sort_by("episode_index")
+
+    def quarantine(self) -> str:
+        """quarantine.jsonl, in order of the ids."""
+        lines = []
+        for item in sorted(self.refused, key=lambda item: item.id):
+            values = asdict(item)
+            lines.append(json.dumps({"id": values.pop("id"), "uri": self.source, **values}) + "\n")
+        return "".join(lines)
+
+    def summaries(self) -> dict[str, dict[str, Any]]:
+        """The manifest's `stats`, over train."""
+        return {name: stats.summary() for name, stats in self.stats.items()}
 
 
 def finish(
     folder: Path,
-    names: list[str],
+    names: Sequence[str],
     embodiment: Embodiment,
     tokenizer: TokenizerSpec,
     plan: dict[str, Any],
     source: str,
+    stats: dict[str, dict[str, Any]] | None = None,
+    hashes: Mapping[str, str] | None = None,
 ) -> Manifest:
     """Derive and write everything that is not a shard; the manifest comes last.
 
@@ -169,77 +259,75 @@ def finish(
         folder: of the shard set.
         names: of the shards, in plan order; all are there.
         source: URI the recordings came from.
+        stats: the summary to state instead of the footers' own.
+        hashes: sha256 of shards that need not be read for it.
 
     Raises:
         ShardError: a shard is damaged.
     """
-    footers: list[Footer] = []
+    gathered = Gathered(source)
     files: list[ShardFile] = []
-    for name in names:
-        path = folder / name
-        footer, row_groups = read_footer(path, str(path))
-        footers.append(footer)
-        files.append(
-            ShardFile(
-                path=name,
-                split=footer.split,
-                rows=sum(row_groups),
-                episodes=len(footer.episodes),
-                bytes=path.stat().st_size,
-                sha256=file_sha256(path),
-                row_groups=tuple(row_groups),
-            )
-        )
+    for file, footer in _described(folder, names, hashes or {}):
+        files.append(file)
+        gathered.add(footer)
+    episodes = gathered.episodes()
+    with atomic_path(folder / EPISODES) as part:
+        pq.write_table(episodes, part, compression="zstd")
+    write_atomic(folder / QUARANTINE, gathered.quarantine())
+    write_atomic(folder / EMBODIMENT, embodiment.to_yaml())
     manifest = Manifest(
         plan=plan,
         embodiment=embodiment,
         tokenizer=tokenizer,
         shards=tuple(files),
-        splits={split: _split_totals(footers, split) for split in ("train", "val")},
-        stats={name: stats.summary() for name, stats in merged_stats(footers).items()},
-        quarantined=sum(len(footer.quarantine) for footer in footers),
+        splits={split: split_totals(episodes, files, split) for split in SPLITS},
+        stats=stats or gathered.summaries(),
+        quarantined=len(gathered.refused),
         source=source,
+        files={name: file_sha256(folder / name) for name in (EPISODES, QUARANTINE, EMBODIMENT)},
     )
-    with atomic_path(folder / EPISODES) as part:
-        pq.write_table(episode_table(footers, source), part, compression="zstd")
-    refused = sorted((item for footer in footers for item in footer.quarantine), key=lambda item: item.id)
-    lines = [
-        json.dumps({"id": item.id, "uri": source, "type": item.type, "message": item.message})
-        for item in refused
-    ]
-    write_atomic(folder / QUARANTINE, "".join(f"{line}\n" for line in lines))
-    write_atomic(folder / EMBODIMENT, embodiment.to_yaml())
-    write_atomic(folder / MANIFEST, json.dumps(manifest.to_json(), indent=1) + "\n")
+    write_atomic(folder / MANIFEST, manifest.to_text())
     return manifest
 
 
-def merged_stats(footers: list[Footer]) -> dict[str, Stats]:
-    """Statistics over the train shards, merged in plan order."""
-    merged: dict[str, Stats] = {}
-    for footer in footers:
-        for name, stats in footer.stats.items():
-            if name not in merged:
-                merged[name] = Stats.empty(len(stats.mean))
-            if footer.split == "train":
-                merged[name].merge(stats)
-    return merged
+def _described(
+    folder: Path, names: Sequence[str], hashes: Mapping[str, str]
+) -> Iterator[tuple[ShardFile, Footer]]:
+    """Each shard as the manifest lists it, with its footer; a few are hashed at a time."""
+
+    def describe(name: str) -> tuple[ShardFile, Footer]:
+        path = folder / name
+        footer, row_groups = read_footer(path, str(path))
+        file = ShardFile(
+            path=name,
+            split=footer.split,
+            rows=sum(row_groups),
+            episodes=len(footer.episodes),
+            bytes=path.stat().st_size,
+            sha256=hashes.get(name) or file_sha256(path),
+            row_groups=tuple(row_groups),
+        )
+        return file, footer
+
+    with ThreadPoolExecutor(HASHERS) as pool:
+        for start in range(0, len(names), 4 * HASHERS):  # a few footers in memory, however many shards
+            yield from pool.map(describe, names[start : start + 4 * HASHERS])
 
 
-def episode_table(footers: list[Footer], source: str) -> pa.Table:
-    """episodes.parquet, in order of episode_index."""
-    rows = sorted((row for footer in footers for row in footer.episodes), key=lambda row: row.episode_index)
+def split_totals(episodes: pa.Table, files: Sequence[ShardFile], split: str) -> dict[str, int]:
+    """Counts of one split, as the manifest states them."""
+    rows = episodes.filter(pc.equal(episodes["split"], split))
+    return {
+        "episodes": len(rows),
+        "frames": pc.sum(rows["length"]).as_py() or 0,
+        "rows": pc.sum(rows["rows"]).as_py() or 0,
+        "shards": sum(file.split == split for file in files),
+    }
+
+
+def _episode_table(rows: Sequence[EpisodeRow], source: str) -> pa.Table:
     columns = {
         name: [getattr(row, name) for row in rows] for name in _EPISODE_SCHEMA.names if name != "source"
     }
     columns["source"] = [source] * len(rows)
     return pa.table(columns, schema=_EPISODE_SCHEMA)
-
-
-def _split_totals(footers: list[Footer], split: str) -> dict[str, int]:
-    rows = [row for footer in footers if footer.split == split for row in footer.episodes]
-    return {
-        "episodes": len(rows),
-        "frames": sum(row.length for row in rows),
-        "rows": sum(row.rows for row in rows),
-        "shards": sum(footer.split == split for footer in footers),
-    }

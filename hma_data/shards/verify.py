@@ -1,143 +1,175 @@
-"""Check a shard set: every hash, row count and invariant. Nothing is changed."""
+"""Check a shard set: every hash, row count and invariant. Nothing is changed.
 
-import json
+Shards are checked a few at a time by threads (hashing and parquet leave the interpreter alone), a row
+group in memory for each, so memory does not grow with the set.
+"""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from hma_data.embodiment import Embodiment
+from hma_data.engines.local import usable_cores
 from hma_data.errors import HMAError
 from hma_data.files import PART, file_sha256
-from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest, episode_table, merged_stats
-from hma_data.shards.schema import Footer, arrow_schema, read_footer, to_numpy, token_column
+from hma_data.shards.check import Checked, check_shard, plan_problem, same_stats
+from hma_data.shards.manifest import (
+    EMBODIMENT,
+    EPISODES,
+    MANIFEST,
+    QUARANTINE,
+    SPLITS,
+    Gathered,
+    Manifest,
+    seal_problem,
+    split_totals,
+)
 from hma_data.stats import Stats
 
+BESIDE = {".lock", "README.md", ".gitattributes"}  # a running job's, and what a hub adds
+OnProgress = Callable[[int, int], None]
 
-def verify(folder: Path) -> list[str]:
-    """Everything wrong with a shard set, a line each; empty when it is sound."""
+
+def verify(
+    folder: Path,
+    *,
+    workers: int | None = None,
+    quick: bool = False,
+    on_progress: OnProgress = lambda done, total: None,
+) -> list[str]:
+    """Everything wrong with a shard set, a line each; empty when it is sound.
+
+    Args:
+        workers: threads; None takes the cores.
+        quick: sizes and footers only: seconds for any set, but a flipped bit in a shard stays unseen.
+        on_progress: called with (bytes checked, bytes in all) after each shard.
+    """
+    restat = f"hma shards restat {folder} writes it anew from the shards"
     try:
         manifest = Manifest.load(folder)
+        seal = seal_problem((folder / MANIFEST).read_bytes())
     except HMAError as fault:
         return [str(fault)]
-    found: list[str] = []
-    footers: list[Footer] = []
-    for shard in manifest.shards:
-        path = folder / shard.path
-        if not path.is_file():
-            found.append(f"{path}: is missing")
-        elif file_sha256(path) != shard.sha256:
-            found.append(f"{path}: its bytes changed since the manifest was written (sha256 differs)")
+    except OSError as fault:
+        return [f"{folder / MANIFEST}: cannot be read: {fault.strerror} — check its permissions"]
+    fault_of_plan = seal or plan_problem(manifest)
+    found = [f"{folder / MANIFEST}: {fault_of_plan} — {restat}"] if fault_of_plan else []
+    gathered, rows = Gathered(manifest.source), dict[str, Stats]()
+    whole = True
+    for checked in _checked(folder, manifest, workers or usable_cores(), quick, on_progress):
+        found += checked.problems
+        if checked.footer is None or checked.problems:
+            whole = False
+            continue
+        gathered.add(checked.footer)
+        if checked.footer.split == "train":
+            for name, stats in checked.stats.items():
+                rows.setdefault(name, Stats.empty(len(stats.mean))).merge(stats)
+    found += _foreign(folder, manifest)
+    found += _other_files(folder, manifest)
+    if whole:
+        found += _set_problems(folder, manifest, gathered, rows, restat)
+    return found
+
+
+def _checked(
+    folder: Path, manifest: Manifest, workers: int, quick: bool, on_progress: OnProgress
+) -> Iterator[Checked]:
+    """Each shard checked, in the manifest's order."""
+    total = sum(shard.bytes for shard in manifest.shards)
+    done, batch = 0, 4 * workers
+    with ThreadPoolExecutor(workers) as pool:
+        for start in range(0, len(manifest.shards), batch):
+            shards = manifest.shards[start : start + batch]
+            results = pool.map(lambda shard: check_shard(folder, shard, manifest, quick), shards)
+            for shard, checked in zip(shards, results):
+                done += shard.bytes
+                on_progress(done, total)
+                yield checked
+
+
+def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
+    """Files that are not of the set."""
+    known = {shard.path for shard in manifest.shards} | {MANIFEST, EPISODES, QUARANTINE, EMBODIMENT} | BESIDE
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if name in known or (path.is_dir() and name in SPLITS):
+            continue
+        if path.name.endswith(PART):
+            yield f"{path}: is left of a job that runs or was killed — run the same hma convert again"
         else:
-            try:
-                footer, row_groups = read_footer(path, str(path))
-                footers.append(footer)
-                if tuple(row_groups) != shard.row_groups:
-                    found.append(f"{path}: row groups {row_groups} differ from the manifest's")
-                found += _shard_problems(path, footer, manifest)
-            except (HMAError, pa.ArrowInvalid) as fault:
-                found.append(str(fault))
-    found += _strays(folder, manifest)
-    if not found:
-        found += _set_problems(folder, manifest, footers)
-    return found
+            yield f"{path}: is not in the manifest — move it out of the shard set"
 
 
-def _shard_problems(path: Path, footer: Footer, manifest: Manifest) -> list[str]:
-    found: list[str] = []
-    if footer.plan["hash"] != manifest.plan["hash"]:
-        theirs, ours = footer.plan["hash"], manifest.plan["hash"]
-        return [f"{path}: was made by another plan ({theirs}) than the manifest's ({ours})"]
-    if any(row.split != footer.split or not path.as_posix().endswith(row.shard) for row in footer.episodes):
-        found.append(f"{path}: its episodes name another shard or split")
-    embodiment, spec = manifest.embodiment, manifest.tokenizer
-    strided = manifest.plan["frames"] == "strided"
-    schema = arrow_schema(
-        spec,
-        embodiment.chunk_dim if strided else embodiment.action_dim,
-        embodiment.state.dims if embodiment.state else 0,
-        len(manifest.cameras),
-    )
-    with pq.ParquetFile(path) as file:
-        if not file.schema_arrow.equals(schema, check_metadata=False):
-            return [
-                *found,
-                f"{path}: columns {file.schema_arrow.names} are not those of the manifest's embodiment",
-            ]
-        found += _row_problems(path, file, footer, manifest)
-    return found
+def _other_files(folder: Path, manifest: Manifest) -> Iterator[str]:
+    """What the manifest says about the files that are no shards."""
+    remedy = f"hma shards restat {folder} writes it anew from the shards"
+    for name in (EPISODES, QUARANTINE, EMBODIMENT):
+        path = folder / name
+        try:
+            if name not in manifest.files:
+                yield f"{folder / MANIFEST}: states no sha256 of {name} — {remedy}"
+            elif file_sha256(path) != manifest.files[name]:
+                yield f"{path}: its bytes changed since the manifest was written (sha256 differs) — {remedy}"
+        except FileNotFoundError:
+            yield f"{path}: is missing — {remedy}"
+        except OSError as fault:
+            yield f"{path}: cannot be read: {fault.strerror} — {remedy}"
+    try:
+        if Embodiment.load(folder / EMBODIMENT) != manifest.embodiment:
+            yield f"{folder / EMBODIMENT}: is another embodiment than the manifest's — {remedy}"
+    except (HMAError, OSError) as fault:
+        yield " ".join(f"{folder / EMBODIMENT}: cannot be used: {fault}".split())
 
 
-def _row_problems(path: Path, file: pq.ParquetFile, footer: Footer, manifest: Manifest) -> list[str]:
-    """Rows against the footer: whole episodes, frames counting up, tokens in range, finite numbers."""
-    found: list[str] = []
-    column = token_column(manifest.tokenizer)[0]
-    episode, frame, time = [], [], []
-    actions = Stats.empty(manifest.embodiment.action_dim)
-    for group in range(file.metadata.num_row_groups):
-        table = file.read_row_group(group)
-        tokens = to_numpy(table[column])
-        if manifest.tokenizer.vocab_size and tokens.size and tokens.max() >= manifest.tokenizer.vocab_size:
-            last = manifest.tokenizer.vocab_size - 1
-            found.append(f"{path}: row group {group} has token {tokens.max()}, the vocabulary ends at {last}")
-        for name in ("action", "state"):
-            if name in table.column_names and not np.isfinite(to_numpy(table[name])).all():
-                found.append(f"{path}: row group {group} has {name} values that are not finite")
-        episode.append(to_numpy(table["episode_index"]))
-        frame.append(to_numpy(table["frame_index"]))
-        time.append(to_numpy(table["timestamp"]))
-        actions.merge(Stats.of(to_numpy(table["action"]).reshape(-1, manifest.embodiment.action_dim)))
-    cameras = len(manifest.cameras)
-    expected_episode = np.concatenate(
-        [np.full(row.rows, row.episode_index) for row in footer.episodes] or [np.zeros(0)]
-    )
-    expected_frame = np.concatenate(
-        [np.tile(np.arange(row.length), cameras) for row in footer.episodes] or [np.zeros(0)]
-    )
-    episodes, frames = np.concatenate(episode or [np.zeros(0)]), np.concatenate(frame or [np.zeros(0)])
-    if not np.array_equal(episodes, expected_episode) or not np.array_equal(frames, expected_frame):
-        return [*found, f"{path}: rows are not the episodes and frames its footer names"]
-    times = np.concatenate(time or [np.zeros(0)])
-    if (np.diff(times)[np.diff(frames) > 0] < 0).any():
-        found.append(f"{path}: timestamps go back within an episode")
-    said = footer.stats["action"]
-    kept_all = manifest.plan["frames"] == "all" and cameras == 1
-    if kept_all and (
-        said.count != actions.count or not np.allclose(said.mean, actions.mean, rtol=1e-9, atol=1e-12)
-    ):
-        found.append(f"{path}: action statistics in the footer are not those of its rows")
-    return found
+def _set_problems(
+    folder: Path, manifest: Manifest, gathered: Gathered, rows: dict[str, Stats], restat: str
+) -> Iterator[str]:
+    """The files derived from the footers still say what the footers say, and episodes stand in one split."""
+    expected = gathered.episodes()
+    yield from _episode_problems(folder, expected)
+    try:
+        if not pq.read_table(folder / EPISODES).equals(expected):
+            yield f"{folder / EPISODES}: differs from the shards' footers — {restat}"
+    except (OSError, pa.ArrowException) as fault:
+        yield f"{folder / EPISODES}: cannot be read: {' '.join(str(fault).split())} — {restat}"
+    try:
+        if (folder / QUARANTINE).read_bytes() != gathered.quarantine().encode():
+            yield f"{folder / QUARANTINE}: differs from the shards' footers — {restat}"
+    except OSError as fault:
+        yield f"{folder / QUARANTINE}: cannot be read: {fault.strerror} — {restat}"
+    where = folder / MANIFEST
+    for split in SPLITS:
+        if manifest.splits.get(split) != split_totals(expected, manifest.shards, split):
+            yield f"{where}: its counts of split {split} are not those of the shards — {restat}"
+    if manifest.quarantined != len(gathered.refused):
+        counted = f"says {manifest.quarantined} are in quarantine, the shards {len(gathered.refused)}"
+        yield f"{where}: {counted} — {restat}"
+    footers = gathered.summaries()
+    own = {name: stats.summary() for name, stats in rows.items()} or footers
+    for name in footers.keys() | manifest.stats.keys():
+        said = manifest.stats.get(name)
+        if not said or not any(name in s and same_stats(said, s[name]) for s in (footers, own)):
+            yield f"{where}: its statistics of {name} are not those of the train shards — {restat}"
 
 
-def _strays(folder: Path, manifest: Manifest) -> list[str]:
-    listed = {shard.path for shard in manifest.shards}
-    return [
-        f"{path}: is not in the manifest"
-        for path in sorted(
-            [*folder.glob("train/*"), *folder.glob("val/*"), *folder.glob("train/.*"), *folder.glob("val/.*")]
+def _episode_problems(folder: Path, episodes: pa.Table) -> Iterator[str]:
+    """No episode twice, none in both splits, nor recordings that belong together."""
+    for column, said in (("id", "stands in it twice"), ("episode_index", "is the number of two episodes")):
+        counts = pc.value_counts(episodes[column].combine_chunks())
+        for item in counts.filter(pc.greater(counts.field("counts"), 1)).to_pylist()[:3]:
+            remedy = "convert again with --overwrite"
+            yield f"{folder}: episode {column} {item['values']!r} {said} — {remedy}"
+    if "group" not in episodes.column_names:
+        return
+    grouped = episodes.filter(pc.not_equal(episodes["group"], ""))
+    pairs = grouped.group_by("group").aggregate([("split", "count_distinct")])
+    for name in pairs.filter(pc.greater(pairs["split_count_distinct"], 1))["group"].to_pylist()[:3]:
+        yield (
+            f"{folder}: episodes of one recording, {name!r}, stand in both splits — "
+            "hma shards split makes a set where they do not"
         )
-        if path.relative_to(folder).as_posix() not in listed or path.name.endswith(PART)
-    ]
-
-
-def _set_problems(folder: Path, manifest: Manifest, footers: list[Footer]) -> list[str]:
-    """The files derived from the footers still say what the footers say."""
-    found: list[str] = []
-    rows = [row for footer in footers for row in footer.episodes]
-    if len({row.id for row in rows}) != len(rows):
-        found.append(f"{folder}: an episode stands in it twice, or in both splits")
-    try:
-        if not pq.read_table(folder / EPISODES).equals(episode_table(footers, manifest.source)):
-            found.append(f"{folder / EPISODES}: differs from the shards' footers")
-    except (OSError, pa.ArrowInvalid) as fault:
-        found.append(f"{folder / EPISODES}: cannot be read: {fault}")
-    try:
-        refused = {json.loads(line)["id"] for line in (folder / QUARANTINE).read_text().splitlines()}
-        if refused != {item.id for footer in footers for item in footer.quarantine}:
-            found.append(f"{folder / QUARANTINE}: differs from the shards' footers")
-    except (OSError, ValueError, KeyError) as fault:
-        found.append(f"{folder / QUARANTINE}: cannot be read: {fault}")
-    stats = {name: merged.summary() for name, merged in merged_stats(footers).items()}
-    if json.loads(json.dumps(stats)) != manifest.stats:
-        found.append(f"{folder}: the manifest's statistics are not those of the train shards")
-    return found
