@@ -9,9 +9,12 @@ quarantine with its reason; the rest goes on.
 import json
 import re
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import pyarrow.parquet as pq
 
 from hma_data.embodiment import Embodiment
 from hma_data.engines.base import LIMITS, Limits, Retry
@@ -21,6 +24,7 @@ from hma_data.output import clear, finished_shards, locked
 from hma_data.plan import Plan, Settings, make_plan
 from hma_data.shard_work import Job, MakeWork, Tick
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
+from hma_data.shards.schema import flag_counts
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
@@ -46,6 +50,7 @@ class Summary:
 
     Attributes:
         reasons: error type and message (without the episode's id) -> episodes refused for it.
+        flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
         too_many: more than `max_quarantine` was refused; the command ends with exit code 1.
     """
 
@@ -55,6 +60,7 @@ class Summary:
     made_shards: int
     seconds: float
     reasons: dict[str, int]
+    flags: dict[str, int]
     too_many: bool
 
 
@@ -135,7 +141,7 @@ def convert(
             raise SourceError(uri, f"gave no usable episode, so nothing was written: {told}")
     too_many = manifest.quarantined > max_quarantine * plan.episodes
     seconds = time.monotonic() - begun
-    return Summary(out, manifest, len(done), len(todo), seconds, reasons, too_many)
+    return Summary(out, manifest, len(done), len(todo), seconds, reasons, _flags(out), too_many)
 
 
 def _finish(
@@ -156,6 +162,15 @@ def _reasons(out: Path) -> dict[str, int]:
             text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
         reasons[text] = reasons.get(text, 0) + 1
     return reasons
+
+
+def _flags(out: Path) -> dict[str, int]:
+    """Counts of the episodes' flags, added up."""
+    totals: Counter[str] = Counter()
+    for item in pq.read_table(out / EPISODES, columns=["flags"])["flags"].value_counts().to_pylist():
+        for name, count in flag_counts(item["values"] or "").items():
+            totals[name] += count * item["counts"]
+    return dict(sorted(totals.items()))
 
 
 _COUNTED = ("frames", "episodes", "quarantined", "bytes")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError
 
 Floats = NDArray[np.float64]
+Known = NDArray[np.bool_] | None
 
 
 class Stream(Protocol):
@@ -33,14 +34,18 @@ class Signal:
     Attributes:
         timestamps: (T,) seconds.
         values: (T, A) float32, in the order of the embodiment's components, sign and offset applied.
+        known: (T,) False where the recording has no value; None where it has all.
     """
 
     timestamps: Floats
     values: NDArray[np.float32]
+    known: Known = None
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or len(self.timestamps) != len(self.values):
             raise ValueError(f"{len(self.timestamps)} times for values {self.values.shape}")
+        if self.known is not None and self.known.shape != self.timestamps.shape:
+            raise ValueError(f"{len(self.timestamps)} times for marks {self.known.shape}")
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,8 @@ class Episode:
         instruction: what was asked, empty when nothing was.
         success: None when the recording does not say.
         source: the file or URI it comes from.
-        metadata: plain values worth keeping.
+        metadata: plain values worth keeping; `flags`, name -> count, stand in episodes.parquet and are
+            added up in the summary of a conversion.
     """
 
     id: str
@@ -82,6 +88,8 @@ class Clip:
         frame_indices: camera -> (T,) index into its stream.
         skew_ms: stream -> (T,) milliseconds by which it was moved onto the grid.
         trimmed: frames left out at both ends, where not every stream was running.
+        repeated: frames left out because they bear the stamp of the one before.
+        action_known, state_known: (T,) False where there is no value and zeros stand; None: all are known.
     """
 
     episode: Episode
@@ -91,9 +99,33 @@ class Clip:
     frame_indices: dict[str, NDArray[np.int64]]
     skew_ms: dict[str, Floats]
     trimmed: int = 0
+    repeated: int = 0
+    action_known: Known = None
+    state_known: Known = None
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    @property
+    def known_actions(self) -> NDArray[np.float32]:
+        """(N, A) the actions that are known."""
+        return self.actions if self.action_known is None else self.actions[self.action_known]
+
+    @property
+    def known_states(self) -> NDArray[np.float32] | None:
+        """(N, A') the states that are known, or None."""
+        return (
+            self.states if self.states is None or self.state_known is None else self.states[self.state_known]
+        )
+
+    @property
+    def flags(self) -> dict[str, int]:
+        """What is worth counting: the source's own, then frames that are masked or repeated."""
+        found: dict[str, int] = dict(self.episode.metadata.get("flags", {}))
+        for name, known in (("masked_actions", self.action_known), ("masked_states", self.state_known)):
+            found[name] = 0 if known is None else int((~known).sum())
+        found["repeated_frames"] = self.repeated
+        return {name: count for name, count in found.items() if count}
 
     def frames_at(self, camera: str, grid: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Pictures (n, H, W, 3) of those grid frames."""

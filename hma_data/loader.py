@@ -27,7 +27,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 from hma_data.errors import ShardError, UsageError
 from hma_data.mixture import Mixture
 from hma_data.shards.reader import RowGroupCache, ShardSet
-from hma_data.shards.schema import token_column
+from hma_data.shards.schema import mask_columns, token_column
 from hma_data.windows import Ints, WindowIndex
 
 
@@ -38,7 +38,7 @@ class Batch:
     Attributes:
         embodiment: B ids; may mix.
         actions: (B, T, Kmax) float32 raw; rows of narrower embodiments are zero at the end.
-        action_mask: (B, T) bool, True where the chunk is known.
+        action_mask: (B, T) bool, True where the chunk is known: all of its steps are.
         tokens: (B, T, h, w) int64, or None.
         latents: (B, T, c, H, W) float32 as stored, or None.
         episode, frame: (B,) int64, where the window comes from.
@@ -76,15 +76,18 @@ class _Rows:
     actions: NDArray[np.float32]
     episode: NDArray[np.int32]
     frame: NDArray[np.int32]
+    known: NDArray[np.bool_]  # whether the row's action is
 
     def cut(self, first: Ints, index: WindowIndex) -> dict[str, NDArray[Any]]:
-        """Windows that start at these rows: tokens (n, T, S), actions (n, T, K), episode, frame (n,)."""
+        """Windows that start at these rows: tokens (n, T, S), actions (n, T, K), known (n, T), …"""
         steps = first[:, None] + np.arange(0, index.span, index.row_stride)
         every = first[:, None] + np.arange(index.span)
         chunks = self.actions[every].reshape(len(first), index.frames, -1)
+        known = np.all(self.known[every].reshape(len(first), index.frames, -1), axis=2)
         return {
             "tokens": self.tokens[steps],
             "actions": chunks,
+            "known": known,
             "episode": self.episode[first],
             "frame": self.frame[first],
         }
@@ -97,8 +100,9 @@ class _SplitReader:
         self.shards, self.split = shards, split
         self.index = WindowIndex.of(shards, split, frames, stride)
         self._token_name = token_column(shards.spec)[0]
-        columns = [self._token_name, "action", "episode_index", "frame_index"]
-        self._cache = RowGroupCache(shards, split, columns, cache)
+        self._columns = [self._token_name, "action", "episode_index", "frame_index"]
+        self._masks = [name for name in mask_columns(shards.embodiment) if name == "action_known"]
+        self._cache = RowGroupCache(shards, split, self._columns + self._masks, cache)
 
     def rows(self, group: int) -> _Rows:
         """All rows that the windows starting in row group `group` need."""
@@ -108,10 +112,14 @@ class _SplitReader:
         ]
         extra = self.index.span - 1  # rows past the group that its windows may need
         kept = int(self.index.edges[group + 1] - self.index.edges[group]) + extra
-        names = (self._token_name, "action", "episode_index", "frame_index")
+        names = self._columns + self._masks
         if len(parts) == 1:
-            return _Rows(*(parts[0][name] for name in names))
-        return _Rows(*(np.concatenate([part[name] for part in parts])[:kept] for name in names))
+            found = [parts[0][name] for name in names]
+        else:
+            found = [np.concatenate([part[name] for part in parts])[:kept] for name in names]
+        if not self._masks:
+            found.append(np.ones(len(found[0]), np.bool_))
+        return _Rows(*found)
 
 
 def open_sets(data: Sequence[str | Path | ShardSet]) -> dict[str, ShardSet]:
@@ -153,6 +161,7 @@ def _assemble(
     width = max(windows["actions"].shape[2] for _, windows in pieces.values())
     frames = next(iter(pieces.values()))[1]["actions"].shape[1]
     actions = np.zeros((size, frames, width), np.float32)
+    known = np.ones((size, frames), np.bool_)
     episode, frame = np.zeros(size, np.int64), np.zeros(size, np.int64)
     spec = next(iter(sets.values())).spec
     discrete = spec.kind == "discrete"
@@ -160,12 +169,13 @@ def _assemble(
     tokens = np.empty((size, frames, *shape), np.int64 if discrete else np.float32)
     for places, windows in pieces.values():
         actions[places, :, : windows["actions"].shape[2]] = windows["actions"]
+        known[places] = windows["known"]
         episode[places], frame[places] = windows["episode"], windows["frame"]
         tokens[places] = windows["tokens"].reshape(len(places), frames, *shape)
     return Batch(
         embodiment=names,
         actions=torch.from_numpy(actions),
-        action_mask=torch.ones(size, frames, dtype=torch.bool),
+        action_mask=torch.from_numpy(known),
         tokens=torch.from_numpy(tokens) if discrete else None,
         latents=None if discrete else torch.from_numpy(tokens),
         episode=torch.from_numpy(episode),

@@ -30,7 +30,7 @@ from hma_data.errors import (
 )
 from hma_data.plan import ShardUnit
 from hma_data.prefetch import prefetch
-from hma_data.shards.schema import EpisodeRow, Footer, Refused, arrow_schema
+from hma_data.shards.schema import EpisodeRow, Footer, Refused, arrow_schema, flags_text, mask_columns
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef, open_source
 from hma_data.stats import Stats
@@ -101,7 +101,7 @@ def make_shard(
     cameras: list[str] = job.facts["cameras"]
     width = embodiment.chunk_dim if strided else embodiment.action_dim
     state_width = embodiment.state.dims if embodiment.state else 0
-    schema = arrow_schema(tokenizer.spec, width, state_width, len(cameras))
+    schema = arrow_schema(tokenizer.spec, width, state_width, len(cameras), mask_columns(embodiment))
     rows: list[EpisodeRow] = []
     refused: list[Refused] = []
     stats = {"action": Stats.empty(embodiment.action_dim)}
@@ -119,9 +119,9 @@ def make_shard(
             start = writer.rows
             for piece in _cut(item, cameras, embodiment.stride if strided else 1):
                 writer.add(piece)
-            stats["action"].merge(Stats.of(item.clip.actions))
-            if item.clip.states is not None:
-                stats["state"].merge(Stats.of(item.clip.states))
+            stats["action"].merge(Stats.of(item.clip.known_actions))
+            if item.clip.known_states is not None:
+                stats["state"].merge(Stats.of(item.clip.known_states))
             rows.append(_row(item, unit, start, writer.rows - start, len(cameras)))
             report(Tick(episodes=1))
         writer.close(Footer(job.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
@@ -206,14 +206,21 @@ def _cut(item: _Whole, cameras: list[str], stride: int) -> Iterator[EpisodeRows]
     """The episode's rows, camera after camera; strided rows carry the whole chunk of actions."""
     clip = item.clip
     kept = len(clip) // stride
+    actions: NDArray[np.float32] = clip.actions[: kept * stride].reshape(kept, -1)
+    known, state_known = clip.action_known, clip.state_known
+    if known is not None:
+        known = np.all(known[: kept * stride].reshape(kept, -1), axis=1)
+        actions = np.where(known[:, None], actions, np.float32(0))
     for camera in cameras:
         yield EpisodeRows(
             episode_index=item.index,
             timestamps=clip.timestamps[: kept * stride : stride],
             tokens=item.tokens[camera],
-            actions=clip.actions[: kept * stride].reshape(kept, -1),
+            actions=actions,
             states=None if clip.states is None else clip.states[: kept * stride : stride],
             camera=camera,
+            action_known=known,
+            state_known=None if state_known is None else state_known[: kept * stride : stride],
         )
 
 
@@ -237,5 +244,5 @@ def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> 
         skew_max_ms=worst[2],
         skew=json.dumps(skew),
         trimmed=clip.trimmed,
-        flags="trimmed" if clip.trimmed else "",
+        flags=flags_text(clip.trimmed, clip.flags),
     )

@@ -4,6 +4,7 @@ S = h·w tokens a frame, c channels, A values of an action. docs/format.md state
 """
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
 from hma_data.stats import Stats
 from hma_data.tokenizers.base import TokenizerSpec
@@ -36,7 +38,7 @@ class EpisodeRow:
         skew_p50_ms, skew_p95_ms, skew_max_ms: of the stream that was moved furthest.
         skew: stream -> [p50, p95, max] in ms, as JSON.
         trimmed: frames cut at the ends, where not every stream ran.
-        flags: remarks, comma separated.
+        flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
     """
 
     episode_index: int
@@ -134,6 +136,18 @@ class Footer:
             raise ShardError(where, f"has a damaged footer: {fault}") from fault
 
 
+def flags_text(trimmed: int, counts: Mapping[str, int]) -> str:
+    """The flags of an episode: trimmed, then each count as name=count."""
+    words = ["trimmed"] if trimmed else []
+    return ",".join([*words, *(f"{name}={count}" for name, count in sorted(counts.items()))])
+
+
+def flag_counts(flags: str) -> dict[str, int]:
+    """The counts that `flags_text` wrote; words without one are left out."""
+    pairs = (word.partition("=") for word in flags.split(","))
+    return {name.strip(): int(count) for name, _, count in pairs if count.strip().isdecimal()}
+
+
 def token_column(spec: TokenizerSpec) -> tuple[str, int]:
     """Name of the column that holds a frame, and its values a row."""
     if spec.kind == "discrete":
@@ -148,8 +162,22 @@ def _vector(values: pa.DataType, width: int) -> pa.DataType:
 _STORED = {"uint8": pa.uint8(), "uint16": pa.uint16(), "uint32": pa.uint32(), "float16": pa.float16()}
 
 
-def arrow_schema(spec: TokenizerSpec, action_width: int, state_width: int, cameras: int) -> pa.Schema:
-    """Columns of a shard; no value is ever null."""
+def mask_columns(embodiment: Embodiment) -> tuple[str, ...]:
+    """Columns that say which numbers are known: of embodiments some of whose numbers may not be.
+
+    Those are the ones with `sync.beyond: mask`, and hand videos with `missing: mask`.
+    """
+    layout = embodiment.source.layout or {}
+    hands = embodiment.source.format == "hands" and layout.get("missing") == "mask"
+    if embodiment.sync.beyond != "mask" and not hands:
+        return ()
+    return ("action_known", "state_known") if embodiment.state else ("action_known",)
+
+
+def arrow_schema(
+    spec: TokenizerSpec, action_width: int, state_width: int, cameras: int, masks: Sequence[str] = ()
+) -> pa.Schema:
+    """Columns of a shard; no value is ever null. `masks`: see `mask_columns`."""
     name, width = token_column(spec)
     columns: list[tuple[str, pa.DataType]] = [
         ("episode_index", pa.int32()),
@@ -162,6 +190,7 @@ def arrow_schema(spec: TokenizerSpec, action_width: int, state_width: int, camer
     columns.append(("action", _vector(pa.float32(), action_width)))
     if state_width:
         columns.append(("state", _vector(pa.float32(), state_width)))
+    columns += [(mask, pa.bool_()) for mask in masks]
     return pa.schema([pa.field(column, kind, nullable=False) for column, kind in columns])
 
 

@@ -25,6 +25,7 @@ class EpisodeRows:
         tokens: (T, h, w) ids or (T, c, h, w) latents.
         actions: (T, A) float32; states: (T, A') or None.
         camera: its name; written only where the shard set has more than one.
+        action_known, state_known: (T,) or None where all are; written only where the shard set has them.
     """
 
     episode_index: int
@@ -33,6 +34,8 @@ class EpisodeRows:
     actions: NDArray[np.float32]
     states: NDArray[np.float32] | None
     camera: str
+    action_known: NDArray[np.bool_] | None = None
+    state_known: NDArray[np.bool_] | None = None
 
 
 class ShardWriter:
@@ -70,6 +73,9 @@ class ShardWriter:
             self._tokens: episode.tokens,
             "action": episode.actions,
         }
+        for name in ("action_known", "state_known"):
+            known = getattr(episode, name)
+            values[name] = np.ones(length, np.bool_) if known is None else known
         if episode.states is not None:
             values["state"] = episode.states
         table = pa.table([to_arrow(field, values[field.name]) for field in self._schema], schema=self._schema)

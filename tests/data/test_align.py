@@ -220,7 +220,7 @@ def test_a_held_command_ends_with_its_stream_where_a_limit_is_set() -> None:
 
 
 def test_streams_that_never_overlap_are_told_with_their_times() -> None:
-    with pytest.raises(AlignmentError, match=r"never run together: .*action/0 100\.000 to 101\.900"):
+    with pytest.raises(AlignmentError, match=r"never run together: .*a 100\.000 to 101\.900"):
         to_clip(episode(STEADY, STEADY, STEADY + 100, STEADY, STEADY), embodiment())
 
 
