@@ -239,6 +239,7 @@ def _report_conversion(summary: Any, max_quarantine: float, json: bool) -> None:
             "shards_kept": summary.kept_shards,
             "seconds": summary.seconds,
             "reasons": summary.reasons,
+            "flags": summary.flags,
             "too_many_quarantined": summary.too_many,
         }
         print_json(facts)
@@ -250,6 +251,9 @@ def _report_conversion(summary: Any, max_quarantine: float, json: bool) -> None:
             f"{human_bytes(totals['bytes'])} in "
             f"{len(manifest.shards)} shards{kept}, {human_seconds(summary.seconds)}"
         )
+        if summary.flags:
+            counts = [f"{count:,} {name.replace('_', ' ')}" for name, count in summary.flags.items()]
+            print(f"flags: {', '.join(counts)}")
     for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:20]:
         typer.echo(f"quarantine: {count:,} × {reason}", err=True)
     if summary.too_many:
