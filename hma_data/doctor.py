@@ -103,7 +103,7 @@ def _episodes(uri: str, robot: Embodiment, sample: int) -> Iterator[Finding]:
         yield Finding("usable", severity, f"{count} of {len(chosen)} episodes looked at: {reason}")
     if clips:
         yield from _times(clips, robot)
-        yield from _numbers(np.concatenate([clip.actions for clip in clips]), robot)
+        yield from _numbers(np.concatenate([clip.known_actions for clip in clips]), robot)
         yield from _looks(pictures, robot)
 
 

@@ -78,7 +78,7 @@ def _check(report: dict[str, Any], uri: str, robot: Embodiment) -> None:
         report["problems"].append(
             f"{robot.id} says {robot.rate_hz:g} Hz, the recording's grid ticks at {measured:.3g} Hz"
         )
-    constant = np.flatnonzero(clip.actions.std(axis=0) == 0)
+    constant = np.flatnonzero(clip.known_actions.std(axis=0) == 0)
     if len(constant):
         names = robot.action.names()
         facts["constant in it"] = "action " + ", ".join(names[i] for i in constant)
