@@ -10,18 +10,30 @@ import json
 import re
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import pyarrow.parquet as pq
 
 from hma_data.embodiment import Embodiment
 from hma_data.engines.base import LIMITS, Limits, Retry
-from hma_data.engines.local import run
-from hma_data.errors import RegistryError, SourceError
-from hma_data.output import clear, finished_shards, locked
-from hma_data.plan import Plan, Settings, make_plan
+from hma_data.engines.local import run as run_local
+from hma_data.errors import OutputError, RegistryError, SourceError
+from hma_data.extend import extended
+from hma_data.output import (
+    Journal,
+    Made,
+    Share,
+    base_manifest,
+    clear,
+    finished_shards,
+    locked,
+    remove_journals,
+)
+from hma_data.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.shard_work import Job, MakeWork, Tick
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
 from hma_data.shards.schema import flag_counts
@@ -64,6 +76,21 @@ class Summary:
     too_many: bool
 
 
+@dataclass(frozen=True)
+class Shared:
+    """What one share of a conversion did; the shard set is finished by whoever comes last.
+
+    Attributes:
+        missing: shards that other shares have still to make.
+    """
+
+    out: Path
+    kept_shards: int
+    made_shards: int
+    missing: int
+    seconds: float
+
+
 def plan_conversion(
     embodiment: Embodiment, source: str | None, tokenizer: Tokenizer, settings: Settings
 ) -> tuple[Plan, str]:
@@ -85,11 +112,13 @@ def convert(
     *,
     settings: Settings | None = None,
     workers: int = 0,
+    engine: Literal["local", "ray"] = "local",
     weights: str | None = None,
     device: str = "cpu",
     limits: Limits = LIMITS,
     max_quarantine: float = 0.01,
     overwrite: bool = False,
+    extend: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> Summary:
     """Convert a recording into the shard set `out`; running it again continues.
@@ -99,10 +128,12 @@ def convert(
         source: URI of the recording; None takes the one in the embodiment's YAML.
         tokenizer: name, see `get_tokenizer`; or one that is open already, for work in this process.
         workers: processes, which may crash or hang without ending the job; 0 works in this one.
+        engine: what runs the workers: this machine, or a Ray cluster.
         weights, device: of the tokenizer.
         limits: when a worker counts as hanging, and how often it may be lost.
         max_quarantine: fraction of episodes that may be refused.
         overwrite: throw away what `out` holds, if it is a shard set.
+        extend: add the episodes that a finished set in `out` does not have yet.
         on_progress: called after every batch of frames or so.
 
     Raises:
@@ -111,46 +142,148 @@ def convert(
         HMAError: the embodiment or the tokenizer cannot be used.
     """
     begun = time.monotonic()
-    opened = (
-        get_tokenizer(tokenizer, weights=weights, device=device) if isinstance(tokenizer, str) else tokenizer
+    conversion = _Conversion(
+        embodiment, source, tokenizer, out, settings or Settings(), workers, engine, weights, device, limits
     )
-    plan, uri = plan_conversion(embodiment, source, opened, settings or Settings())
     with locked(out):
         if overwrite:
             clear(out)
-        done = finished_shards(out, plan)
-        todo = [unit for unit in plan.units if unit.name not in done]
-        progress = Progress(total_episodes=plan.episodes, total_frames=plan.frames, kept_shards=len(done))
-        for unit in plan.units:
-            if unit.name in done:
-                progress.episodes += len(unit.episodes)
-                progress.frames += unit.frames
-        on_progress(progress)
-
-        job = Job(uri, embodiment, opened.spec.name, weights, device, out.absolute(), plan.facts)
-        processes = workers if isinstance(tokenizer, str) else 0
-        make_work = MakeWork(job, None if processes else opened)
-        for _ in run(todo, make_work, processes, _Counter(progress, on_progress), limits):
-            on_progress(progress)
-        manifest = _finish(out, plan, embodiment, opened, uri, bool(todo))
+        plan, base = conversion.plan(extend)
+        done, made = conversion.make(plan, base, None, on_progress)
+        manifest = conversion.finish(plan, base, bool(made))
         reasons = _reasons(out)
         if not any(split["episodes"] for split in manifest.splits.values()):
             clear(out)
             worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
-            raise SourceError(uri, f"gave no usable episode, so nothing was written: {told}")
-    too_many = manifest.quarantined > max_quarantine * plan.episodes
+            raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
+    episodes = sum(split["episodes"] for split in manifest.splits.values())
+    too_many = manifest.quarantined > max_quarantine * (episodes + manifest.quarantined)
     seconds = time.monotonic() - begun
-    return Summary(out, manifest, len(done), len(todo), seconds, reasons, _flags(out), too_many)
+    return Summary(out, manifest, done, made, seconds, reasons, _flags(out), too_many)
 
 
-def _finish(
-    out: Path, plan: Plan, embodiment: Embodiment, tokenizer: Tokenizer, uri: str, changed: bool
-) -> Manifest:
-    names = [unit.name for unit in plan.units]
-    if not changed and (out / MANIFEST).is_file() and (out / EPISODES).is_file():
-        return Manifest.load(out)
-    return finish(out, names, embodiment, tokenizer.spec, plan.facts, uri)
+def convert_share(
+    embodiment: Embodiment,
+    source: str | None,
+    tokenizer: str | Tokenizer,
+    out: Path,
+    share: Share,
+    *,
+    settings: Settings | None = None,
+    workers: int = 0,
+    weights: str | None = None,
+    device: str = "cpu",
+    limits: Limits = LIMITS,
+    extend: bool = False,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> Shared:
+    """One share of a conversion, for an array of jobs over one folder that all of them see.
+
+    The bytes are those that `convert` alone would make. Arguments as there.
+    """
+    begun = time.monotonic()
+    conversion = _Conversion(
+        embodiment, source, tokenizer, out, settings or Settings(), workers, "local", weights, device, limits
+    )
+    with locked(out, share):
+        plan, base = conversion.plan(extend)
+        done, made = conversion.make(plan, base, share, on_progress)
+    missing = len(plan.units)
+    with suppress(OutputError), locked(out):  # others are still writing: the last of them comes here
+        missing -= len(finished_shards(out, plan, base, shared=False))
+        if not missing:
+            conversion.finish(plan, base, True)
+    if missing:
+        missing = sum(not (out / unit.name).is_file() for unit in plan.units)
+    return Shared(out, done, made, missing, time.monotonic() - begun)
+
+
+class _Conversion:
+    """What `convert` and `convert_share` have in common."""
+
+    def __init__(
+        self,
+        embodiment: Embodiment,
+        source: str | None,
+        tokenizer: str | Tokenizer,
+        out: Path,
+        settings: Settings,
+        workers: int,
+        engine: str,
+        weights: str | None,
+        device: str,
+        limits: Limits,
+    ) -> None:
+        self._embodiment, self._out, self._settings = embodiment, out, settings
+        self._named = isinstance(tokenizer, str)
+        self._workers, self._engine, self._limits = workers if self._named else 0, engine, limits
+        self._weights, self._device = weights, device
+        self._tokenizer = (
+            get_tokenizer(tokenizer, weights=weights, device=device)
+            if isinstance(tokenizer, str)
+            else tokenizer
+        )
+        self._whole, self.uri = plan_conversion(embodiment, source, self._tokenizer, settings)
+
+    def plan(self, extend: bool) -> tuple[Plan, Manifest | None]:
+        """What is to be made, and the set it extends; a set that was extended before may be continued."""
+        base = base_manifest(self._out)
+        if base is None or not (extend or "extends" in base.plan):
+            return self._whole, None
+        plan = extended(self._out, base, self._whole, self._settings.shard_frames)
+        if plan.units and not extend:
+            raise OutputError(
+                self._out,
+                f"lacks {plan.episodes:,} episodes that the recording has now",
+                "--extend adds them",
+            )
+        return plan, base
+
+    def make(
+        self,
+        plan: Plan,
+        base: Manifest | None,
+        share: Share | None,
+        on_progress: Callable[[Progress], None],
+    ) -> tuple[int, int]:
+        """Make the shards that are not there; how many were, and how many are made."""
+        mine = plan.units[share.index :: share.count] if share else plan.units
+        there = finished_shards(self._out, plan, base, share is not None)
+        todo = [unit for unit in mine if unit.name not in there]
+        kept = [unit for unit in mine if unit.name in there]
+        progress = Progress(
+            episodes=sum(len(unit.episodes) for unit in kept),
+            frames=sum(unit.frames for unit in kept),
+            kept_shards=len(kept) + (len(base.shards) if base else 0),
+            total_episodes=sum(len(unit.episodes) for unit in mine),
+            total_frames=sum(unit.frames for unit in mine),
+        )
+        on_progress(progress)
+        if todo:
+            journal = Journal(self._out, share)
+            for made in self._run(todo, plan, _Counter(progress, on_progress)):
+                journal.add(made)
+                on_progress(progress)
+        return progress.kept_shards, len(todo)
+
+    def _run(self, todo: list[ShardUnit], plan: Plan, on_event: "_Counter") -> Iterator[Made]:
+        name = self._tokenizer.spec.name
+        job = Job(
+            self.uri, self._embodiment, name, self._weights, self._device, self._out.absolute(), plan.facts
+        )
+        make_work = MakeWork(job, None if self._workers else self._tokenizer)
+        return run_local(todo, make_work, self._workers, on_event, self._limits)
+
+    def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
+        """The manifest and what else is derived from footers; nothing where nothing changed."""
+        out = self._out
+        if not changed and (out / MANIFEST).is_file() and (out / EPISODES).is_file():
+            return Manifest.load(out)
+        names = [*(shard.path for shard in (base.shards if base else ())), *(u.name for u in plan.units)]
+        manifest = finish(out, names, self._embodiment, self._tokenizer.spec, plan.facts, self.uri)
+        remove_journals(out)
+        return manifest
 
 
 def _reasons(out: Path) -> dict[str, int]:

@@ -111,7 +111,7 @@ def make_plan(
     units = [
         unit
         for split in ("train", "val")
-        for unit in _pack(split, [(i, ref) for i, ref in enumerate(refs) if splits[i] == split], target)
+        for unit in pack(split, [(i, ref) for i, ref in enumerate(refs) if splits[i] == split], target)
     ]
     facts: dict[str, Any] = {
         "embodiment": embodiment.id,
@@ -121,11 +121,11 @@ def make_plan(
         "frames": settings.frames,
         "frame_stride": embodiment.stride if settings.frames == "strided" else 1,
         "settings": {**asdict(settings), "cameras": cameras},
-        "recording": _digest([(ref.id, ref.fingerprint) for ref in refs]),
-        "shards": _digest([(unit.name, [i for i, _ in unit.episodes]) for unit in units]),
+        "recording": digest([(ref.id, ref.fingerprint) for ref in refs]),
+        "shards": digest([(unit.name, [i for i, _ in unit.episodes]) for unit in units]),
     }
     facts = json.loads(json.dumps(facts))  # the plain form, as a footer gives it back
-    return Plan(tuple(units), {**facts, "hash": _digest(facts)})
+    return Plan(tuple(units), {**facts, "hash": digest(facts)})
 
 
 def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) -> list[str]:
@@ -150,7 +150,8 @@ def shard_size(frames: int) -> int:
     return min(LARGEST_SHARD, max(SMALLEST_SHARD, frames // SHARDS_WANTED))
 
 
-def _pack(split: str, episodes: list[tuple[int, EpisodeRef]], target: int) -> list[ShardUnit]:
+def pack(split: str, episodes: list[tuple[int, EpisodeRef]], target: int, begun: int = 0) -> list[ShardUnit]:
+    """Episodes into shards of about `target` frames; `begun` shards of the split are there already."""
     groups: list[list[tuple[int, EpisodeRef]]] = []
     filled = target
     for item in episodes:
@@ -160,7 +161,8 @@ def _pack(split: str, episodes: list[tuple[int, EpisodeRef]], target: int) -> li
         groups[-1].append(item)
         filled += max(item[1].frames, 1)
     return [
-        ShardUnit(f"{split}/shard-{i:05d}.parquet", split, tuple(group)) for i, group in enumerate(groups)
+        ShardUnit(f"{split}/shard-{i:05d}.parquet", split, tuple(group))
+        for i, group in enumerate(groups, start=begun)
     ]
 
 
@@ -168,7 +170,8 @@ def _unit_interval(text: str) -> float:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") / 2**64
 
 
-def _digest(value: Any) -> str:
+def digest(value: Any) -> str:
+    """Sixteen hex digits over plain values."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -6,6 +6,8 @@ whole or absent. Whatever engine runs it, the bytes are the same.
 
 import json
 import sys
+import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.align import to_clip
+from hma_data.batching import Batches
 from hma_data.embodiment import Embodiment
 from hma_data.engines.base import FIRST, Attempt, Report, Step, Work
 from hma_data.engines.local import usable_cores
@@ -28,13 +31,15 @@ from hma_data.errors import (
     ShardError,
     TokenizerError,
 )
+from hma_data.output import Made, made
 from hma_data.plan import ShardUnit
 from hma_data.prefetch import prefetch
+from hma_data.retry import WAITS_S, disk_is_full, storage_is_away, worth_another_try
 from hma_data.shards.schema import EpisodeRow, Footer, Refused, arrow_schema, flags_text, mask_columns
 from hma_data.shards.writer import EpisodeRows, ShardWriter
-from hma_data.sources.base import EpisodeRef, open_source
+from hma_data.sources.base import EpisodeRef, Source, open_source
 from hma_data.stats import Stats
-from hma_data.tokenizers.base import Tokenizer, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.video import prepare
 
 BATCH = 32  # frames decoded and tokenized together
@@ -86,9 +91,11 @@ class MakeWork:
                 sys.modules["torch"].set_num_threads(max(1, usable_cores() // workers))
         job = self.job
 
-        def work(unit: ShardUnit, report: Report, attempt: Attempt) -> str:
+        def work(unit: ShardUnit, report: Report, attempt: Attempt) -> Made:
             make_shard(job, unit, tokenizer, report, attempt)
-            return unit.name
+            done = made(job.out, unit.name)
+            report(Tick(bytes=done.bytes))
+            return done
 
         return work
 
@@ -125,7 +132,6 @@ def make_shard(
             rows.append(_row(item, unit, start, writer.rows - start, len(cameras)))
             report(Tick(episodes=1))
         writer.close(Footer(job.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
-    report(Tick(bytes=(job.out / unit.name).stat().st_size))
 
 
 @dataclass
@@ -142,6 +148,11 @@ class _Frames:
 
 
 @dataclass
+class _End:
+    """Of the episode that was begun."""
+
+
+@dataclass
 class _Whole:
     index: int
     ref: EpisodeRef
@@ -149,57 +160,94 @@ class _Whole:
     tokens: dict[str, NDArray[Any]]
 
 
+Decoded = _Begin | _Frames | _End | Refused
+
+
 def _decoded(
     job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt
-) -> Iterator[_Begin | _Frames | Refused | None]:
-    """Runs ahead in a thread: per episode a _Begin, its pictures in batches, then None; or a Refused."""
+) -> Iterator[Decoded]:
+    """Runs ahead in a thread: per episode a _Begin, its pictures in batches, an _End; or a Refused.
+
+    An episode may be begun again, or refused, after some of its pictures; what came of it before is void.
+    """
     source = open_source(job.embodiment.source.format)
-    spec = tokenizer.spec
-    strided = job.facts["frames"] == "strided"
     for index, ref in unit.episodes:
         if ref.id in attempt.refused:
             yield Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")
             continue
         report(Step(ref.id))
-        try:
-            clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
-            stride = job.embodiment.stride if strided else 1
-            if len(clip) < stride:
-                raise EpisodeError(ref.id, f"has {len(clip)} frames, fewer than one stride of {stride}")
-            yield _Begin(index, ref, clip)
-            for name in job.facts["cameras"]:
-                camera = job.embodiment.camera(name)
-                kept = np.arange(0, len(clip) // stride * stride, stride)
-                for start in range(0, len(kept), BATCH):
-                    raw = clip.frames_at(name, kept[start : start + BATCH])
-                    yield _Frames(name, prepare(raw, camera, spec.image_size, spec.resize_filter))
-            yield None
-        except FATAL:
-            raise
-        except MemoryError:
-            raise
-        except Exception as fault:  # whatever one recording does to a decoder must not end the job
-            text = str(fault) if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}"
-            yield Refused(ref.id, type(fault).__name__, text)
+        for wait_s in (*WAITS_S, None):
+            try:
+                yield from _episode(job, source, tokenizer.spec, index, ref)
+                break
+            except (*FATAL, MemoryError):
+                raise
+            except Exception as fault:  # whatever one recording does to a decoder must not end the job
+                if disk_is_full(fault):
+                    raise OutputError(
+                        ref.id, f"there is no space to unpack it: {fault}", "free space"
+                    ) from fault
+                if wait_s is not None and worth_another_try(fault):
+                    time.sleep(wait_s)
+                    continue
+                if storage_is_away(fault):
+                    remedy = "everything finished is kept: run the same command again"
+                    raise OutputError(job.source, f"storage does not answer: {fault}", remedy) from fault
+                text = str(fault) if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}"
+                yield Refused(ref.id, type(fault).__name__, text)
+                break
 
 
-def _tokenized(
-    items: Iterator[_Begin | _Frames | Refused | None], tokenizer: Tokenizer, report: Report
-) -> Iterator[_Whole | Refused]:
+def _episode(job: Job, source: Source, spec: TokenizerSpec, index: int, ref: EpisodeRef) -> Iterator[Decoded]:
+    clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
+    stride = job.embodiment.stride if job.facts["frames"] == "strided" else 1
+    if len(clip) < stride:
+        raise EpisodeError(ref.id, f"has {len(clip)} frames, fewer than one stride of {stride}")
+    yield _Begin(index, ref, clip)
+    for name in job.facts["cameras"]:
+        camera = job.embodiment.camera(name)
+        kept = np.arange(0, len(clip) // stride * stride, stride)
+        for start in range(0, len(kept), BATCH):
+            raw = clip.frames_at(name, kept[start : start + BATCH])
+            yield _Frames(name, prepare(raw, camera, spec.image_size, spec.resize_filter))
+    yield _End()
+
+
+def _tokenized(items: Iterator[Decoded], tokenizer: Tokenizer, report: Report) -> Iterator[_Whole | Refused]:
+    """Whole episodes and refused ones, in order; batches cross the borders of episodes."""
+    batches = Batches(tokenizer.encode, BATCH)
+    waiting: deque[_Begin | Refused] = deque()
     begun: _Begin | None = None
-    tokens: dict[str, list[NDArray[Any]]] = {}
+
+    def ready() -> Iterator[_Whole | Refused]:
+        while waiting:
+            first = waiting[0]
+            if isinstance(first, _Begin):
+                if first is begun or not batches.whole(first.index):
+                    return
+                yield _Whole(first.index, first.ref, first.clip, batches.take(first.index))
+            else:
+                yield first
+            waiting.popleft()
+
     for item in items:
+        if begun and isinstance(item, _Begin | Refused):  # what came of it before is void
+            batches.drop(begun.index)
+            waiting.pop()
+            begun = None
         if isinstance(item, Refused):
-            yield item
+            waiting.append(item)
         elif isinstance(item, _Begin):
-            begun, tokens = item, {}
+            begun = item
+            waiting.append(item)
         elif isinstance(item, _Frames):
-            tokens.setdefault(item.camera, []).append(tokenizer.encode(item.frames))
-            report(Tick(frames=len(item.frames)))
-        else:
             assert begun is not None
-            whole = {camera: np.concatenate(parts) for camera, parts in tokens.items()}
-            yield _Whole(begun.index, begun.ref, begun.clip, whole)
+            report(Tick(frames=batches.add(begun.index, item.camera, item.frames)))
+        else:
+            begun = None
+        yield from ready()
+    report(Tick(frames=batches.flush()))
+    yield from ready()
 
 
 def _cut(item: _Whole, cameras: list[str], stride: int) -> Iterator[EpisodeRows]:
