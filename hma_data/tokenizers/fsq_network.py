@@ -45,6 +45,8 @@ class FsqConfig:
         sizes = [n for digit in self.levels for n in digit]
         if not sizes or min(sizes) < 2 or max(sizes) > 4096 or len(sizes) > 64:
             raise ValueError(f"levels must be 1 to 64 numbers of 2 or more, got {self.levels}")
+        if math.prod(sizes) > 2**31:
+            raise ValueError(f"levels make {math.prod(sizes)} ids, more than 2^31: {self.levels}")
         widths = (*self.width, self.fine_width, self.hidden)
         blocks = (*self.encoder_blocks, *self.decoder_blocks)
         if len(widths) != 4 or len(blocks) != 5 or min(widths) < 1 or max(widths) > 4096:

@@ -4,7 +4,7 @@ A kernel may sum in another order when the batch has another size or more thread
 the last bits of a latent decide its sign or its rounding. So frames go through in batches of one size,
 the last one padded, and on a CPU each frame is encoded by one thread, several frames at a time: the
 same frame then gives the same tokens whatever the batch, the worker or the number of cores.
-float32 on a CPU; bfloat16 and channels-last on CUDA.
+float32 on a CPU; bfloat16 and channels-last on CUDA, where a network does not ask for float32.
 
 B pictures of a batch, S side, c channels, h·w grid. Pixels inside are (B, 3, S, S) in [-1, 1].
 """
@@ -35,25 +35,31 @@ class NetworkTokenizer:
     """
 
     def __init__(
-        self, spec: TokenizerSpec, network: nn.Module, device: torch.device, encode: Step, decode: Step
+        self,
+        spec: TokenizerSpec,
+        network: nn.Module,
+        device: torch.device,
+        encode: Step,
+        decode: Step,
+        *,
+        light: bool = False,
     ) -> None:
         """
         Args:
             network: placed on `device` here.
             encode: pixels (B, 3, S, S) -> int64 ids (B, h, w), or latents (B, c, h, w).
             decode: the same back to pixels.
+            light: a network of plain convolutions, small enough for float32 and channels-last anywhere.
         """
         cuda = device.type == "cuda"
         self.spec, self.device = spec, device
-        self.dtype = torch.bfloat16 if cuda else torch.float32
+        self.dtype = torch.bfloat16 if cuda and not light else torch.float32
         self.batch = 32 if cuda else 8 if device.type == "mps" else 1
-        self.network = network.eval().requires_grad_(False).to(device)
-        self._format = torch.channels_last if cuda else torch.contiguous_format
-        if cuda:
-            network.to(self.dtype)
-            for parameter in network.parameters():
-                if parameter.ndim == 4:
-                    parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+        self.network = network.eval().requires_grad_(False).to(device, self.dtype)
+        self._format = torch.channels_last if cuda or light else torch.contiguous_format
+        for parameter in network.parameters():
+            if parameter.ndim == 4:
+                parameter.data = parameter.data.contiguous(memory_format=self._format)
         self._encode, self._decode = encode, decode
 
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[Any]:

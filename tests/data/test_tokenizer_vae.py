@@ -9,14 +9,14 @@ import torch
 
 from hma_data.errors import TokenizerError
 from hma_data.shipped import shipped
-from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 from hma_data.tokenizers.corpus import draw_scene
 from hma_data.tokenizers.embedded import read_weights, save_weights
 from hma_data.tokenizers.eval import evaluate, psnr_db
 from hma_data.tokenizers.fsq import WEIGHTS as FSQ_WEIGHTS
 from hma_data.tokenizers.recipe import load_recipe
 from hma_data.tokenizers.train import train
-from hma_data.tokenizers.vae import WEIGHTS, VaeTokenizer
+from hma_data.tokenizers.vae import WEIGHTS
 from hma_data.tokenizers.vae_network import FORMAT, VaeAutoencoder, VaeConfig
 
 RECIPE = shipped("recipes") / "tokenizer" / "vae.yaml"
@@ -24,10 +24,8 @@ SMALL = VaeConfig(width=8, hidden=8, encoder_blocks=1, decoder_blocks=(1, 1), fi
 
 
 @pytest.fixture(scope="module")
-def vae() -> VaeTokenizer:
-    tokenizer = get_tokenizer("vae-8")
-    assert isinstance(tokenizer, VaeTokenizer)
-    return tokenizer
+def vae() -> Tokenizer:
+    return get_tokenizer("vae-8")
 
 
 @pytest.fixture(scope="module")
@@ -53,25 +51,6 @@ def test_near_latents_decode_to_near_pictures(vae, frames):
     assert psnr_db(plain, moved).mean() > 30
 
 
-@pytest.mark.parametrize("sizes", [(1,) * 9, (3, 3, 3), (8, 1)])
-def test_a_frame_has_the_same_latents_in_any_batch(vae, frames, sizes):
-    ends = np.cumsum(sizes)
-    parts = [vae.encode(frames[end - n : end]) for n, end in zip(sizes, ends)]
-    assert np.array_equal(np.concatenate(parts), vae.encode(frames))
-
-
-def test_a_frame_has_the_same_latents_with_any_number_of_threads(vae, frames):
-    before = torch.get_num_threads()
-    try:
-        made = []
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            made.append(vae.encode(frames[:4]))
-    finally:
-        torch.set_num_threads(before)
-    assert np.array_equal(made[0], made[1])
-
-
 @pytest.mark.parametrize("shape", [(1, 4, 16, 16), (1, 3, 32, 32), (4, 32, 32)])
 def test_latents_of_another_shape_are_refused(vae, shape):
     with pytest.raises(TokenizerError, match="decodes"):
@@ -92,7 +71,7 @@ def test_weights_whose_config_lies_are_refused(tmp_path, change):
     config, tensors, _ = read_weights(WEIGHTS, FORMAT, VaeConfig)
     path = tmp_path / "lying.safetensors"
     save_file(tensors, path, {"format": FORMAT, "config": json.dumps(config.to_json() | change)})
-    with pytest.raises(TokenizerError, match=r"fit the network|describes no network"):
+    with pytest.raises(TokenizerError, match=r"the network takes|describes no network"):
         get_tokenizer("vae-8", weights=str(path))
 
 
