@@ -47,6 +47,13 @@ class Steps:
         """T byte strings of a key."""
         return column_blobs(self.example, self.features[key], self.count, self.name)
 
+    def text(self, key: str) -> str:
+        """The first text of a key; empty where the steps have none."""
+        feature = self.features[key]
+        name = f"{feature.name}/ragged_flat_values"
+        blobs = self.example.blobs(name) if name in self.example else self.blobs(key)
+        return bytes(blobs[0]).decode(errors="replace") if blobs else ""
+
     def decoder(self, key: str) -> Decode:
         """Step -> (H, W, 3) picture of a key."""
         feature = self.features[key]
@@ -80,7 +87,7 @@ class _Raw:
         if not self._blobs:
             return self._all[index]
         feature = self._feature
-        return tensor(self._blobs[index], feature, np.dtype(np.uint8), feature.shape, self._steps.name)
+        return tensor(self._blobs[index], feature, feature.shape, self._steps.name)
 
 
 def is_camera(feature: Feature) -> bool:
@@ -134,7 +141,7 @@ def text_feature(folder: Folder, key: str) -> Feature:
     feature = step_feature(folder, key) if inside else folder.features[key]
     if feature.kind == "text":
         return feature
-    if inside and feature.kind == "number" and np.dtype(feature.dtype).kind in "iu":  # codes of letters
+    if inside and feature.kind == "number" and feature.dtype.startswith(("int", "uint")):  # codes of letters
         return feature
     raise SourceError(folder.uri, f"source.instruction: {key} is {described(feature)}, not text")
 
@@ -152,7 +159,7 @@ def instruction(folder: Folder, steps: Steps, key: str | None) -> str:
     if key not in folder.step_features:
         return str(scalar(steps.example, feature) or "")
     if feature.kind == "text":
-        return bytes(steps.blobs(key)[0]).decode(errors="replace")
+        return steps.text(key)
     codes = steps.numbers(key)[0].ravel()  # language_table: bytes of UTF-8, padded with zeros
     return bytes(int(code) & 0xFF for code in codes if code).decode(errors="replace")
 

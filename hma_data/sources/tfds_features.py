@@ -22,6 +22,7 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.tf_example import Example
 
 Shape = tuple[int | None, ...]
+BFLOAT16 = "bfloat16"  # NumPy has none: given as the float32 of the same value
 MAX_TENSOR_BYTES = 1 << 28  # one value that claims more is a bomb or an error
 
 # Content keys of a feature in features.json -> the class that wrote it; legacy files name the class only.
@@ -116,8 +117,8 @@ def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feat
 
 def _tensor(name: str, shape: Shape, dtype: str, nesting: Shape, encoding: str) -> Feature:
     try:
-        readable = np.dtype(dtype).kind in "fiub"
-    except TypeError:  # bfloat16 and the like
+        readable = dtype == BFLOAT16 or np.dtype(dtype).kind in "fiub"
+    except TypeError:  # float8 and the like
         readable = False
     if not nesting and shape and shape[0] is None and encoding == "none":
         shape, nesting = shape[1:], (None,)  # an episode without `steps`: the tensor is the sequence
@@ -191,11 +192,10 @@ def column(example: Example, feature: Feature, steps: int, where: str) -> NDArra
         EpisodeError: the feature is missing, of another kind, ragged, or has not T rows.
     """
     name, sizes = _stored(example, feature, steps, where)
-    dtype = np.dtype(feature.dtype)
     if feature.encoding != "none":
-        values = _decoded(example, feature, name, dtype, where)
+        values = _decoded(example, feature, name, where)
     else:
-        values = example.numbers(name).astype(dtype, copy=False)
+        values = example.numbers(name).astype(_given(feature), copy=False)
     inner = values.shape[1:] if feature.encoding != "none" else feature.shape
     shape = [*sizes, *(-1 if size is None else size for size in inner)]
     try:
@@ -227,7 +227,7 @@ def scalar(example: Example, feature: Feature) -> Any:
         blobs = example.blobs(feature.name)
         return bytes(blobs[0]).decode(errors="replace") if blobs else None
     values = example.numbers(feature.name) if feature.kind == "number" else ()
-    return np.asarray(values).astype(feature.dtype)[0].item() if len(values) == 1 else None
+    return np.asarray(values).astype(_given(feature))[0].item() if len(values) == 1 else None
 
 
 def _stored(example: Example, feature: Feature, steps: int, where: str) -> tuple[str, list[int]]:
@@ -249,7 +249,12 @@ def _stored(example: Example, feature: Feature, steps: int, where: str) -> tuple
     return f"{feature.name}/ragged_flat_values", sizes
 
 
-def _decoded(example: Example, feature: Feature, name: str, dtype: np.dtype, where: str) -> NDArray[Any]:
+def _given(feature: Feature) -> np.dtype:
+    """The dtype its values are given in."""
+    return np.dtype(np.float32 if feature.dtype == BFLOAT16 else feature.dtype)
+
+
+def _decoded(example: Example, feature: Feature, name: str, where: str) -> NDArray[Any]:
     """Tensors kept as bytes or zlib, (n, …)."""
     blobs = example.blobs(name)
     shapes: Any = [feature.shape] * len(blobs)
@@ -258,13 +263,13 @@ def _decoded(example: Example, feature: Feature, name: str, dtype: np.dtype, whe
         if len(shapes) != len(blobs) * len(feature.shape):
             raise EpisodeError(where, f"{feature.name} has {len(shapes)} sizes for {len(blobs)} tensors")
         shapes = shapes.reshape(len(blobs), -1)
-    values = [tensor(blob, feature, dtype, shape, where) for blob, shape in zip(blobs, shapes)]
+    values = [tensor(blob, feature, shape, where) for blob, shape in zip(blobs, shapes)]
     if len({value.shape for value in values}) > 1:
         raise EpisodeError(where, f"{feature.name} changes shape from step to step")
-    return np.stack(values) if values else np.zeros((0, 0), dtype)
+    return np.stack(values) if values else np.zeros((0, 0), _given(feature))
 
 
-def tensor(blob: memoryview, feature: Feature, dtype: np.dtype, shape: Any, where: str) -> NDArray[Any]:
+def tensor(blob: memoryview, feature: Feature, shape: Any, where: str) -> NDArray[Any]:
     """One tensor encoded to bytes.
 
     Args:
@@ -274,14 +279,18 @@ def tensor(blob: memoryview, feature: Feature, dtype: np.dtype, shape: Any, wher
         EpisodeError: the bytes do not decompress, or do not fill the shape.
     """
     sizes = [-1 if size is None else int(size) for size in shape]
+    dtype = np.dtype(np.uint16 if feature.dtype == BFLOAT16 else feature.dtype)
     limit = MAX_TENSOR_BYTES if -1 in sizes else math.prod(sizes) * dtype.itemsize + 1
     try:
         data: Any = blob
         if feature.encoding == "zlib":
             data = zlib.decompressobj().decompress(blob, min(max(limit, 1), MAX_TENSOR_BYTES))
-        return np.frombuffer(data, dtype).reshape(sizes)
+        values = np.frombuffer(data, dtype).reshape(sizes)
     except (zlib.error, ValueError) as fault:
         raise EpisodeError(where, f"{feature.name} is not {_printed(feature)}: {fault}") from fault
+    if feature.dtype == BFLOAT16:
+        return (values.astype(np.uint32) << 16).view(np.float32)
+    return values
 
 
 def _printed(feature: Feature) -> str:
