@@ -247,7 +247,8 @@ def _moved(
     if signal.known is None:
         return values, None, skew
     before, age_ms = hold(signal.timestamps, grid)
-    after = np.minimum(before + (age_ms > 0), len(signal.values) - 1)
+    exact = age_ms <= 1e3 * rounding(signal.timestamps, grid)
+    after = np.minimum(before + ~exact, len(signal.values) - 1)
     return values, signal.known[before] & signal.known[after], skew
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 from hma_data import infer_topics
-from hma_data.embodiment import ID_PATTERN, TODO
+from hma_data.embodiment import ID_PATTERN, TODO, find
 from hma_data.errors import SourceError, UsageError
 from hma_data.infer_choices import Choice, actions, camera_names, cameras, instruction, likely, states
 from hma_data.infer_space import names_of, space_of
@@ -40,10 +40,20 @@ def infer(uri: str, embodiment_id: str) -> str:
 
 def from_inspection(found: Inspection, embodiment_id: str) -> str:
     """See `infer`."""
+    if found.format == "hands":
+        return _of_hands(found, embodiment_id)
     readable = replace(found, keys=tuple(key for key in found.keys if _is_text(key.key)))
     text = yaml_text(_Draft(readable).values(embodiment_id))
     where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
     return f"# Inferred from {where}; answer every {TODO}, then: hma registry validate FILE\n{text}"
+
+
+def _of_hands(found: Inspection, embodiment_id: str) -> str:
+    """Videos have nothing of their own that could be an action: what comes along for them is copied."""
+    where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
+    values = find("hand_video").to_dict() | {"id": embodiment_id}
+    head = "a copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
+    return f"# For the videos of {where}: {head}\n{yaml_text(values)}"
 
 
 def _is_text(text: str) -> bool:

@@ -4,8 +4,9 @@ N pictures, H×W pixels, A action dims; pictures are uint8 RGB.
 """
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -99,17 +100,22 @@ def write_png(path: Path, picture: Images) -> None:
         part.write_bytes(png_bytes(picture))
 
 
-def write_mp4(path: Path, frames: Images, fps: float) -> None:
-    """An H.264 file of frames (N, H, W, 3), whole or absent; odd sides are padded by a pixel."""
+def write_mp4(path: Path, frames: Iterable[Images], fps: float) -> None:
+    """An H.264 file of frames (H, W, 3) of one size, whole or absent; odd sides are padded by a pixel.
+
+    Frames are taken one by one, so that a generator of any length may give them; there is at least one.
+    """
     import av
 
-    frames = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), mode="edge")
+    rest = iter(frames)
+    first = next(rest)
+    height, width = (side + side % 2 for side in first.shape[:2])
     with atomic_path(path) as part, av.open(str(part), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
-        stream.height, stream.width, stream.pix_fmt = frames.shape[1], frames.shape[2], "yuv420p"
+        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
         stream.options = {"crf": "18", "preset": "fast"}
-        for frame in frames:
-            container.mux(
-                stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24"))
-            )
+        for frame in chain([first], rest):
+            odd = ((0, height - frame.shape[0]), (0, width - frame.shape[1]), (0, 0))
+            padded = np.ascontiguousarray(np.pad(frame, odd, mode="edge"))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(padded, format="rgb24")))
         container.mux(stream.encode(None))

@@ -12,11 +12,13 @@ with `/next` for the value at the next labelled frame, `/delta` for next minus c
 nothing for the current one. Left and right are the person's own.
 
 Labels come from a detector or from annotations (`source.layout.labels`, see hands_layout). A
-frame without a needed hand ends a run, or its last place is held. With annotations each run of
+frame without a needed hand ends a run, or its last place is held, or the run goes on and the values that
+need the hand are not known (`source.layout.missing`: split, hold, mask). With annotations each run of
 at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain name `clip.mp4` is
-the longest. The detector runs while an episode is read, not while episodes are counted, so there
-a video is one episode, `clip.mp4`: its longest run. What it leaves out is counted in the
-episode's metadata; `detect` writes a table with which all runs become episodes.
+the longest. Runs of one video share a group, so that they come into one split. The detector runs while an
+episode is read, not while episodes are counted, so there a video is one episode, `clip.mp4`: its longest
+run. What is held, masked and left out is counted in the episode's metadata and flags; `detect` writes a table
+with which all runs become episodes.
 
 T frames of an episode.
 """
@@ -56,7 +58,6 @@ __all__ = ["CAMERA", "HandsSource", "detect", "open"]
 
 CAMERA = "video"
 RATE_TOLERANCE = 0.01  # of the rate
-EARLY_S = 1e-6  # seconds by which actions are stamped early, so that a grid's rounded times still find them
 REGULAR = 0.1  # of the median interval, by which the others of a regular video may differ
 
 
@@ -108,10 +109,11 @@ class HandsSource:
         file, runs = self.runs(uri, video.name, embodiment)
         if not runs.spans:
             raise EpisodeError(video.path, *_no_run(runs, _needed(embodiment), layout))
+        alone = number is None
         number = runs.longest() if number is None else number
         if number >= len(runs.spans):
             raise EpisodeError(video.path, f"has {len(runs.spans)} runs, no run {number}")
-        return _episode(episode_id, file, runs, number, embodiment, layout)
+        return _episode(episode_id, file, runs, number, embodiment, alone)
 
     def runs(self, uri: str, name: str, embodiment: Embodiment) -> tuple[VideoFile, Runs]:
         """A video and all its runs; see read."""
@@ -222,7 +224,7 @@ def _runs_of(
         values = [runs.labels.points[point][slice(*span)].tobytes() for point in needed]
         content = [mark.encode(), runs.labels.frames[slice(*span)].tobytes(), *values]
         frames = episode_frames(runs.labels, span, layout)
-        refs.append(EpisodeRef(f"{video.name}#{number}", frames, None, _digest(*content)))
+        refs.append(EpisodeRef(f"{video.name}#{number}", frames, None, _digest(*content), group=video.name))
     return refs
 
 
@@ -266,9 +268,10 @@ def _no_run(runs: Runs, needed: tuple[str, ...], layout: HandsLayout) -> tuple[s
 
 
 def _episode(
-    episode_id: str, file: VideoFile, runs: Runs, number: int, embodiment: Embodiment, layout: HandsLayout
+    episode_id: str, file: VideoFile, runs: Runs, number: int, embodiment: Embodiment, alone: bool
 ) -> Episode:
-    span, labels = runs.spans[number], runs.labels
+    """Run `number` of a video, which is all there is of it where it is `alone`."""
+    span, labels, layout = runs.spans[number], runs.labels, layout_of(embodiment)
     marks = labels.frames[span[0] : span[1]]
     every = layout.pictures == "every"
     shown = np.arange(marks[0], marks[-1]) if every else marks[:-1]
@@ -281,27 +284,37 @@ def _episode(
     state: tuple[Signal, ...] = ()
     if embodiment.state:
         state = (_signal(embodiment.state, file, labels, span, to_last=not steady),)
-    early = 0.0 if steady else EARLY_S
     return Episode(
         id=episode_id,
         streams={camera.name: stream for camera in embodiment.cameras},
-        actions=(_signal(embodiment.action, file, labels, span, early=early),),
+        actions=(_signal(embodiment.action, file, labels, span),),
         states=state,
         rate_stamped=steady,
         instruction=text,
         source=str(file.path),
         metadata={"labels": layout.labels, "run": number, "runs": len(runs.spans)}
-        | {"first_frame": int(marks[0]), "video_frames": len(file), **runs.counts},
+        | {"first_frame": int(marks[0]), "video_frames": len(file), **runs.counts}
+        | {"flags": _flags(runs, number, alone)},
     )
 
 
+def _flags(runs: Runs, number: int, alone: bool) -> dict[str, int]:
+    """What is counted over episodes; what no run takes counts in the first, or in the one that is alone."""
+    start, stop = runs.spans[number]
+    own = slice(start, stop - 1)
+    dropped = 0 if number else runs.counts["dropped"]
+    if alone:
+        dropped = len(runs.labels) - (stop - start - 1)
+    counts = {
+        "held_frames": int(runs.held[own].sum()),
+        "masked_frames": int(runs.missing[own].sum()),
+        "dropped_frames": dropped,
+    }
+    return {name: count for name, count in counts.items() if count}
+
+
 def _signal(
-    vector: Vector,
-    file: VideoFile,
-    labels: HandLabels,
-    span: tuple[int, int],
-    to_last: bool = False,
-    early: float = 0.0,
+    vector: Vector, file: VideoFile, labels: HandLabels, span: tuple[int, int], to_last: bool = False
 ) -> Signal:
     """A vector over a run of n labels: n - 1 values; n to the last, where all are current ones."""
     keys = [part.key for part in vector.components]
@@ -310,7 +323,11 @@ def _signal(
     else:
         pieces = [values_of(key, labels.points, span) for key in keys]
     values = compose(vector, pieces, str(file.path))
-    return Signal(file.timestamps[labels.frames[span[0] :][: len(values)]] - early, values)
+    times = file.timestamps[labels.frames[span[0] :][: len(values)]]
+    known = np.all([np.isfinite(piece).all(axis=1) for piece in pieces], axis=0)
+    if known.all():
+        return Signal(times, values)
+    return Signal(times, np.where(known[:, None], values, np.float32(0)), known)
 
 
 def _regular(times: Floats) -> bool:

@@ -7,9 +7,9 @@
 | labels | detector, landmarks, epic_kitchens_hand_objects, ego4d_fho, egoexo4d_hand_pose | detector |
 | annotations | file or folder of the labels, absolute or below the videos' folder | that folder |
 | models | of the detector: folder of .tflite files or a .task bundle | $HMA_HAND_MODELS |
-| missing | split: a frame without a needed hand ends the run; hold: its last place is kept | split |
-| max_hold | labelled frames in a row for which `hold` keeps it | no limit |
-| min_frames | shorter runs are left out | 12 |
+| missing | what a frame without a needed hand does, see below: split, hold, mask | split |
+| max_hold | labelled frames in a row for which the last place is kept | no limit; with mask 0 |
+| min_frames | runs with fewer frames (with hands) are left out | 12 |
 | min_score | labels below it are no hand | 0.5 |
 | max_gap_s | seconds between labels of one run, where labels are irregular | 3 |
 | pictures | labelled: frames with a label; every: all from the first to the last of a run | labelled |
@@ -17,6 +17,9 @@
 | label_size | WIDTHxHEIGHT of the pictures that pixel labels were made on | the video's |
 | camera | Ego-Exo4D: which camera's labels and videos | cam01 |
 | mirrored | true for mirrored pictures (front cameras): the detector's left and right change places | false |
+
+missing: split ends the run. hold keeps the hand's last place, for `max_hold` frames, and then ends the run.
+mask goes on with the run: the values that need the hand are not known, with `max_hold` from its end on.
 """
 
 import os
@@ -32,7 +35,7 @@ from hma_data.sources.base import VIDEO_SUFFIXES, local_path
 LABELS = ("detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose")
 _CHOICES = {
     "labels": LABELS,
-    "missing": ("split", "hold"),
+    "missing": ("split", "hold", "mask"),
     "pictures": ("labelled", "every"),
     "mirrored": ("true", "false"),
 }
@@ -194,12 +197,11 @@ def header_of(path: Path) -> Header:
     Raises:
         EpisodeError: it is no video, or damaged.
     """
-    from hma_data.sources import video_file
+    from hma_data.sources.video_file import opened
 
     if not path.is_file():
         raise EpisodeError(path, "no such video file")
-    with video_file._explained(str(path)), video_file._open(str(path)) as container:
-        stream = video_file._video_stream(container, str(path))
+    with opened(path) as (container, stream):
         hz = float(stream.average_rate or 0)
         seconds = float(stream.duration * stream.time_base) if stream.duration else 0.0
         if not seconds and container.duration:

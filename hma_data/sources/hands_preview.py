@@ -1,8 +1,8 @@
 """Look at the hands that were found: a video with them drawn in.
 
 The left hand is orange with filled dots, the right one blue with rings. A frame that no run
-takes, because a needed hand is missing, has a grey bar at its top. A cross without fingers is a place
-that is only held.
+takes or that is masked, because a needed hand is missing, has a grey bar at its top. A cross
+without fingers is a place that is only held.
 """
 
 from pathlib import Path
@@ -55,9 +55,9 @@ def preview(
     chosen = np.arange(len(file))[first : first + limit]
     if not len(chosen):
         raise EpisodeError(file.path, f"has {len(file)} frames, none from {first} on")
-    pictures = [annotated(file.frames([index])[0], runs, int(index)) for index in chosen]
+    pictures = (annotated(file.frames([index])[0], runs, int(index)) for index in chosen)
     final = Path(out)
-    write_mp4(final, np.stack(pictures), file.table.hz or 30.0)
+    write_mp4(final, pictures, file.table.hz or 30.0)
     return final
 
 
@@ -70,7 +70,7 @@ def annotated(picture: Images, runs: Runs, frame: int) -> Images:
     row = int(np.searchsorted(runs.labels.frames, frame))
     if row == len(runs.labels) or runs.labels.frames[row] != frame:
         return shown
-    if not any(start <= row < stop for start, stop in runs.spans):
+    if runs.missing[row] or not any(start <= row < stop for start, stop in runs.spans):
         cv2.rectangle(shown, (0, 0), (size[0], max(4, size[1] // 40)), LEFT_OUT, -1)
     for side in SIDES:
         points = {

@@ -116,11 +116,15 @@ class Runs:
     Attributes:
         labels: as fractions, gaps of regular labels filled in, hands held.
         spans: [from, to) into the labels, one a run; the last frame of a run only ends it.
+        missing: (N,) labels that lack a needed hand, held ones not among them.
+        held: (N,) labels in which a needed hand keeps its last place.
         counts: labelled, without_hands, outside, held, dropped: frames.
     """
 
     labels: HandLabels
     spans: tuple[tuple[int, int], ...]
+    missing: NDArray[np.bool_]
+    held: NDArray[np.bool_]
     counts: dict[str, int] = field(default_factory=dict)
 
     def longest(self) -> int:
@@ -151,22 +155,28 @@ def cut_into_runs(
             raise EpisodeError(where, f"no label has {point}", f"labels have {', '.join(have) or 'no hands'}")
     labels, step = _gaps_filled(labels)
     there = np.all([np.isfinite(labels.points[point]).all(axis=1) for point in needed], axis=0)
-    without = int((~there).sum())
-    if layout.missing == "hold":
-        held = {point: _held(labels.points[point], layout.max_hold) for point in needed}
-        labels = replace(labels, points=labels.points | held)
-        there = np.all([np.isfinite(values).all(axis=1) for values in held.values()], axis=0)
+    without = ~there
+    if layout.missing != "split":
+        limit = 0 if layout.missing == "mask" and layout.max_hold is None else layout.max_hold
+        kept = {point: _held(labels.points[point], limit) for point in needed}
+        labels = replace(labels, points=labels.points | kept)
+        there = np.all([np.isfinite(values).all(axis=1) for values in kept.values()], axis=0)
     widest = max(1, round(layout.max_gap_s * video.hz)) if labels.irregular else step
-    spans = find_spans(labels.frames, there, widest)
-    long = [span for span in spans if episode_frames(labels, span, layout) >= max(1, layout.min_frames)]
+    usable = np.ones_like(there) if layout.missing == "mask" else there
+    least = max(1, layout.min_frames)
+    long = [
+        (start, stop)
+        for start, stop in find_spans(labels.frames, usable, widest)
+        if episode_frames(labels, (start, stop), layout) - int((~there[start:stop]).sum()) >= least
+    ]
     counts = {
         "labelled": len(labels),
-        "without_hands": without,
+        "without_hands": int(without.sum()),
         "outside": outside,
-        "held": without - int((~there).sum()),
+        "held": int((without & there).sum()),
         "dropped": len(labels) - sum(stop - start - 1 for start, stop in long),
     }
-    return Runs(labels, tuple(long), counts)
+    return Runs(labels, tuple(long), ~there, without & there, counts)
 
 
 def episode_frames(labels: HandLabels, span: tuple[int, int], layout: HandsLayout) -> int:
@@ -185,7 +195,10 @@ def find_spans(frames: Frames, there: NDArray[np.bool_], widest: int) -> list[tu
 
 
 def values_of(key: str, points: dict[str, Floats], span: tuple[int, int]) -> Floats:
-    """(n - 1, w) values of a key over a run of n labels; the last label is only a next one."""
+    """(n - 1, w) values of a key over a run of n labels, NaN where a hand is missing that it needs.
+
+    The last label is only a next one.
+    """
     start, stop = span
     values = points[point_of(key, key)][start:stop]
     if key.endswith("/next"):

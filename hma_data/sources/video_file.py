@@ -73,8 +73,7 @@ def frame_table(path: Path) -> FrameTable:
 
 @lru_cache(maxsize=64)  # LeRobotDataset v3 keeps hundreds of episodes in one file
 def _cached_table(path: str, size: int, changed: int) -> FrameTable:
-    with _explained(path), _open(path) as container:
-        stream = _video_stream(container, path)
+    with opened(path) as (container, stream):
         shown: list[int] = []
         keyframes: list[tuple[int, int]] = []
         for packet in container.demux(stream):
@@ -227,6 +226,17 @@ class VideoFile:
         picture: Images = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
         quarters = round(frame.rotation / 90) % 4  # a telephone's way to say it was held upright
         return np.ascontiguousarray(np.rot90(picture, quarters)) if quarters else picture
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
+    """A video file's container and its video stream; FFmpeg's errors become ours.
+
+    Raises:
+        EpisodeError: it is no video, or damaged.
+    """
+    with _explained(str(path)), _open(str(path)) as container:
+        yield container, _video_stream(container, str(path))
 
 
 def _open(path: str) -> Any:
