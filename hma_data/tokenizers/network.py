@@ -32,6 +32,7 @@ class NetworkTokenizer:
         spec: what decides the tokens.
         network: torch module with `encoder` and `decoder`, in evaluation mode.
         batch: frames a pass through the network.
+        light: decodes each frame on one thread too, which is fast enough for a small network.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class NetworkTokenizer:
             light: a network of plain convolutions, small enough for float32 and channels-last anywhere.
         """
         cuda = device.type == "cuda"
-        self.spec, self.device = spec, device
+        self.spec, self.device, self.light = spec, device, light
         self.dtype = torch.bfloat16 if cuda and not light else torch.float32
         self.batch = 32 if cuda else 8 if device.type == "mps" else 1
         self.network = network.eval().requires_grad_(False).to(device, self.dtype)
@@ -71,26 +72,9 @@ class NetworkTokenizer:
         check_frames(frames, self.spec)
         cells = self.spec.grid if self.spec.kind == "discrete" else (self.spec.channels or 0, *self.spec.grid)
         tokens = np.empty((len(frames), *cells), self.spec.dtype)
-        parts = [frames[start : start + self.batch] for start in range(0, len(frames), self.batch)]
-        if self.device.type != "cpu":
-            self._fill(tokens, map(self._encode_batch, parts))
-        elif parts:
-            with _single_threads(len(parts)) as pool:
-                self._fill(tokens, pool.map(self._encode_batch, parts))
+        self._fill(tokens, self._encode_batch, frames, alone=True)
         return tokens
 
-    @torch.inference_mode()
-    def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
-        """Up to a batch of frames, encoded and checked."""
-        pixels = self._padded(frames).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
-        pixels = pixels.to(self.dtype).contiguous(memory_format=self._format)
-        return self._storable(self._encode(pixels)[: len(frames)])
-
-    def _fill(self, tokens: NDArray[Any], batches: Iterator[NDArray[Any]]) -> None:
-        for index, made in enumerate(batches):
-            tokens[index * self.batch : (index + 1) * self.batch] = made
-
-    @torch.inference_mode()
     def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
         """What `encode` gives -> (N, S, S, 3) uint8 RGB.
 
@@ -105,14 +89,45 @@ class NetworkTokenizer:
             )
         size = self.spec.image_size
         frames = np.empty((len(tokens), size, size, 3), np.uint8)
-        for start in range(0, len(tokens), self.batch):
-            part = tokens[start : start + self.batch].astype(np.int64 if discrete else np.float32)
-            values = self._padded(part)
-            pixels = self._decode(values if discrete else values.to(self.dtype)).float()
-            whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
-            made = whole.permute(0, 2, 3, 1).cpu().numpy()
-            frames[start : start + self.batch] = made[: len(frames) - start]
+        self._fill(frames, self._decode_batch, tokens, alone=self.light)
         return frames
+
+    def _fill(
+        self,
+        out: NDArray[Any],
+        step: Callable[[NDArray[Any]], NDArray[Any]],
+        items: NDArray[Any],
+        alone: bool,
+    ) -> None:
+        """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time; on a CPU several batches
+        side by side, each on one thread, where they are to be computed alone."""
+        parts = [items[start : start + self.batch] for start in range(0, len(items), self.batch)]
+        if alone and parts and self.device.type == "cpu":
+            with _single_threads(len(parts)) as pool:
+                self._store(out, pool.map(step, parts))
+        else:
+            self._store(out, map(step, parts))
+
+    def _store(self, out: NDArray[Any], batches: Iterator[NDArray[Any]]) -> None:
+        for index, made in enumerate(batches):
+            out[index * self.batch : (index + 1) * self.batch] = made
+
+    @torch.inference_mode()
+    def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+        """Up to a batch of frames, encoded and checked."""
+        pixels = self._padded(frames).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
+        pixels = pixels.to(self.dtype).contiguous(memory_format=self._format)
+        return self._storable(self._encode(pixels)[: len(frames)])
+
+    @torch.inference_mode()
+    def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+        """Up to a batch of ids or latents, decoded."""
+        discrete = self.spec.kind == "discrete"
+        values = self._padded(tokens.astype(np.int64 if discrete else np.float32))
+        pixels = self._decode(values if discrete else values.to(self.dtype)).float()
+        whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
+        made: NDArray[np.uint8] = whole.permute(0, 2, 3, 1).cpu().numpy()
+        return made[: len(tokens)]
 
     def _storable(self, made: Tensor) -> NDArray[Any]:
         """Ids or latents as an array, checked to fit what the spec stores."""
