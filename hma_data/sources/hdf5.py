@@ -8,14 +8,15 @@ said by `source.layout`:
       layout: {episodes: "data/*", timestamps: obs/time}   # "/" means one file an episode
 
 A uri is a file or a folder of files. Keys are paths inside the episode's group. HDF5 keeps no
-rate: it is the embodiment's `frequency_hz`, unless `layout.timestamps` names seconds.
+rate: it is the embodiment's `frequency_hz`, unless `layout.timestamps` names seconds. Where
+pictures and states have one row more than the actions (ManiSkill), `last_observation: drop`
+leaves out the row after the last action.
 
-T frames of an episode, n of them asked for.
+T frames of an episode.
 """
 
 import hashlib
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,25 @@ from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Signal, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
-from hma_data.sources.hdf5_file import OpenFiles, child, dataset, explained, member, numbers, rows, text, walk
-from hma_data.sources.hdf5_layout import WHOLE_FILE, Place, Places, episodes_pattern
+from hma_data.sources.hdf5_file import (
+    MAX_NUMBERS,
+    OpenFiles,
+    child,
+    dataset,
+    explained,
+    member,
+    numbers,
+    text,
+    walk,
+)
+from hma_data.sources.hdf5_layout import WHOLE_FILE, Layout, Place, Places, layout_of
+from hma_data.sources.hdf5_pictures import PictureRows, as_rgb, encoded, picture_kind
 from hma_data.spec import Vector
-from hma_data.video import MAX_PIXELS, Images, decode_image
 
-TEXT_KEYS = ("language_instruction", "instruction", "lang", "task_description", "task")
-_SPLITS = {"train": "train", "valid": "val"}
+__all__ = ["Hdf5Source", "as_rgb", "encoded", "environment", "open", "picture_kind"]
+
+TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
+_SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "val")
 
 
 class Hdf5Source:
@@ -59,8 +72,7 @@ class Hdf5Source:
         Raises:
             SourceError: nothing there, a single file that is damaged, or no mask of the name `source.split`.
         """
-        pattern = episodes_pattern(embodiment)
-        places = self._places.all(uri, pattern)
+        places = self._places.all(uri, layout_of(embodiment).episodes)
         fingerprints = {file: file_fingerprint(file) for file in {place.file for place in places.values()}}
         whole = {place.file for place in places.values() if place.group == WHOLE_FILE}
         masks = {file: {} if file in whole else self._masks(file) for file in fingerprints}
@@ -74,8 +86,8 @@ class Hdf5Source:
             if chosen and name not in found.get(chosen, ()):
                 continue
             split = None
-            if not chosen and set(_SPLITS) <= set(found):
-                split = next((ours for mask, ours in _SPLITS.items() if name in found[mask]), None)
+            if not chosen and {_SPLITS.get(mask) for mask in found} >= {"train", "val"}:
+                split = next((ours for mask, ours in _SPLITS.items() if name in found.get(mask, ())), None)
             digest = hashlib.sha256(f"{fingerprints[place.file]} {place.group}".encode()).hexdigest()[:16]
             refs.append(EpisodeRef(episode_id, self._length(place, embodiment), split, digest))
         return refs
@@ -87,27 +99,46 @@ class Hdf5Source:
             EpisodeError: a damaged file, a missing key, a wrong width, an empty episode.
             SourceError: no such episode, or no rate and no times.
         """
-        place = self._places.find(uri, episode_id, episodes_pattern(embodiment))
+        layout = layout_of(embodiment)
+        place = self._places.find(uri, episode_id, layout.episodes)
         where = str(place)
         with explained(where):
             group = self._places.group(place)
             actions = _vector(group, embodiment.action, where)
+            series = _Series(group, embodiment, len(actions), where)
             states = _vector(group, embodiment.state, where) if embodiment.state else None
-            clock = _Clock(group, embodiment, where)
+            if states is not None:
+                states = series.trimmed(
+                    embodiment.state.components[0].key if embodiment.state else "", states
+                )
             streams = {
-                camera.name: _Pictures(self._places, place, camera.key, clock)
+                camera.name: self._pictures(place, group, camera.key, layout, series)
                 for camera in embodiment.cameras
             }
             return Episode(
                 id=episode_id,
                 streams=dict(streams),
-                actions=(Signal(clock.times(len(actions)), actions),),
-                states=() if states is None else (Signal(clock.times(len(states)), states),),
+                actions=(Signal(series.times, actions),),
+                states=() if states is None else (Signal(series.times, states),),
                 instruction=_instruction(group, embodiment.source.instruction, where),
                 success=_success(group),
                 source=where,
                 metadata=_metadata(group),
             )
+
+    def _pictures(
+        self, place: Place, group: h5py.Group, key: str, layout: Layout, series: "_Series"
+    ) -> PictureRows:
+        try:
+            found = dataset(group, key, str(place))
+        except EpisodeError as fault:
+            if "states" in group and not any(picture_kind(item) for _, item in walk(group)):
+                said = "holds a simulator's states and no pictures"
+                remedy = "render them first, as robomimic's dataset_states_to_obs.py does"
+                raise EpisodeError(place, said, remedy) from fault
+            raise
+        series.check(key, len(found))
+        return PictureRows(self._places, self._files, place, key, layout, series.times)
 
     def _length(self, place: Place, embodiment: Embodiment | None) -> int:
         """T as the action's rows, or the most rows of any dataset; 0 when it cannot be read."""
@@ -117,8 +148,10 @@ class Hdf5Source:
                 group = self._places.group(place)
                 for key in keys:
                     if key.strip("/") in group:
-                        return len(dataset(group, key, str(place)))
-                return max((item.shape[0] for _, item in walk(group) if item.shape), default=0)
+                        found = dataset(group, key, str(place))
+                        return len(found) if len(found) <= MAX_NUMBERS else 0
+                lengths = [item.shape[0] for _, item in walk(group) if item.shape]
+                return max((length for length in lengths if length <= MAX_NUMBERS), default=0)
         except HMAError:
             return 0
 
@@ -130,34 +163,56 @@ class Hdf5Source:
                 return {}
             lists = {name: child(mask, name) for name in mask}
             return {
-                name: {text(row) for row in found[()]}
+                name: {text(row).rsplit("/", 1)[-1] for row in numbers(mask, name, str(file))}
+                if len(found)
+                else set()
                 for name, found in lists.items()
                 if isinstance(found, h5py.Dataset) and found.ndim == 1
             }
 
 
-class _Clock:
-    """Times of an episode: its own where the YAML names them, else ticks of the embodiment's rate."""
+class _Series:
+    """The lengths and times of an episode's series; its own times where the YAML names them.
 
-    def __init__(self, group: h5py.Group, embodiment: Embodiment, where: str) -> None:
-        key = (embodiment.source.layout or {}).get("timestamps")
-        self._where, self._recorded = where, None if key is None else _times(group, key, where)
+    Args:
+        length: of the actions, which all others must have.
+    """
+
+    def __init__(self, group: h5py.Group, embodiment: Embodiment, length: int, where: str) -> None:
+        self._where, self._length = where, length
+        self._drops = layout_of(embodiment).last_observation == "drop"
+        key = layout_of(embodiment).timestamps
         if key is None and embodiment.frequency_hz is None:
             raise SourceError(
                 f"embodiment {embodiment.id}",
                 "frequency_hz is null, and HDF5 keeps no times of itself",
                 "set frequency_hz, or source.layout.timestamps to the key of the seconds",
             )
-        # With an unknown rate a recording can still be looked at; converting it is refused before.
-        self._hz = embodiment.frequency_hz if isinstance(embodiment.frequency_hz, float) else 1.0
+        if key is not None:
+            self.times = self.trimmed(key, _times(group, key, where))
+        else:  # With an unknown rate a recording can still be looked at; converting it is refused before.
+            hz = embodiment.frequency_hz if isinstance(embodiment.frequency_hz, float) else 1.0
+            self.times = rate_times(length, hz)
 
-    def times(self, length: int) -> Floats:
-        """(length,) seconds."""
-        if self._recorded is None:
-            return rate_times(length, self._hz)
-        if length != len(self._recorded):
-            raise EpisodeError(self._where, f"has {len(self._recorded)} times for {length} frames")
-        return self._recorded
+    def check(self, key: str, length: int) -> None:
+        """That a series is as long as the actions, or ends with the observation that is dropped.
+
+        Raises:
+            EpisodeError: it is not.
+        """
+        if length == self._length or (self._drops and length == self._length + 1):
+            return
+        remedy = ""
+        if length == self._length + 1:
+            remedy = (
+                "if the last was observed after the last action, set source.layout.last_observation: drop"
+            )
+        raise EpisodeError(self._where, f"differ in length: actions {self._length}, {key} {length}", remedy)
+
+    def trimmed(self, key: str, values: NDArray[Any]) -> NDArray[Any]:
+        """(T, …) values without the observation after the last action."""
+        self.check(key, len(values))
+        return values[: self._length]
 
 
 def _times(group: h5py.Group, key: str, where: str) -> Floats:
@@ -167,76 +222,9 @@ def _times(group: h5py.Group, key: str, where: str) -> Floats:
     return values.reshape(-1).astype(np.float64)
 
 
-class _Pictures:
-    """A camera's Stream: (T, H, W, 3) raw, or a JPEG or PNG a row."""
-
-    def __init__(self, places: Places, place: Place, key: str, clock: _Clock) -> None:
-        self._places, self._place, self._key = places, place, key
-        found = self._dataset()
-        self._raw = picture_kind(found) == "raw"
-        self.timestamps = clock.times(len(found))
-
-    def _dataset(self) -> h5py.Dataset:
-        where = str(self._place)
-        found = dataset(self._places.group(self._place), self._key, where)
-        kind = picture_kind(found)
-        if kind is None or (kind == "raw" and np.prod(found.shape[1:], dtype=float) > 4 * MAX_PIXELS):
-            raise EpisodeError(
-                where,
-                f"{self._key!r} holds {found.shape} {found.dtype}, not colour pictures",
-                "expected (T, H, W, 3) uint8, or encoded pictures",
-            )
-        return found
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
-        with explained(self._place):
-            found = rows(self._dataset(), indices)
-        if self._raw:
-            return as_rgb(found)
-        if not len(found):
-            return np.zeros((0, 1, 1, 3), np.uint8)
-        pictures = [
-            decode_image(encoded(row), f"{self._place} {self._key}[{index}]")
-            for row, index in zip(found, indices, strict=True)
-        ]
-        if len({picture.shape for picture in pictures}) > 1:
-            raise EpisodeError(self._place, f"{self._key!r} has pictures of several sizes")
-        return np.stack(pictures)
-
-
 def open() -> Hdf5Source:
     """The source."""
     return Hdf5Source()
-
-
-def picture_kind(found: h5py.Dataset) -> str | None:
-    """`raw`, `encoded`, or None for what cannot be pictures, by dtype and shape."""
-    shape: tuple[int, ...] = found.shape or ()
-    if found.dtype == np.uint8 and len(shape) == 4 and (shape[3] in (1, 3, 4) or shape[1] in (1, 3)):
-        return "raw"
-    if found.dtype == np.uint8 and len(shape) == 3:
-        return "raw"
-    padded = found.dtype == np.uint8 and len(shape) == 2
-    return "encoded" if padded or (len(shape) == 1 and found.dtype.kind in "OSV") else None
-
-
-def as_rgb(pictures: NDArray[np.uint8]) -> Images:
-    """(n, H, W), (n, H, W, 1|3|4) or (n, 1|3, H, W) -> (n, H, W, 3)."""
-    if pictures.ndim == 3:
-        pictures = pictures[..., None]
-    elif pictures.shape[3] not in (1, 3, 4):
-        pictures = pictures.transpose(0, 2, 3, 1)
-    if pictures.shape[3] == 1:
-        pictures = np.repeat(pictures, 3, axis=3)
-    return np.ascontiguousarray(pictures[..., :3])
-
-
-def encoded(row: Any) -> NDArray[np.uint8]:
-    """One encoded picture's bytes; zeros after its end are harmless."""
-    if isinstance(row, np.ndarray) and row.dtype == np.uint8:
-        return row
-    return np.frombuffer(row.tobytes() if isinstance(row, np.void) else bytes(row), np.uint8)
 
 
 def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32]:
@@ -262,17 +250,27 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
         for name in TEXT_KEYS:
             if name in holder.attrs and (found := text(holder.attrs[name])):
                 return found
+            if said := _text_row(holder, name):
+                return said
         said = _json(holder, "problem_info").get("language_instruction", "")
         if said := text("".join(map(str, said)) if isinstance(said, list) else said):
             return said
     return ""
 
 
+def _text_row(holder: h5py.Group, name: str) -> str:
+    """The text of a dataset of one value; empty where there is none."""
+    found = child(holder, name)
+    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+        return ""
+    return text(found[()]) if found.size == 1 and found.dtype.kind in "OS" else ""
+
+
 def _success(group: h5py.Group) -> bool | None:
-    """By the last reward; by the last `done` only where rewards are not kept, for time-outs are done too."""
+    """By the last `success` or reward; by the last `done` only without them, for time-outs are done too."""
     if "success" in group.attrs:
         return bool(np.all(group.attrs["success"]))
-    for key in ("rewards", "dones"):
+    for key in ("success", "rewards", "dones"):
         found = child(group, key)
         if isinstance(found, h5py.Dataset) and found.ndim == 1 and len(found) and found.dtype.kind in "fiub":
             return bool(found[-1] > 0)

@@ -9,6 +9,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,23 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError, HMAError
 
 OPEN_FILES = 8
-CHUNK_CACHE = 16 << 20  # bytes a dataset; frames of one chunk asked for in two calls are inflated once
-MAX_BYTES = 1 << 30  # of a chunk, or of numbers read whole
+CHUNK_CACHE = 16 << 20  # bytes a dataset, where its chunks are not larger
+HELD_BYTES = 512 << 20  # of chunks kept inflated, over all datasets of pictures
+MAX_BYTES = 1 << 30  # of a chunk
+MAX_NUMBERS = 1 << 26  # values read whole; they become float64
 MAX_KEYS, MAX_DEPTH = 5_000, 16
 
 
 class OpenFiles:
-    """The files open in this process, the least recently used closed first; none outlives a fork."""
+    """The files open in this process, the least recently used closed first; none outlives a fork.
+
+    Datasets of pictures are kept open too, so that a chunk that several calls want is inflated once.
+    """
 
     def __init__(self) -> None:
         self._process = os.getpid()
         self._files: OrderedDict[Path, tuple[tuple[int, int], h5py.File]] = OrderedDict()
+        self._held: OrderedDict[tuple[Path, str, str], tuple[int, h5py.Dataset]] = OrderedDict()
 
     def get(self, path: Path) -> h5py.File:
         """The open file, opened anew where it has changed.
@@ -38,7 +45,7 @@ class OpenFiles:
             OSError: it is not HDF5, or is cut off; `explained` says so in our words.
         """
         if self._process != os.getpid():
-            self._files, self._process = OrderedDict(), os.getpid()
+            self._files, self._held, self._process = OrderedDict(), OrderedDict(), os.getpid()
         status = path.stat()
         state = (status.st_size, status.st_mtime_ns)
         held = self._files.get(path)
@@ -50,6 +57,42 @@ class OpenFiles:
         while len(self._files) > OPEN_FILES:
             self._files.popitem(last=False)[1][1].close()
         return self._files[path][1]
+
+    def cached(self, path: Path, group: h5py.Group, key: str, where: str) -> h5py.Dataset:
+        """The dataset at `key` of a group of that open file, with room for the chunks beside each other.
+
+        Raises:
+            EpisodeError: see `dataset`.
+        """
+        name = (path, str(group.name), key)
+        if name not in self._held or not self._held[name][1]:  # false once its file is closed
+            self._held.pop(name, None)
+            self._held[name] = _with_room(group, key, where)
+        self._held.move_to_end(name)
+        while len(self._held) > 1 and sum(room for room, _ in self._held.values()) > HELD_BYTES:
+            self._held.popitem(last=False)
+        return self._held[name][1]
+
+
+def _with_room(group: h5py.Group, key: str, where: str) -> tuple[int, h5py.Dataset]:
+    """Bytes of its cache, and the dataset."""
+    found = dataset(group, key, where)
+    room = min(max(band_bytes(found), CHUNK_CACHE), HELD_BYTES) if found.chunks else 0
+    if room <= CHUNK_CACHE:
+        return room, found
+    slots = 100 * (room // (int(np.prod(found.chunks)) * found.dtype.itemsize) + 1) + 1
+    del found  # the cache is made when the first handle is opened
+    access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
+    access.set_chunk_cache(min(slots, 1_000_003), room, 1.0)
+    return room, h5py.Dataset(h5py.h5d.open(group.id, key.strip("/").encode(), access))
+
+
+def band_bytes(found: h5py.Dataset) -> int:
+    """Bytes, inflated, of all chunks that hold a row; 0 without chunks."""
+    if not found.chunks:
+        return 0
+    sides = [-(-side // chunk) * chunk for side, chunk in zip(found.shape[1:], found.chunks[1:], strict=True)]
+    return int(found.chunks[0] * np.prod(sides, dtype=float)) * int(found.dtype.itemsize)
 
 
 def _open(path: Path) -> h5py.File:
@@ -73,9 +116,12 @@ def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[N
         yield
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as fault:
         lines = str(fault).splitlines() or [type(fault).__name__]
-        raise error(
-            where, f"cannot be read as HDF5: {lines[0]}", "the file may be cut off or damaged"
-        ) from fault
+        remedy = "the file may be cut off or damaged"
+        if "plugin" in lines[0] or ("filter" in lines[0] and "not registered" in lines[0]):
+            remedy = (
+                "it is compressed in a way that HDF5 alone does not know; rewrite it with h5repack -f GZIP=4"
+            )
+        raise error(where, f"cannot be read as HDF5: {lines[0]}", remedy) from fault
 
 
 def member(group: h5py.Group, key: str, where: str) -> Any:
@@ -92,13 +138,20 @@ def member(group: h5py.Group, key: str, where: str) -> Any:
         if isinstance(link, h5py.ExternalLink):
             raise EpisodeError(where, f"{key!r} links to another file, {link.filename!r}", "copy it in")
         found = found[part]
+        if _strays(found, group):  # by way of a soft link
+            raise EpisodeError(where, f"{key!r} links to another file, {found.file.filename!r}", "copy it in")
     return found
 
 
 def child(group: h5py.Group, name: str) -> Any:
     """The direct member of that name, or None where there is none in this file."""
     link = group.get(name, getlink=True)
-    return None if link is None or isinstance(link, h5py.ExternalLink) else group.get(name)
+    found = None if link is None or isinstance(link, h5py.ExternalLink) else group.get(name)
+    return None if found is None or _strays(found, group) else found
+
+
+def _strays(found: Any, group: h5py.Group) -> bool:
+    return bool(found.file.filename != group.file.filename)
 
 
 def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
@@ -127,7 +180,7 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
 def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
     """All values (T, …) of a dataset of numbers."""
     found = dataset(group, key, where)
-    if np.prod(found.shape, dtype=float) * found.dtype.itemsize > MAX_BYTES:
+    if np.prod(found.shape, dtype=float) > MAX_NUMBERS:
         raise EpisodeError(where, f"{key!r} has shape {found.shape}, too large for numbers over time")
     values: NDArray[Any] = found[()]
     return values
@@ -136,7 +189,7 @@ def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
 def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
     """The rows of those indices (n, …), in the order asked for.
 
-    Neighbours are read as one slice, and so are rows of one chunk, which is inflated once.
+    Neighbours are read as one slice. So are rows of one chunk too large for the cache, to inflate it once.
     """
     wanted = np.asarray(indices, np.int64).reshape(-1)
     if not len(wanted):
@@ -144,11 +197,20 @@ def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDA
     if not 0 <= wanted.min() <= wanted.max() < len(found):
         raise IndexError(f"{found.name} has {len(found)} rows, asked for {wanted.min()} to {wanted.max()}")
     ordered = np.unique(wanted)
-    band = ordered // (found.chunks[0] if found.chunks else 1)
-    breaks = np.flatnonzero((np.diff(ordered) > 1) & (np.diff(band) > 0)) + 1
-    parts = [found[run[0] : run[-1] + 1][run - run[0]] for run in np.split(ordered, breaks)]
-    joined: NDArray[Any] = np.concatenate(parts)
-    return joined[np.searchsorted(ordered, wanted)]
+    apart = np.diff(ordered) > 1
+    if band_bytes(found) > HELD_BYTES:
+        apart &= np.diff(ordered // found.chunks[0]) > 0
+    read = np.empty((len(ordered), *found.shape[1:]), found.dtype)
+    ends = [0, *(np.flatnonzero(apart) + 1), len(ordered)]
+    for start, stop in pairwise(ends):
+        first, last = int(ordered[start]), int(ordered[stop - 1])
+        if last - first + 1 > stop - start:
+            read[start:stop] = found[first : last + 1][ordered[start:stop] - first]
+        elif read.dtype.hasobject:
+            read[start:stop] = found[first : last + 1]
+        else:
+            found.read_direct(read, np.s_[first : last + 1], np.s_[int(start) : int(stop)])
+    return read if np.array_equal(ordered, wanted) else read[np.searchsorted(ordered, wanted)]
 
 
 def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:

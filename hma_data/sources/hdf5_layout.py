@@ -1,11 +1,12 @@
 """Where the episodes of HDF5 recordings are: in which file, in which group, under which id.
 
 A uri is a file or a folder of files. A pattern such as `data/*` names the groups that are
-episodes; `/` says that each file is one. Without one it is seen from the file.
+episodes; `/` says that each file is one. Without one it is seen from the file. `Layout` is all
+that `source.layout` may say.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -17,9 +18,33 @@ from hma_data.sources.base import local_path
 from hma_data.sources.hdf5_file import OpenFiles, child, explained, member
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
-LAYOUT_KEYS = ("episodes", "timestamps")
+PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
+AXES = ("THWC", "TCHW")
 WHOLE_FILE = "/"
 _EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What `source.layout` says of HDF5.
+
+    Attributes:
+        episodes: pattern of the groups that are episodes, `/` for whole files; None: seen from the file.
+        timestamps: key of the seconds; None: frames tick at the embodiment's rate.
+        axes: of pictures; None: seen from the shape.
+        pixels: range of pictures that are not uint8; None: such are no pictures.
+        last_observation: `drop` where pictures and states have one row more than the actions, taken after
+            the last of them.
+    """
+
+    episodes: str | None = None
+    timestamps: str | None = None
+    axes: str | None = None
+    pixels: str | None = None
+    last_observation: str | None = None
+
+
+_ALLOWED = {"axes": AXES, "pixels": tuple(PIXELS), "last_observation": ("drop",)}
 
 
 @dataclass(frozen=True)
@@ -114,22 +139,25 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
-def episodes_pattern(embodiment: Embodiment | None) -> str | None:
-    """`source.layout.episodes`; None where the YAML leaves it to the file.
+def layout_of(embodiment: Embodiment | None) -> Layout:
+    """What the YAML says of the layout; nothing without an embodiment.
 
     Raises:
-        SourceError: `source.layout` has keys HDF5 does not know.
+        SourceError: a key or a value that HDF5 does not know.
     """
-    layout = (embodiment.source.layout or {}) if embodiment else {}
-    unknown = [key for key in layout if key not in LAYOUT_KEYS]
-    if embodiment and unknown:
-        raise SourceError(
-            f"embodiment {embodiment.id}",
-            f"source.layout.{unknown[0]} is not known for hdf5",
-            f"known: {', '.join(LAYOUT_KEYS)}",
-        )
-    pattern = layout.get("episodes")
-    return pattern and (pattern.strip("/") or WHOLE_FILE)
+    said = (embodiment.source.layout or {}) if embodiment else {}
+    where = f"embodiment {embodiment.id}" if embodiment else ""
+    known = [entry.name for entry in fields(Layout)]
+    for key, value in said.items():
+        if key not in known:
+            fault = f"source.layout.{key} is not known for hdf5"
+            raise SourceError(where, fault, f"known: {', '.join(known)}")
+        if key in _ALLOWED and value not in _ALLOWED[key]:
+            allowed = f"allowed: {', '.join(_ALLOWED[key])}"
+            raise SourceError(where, f"source.layout.{key} is {value!r}", allowed)
+    layout = Layout(**said)
+    pattern = layout.episodes
+    return replace(layout, episodes=pattern and (pattern.strip("/") or WHOLE_FILE))
 
 
 def _episodes(handle: h5py.File, file: Path, pattern: str | None) -> dict[str, Place]:
@@ -149,8 +177,10 @@ def _episodes(handle: h5py.File, file: Path, pattern: str | None) -> dict[str, P
 
 def _guess_pattern(handle: h5py.File) -> str:
     data = child(handle, "data")
-    if isinstance(data, h5py.Group) and all(isinstance(child(data, name), h5py.Group) for name in data):
-        return "data/*"
+    if isinstance(data, h5py.Group):
+        inside = [found for name in data if (found := child(data, name)) is not None]
+        if all(isinstance(found, h5py.Group) for found in inside):
+            return "data/*"
     groups = [name for name in handle if isinstance(child(handle, name), h5py.Group)]
     if groups and len(groups) == len(handle) and all(_EPISODE_NAME.fullmatch(name) for name in groups):
         return "*"

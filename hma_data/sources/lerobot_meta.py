@@ -299,15 +299,15 @@ def _features(found: Any, where: object) -> dict[str, Feature]:
         shape = entry.get("shape") if isinstance(entry, dict) else None
         if not isinstance(shape, list) or not all(isinstance(side, int) and side >= 0 for side in shape):
             raise SourceError(where, f"features[{name!r}] has no shape")
-        video = entry.get("info") or entry.get("video_info") or {}
-        video = video if isinstance(video, dict) else {}
+        facts = [found for name in ("video_info", "info") if isinstance(found := entry.get(name), dict)]
+        video = {name: value for found in facts for name, value in found.items()}
         features[name] = Feature(
             name=name,
             dtype=str(entry.get("dtype")),
             shape=tuple(shape),
             names=_names(entry.get("names"), math.prod(shape)),
             codec=str(video["video.codec"]) if "video.codec" in video else None,
-            depth=bool(video.get("video.is_depth_map")),
+            depth=bool(video.get("is_depth_map") or video.get("video.is_depth_map")),
         )
     return features
 

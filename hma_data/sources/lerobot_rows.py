@@ -180,8 +180,10 @@ def _column_of_group(path: Path, changed: int, group: int, key: str) -> pa.Array
 
 
 def _only(table: pa.Table, key: str) -> pa.Array:
+    """A table's column in one piece; as plain lists where a library has registered a type for matrices."""
     column = table.column(key).combine_chunks()
-    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    return column.storage if isinstance(column, pa.ExtensionArray) else column
 
 
 def _changed(path: Path) -> int:

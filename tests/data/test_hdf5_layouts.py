@@ -1,0 +1,355 @@
+"""HDF5 as other projects write it: ManiSkill, RoboMIND, robosuite, pictures of other numbers and axes."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from hma_data.align import to_clip
+from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.sources.base import open_source
+from tests.data.hdf5_files import H, T, W, embodiment, fill, pictures
+
+
+def one(path: Path, key: str = "obs/agentview_image", **written: Any) -> Path:
+    """A file of one demo whose pictures are replaced by what is given."""
+    with h5py.File(path / "a.h5", "w") as file:
+        group = file.create_group("data/demo_0")
+        fill(group)
+        del group["obs/agentview_image"]
+        group.create_dataset(key, **written)
+    return path / "a.h5"
+
+
+def shown(path: Path, indices: Any = range(T), **layout: str) -> np.ndarray:
+    robot = embodiment(source={"format": "hdf5"} | ({"layout": layout} if layout else {}))
+    return open_source("hdf5").read(str(path), "demo_0", robot).streams["front"].frames(indices)
+
+
+# -- ManiSkill
+
+
+@pytest.fixture
+def maniskill(tmp_path: Path) -> Path:
+    """Two trajectories with an observation after the last action, and the JSON beside."""
+    path = tmp_path / "trajectory.rgb.pd_ee_delta_pose.h5"
+    with h5py.File(path, "w") as file:
+        for i in range(2):
+            group = file.create_group(f"traj_{i}")
+            group["actions"] = np.full((T, 3), i, np.float32)
+            group["success"] = np.arange(T) > T - 2 + i
+            group["terminated"] = group["truncated"] = np.zeros(T, bool)
+            group["obs/agent/qpos"] = np.arange(2 * (T + 1)).reshape(T + 1, 2)
+            group["obs/sensor_data/base_camera/rgb"] = pictures(T + 1, i)
+            group["obs/sensor_data/base_camera/depth"] = np.zeros((T + 1, H, W, 1), np.int16)
+    path.with_suffix(".json").write_text("{}")
+    return path
+
+
+def maniskill_arm(**layout: str) -> Any:
+    return embodiment(
+        cameras=[{"name": "base", "key": "obs/sensor_data/base_camera/rgb"}],
+        state={"components": [{"key": "obs/agent/qpos", "dims": 2}]},
+        source={"format": "hdf5", "layout": layout} if layout else {"format": "hdf5"},
+    )
+
+
+def test_the_observation_after_the_last_action_is_dropped(maniskill: Path) -> None:
+    arm, source = maniskill_arm(last_observation="drop"), open_source("hdf5")
+    assert [(ref.id, ref.frames) for ref in source.index(str(maniskill), arm)] == [
+        ("traj_0", T),
+        ("traj_1", T),
+    ]
+    clip = to_clip(source.read(str(maniskill), "traj_1", arm), arm)
+    assert len(clip) == T and clip.states is not None
+    np.testing.assert_array_equal(clip.states, np.arange(2 * T).reshape(T, 2))
+    np.testing.assert_array_equal(clip.frames_at("base", np.arange(T)), pictures(T + 1, 1)[:T])
+    assert [source.read(str(maniskill), f"traj_{i}", arm).success for i in range(2)] == [True, False]
+
+
+def test_one_observation_more_is_refused_with_what_to_set(maniskill: Path) -> None:
+    with pytest.raises(EpisodeError, match=r"actions 9, obs/agent/qpos 10.*layout\.last_observation: drop"):
+        open_source("hdf5").read(str(maniskill), "traj_0", maniskill_arm())
+
+
+def test_two_observations_more_are_refused_all_the_same(maniskill: Path) -> None:
+    with h5py.File(maniskill, "a") as file:
+        del file["traj_0/obs/sensor_data/base_camera/rgb"]
+        file["traj_0/obs/sensor_data/base_camera/rgb"] = pictures(T + 2)
+    with pytest.raises(EpisodeError, match="actions 9, obs/sensor_data/base_camera/rgb 11"):
+        open_source("hdf5").read(str(maniskill), "traj_0", maniskill_arm(last_observation="drop"))
+
+
+def test_as_many_observations_as_actions_need_nothing_dropped(tmp_path: Path) -> None:
+    np.testing.assert_array_equal(shown(one(tmp_path, data=pictures()), last_observation="drop"), pictures())
+
+
+# -- numbers and axes of pictures
+
+
+@pytest.mark.parametrize(
+    ("dtype", "pixels", "factor"),
+    [
+        ("f4", "0-1", 1 / 255),
+        ("f2", "0-1", 1 / 255),
+        ("f8", "0-255", 1),
+        ("i8", "0-255", 1),
+        ("u2", "0-65535", 257),
+    ],
+)
+def test_other_numbers_become_bytes_by_the_range_named(
+    tmp_path: Path, dtype: str, pixels: str, factor: float
+) -> None:
+    path = one(tmp_path, data=(pictures().astype(float) * factor).astype(dtype))
+    np.testing.assert_array_equal(shown(path, [5, 2, 7], pixels=pixels), pictures()[[5, 2, 7]])
+
+
+@pytest.mark.parametrize("dtype", ["f4", "u2", "i8"])
+def test_other_numbers_without_a_range_are_refused_with_what_to_set(tmp_path: Path, dtype: str) -> None:
+    with pytest.raises(EpisodeError, match=r"not colour pictures.*layout\.pixels.*0-1, 0-255, 0-65535"):
+        shown(one(tmp_path, data=pictures().astype(dtype)))
+
+
+@pytest.mark.parametrize("value", [200.0, -0.5, np.nan, np.inf])
+def test_values_outside_the_range_named_are_refused(tmp_path: Path, value: float) -> None:
+    stored = np.zeros((T, H, W, 3), np.float32)
+    stored[4, 3, 2, 1] = value
+    path = one(tmp_path, data=stored)
+    assert shown(path, [3], pixels="0-1").max() == 0
+    with pytest.raises(EpisodeError, match=r"layout\.pixels says 0-1"):
+        shown(path, [4], pixels="0-1")
+
+
+@pytest.mark.parametrize("axes", ["TCHW", None])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_channels_may_come_first(tmp_path: Path, axes: str | None, channels: int) -> None:
+    stored = pictures()[..., :channels]
+    path = one(tmp_path, data=stored.transpose(0, 3, 1, 2))
+    found = shown(path, **({"axes": axes} if axes else {}))
+    np.testing.assert_array_equal(found, np.broadcast_to(stored, (T, H, W, 3)))
+
+
+def test_axes_that_could_be_either_are_refused_until_said(tmp_path: Path) -> None:
+    path = one(tmp_path, data=np.arange(T * 36, dtype=np.uint8).reshape(T, 3, 4, 3))
+    with pytest.raises(EpisodeError, match=r"first or last.*layout\.axes"):
+        shown(path)
+    assert shown(path, axes="THWC").shape == (T, 3, 4, 3) and shown(path, axes="TCHW").shape == (T, 4, 3, 3)
+
+
+def test_axes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(EpisodeError, match=r"pictures \(12, 16, 3\), source\.layout\.axes says TCHW"):
+        shown(one(tmp_path, data=pictures()), axes="TCHW")
+
+
+def test_a_value_the_layout_does_not_know_is_refused(tmp_path: Path) -> None:
+    path = one(tmp_path, data=pictures())
+    for key, allowed in (("axes", "THWC, TCHW"), ("pixels", "0-1, 0-255"), ("last_observation", "drop")):
+        with pytest.raises(SourceError, match=rf"source\.layout\.{key} is 'x'.*{allowed}"):
+            shown(path, **{key: "x"})
+
+
+# -- other recorders
+
+
+def test_robomind_pictures_and_words_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "task/success_episodes/train/0702_1/data/trajectory.hdf5"
+    path.parent.mkdir(parents=True)
+    flat = np.repeat(np.arange(T, dtype=np.uint8) * 20, H * W * 3).reshape(T, H, W, 3)
+    with h5py.File(path, "w") as file:
+        stored = file.create_dataset("observations/rgb_images/camera_top", (T,), h5py.vlen_dtype(np.uint8))
+        for row, picture in enumerate(flat):
+            stored[row] = cv2.imencode(".jpg", picture)[1].reshape(-1)
+        file["puppet/joint_position"] = np.zeros((T, 7))
+        file["master/joint_position"] = np.ones((T, 7))
+        file["language_raw"] = np.array([b"put the cup away"])
+        file["language_distilbert"] = np.zeros((1, 1, 768), np.float32)
+    arm = embodiment(
+        action={"space": "joint_position", "components": [{"key": "master/joint_position", "dims": 7}]},
+        state={"components": [{"key": "puppet/joint_position", "dims": 7}]},
+        cameras=[{"name": "top", "key": "observations/rgb_images/camera_top"}],
+    )
+    source = open_source("hdf5")
+    (ref,) = source.index(str(tmp_path), arm)
+    episode = source.read(str(tmp_path), ref.id, arm)
+    assert ref.id == "task/success_episodes/train/0702_1/data/trajectory"
+    assert episode.instruction == "put the cup away"
+    means = episode.streams["top"].frames(range(T)).mean(axis=(1, 2, 3))
+    assert np.abs(means - 20 * np.arange(T)).max() < 3
+
+
+def test_signed_bytes_and_opaque_rows_are_pictures(tmp_path: Path) -> None:
+    pngs = [cv2.imencode(".png", picture[..., ::-1])[1].tobytes() for picture in pictures()]
+    longest = max(map(len, pngs))
+    opaque = np.array([np.void(png.ljust(longest, b"\0")) for png in pngs])
+    np.testing.assert_array_equal(shown(one(tmp_path, data=opaque), [3, 8]), pictures()[[3, 8]])
+    np.testing.assert_array_equal(shown(one(tmp_path, data=np.array(pngs)), [3]), pictures()[[3]])
+    path = one(tmp_path, shape=(T,), dtype=h5py.vlen_dtype(np.int8))
+    with h5py.File(path, "a") as file:
+        for row, png in enumerate(pngs):
+            file["data/demo_0/obs/agentview_image"][row] = np.frombuffer(png, np.int8)
+    np.testing.assert_array_equal(shown(path, [0, 8]), pictures()[[0, 8]])
+
+
+def test_states_without_pictures_say_that_they_must_be_rendered(tmp_path: Path) -> None:
+    path = tmp_path / "demo.hdf5"
+    with h5py.File(path, "w") as file:
+        group = file.create_group("data/demo_0")
+        group["states"], group["actions"] = np.zeros((T, 32)), np.zeros((T, 3))
+        group.attrs["model_file"] = "<mujoco/>"
+    with pytest.raises(EpisodeError, match=r"simulator's states and no pictures.*dataset_states_to_obs"):
+        open_source("hdf5").read(str(path), "demo_0", embodiment())
+
+
+@pytest.mark.parametrize(
+    ("masks", "expected"),
+    [
+        ({"train": [0], "valid": [1]}, ["train", "val", None]),
+        ({"train": [0, 2], "val": [1]}, ["train", "val", "train"]),
+        ({"20_percent_train": [0], "20_percent_valid": [1]}, [None] * 3),
+        ({"train": [0, 1], "valid": []}, ["train", "train", None]),
+    ],
+)
+def test_masks_by_their_names(
+    tmp_path: Path, masks: dict[str, list[int]], expected: list[str | None]
+) -> None:
+    path = tmp_path / "demos.hdf5"
+    with h5py.File(path, "w") as file:
+        for i in range(3):
+            fill(file.create_group(f"data/demo_{i}"))
+        for name, demos in masks.items():
+            file[f"mask/{name}"] = np.array([f"data/demo_{i}".encode() for i in demos], "S16")
+    assert [ref.split for ref in open_source("hdf5").index(str(path))] == expected
+    for name, demos in masks.items():
+        chosen = open_source("hdf5").index(str(path), embodiment(source__split=name))
+        assert [ref.id for ref in chosen] == [f"demo_{i}" for i in demos]
+
+
+# -- chunks
+
+
+@pytest.mark.parametrize("chunks", [(T, H, W, 3), (4, H, W, 3), (5, 5, 7, 1), (1, H, W, 3), None])
+def test_batches_in_any_order_are_the_frames_whatever_the_chunks(
+    tmp_path: Path, chunks: tuple[int, ...] | None
+) -> None:
+    options = {"chunks": chunks, "compression": "gzip", "shuffle": True} if chunks else {}
+    path = one(tmp_path, data=pictures(), **options)
+    stream = open_source("hdf5").read(str(path), "demo_0", embodiment()).streams["front"]
+    for batch in ([0, 1, 2], [3, 4, 8], [8, 0], [5, 5], [], [2, 6, 7]):
+        np.testing.assert_array_equal(stream.frames(batch), pictures()[batch])
+
+
+def test_a_chunk_larger_than_the_usual_cache_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hma_data.sources import hdf5_file
+
+    monkeypatch.setattr(hdf5_file, "CHUNK_CACHE", 1000)
+    path = one(tmp_path, data=pictures(), chunks=(T, H, W, 3), compression="gzip")
+    stream = open_source("hdf5").read(str(path), "demo_0", embodiment()).streams["front"]
+    np.testing.assert_array_equal(stream.frames([0, 1]), pictures()[:2])
+    content = bytearray(path.read_bytes())
+    with h5py.File(path) as file:
+        place = file["data/demo_0/obs/agentview_image"].id.get_chunk_info(0)
+    status = path.stat()
+    content[place.byte_offset : place.byte_offset + place.size] = bytes(place.size)
+    with path.open("r+b") as file:  # in place, so that the open file sees it
+        file.write(content)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    np.testing.assert_array_equal(stream.frames([5, 8]), pictures()[[5, 8]])
+
+
+# -- hostile files
+
+
+def refusal(path: Path, **changes: Any) -> str:
+    with pytest.raises(HMAError) as found:
+        robot = embodiment(**changes)
+        clip = to_clip(open_source("hdf5").read(str(path), "demo_0", robot), robot)
+        clip.frames_at("front", np.arange(3))
+    assert "\n" not in str(found.value)
+    return str(found.value)
+
+
+def test_a_soft_link_through_another_file_is_refused(tmp_path: Path) -> None:
+    path, secret = one(tmp_path, data=pictures()), tmp_path / "secret.bin"
+    with h5py.File(secret, "w") as file:
+        file["inner/image"], file["inner/actions"] = pictures(), np.zeros((T, 3))
+    with h5py.File(path, "a") as file:
+        file["away"] = h5py.ExternalLink(str(secret), "/inner")
+        del file["data/demo_0/obs/agentview_image"]
+        file["data/demo_0/obs/agentview_image"] = h5py.SoftLink("/away/image")
+        file["data/demo_1"] = h5py.SoftLink("/away")
+    assert "links to another file" in refusal(path)
+    assert open_source("hdf5").episode_ids(str(path)) == ["demo_0"]
+
+
+@pytest.mark.parametrize("dtype", [h5py.ref_dtype, h5py.regionref_dtype, h5py.vlen_dtype(np.float64)])
+def test_references_and_lists_are_no_pictures(tmp_path: Path, dtype: Any) -> None:
+    path = one(tmp_path, shape=(T,), dtype=dtype)
+    assert "not colour pictures" in refusal(path)
+
+
+def test_references_are_no_actions(tmp_path: Path) -> None:
+    path = one(tmp_path, data=pictures())
+    with h5py.File(path, "a") as file:
+        group = file["data/demo_0"]
+        del group["actions"]
+        group["actions"] = np.array([[group.ref] * 3] * T, dtype=h5py.ref_dtype)
+    assert "not numbers" in refusal(path)
+
+
+@pytest.mark.parametrize("shape", [(10**12, H, W, 3), (10**12,), (T, 10**6, 10**6, 3), (10**9, 1)])
+def test_sizes_no_recording_has_are_refused_at_once(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    path = one(tmp_path, shape=shape, dtype="u1", chunks=(1,) * len(shape))
+    with h5py.File(path, "a") as file:
+        file.create_dataset("data/demo_0/bomb", shape, "u1", chunks=(1,) * len(shape))
+    refusal(path)
+    wide = embodiment(action={"space": "mixed", "components": [{"key": "bomb", "dims": 1}]})
+    assert open_source("hdf5").index(str(path), wide)[0].frames <= 10**9
+    assert "too large" in refusal(path, action={"space": "mixed", "components": [{"key": "bomb", "dims": 1}]})
+
+
+def test_a_cell_of_a_picture_bomb_is_refused(tmp_path: Path) -> None:
+    png = bytearray(cv2.imencode(".png", pictures()[0])[1].tobytes())
+    png[16:24] = (60_000).to_bytes(4, "big") * 2
+    assert "claims 60000×60000" in refusal(one(tmp_path, data=np.array([bytes(png)] * T)))
+
+
+def test_a_group_that_holds_itself_ends(tmp_path: Path) -> None:
+    path = one(tmp_path, data=pictures())
+    with h5py.File(path, "a") as file:
+        file["data/demo_0/loop"] = file["data/demo_0"]
+        file["data/demo_0/soft"] = h5py.SoftLink("/data/demo_0/soft")
+    assert shown(path).shape == (T, H, W, 3)
+    assert open_source("hdf5").inspect(str(path)).episodes == 1
+    assert "has no 'x'" in refusal(path, cameras=[{"name": "front", "key": "x"}])
+    refusal(path, cameras=[{"name": "front", "key": "soft"}])
+
+
+def test_an_unknown_compression_says_so(tmp_path: Path) -> None:
+    path = one(tmp_path, data=pictures(), chunks=(T, H, W, 3), compression="gzip")
+    with h5py.File(path, "a") as file:
+        group = file["data/demo_0/obs"]
+        del group["agentview_image"]
+        plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plan.set_chunk((T, H, W, 3))
+        plan.set_filter(32_099, h5py.h5z.FLAG_OPTIONAL, ())
+        space = h5py.h5s.create_simple((T, H, W, 3))
+        stored = h5py.h5d.create(group.id, b"agentview_image", h5py.h5t.STD_U8LE, space, plan)
+        stored.write_direct_chunk((0, 0, 0, 0), b"x" * 100, 0)
+    assert "compressed in a way that HDF5 alone does not know" in refusal(path)
+
+
+def test_a_json_of_the_simulator_may_be_anything(tmp_path: Path) -> None:
+    path = one(tmp_path, data=pictures())
+    for value in ("[", json.dumps([1]), json.dumps({"env_kwargs": 3}), "[" * 5_000):
+        with h5py.File(path, "a") as file:
+            file["data"].attrs["env_args"] = value
+            file["data"].attrs["problem_info"] = value
+        assert open_source("hdf5").inspect(str(path)).episodes == 1
+        assert shown(path, [0]).shape == (1, H, W, 3)
