@@ -45,6 +45,7 @@ class EpisodeRef:
         split: the source's own, "train" or "val"; None where it has none.
         fingerprint: changes when the recording's bytes change (size and sample of content, not time stamps).
         group: shared by episodes cut from one recording, which belong into one split; its own id where empty.
+        left_out: frames of that recording which are in none of its episodes.
     """
 
     id: str
@@ -52,6 +53,7 @@ class EpisodeRef:
     split: str | None = None
     fingerprint: str = ""
     group: str = ""
+    left_out: int = 0
 
 
 @dataclass(frozen=True)
