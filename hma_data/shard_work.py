@@ -293,4 +293,5 @@ def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> 
         skew=json.dumps(skew),
         trimmed=clip.trimmed,
         flags=flags_text(clip.trimmed, clip.flags),
+        group=item.ref.group,
     )

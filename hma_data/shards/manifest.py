@@ -54,6 +54,7 @@ _EPISODE_SCHEMA = pa.schema(
         ("skew", pa.string()),
         ("trimmed", pa.int64()),
         ("flags", pa.string()),
+        ("group", pa.string()),
     ]
 )
 
@@ -168,6 +169,7 @@ class Manifest:
                 raise ShardError(
                     path,
                     f"has schema version {values['schema_version']}, this release reads {SCHEMA_VERSION}",
+                    "read it with the release that wrote it",
                 )
             return cls(
                 plan=values["plan"],
@@ -329,5 +331,5 @@ def _episode_table(rows: Sequence[EpisodeRow], source: str) -> pa.Table:
     columns = {
         name: [getattr(row, name) for row in rows] for name in _EPISODE_SCHEMA.names if name != "source"
     }
-    columns["source"] = [source] * len(rows)
+    columns["source"] = [row.source or source for row in rows]
     return pa.table(columns, schema=_EPISODE_SCHEMA)

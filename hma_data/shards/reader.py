@@ -3,6 +3,7 @@
 N rows, S tokens a frame, A values of an action.
 """
 
+import json
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +18,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from hma_data.errors import ShardError
-from hma_data.shards.manifest import EPISODES, Manifest
-from hma_data.shards.schema import to_numpy, token_column
+from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest
+from hma_data.shards.schema import mask_columns, to_numpy, token_column
 
 Ints = NDArray[np.int64]
 
@@ -69,8 +70,27 @@ class ShardSet:
         path = self.folder / EPISODES
         try:
             return pq.read_table(path)
-        except (OSError, pa.ArrowInvalid) as fault:
+        except (OSError, pa.ArrowException) as fault:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
+
+    def refused(self) -> list[dict[str, Any]]:
+        """quarantine.jsonl, a mapping a refused episode.
+
+        Raises:
+            ShardError: it is not there or damaged.
+        """
+        path = self.folder / QUARANTINE
+        try:
+            return [dict(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+        except (OSError, ValueError, TypeError) as fault:
+            raise ShardError(
+                path, f"cannot be read: {fault}", f"hma shards restat {self.folder} writes it anew"
+            ) from fault
+
+    def columns(self) -> list[str]:
+        """What `read` gives, without the camera's name and the frame's number, which follow from the rest."""
+        names = [token_column(self.spec)[0], "episode_index", "timestamp", "action"]
+        return [*names, *(["state"] if self.embodiment.state else []), *mask_columns(self.embodiment)]
 
     def shards(self, split: str) -> list[str]:
         """Names of a split's shards, in order."""
@@ -103,7 +123,7 @@ class ShardSet:
         try:
             with pq.ParquetFile(path, pre_buffer=False) as file:
                 table = file.read_row_groups(list(row_groups), columns=list(columns), use_threads=False)
-        except (OSError, pa.ArrowInvalid, pa.ArrowKeyError) as fault:
+        except (OSError, pa.ArrowException) as fault:
             raise ShardError(
                 path, f"cannot be read: {fault}", "hma shards verify tells what is damaged"
             ) from fault
@@ -121,14 +141,8 @@ class ShardSet:
         if not found:
             raise ShardError(self.folder, f"has no episode {episode_index}")
         row = found[0]
-        groups = next(shard.row_groups for shard in self.manifest.shards if shard.path == row["shard"])
-        edges = np.concatenate([[0], np.cumsum(groups)])
-        first = int(np.searchsorted(edges, row["row_start"], side="right")) - 1
-        last = int(np.searchsorted(edges, row["row_start"] + row["rows"], side="left"))
-        wanted = columns or [token_column(self.spec)[0], "action", "timestamp"]
-        values = self.read(row["shard"], range(first, last), wanted)
-        begin = row["row_start"] - edges[first]
-        return {name: value[begin : begin + row["rows"]] for name, value in values.items()}
+        reader = EpisodeReader(self, columns or [token_column(self.spec)[0], "action", "timestamp"])
+        return reader.rows(row["shard"], row["row_start"], row["rows"])
 
     def tokens(self, rows: NDArray[Any]) -> NDArray[Any]:
         """(N, width) of the token column -> (N, h, w) or (N, c, h, w)."""
@@ -138,6 +152,53 @@ class ShardSet:
             if self.spec.kind == "discrete"
             else rows.reshape(-1, self.spec.channels or 1, h, w)
         )
+
+
+class EpisodeReader:
+    """Rows of whole episodes, one after another; the last row groups stay decoded.
+
+    Reading episodes in their order decodes every row group once.
+    """
+
+    def __init__(self, shards: ShardSet, columns: Sequence[str], kept: int = 2) -> None:
+        self._set, self._columns, self._kept = shards, list(columns), kept
+        self._edges = {
+            shard.path: np.cumsum([0, *shard.row_groups], dtype=np.int64) for shard in shards.manifest.shards
+        }
+        self._groups: OrderedDict[tuple[str, int], dict[str, NDArray[Any]]] = OrderedDict()
+
+    def rows(self, shard: str, row_start: int, rows: int) -> dict[str, NDArray[Any]]:
+        """Columns of `rows` rows of a shard from `row_start` on: (rows,) or (rows, width) each.
+
+        Raises:
+            ShardError: the shard has no such rows, is missing or damaged.
+        """
+        edges = self._edges.get(shard, np.zeros(1, np.int64))
+        if row_start < 0 or rows < 1 or row_start + rows > edges[-1]:
+            raise ShardError(
+                self._set.folder / shard,
+                f"has {edges[-1]:,} rows, {EPISODES} names {row_start:,} to {row_start + rows:,}",
+                "hma shards verify tells what is damaged",
+            )
+        first = int(np.searchsorted(edges, row_start, side="right")) - 1
+        last = int(np.searchsorted(edges, row_start + rows, side="left"))
+        parts = []
+        for group in range(first, last):
+            begin, end = (int(np.clip(at - edges[group], 0, None)) for at in (row_start, row_start + rows))
+            values = self._group(shard, group)
+            parts.append({name: values[name][begin:end] for name in self._columns})
+        if len(parts) == 1:
+            return parts[0]
+        return {name: np.concatenate([part[name] for part in parts]) for name in self._columns}
+
+    def _group(self, shard: str, group: int) -> dict[str, NDArray[Any]]:
+        key = (shard, group)
+        if key not in self._groups:
+            while len(self._groups) >= self._kept:
+                self._groups.popitem(last=False)
+            self._groups[key] = self._set.read(shard, [group], self._columns)
+        self._groups.move_to_end(key)
+        return self._groups[key]
 
 
 class RowGroupCache:

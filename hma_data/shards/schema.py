@@ -39,6 +39,8 @@ class EpisodeRow:
         skew: stream -> [p50, p95, max] in ms, as JSON.
         trimmed: frames cut at the ends, where not every stream ran.
         flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
+        group: shared by episodes of one recording, which belong into one split; empty for one of its own.
+        source: where it is another than the set's.
     """
 
     episode_index: int
@@ -57,6 +59,8 @@ class EpisodeRow:
     skew: str
     trimmed: int
     flags: str
+    group: str = ""
+    source: str = ""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ group in memory for each, so memory does not grow with the set.
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pyarrow as pa
@@ -66,14 +67,30 @@ def verify(
             whole = False
             continue
         gathered.add(checked.footer)
-        if checked.footer.split == "train":
-            for name, stats in checked.stats.items():
-                rows.setdefault(name, Stats.empty(len(stats.mean))).merge(stats)
+        _merge_train(rows, checked)
     found += _foreign(folder, manifest)
     found += _other_files(folder, manifest)
     if whole:
         found += _set_problems(folder, manifest, gathered, rows, restat)
     return found
+
+
+def check_rows(
+    folder: Path, manifest: Manifest, workers: int | None, on_progress: OnProgress
+) -> tuple[list[str], dict[str, Stats]]:
+    """What is wrong with the shards, and the statistics of the train shards' rows."""
+    found: list[str] = []
+    rows: dict[str, Stats] = {}
+    for checked in _checked(folder, manifest, workers or usable_cores(), False, on_progress):
+        found += checked.problems
+        _merge_train(rows, checked)
+    return found, rows
+
+
+def _merge_train(rows: dict[str, Stats], checked: Checked) -> None:
+    if checked.footer and checked.footer.split == "train":
+        for name, stats in checked.stats.items():
+            rows.setdefault(name, Stats.empty(len(stats.mean))).merge(stats)
 
 
 def _checked(
@@ -115,15 +132,14 @@ def _other_files(folder: Path, manifest: Manifest) -> Iterator[str]:
                 yield f"{folder / MANIFEST}: states no sha256 of {name} — {remedy}"
             elif file_sha256(path) != manifest.files[name]:
                 yield f"{path}: its bytes changed since the manifest was written (sha256 differs) — {remedy}"
+            elif name == EMBODIMENT and Embodiment.load(path) != manifest.embodiment:
+                yield f"{path}: is another embodiment than the manifest's — {remedy}"
         except FileNotFoundError:
             yield f"{path}: is missing — {remedy}"
         except OSError as fault:
             yield f"{path}: cannot be read: {fault.strerror} — {remedy}"
-    try:
-        if Embodiment.load(folder / EMBODIMENT) != manifest.embodiment:
-            yield f"{folder / EMBODIMENT}: is another embodiment than the manifest's — {remedy}"
-    except (HMAError, OSError) as fault:
-        yield " ".join(f"{folder / EMBODIMENT}: cannot be used: {fault}".split())
+        except HMAError as fault:
+            yield " ".join(str(fault).split())
 
 
 def _set_problems(
@@ -132,16 +148,12 @@ def _set_problems(
     """The files derived from the footers still say what the footers say, and episodes stand in one split."""
     expected = gathered.episodes()
     yield from _episode_problems(folder, expected)
-    try:
+    with suppress(OSError, pa.ArrowException):  # unreadable is unlike its sha256, which was said already
         if not pq.read_table(folder / EPISODES).equals(expected):
             yield f"{folder / EPISODES}: differs from the shards' footers — {restat}"
-    except (OSError, pa.ArrowException) as fault:
-        yield f"{folder / EPISODES}: cannot be read: {' '.join(str(fault).split())} — {restat}"
-    try:
+    with suppress(OSError):
         if (folder / QUARANTINE).read_bytes() != gathered.quarantine().encode():
             yield f"{folder / QUARANTINE}: differs from the shards' footers — {restat}"
-    except OSError as fault:
-        yield f"{folder / QUARANTINE}: cannot be read: {fault.strerror} — {restat}"
     where = folder / MANIFEST
     for split in SPLITS:
         if manifest.splits.get(split) != split_totals(expected, manifest.shards, split):

@@ -1,0 +1,299 @@
+"""Verification finds whatever is wrong with a shard set, and says where and what to do."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hma_data.convert import convert
+from hma_data.embodiment import Embodiment
+from hma_data.errors import ShardError
+from hma_data.plan import Settings
+from hma_data.shards.manifest import MANIFEST, Manifest, finish, plan_hash, seal_problem
+from hma_data.shards.restat import restat
+from hma_data.shards.verify import verify
+from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+
+SMALL = Settings(val_fraction=0.3, shard_frames=40)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound set of several shards; not to be changed."""
+    folder = tmp_path_factory.mktemp("made")
+    write_toy(folder / "toy.hdf5", [14, 15, 16, 17, 18])
+    arm = Embodiment.from_yaml(ARM_YAML)
+    convert(arm, str(folder / "toy.hdf5"), BlockTokenizer(), folder / "set", settings=SMALL)
+    return folder / "set"
+
+
+@pytest.fixture
+def sound(made: Path, tmp_path: Path) -> Path:
+    """A copy that may be damaged."""
+    return Path(shutil.copytree(made, tmp_path / "set"))
+
+
+def one(problems: list[str], *words: str) -> str:
+    """The one problem, a single line that says all of `words` and what to do."""
+    assert len(problems) == 1, problems
+    assert "\n" not in problems[0]
+    assert " — " in problems[0]
+    for word in words:
+        assert word in problems[0]
+    return problems[0]
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+# -- damage
+
+
+def test_a_sound_set_has_no_problems_however_it_is_verified(made: Path) -> None:
+    assert verify(made) == []
+    assert verify(made, workers=3) == []
+    assert verify(made, quick=True) == []
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_flipped_bit_in_any_byte_of_any_file_is_found(made: Path, data: st.DataObject) -> None:
+    path = data.draw(st.sampled_from(files(made)))
+    whole = path.read_bytes()
+    if not whole:
+        return
+    place = data.draw(st.integers(0, len(whole) - 1))
+    bit = data.draw(st.integers(0, 7))
+    try:
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
+        problems = verify(made)
+        assert any(path.name in problem for problem in problems)
+        assert all("\n" not in problem for problem in problems)
+    finally:
+        path.write_bytes(whole)
+
+
+def test_every_bit_of_the_manifest_is_sealed(made: Path) -> None:
+    text = (made / MANIFEST).read_bytes()
+    assert seal_problem(text) == ""
+    for place in range(min(len(text), 4000)):
+        changed = bytearray(text)
+        changed[place] ^= 1 << place % 8
+        assert seal_problem(bytes(changed))
+
+
+@pytest.mark.parametrize("kept", [0, 3, 4, 100, -20, -1])
+def test_a_truncated_shard_is_found(sound: Path, kept: int) -> None:
+    shard = sound / "train" / "shard-00001.parquet"
+    shard.write_bytes(shard.read_bytes()[:kept])
+    one(verify(sound), "shard-00001.parquet", "bytes", "hma convert")
+    one(verify(sound, quick=True), "shard-00001.parquet", "bytes", "hma convert")
+
+
+@pytest.mark.parametrize("name", ["episodes.parquet", "quarantine.jsonl", "embodiment.yaml"])
+def test_a_missing_file_is_found_and_restat_brings_it_back(sound: Path, made: Path, name: str) -> None:
+    (sound / name).unlink()
+    assert all(name in problem and "restat" in problem for problem in verify(sound))
+    assert verify(sound)
+    restat(sound)
+    assert verify(sound) == []
+    assert (sound / name).read_bytes() == (made / name).read_bytes()
+
+
+def test_a_missing_shard_is_found(sound: Path) -> None:
+    (sound / "val" / "shard-00000.parquet").unlink()
+    one(verify(sound), "val/shard-00000.parquet", "missing", "hma convert")
+
+
+@pytest.mark.parametrize("place", ["train/shard-00099.parquet", "val/x.txt", "notes.txt", "extra/a.bin"])
+def test_a_foreign_file_is_found(sound: Path, place: str) -> None:
+    (sound / place).parent.mkdir(exist_ok=True)
+    (sound / place).write_bytes(b"?")
+    assert any(place in problem and "not in the manifest" in problem for problem in verify(sound))
+
+
+def test_what_a_killed_job_leaves_is_told_apart(sound: Path) -> None:
+    (sound / "train" / ".shard-00000.parquet.12.part").write_bytes(b"?")
+    one(verify(sound), ".part", "killed")
+
+
+# -- the manifest
+
+
+def test_without_a_manifest_it_says_how_to_rebuild_it(sound: Path, made: Path) -> None:
+    (sound / MANIFEST).unlink()
+    one(verify(sound), "has no manifest.json", "hma convert", "hma shards restat")
+    restat(sound)
+    assert (sound / MANIFEST).read_bytes() == (made / MANIFEST).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"[]", b"{}", b"null", b'"x"', b"\xff\xfe", b"[" * 100_000, b'{"schema_version": 7}', b"{"]
+)
+def test_a_manifest_of_anything_else_is_one_clear_error(sound: Path, made: Path, text: bytes) -> None:
+    (sound / MANIFEST).write_bytes(text)
+    one(verify(sound), "manifest.json")
+    if b"7" not in text:
+        restat(sound)
+        assert (sound / MANIFEST).read_bytes() == (made / MANIFEST).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "name", ["../../etc/passwd", "/etc/passwd", "train/../../x", "train/shard-1.parquet"]
+)
+def test_a_manifest_that_names_files_outside_is_refused(sound: Path, name: str) -> None:
+    text = (sound / MANIFEST).read_text()
+    (sound / MANIFEST).write_text(text.replace("train/shard-00000.parquet", name))
+    with pytest.raises(ShardError, match="not the name of a shard"):
+        Manifest.load(sound)
+
+
+def test_a_manifest_of_another_run_is_found(sound: Path, tmp_path: Path, toy_arm, block_tokenizer) -> None:
+    write_toy(tmp_path / "other.hdf5", [14, 15, 16, 17, 20])
+    convert(toy_arm, str(tmp_path / "other.hdf5"), block_tokenizer, tmp_path / "other", settings=SMALL)
+    (sound / MANIFEST).write_bytes((tmp_path / "other" / MANIFEST).read_bytes())
+    problems = verify(sound)
+    assert any("another plan" in problem for problem in problems)
+    assert not verify(tmp_path / "other")
+
+
+def reseal(folder: Path, change) -> None:
+    """Write the manifest with one fact changed and a seal that holds."""
+    values = json.loads((folder / MANIFEST).read_text())
+    change(values)
+    values["manifest_sha256"] = "0" * 64
+    text = json.dumps(values)
+    sealed = text.replace("0" * 64, hashlib.sha256(text.encode()).hexdigest(), 1)
+    (folder / MANIFEST).write_text(sealed)
+
+
+CHANGES = {
+    "counts of split train": lambda m: m["splits"]["train"].update(episodes=3),
+    "in quarantine": lambda m: m["totals"].update(quarantined=2),
+    "statistics of action": lambda m: m["stats"]["action"]["mean"].__setitem__(0, 0.123),
+    "plan's hash": lambda m: m["plan"].update(recording="0123456789abcdef"),
+    "row groups": lambda m: m["shards"][0].update(row_groups=[1, 2]),
+    "another tokenizer": lambda m: m["tokenizer"].update(version=2),
+    "another embodiment": lambda m: m["embodiment"].update(target_hz=1.0),
+}
+
+
+@pytest.mark.parametrize("said", CHANGES)
+def test_a_manifest_that_says_something_false_is_found(sound: Path, said: str) -> None:
+    reseal(sound, lambda values: None)
+    assert verify(sound) == []
+    reseal(sound, CHANGES[said])
+    assert any(said in problem for problem in verify(sound)), verify(sound)
+
+
+# -- shards that are whole, hashed and wrong
+
+
+def footer(path: Path) -> dict[bytes, bytes]:
+    metadata = pq.read_metadata(path).metadata
+    return {key: value for key, value in metadata.items() if key != b"ARROW:schema"}
+
+
+def write(path: Path, table: pa.Table, metadata: dict[bytes, bytes]) -> None:
+    with pq.ParquetWriter(path, table.schema) as writer:
+        writer.write_table(table)
+        writer.add_key_value_metadata(metadata)
+
+
+def rewritten(folder: Path, change) -> list[str]:
+    """Problems after a shard's table was changed and everything derived was written anew over it."""
+    path = folder / "train" / "shard-00000.parquet"
+    write(path, change(pq.read_table(path)), footer(path))
+    manifest = Manifest.load(folder)
+    names = [shard.path for shard in manifest.shards]
+    finish(folder, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source)
+    return verify(folder)
+
+
+def with_values(table: pa.Table, column: str, change) -> pa.Table:
+    """The table with one column's flat values changed by a function of a numpy array."""
+    place, kind = table.schema.get_field_index(column), table.schema.field(column).type
+    array = table[column].combine_chunks()
+    nested = pa.types.is_fixed_size_list(kind)
+    values = np.array((array.flatten() if nested else array).to_numpy(zero_copy_only=False))
+    change(values)
+    flat = pa.array(values, kind.value_type if nested else kind)
+    new = pa.FixedSizeListArray.from_arrays(flat, type=kind) if nested else flat
+    return table.set_column(place, table.schema.field(column), new)
+
+
+WRONG = {
+    "vocabulary": ("tokens", lambda v: v.__setitem__(5, 4096)),
+    "not finite": ("action", lambda v: v.__setitem__(4, np.nan)),
+    "statistics": ("action", lambda v: v.__setitem__(4, 99)),
+    "frame_index": ("frame_index", lambda v: v.__setitem__(3, 9)),
+    "episode_index": ("episode_index", lambda v: v.__setitem__(0, 3)),
+    "go back": ("timestamp", lambda v: v.__setitem__(3, 0.0)),
+}
+
+
+@pytest.mark.parametrize("said", WRONG)
+def test_rows_that_are_wrong_are_found(sound: Path, said: str) -> None:
+    column, change = WRONG[said]
+    problems = rewritten(sound, lambda table: with_values(table, column, change))
+    assert any(said in problem and "shard-00000" in problem for problem in problems), problems
+
+
+def test_rows_that_are_missing_are_found(sound: Path) -> None:
+    problems = rewritten(sound, lambda table: table.slice(1))
+    assert any("shard-00000" in problem for problem in problems)
+
+
+def test_a_column_of_another_width_is_found(sound: Path) -> None:
+    def narrow(table: pa.Table) -> pa.Table:
+        rows = len(table)
+        flat = pa.array(np.zeros(rows * 2, np.float32))
+        return table.set_column(
+            table.schema.get_field_index("action"), "action", pa.FixedSizeListArray.from_arrays(flat, 2)
+        )
+
+    assert any("action" in problem and "columns" in problem for problem in rewritten(sound, narrow))
+
+
+def test_episodes_of_one_recording_in_both_splits_are_found(sound: Path) -> None:
+    for path in [*sound.glob("train/*"), *sound.glob("val/*")]:
+        metadata = footer(path)
+        values = json.loads(metadata[b"hma"])
+        for row in values["episodes"]:
+            row["group"] = "one"
+        write(path, pq.read_table(path), metadata | {b"hma": json.dumps(values).encode()})
+    manifest = Manifest.load(sound)
+    names = [shard.path for shard in manifest.shards]
+    finish(sound, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source)
+    assert any("both splits" in problem for problem in verify(sound))
+
+
+def test_the_hash_of_a_plan_is_over_everything_in_it(made: Path) -> None:
+    plan = Manifest.load(made).plan
+    assert plan_hash(plan) == plan["hash"]
+    assert plan_hash(plan | {"frames": "strided"}) != plan["hash"]
+
+
+# -- restat
+
+
+def test_restat_refuses_when_shards_are_missing_and_no_manifest_tells(sound: Path) -> None:
+    (sound / MANIFEST).unlink()
+    (sound / "train" / "shard-00001.parquet").unlink()
+    with pytest.raises(ShardError, match="hma convert"):
+        restat(sound)
+
+
+def test_restat_refuses_a_damaged_shard(sound: Path) -> None:
+    shard = sound / "train" / "shard-00001.parquet"
+    shard.write_bytes(shard.read_bytes()[:-30])
+    with pytest.raises(ShardError, match="shard-00001"):
+        restat(sound)
