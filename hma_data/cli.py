@@ -1,4 +1,4 @@
-"""The data verbs of `hma`: inspect, convert, mixture; registry, shards and tokenizer in modules of their own.
+"""The data verbs of `hma`: inspect, doctor, mixture; the others in modules of their own.
 
 Only what is light is imported here; each verb imports what it needs.
 """
@@ -10,22 +10,13 @@ from typing import Annotated, Any
 import typer
 
 from hma_data.cli_bench import bench
+from hma_data.cli_convert import convert
 from hma_data.cli_registry import registry_app
 from hma_data.cli_shards import shards_app
 from hma_data.cli_tokenizer import tokenizer_app
-from hma_data.console import human_bytes, human_seconds, print_json, print_table, progress
+from hma_data.console import print_json, print_table
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-EmbodimentOption = Annotated[str, typer.Option("--embodiment", "-e", help="Registry id, or a YAML file.")]
-
-
-class Frames(StrEnum):
-    all = "all"
-    strided = "strided"
-
-
-class Engine(StrEnum):
-    local = "local"
 
 
 def mount(app: typer.Typer) -> None:
@@ -132,136 +123,6 @@ def doctor(
         print(f"{target}: {sum(finding.severity != 'info' for finding in found)} findings")
     worst = max((SEVERITIES.index(finding.severity) for finding in found), default=-1)
     raise typer.Exit(1 if worst >= SEVERITIES.index(fail_on.value) else 0)
-
-
-def convert(
-    embodiment: EmbodimentOption,
-    out: Annotated[Path, typer.Option("--out", help="Folder of the shard set.")],
-    source: Annotated[
-        str | None, typer.Option("--source", help="Recording; default: source.uri of the YAML.")
-    ] = None,
-    tokenizer: Annotated[str, typer.Option("--tokenizer", help="Name of the tokenizer.")] = "fsq-16",
-    weights: Annotated[
-        str | None, typer.Option("--weights", help="The tokenizer's weights, if not the usual.")
-    ] = None,
-    device: Annotated[
-        str, typer.Option("--device", help="Where the tokenizer runs: cpu, cuda, mps.")
-    ] = "cpu",
-    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes; default: one.")] = None,
-    engine: Annotated[Engine, typer.Option("--engine", help="What runs the work.")] = Engine.local,
-    limit: Annotated[int | None, typer.Option("--limit", min=1, help="Only the first episodes.")] = None,
-    frames: Annotated[
-        Frames, typer.Option("--frames", help="All rows, or the model's grid only.")
-    ] = Frames.all,
-    frequency_hz: Annotated[
-        float | None,
-        typer.Option("--frequency-hz", help="The recording's rate, where the YAML's is unknown."),
-    ] = None,
-    camera: Annotated[
-        list[str] | None, typer.Option("--camera", help="Camera to keep; repeat for more.")
-    ] = None,
-    shard_frames: Annotated[
-        int | None, typer.Option("--shard-frames", min=1, help="About so many a shard.")
-    ] = None,
-    val_fraction: Annotated[
-        float, typer.Option("--val-fraction", help="Share of episodes for validation.")
-    ] = 0.05,
-    seed: Annotated[int, typer.Option("--seed", help="Of the split.")] = 0,
-    max_quarantine: Annotated[
-        float, typer.Option("--max-quarantine", min=0, max=1, help="Share of bad episodes allowed.")
-    ] = 0.01,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Throw away the shard set in --out.")
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")] = False,
-    json: Json = False,
-) -> None:
-    """Recordings to tokenized shards; run it again to continue.
-
-    Example: hma convert -e my_arm.yaml --source ./demo.hdf5 --out shards/my_arm
-    """
-    from hma_data.convert import Progress, plan_conversion
-    from hma_data.convert import convert as run
-    from hma_data.embodiment import find
-    from hma_data.plan import Settings
-    from hma_data.tokenizers.base import get_tokenizer
-
-    robot = find(embodiment)
-    if frequency_hz is not None:
-        robot = robot.with_rate(frequency_hz)
-    settings = Settings(frames.value, tuple(camera or ()), val_fraction, seed, limit, shard_frames)
-    if dry_run:
-        plan, uri = plan_conversion(
-            robot, source, get_tokenizer(tokenizer, weights=weights, device=device), settings
-        )
-        units = [{"shard": u.name, "episodes": len(u.episodes), "frames": u.frames} for u in plan.units]
-        facts = {"source": uri, "episodes": plan.episodes, "frames": plan.frames, "shards": units}
-        if json:
-            print_json(facts)
-        else:
-            print(f"{uri}: {plan.episodes:,} episodes, about {plan.frames:,} frames into {len(units)} shards")
-            print_table(["shard", "episodes", "frames, about"], [list(unit.values()) for unit in units])
-        return
-    with progress(f"convert {robot.id}") as update:
-
-        def show(state: Progress) -> None:
-            words = f"{state.episodes:,}/{state.total_episodes:,} episodes, {human_bytes(state.bytes)}"
-            if state.quarantined:
-                words += f", {state.quarantined:,} in quarantine"
-            update(state.frames, words, state.total_frames)
-
-        summary = run(
-            robot,
-            source,
-            tokenizer,
-            out,
-            settings=settings,
-            workers=workers or 1,
-            weights=weights,
-            device=device,
-            max_quarantine=max_quarantine,
-            overwrite=overwrite,
-            on_progress=show,
-        )
-    _report_conversion(summary, max_quarantine, json)
-    raise typer.Exit(1 if summary.too_many else 0)
-
-
-def _report_conversion(summary: Any, max_quarantine: float, json: bool) -> None:
-    manifest = summary.manifest
-    totals = manifest.to_json()["totals"]
-    if json:
-        facts = {
-            "out": str(summary.out),
-            **totals,
-            "splits": manifest.splits,
-            "shards_made": summary.made_shards,
-            "shards_kept": summary.kept_shards,
-            "seconds": summary.seconds,
-            "reasons": summary.reasons,
-            "flags": summary.flags,
-            "too_many_quarantined": summary.too_many,
-        }
-        print_json(facts)
-    else:
-        splits = ", ".join(f"{name} {split['episodes']:,}" for name, split in manifest.splits.items())
-        kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
-        print(
-            f"{summary.out}: {totals['episodes']:,} episodes ({splits}), {totals['frames']:,} frames, "
-            f"{human_bytes(totals['bytes'])} in "
-            f"{len(manifest.shards)} shards{kept}, {human_seconds(summary.seconds)}"
-        )
-        if summary.flags:
-            counts = [f"{count:,} {name.replace('_', ' ')}" for name, count in summary.flags.items()]
-            print(f"flags: {', '.join(counts)}")
-    for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:20]:
-        typer.echo(f"quarantine: {count:,} × {reason}", err=True)
-    if summary.too_many:
-        typer.echo(
-            f"error: {summary.out}: {totals['quarantined']:,} episodes are in quarantine, more than "
-            f"--max-quarantine {max_quarantine:g} allows — see quarantine.jsonl; what was converted is kept",
-            err=True,
-        )
 
 
 # -- mixture

@@ -23,6 +23,7 @@ from hma_data.engines.base import LIMITS, Limits, Retry
 from hma_data.engines.local import run as run_local
 from hma_data.errors import OutputError, RegistryError, SourceError
 from hma_data.extend import extended
+from hma_data.files import remove_parts
 from hma_data.output import (
     Journal,
     Made,
@@ -30,6 +31,7 @@ from hma_data.output import (
     base_manifest,
     clear,
     finished_shards,
+    known_hashes,
     locked,
     remove_journals,
 )
@@ -278,10 +280,20 @@ class _Conversion:
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
         """The manifest and what else is derived from footers; nothing where nothing changed."""
         out = self._out
+        remove_parts(out)  # of workers that died
         if not changed and (out / MANIFEST).is_file() and (out / EPISODES).is_file():
             return Manifest.load(out)
-        names = [*(shard.path for shard in (base.shards if base else ())), *(u.name for u in plan.units)]
-        manifest = finish(out, names, self._embodiment, self._tokenizer.spec, plan.facts, self.uri)
+        kept = base.shards if base else ()
+        names = [*(shard.path for shard in kept), *(unit.name for unit in plan.units)]
+        manifest = finish(
+            out,
+            names,
+            self._embodiment,
+            self._tokenizer.spec,
+            plan.facts,
+            self.uri,
+            hashes={**{shard.path: shard.sha256 for shard in kept}, **known_hashes(out)},
+        )
         remove_journals(out)
         return manifest
 

@@ -37,7 +37,7 @@ def extended(out: Path, base: Manifest, plan: Plan, shard_frames: int | None) ->
     Raises:
         OutputError: the set was made in another way, or an episode of it has changed since.
     """
-    here, there = _ways(plan.facts), _ways(base.plan)
+    here, there = ways(plan.facts), ways(base.plan)
     if here != there:
         raise OutputError(
             out,
@@ -79,7 +79,7 @@ def _with(base: Manifest, new: list[tuple[EpisodeRef, str]], first: int, shard_f
     return Plan(tuple(units), {**facts, "hash": digest(facts)})
 
 
-def _ways(facts: dict[str, Any]) -> dict[str, Any]:
+def ways(facts: dict[str, Any]) -> dict[str, Any]:
     """What must not differ between a set and what extends it; --limit and the like may."""
     ways = {key: value for key, value in facts.items() if key not in _OF_THE_CUT}
     settings = ways["settings"]

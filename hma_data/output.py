@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from hma_data.errors import OutputError
-from hma_data.extend import hashes
+from hma_data.extend import hashes, ways
 from hma_data.files import PART, file_sha256, remove_parts
 from hma_data.plan import Plan, differences
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, Manifest
@@ -159,10 +160,10 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
     return done
 
 
-def _other(out: Path, plan: Plan, theirs: dict[str, object]) -> OutputError:
+def _other(out: Path, plan: Plan, theirs: dict[str, Any]) -> OutputError:
     words = differences(plan.facts, theirs)
     remedy = "choose another --out, or --overwrite to start anew"
-    if words == "recordings":
+    if ways(plan.facts) == ways(theirs):
         remedy = "--extend adds the episodes that are new, --overwrite starts anew"
     return OutputError(out, f"belongs to another conversion; different: {words}", remedy)
 

@@ -20,7 +20,7 @@ from hma_data.errors import HMAError
 
 CRASHES = {"SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGSYS"}  # of a process's own making
 TICK_S = 0.5
-START_FAILURES = 3
+START_FAILURES, KILLS_A_FAILURE = 30, 10  # in a row; a kill from outside weighs less
 
 
 def run(
@@ -152,7 +152,7 @@ class _Pool:
         code = worker.process.exitcode or 0
         name = _signal_name(-code) if code < 0 else f"exit code {code}"
         if not worker.ready:
-            self._start_failures += 1
+            self._start_failures += 1 if code < 0 and name not in CRASHES else KILLS_A_FAILURE
             if self._start_failures >= START_FAILURES:
                 raise HMAError(
                     "a worker", f"ended at its start, by {name}", "try --workers 1, or more memory"
