@@ -58,14 +58,24 @@ def _linear(source_times: Floats, values: Floats, target_times: Floats) -> Float
 
 
 def _quaternions(source_times: Floats, values: Floats, target_times: Floats) -> Floats:
-    """Along the shorter arc, the series continuous in sign; lengths are kept, 1 where the samples have 1."""
+    """Evenly along the shorter arc, continuous in sign; lengths are kept, 1 where the samples have 1."""
     turns = np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     steady = values * np.cumprod(np.concatenate([[1.0], turns]))[:, None]
-    lengths = np.linalg.norm(values, axis=1, keepdims=True)
-    mixed = _linear(source_times, steady, target_times)
-    size = np.linalg.norm(mixed, axis=1, keepdims=True)
-    wanted = _linear(source_times, lengths, target_times)
-    return np.where(size > 0, mixed * wanted / np.where(size > 0, size, 1), mixed)
+    lengths = np.linalg.norm(values, axis=1)
+    last = len(values) - 1
+    before = np.clip(np.searchsorted(source_times, target_times, side="right") - 1, 0, last)
+    after = np.minimum(before + 1, last)
+    share = (
+        _linear(source_times, np.arange(len(values), dtype=np.float64)[:, None], target_times)[:, 0] - before
+    )
+    units = _directions(steady)
+    arc = np.arccos(np.clip((units[before] * units[after]).sum(axis=1), -1, 1))
+    bent = (arc > 1e-4) & (lengths[before] > 0) & (lengths[after] > 0)
+    sine = np.where(bent, np.sin(arc), 1)
+    one = np.where(bent, np.sin((1 - share) * arc) / sine, 1 - share)
+    other = np.where(bent, np.sin(share * arc) / sine, share)
+    mixed = _directions(one[:, None] * units[before] + other[:, None] * units[after])
+    return mixed * ((1 - share) * lengths[before] + share * lengths[after])[:, None]
 
 
 def _angles(source_times: Floats, values: Floats, target_times: Floats, period: float) -> Floats:

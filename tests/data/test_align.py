@@ -263,3 +263,166 @@ def test_values_that_are_not_finite_are_told_with_the_frame() -> None:
 def test_a_stream_without_samples_is_told() -> None:
     with pytest.raises(EpisodeError, match="wrist has no samples"):
         to_clip(episode(STEADY, STEADY[:0], STEADY, STEADY, STEADY), embodiment())
+
+
+# -- times that are equal but for rounding
+
+
+@st.composite
+def ticks(draw: st.DrawFn) -> np.ndarray:
+    """Rising whole numbers of 300ths of a second, some twice."""
+    steps = draw(st.lists(st.integers(0, 40), min_size=0, max_size=25))
+    return np.cumsum([draw(st.integers(0, 60)), *steps])
+
+
+@QUICK
+@given(
+    source=ticks(),
+    targets=ticks(),
+    epoch=st.sampled_from([0.0, 3_600.0, 86_400.5, 1_700_000_000.0, 1_763_740_800.123456]),
+    added=st.booleans(),
+)
+def test_hold_and_nearest_are_those_of_exact_times(
+    source: np.ndarray, targets: np.ndarray, epoch: float, added: bool
+) -> None:
+    floats = epoch + source / 300
+    if added and epoch < 1e6:  # near 1.7e9 each sum loses 0.1 µs, and times drift apart in earnest
+        floats = np.cumsum([epoch + source[0] / 300, *(np.diff(source) * (1 / 300))])
+    grid = epoch + targets[0] / 300 + (targets - targets[0]) / 300
+    held, age_ms = hold(floats, grid)
+    np.testing.assert_array_equal(
+        held, [max((i for i, s in enumerate(source) if s <= t), default=0) for t in targets]
+    )
+    late = targets >= source[0]
+    assert (age_ms[late] >= 0).all() and (age_ms[~late] < 0).all()
+    np.testing.assert_allclose(age_ms, (targets - source[held]) / 0.3, atol=1e-2)
+    near, skew_ms = nearest(floats, grid)
+    np.testing.assert_array_equal(
+        near, [min(range(len(source)), key=lambda i: (abs(source[i] - t), i)) for t in targets]
+    )
+    np.testing.assert_allclose(skew_ms, np.abs(targets - source[near]) / 0.3, atol=1e-2)
+
+
+@pytest.mark.parametrize("epoch", [0.0, 100_000.1, 1_763_740_800.123456])
+@pytest.mark.parametrize("hz", [10.0, 29.97, 30.0, 59.94])
+def test_a_grid_of_the_recordings_own_rate_takes_every_command_in_turn(epoch: float, hz: float) -> None:
+    clock = epoch + np.arange(300) / hz
+    for rate in (None, hz):
+        sync = {"actions": "hold", "states": "nearest"} | ({"rate_hz": rate} if rate else {})
+        clip = to_clip(episode(*[clock] * 5), embodiment(**sync))
+        assert len(clip) == 300 and clip.trimmed == 0
+        np.testing.assert_array_equal(clip.actions[:, 0], clip.episode.actions[0].values[:, 0])
+        np.testing.assert_array_equal(clip.states, clip.episode.states[0].values)
+        assert all(0 <= skew.max() < 2e-3 for skew in clip.skew_ms.values())
+
+
+def test_a_command_a_few_microseconds_late_is_not_in_force_yet() -> None:
+    for epoch in (0.0, 1.7e9):
+        index, _ = hold(np.array([epoch, epoch + 1 + 5e-6]), np.array([epoch + 1]))
+        assert index.tolist() == [0]
+
+
+# -- samples of one stamp
+
+
+def test_of_samples_with_one_stamp_hold_takes_the_last_nearest_the_first() -> None:
+    source = np.array([0, 0, 1, 1, 1, 2.0])
+    targets = np.array([0, 0.2, 0.9, 1, 1.2, 1.9, 2])
+    assert hold(source, targets)[0].tolist() == [1, 1, 1, 4, 4, 4, 5]
+    assert nearest(source, targets)[0].tolist() == [0, 0, 2, 2, 2, 5, 5]
+    values = np.array([0, 10, 20, 50, 30, 40], np.float32)[:, None]
+    between = interpolate(source, values, np.array([0, 0.5, 1, 1.5]))[0]
+    assert between[:, 0].tolist() == [10, 15, 30, 35]  # a step at the stamp, from the first to the last
+
+
+def test_a_camera_that_stamps_two_pictures_alike_gives_one_frame_of_them_and_it_is_counted() -> None:
+    twice = np.sort(np.concatenate([STEADY, STEADY[[4, 9, 9]]]))
+    clip = to_clip(episode(twice, STEADY, STEADY, STEADY, STEADY), embodiment())
+    assert len(clip) == 20 and clip.repeated == 3 and clip.flags == {"repeated_frames": 3}
+    assert (np.diff(clip.timestamps) > 0).all()
+    shown = clip.frames_at("front", np.arange(20))[:, 0, 0, 0].tolist()
+    assert shown == [i + (i > 4) + 2 * (i > 9) for i in range(20)]
+
+
+def test_a_camera_with_one_stamp_for_most_of_its_pictures_is_refused() -> None:
+    coarse = np.floor(STEADY)
+    with pytest.raises(AlignmentError, match="18 of 20 frames of front bear the stamp.*stamp: receive"):
+        to_clip(episode(coarse, STEADY, STEADY, STEADY, STEADY), embodiment())
+
+
+# -- streams by name
+
+
+def test_skew_is_told_by_the_key_of_the_component() -> None:
+    clip = to_clip(episode(STEADY, STEADY, STEADY, STEADY + 0.01, STEADY), embodiment())
+    assert list(clip.skew_ms) == ["front", "wrist", "a", "b", "s"]
+    assert clip.skew_ms["b"].max() == pytest.approx(90)
+
+
+def test_two_components_of_one_topic_share_a_name_and_another_clock_has_its_own() -> None:
+    values = embodiment().to_dict()
+    values["action"]["components"] = [
+        {"key": "/arm.q", "dims": 1, "slice": [0, 1]},
+        {"key": "/arm.q", "dims": 2, "slice": [1, 3]},
+    ]
+    values["state"] = {"components": [{"key": "/arm.q", "dims": 1, "slice": [0, 1]}]}
+    robot = Embodiment.from_values(values, "shared")
+    clip = to_clip(episode(STEADY, STEADY, FAST, FAST, FAST), robot)
+    assert list(clip.skew_ms) == ["front", "wrist", "/arm.q", "state /arm.q"]
+    clip = to_clip(episode(STEADY, STEADY, FAST, STEADY, FAST), robot)
+    assert list(clip.skew_ms) == ["front", "wrist", "/arm.q", "action /arm.q", "state /arm.q"]
+
+
+# -- numbers that would be moved too far
+
+
+GAP = np.delete(STEADY, np.arange(8, 12))  # nothing from 0.8 to 1.1 s
+
+
+def test_masked_actions_are_those_whose_command_is_too_old() -> None:
+    run = episode(STEADY, STEADY, GAP, STEADY, STEADY)
+    with pytest.raises(AlignmentError, match="a is 400.0 ms off"):
+        to_clip(run, embodiment(max_skew_ms=150))
+    clip = to_clip(run, embodiment(max_skew_ms=150, beyond="mask"))
+    assert len(clip) == 20 and clip.state_known is not None and clip.state_known.all()
+    assert np.flatnonzero(~clip.action_known).tolist() == [9, 10, 11]
+    assert not clip.actions[9:12].any() and len(clip.known_actions) == 17
+    np.testing.assert_array_equal(clip.actions[8], [*run.actions[0].values[7], *run.actions[1].values[8]])
+    assert clip.flags == {"masked_actions": 3} and clip.skew_ms["a"].max() == pytest.approx(400)
+
+
+def test_masked_states_are_those_far_from_any_sample() -> None:
+    clip = to_clip(episode(STEADY, STEADY, STEADY, STEADY, GAP), embodiment(max_skew_ms=150, beyond="mask"))
+    assert np.flatnonzero(~clip.state_known).tolist() == [9, 10]
+    assert clip.action_known.all() and clip.flags == {"masked_states": 2}
+
+
+def test_pictures_too_far_off_are_refused_whatever_is_masked() -> None:
+    with pytest.raises(AlignmentError, match="wrist is 200.0 ms off"):
+        to_clip(episode(STEADY, GAP, STEADY, STEADY, STEADY), embodiment(max_skew_ms=150, beyond="mask"))
+
+
+def test_an_episode_without_a_known_action_is_refused() -> None:
+    rare = np.array([0.0, 1.93])
+    sync = {"max_skew_ms": 20, "beyond": "mask", "actions": "nearest"}
+    off = STEADY + 0.05
+    with pytest.raises(EpisodeError, match="not one of its .* actions is known"):
+        to_clip(episode(STEADY, STEADY, off, rare, STEADY), embodiment(**sync))
+
+
+def test_a_value_that_is_not_known_may_be_anything() -> None:
+    clock = np.arange(20) / 10
+    values = np.ones((20, 3), np.float32)
+    values[4] = np.nan
+    known = np.arange(20) != 4
+    picture = Pictures(clock, lambda i: np.zeros((2, 2, 3), np.uint8))
+    robot = Embodiment.from_values(
+        embodiment().to_dict() | {"state": None, "source": {"format": "hdf5"}}, "one clock"
+    )
+    for rate_stamped in (True, False):
+        run = Episode(
+            "e", dict.fromkeys(("front", "wrist"), picture), (Signal(clock, values, known),), (), rate_stamped
+        )
+        clip = to_clip(run, robot)
+        np.testing.assert_array_equal(clip.action_known, known)
+        assert not clip.actions[4].any()
