@@ -68,7 +68,7 @@ def tokenizer_train(
 def tokenizer_eval(
     tokenizer: Annotated[str, typer.Argument(help="Name of the tokenizer.")],
     data: Annotated[
-        list[Path], typer.Argument(help="Pictures, videos, folders of them, recordings, shard sets.")
+        list[str], typer.Argument(help="Pictures, videos, folders of them, recordings, shard sets.")
     ],
     embodiment: Annotated[
         str | None, typer.Option("--embodiment", "-e", help="DATA are recordings of this robot: id or YAML.")
@@ -102,12 +102,12 @@ def tokenizer_eval(
     opened = get_tokenizer(tokenizer, weights=weights, device=device)
     perceptual, missing = _perceptual(lpips, device)
     found, skipped = {}, list[str]()
-    for path in data:
-        chosen = frames_of(path, opened.spec, embodiment=robot, frames=frames, on_skip=skipped.append)
-        found[str(path)] = evaluate(opened, chosen, worst=worst if out else 0, perceptual=perceptual)
+    for place in data:
+        chosen = frames_of(place, opened.spec, embodiment=robot, frames=frames, on_skip=skipped.append)
+        found[place] = evaluate(opened, chosen, worst=worst if out else 0, perceptual=perceptual)
     notes = [missing] if missing else []
     if skipped:
-        notes.append(f"{len(skipped)} episodes could not be read, the first: {skipped[0]}")
+        notes.append(f"{len(skipped)} files or episodes could not be read, the first: {skipped[0]}")
     plain = {name: without_frames(result) for name, result in found.items()}
     if json:
         print_json(plain)

@@ -24,29 +24,47 @@ PICTURES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
 EPISODES = 16  # of a recording, evenly
 
 
+def _ignore(text: str) -> None:
+    """For callers who do not ask what was left out."""
+
+
 def read_frames(
-    path: Path, size: int, *, frames: int = 64, resize_filter: Filter = "area"
+    path: Path,
+    size: int,
+    *,
+    frames: int = 64,
+    resize_filter: Filter = "area",
+    on_skip: Callable[[str], None] = _ignore,
 ) -> Iterator[Frame]:
     """Frames of a picture, a video, or every picture and video below a folder.
 
     Args:
         frames: taken from each video, evenly.
+        on_skip: told of a file in a folder that cannot be decoded.
 
     Raises:
-        TokenizerError: there is no picture and no video.
+        TokenizerError: there is nothing, no picture and no video, or none that can be decoded.
     """
+    if not path.exists():
+        raise TokenizerError(path, "no such file or folder")
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    found = False
+    found, skipped = False, ""
     for file in files:
-        if file.suffix.lower() not in VIDEOS | PICTURES or not file.is_file():
+        if file.suffix.lower() not in VIDEOS | PICTURES:
             continue
-        for picture in _pictures(file, frames):
-            found = True
-            yield resize(picture[None], size, "short_side_crop", resize_filter)[0]
+        try:
+            for picture in _pictures(file, frames):
+                found = True
+                yield resize(picture[None], size, "short_side_crop", resize_filter)[0]
+        except TokenizerError as fault:
+            if file == path:
+                raise
+            skipped = str(fault)
+            on_skip(skipped)
     if not found:
         raise TokenizerError(
             path,
-            "holds no picture and no video",
+            "holds no picture and no video" + (f" that can be decoded: {skipped}" if skipped else ""),
             "name a file or folder of png, jpg, mp4; a recording needs --embodiment",
         )
 
@@ -54,10 +72,16 @@ def read_frames(
 def _pictures(file: Path, frames: int) -> Iterator[Frame]:
     from av.error import FFmpegError
 
+    count = 0
     try:
-        yield from read_pictures(file, frames)
-    except FFmpegError as fault:
-        raise TokenizerError(file, f"is no video that can be decoded: {fault.strerror}") from fault
+        for picture in read_pictures(file, frames):
+            count += 1
+            yield picture
+    except (FFmpegError, IndexError) as fault:  # a container without pictures has no stream 0
+        reason = getattr(fault, "strerror", None) or "it holds no video stream"
+        raise TokenizerError(file, f"is no video that can be decoded: {reason}") from fault
+    if not count:
+        raise TokenizerError(file, "is no picture that can be decoded")
 
 
 def recording_frames(
@@ -66,7 +90,7 @@ def recording_frames(
     spec: TokenizerSpec,
     *,
     frames: int = 64,
-    on_skip: Callable[[str], None] = lambda text: None,
+    on_skip: Callable[[str], None] = _ignore,
 ) -> Iterator[Frame]:
     """Frames of a recording as a conversion would tokenize them: every camera, by the robot's YAML.
 
@@ -108,15 +132,15 @@ def _episode_frames(
 
 
 def frames_of(
-    path: Path,
+    data: str | Path,
     spec: TokenizerSpec,
     *,
     embodiment: "Embodiment | None" = None,
     frames: int = 64,
-    on_skip: Callable[[str], None] = lambda text: None,
+    on_skip: Callable[[str], None] = _ignore,
 ) -> Iterator[Frame]:
-    """Frames of whatever lies at `path`: with an embodiment a recording, else a shard set's source,
-    pictures or videos.
+    """Frames of whatever lies there: with an embodiment a recording (a path or URI), else a shard set's
+    source, pictures or videos.
 
     Raises:
         TokenizerError: nothing there can be measured.
@@ -124,10 +148,11 @@ def frames_of(
     """
     from hma_data.shards.manifest import MANIFEST, Manifest
 
-    uri = str(path)
+    path, uri = Path(data), str(data)
     if embodiment is None and (path / MANIFEST).is_file():
         manifest = Manifest.load(path)
         embodiment, uri = manifest.embodiment, manifest.source
     if embodiment is not None:
         return recording_frames(embodiment, uri, spec, frames=frames, on_skip=on_skip)
-    return read_frames(path, spec.image_size, frames=frames, resize_filter=spec.resize_filter)
+    size, resize_filter = spec.image_size, spec.resize_filter
+    return read_frames(path, size, frames=frames, resize_filter=resize_filter, on_skip=on_skip)

@@ -15,7 +15,7 @@ from hma_data.align import to_clip
 from hma_data.cli_tokenizer import tokenizer_app
 from hma_data.convert import convert
 from hma_data.embodiment import Embodiment
-from hma_data.errors import MissingDependencyError, SourceError
+from hma_data.errors import MissingDependencyError, SourceError, TokenizerError
 from hma_data.sheets import write_png
 from hma_data.sources.base import open_source
 from hma_data.tokenizers import perceptual
@@ -23,7 +23,7 @@ from hma_data.tokenizers.base import TOKENIZERS, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED, Entry
 from hma_data.tokenizers.corpus import draw_scene
 from hma_data.tokenizers.eval import LatentMoments, evaluate
-from hma_data.tokenizers.frames import frames_of
+from hma_data.tokenizers.frames import frames_of, read_frames
 from hma_data.tokenizers.perceptual import open_lpips
 from hma_data.tokenizers.report import to_markdown, write_report
 from hma_data.video import prepare
@@ -72,6 +72,40 @@ def test_a_shard_set_is_measured_on_what_it_was_made_of(arm, block_tokenizer, tm
     spec = block_tokenizer.spec
     from_shards = list(frames_of(tmp_path / "shards", spec, frames=3))
     assert np.array_equal(from_shards, list(frames_of(path, spec, embodiment=robot, frames=3)))
+
+
+def test_a_file_that_cannot_be_decoded_is_told_and_left_out(pictures):
+    (pictures / "1.png").write_bytes(b"junk")
+    (pictures / "film.mp4").write_bytes(b"junk")
+    skipped: list[str] = []
+    assert len(list(read_frames(pictures, 64, on_skip=skipped.append))) == 2
+    assert [text.split(": ")[0] for text in skipped] == [str(pictures / n) for n in ("1.png", "film.mp4")]
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.mp4", "a.gif"])
+def test_a_file_that_cannot_be_decoded_is_refused_where_it_is_all_there_is(tmp_path, name):
+    (tmp_path / name).write_bytes(b"junk")
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(TokenizerError, match=name):
+            list(read_frames(path, 64))
+
+
+def test_a_film_without_pictures_is_refused(tmp_path):
+    import av
+
+    with av.open(str(tmp_path / "sound.mp4"), "w") as container:
+        stream = container.add_stream("aac", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    with pytest.raises(TokenizerError, match="no video stream"):
+        list(read_frames(tmp_path / "sound.mp4", 64))
+
+
+def test_what_is_not_there_is_named(tmp_path):
+    with pytest.raises(TokenizerError, match="gone: no such file or folder"):
+        list(read_frames(tmp_path / "gone", 64))
 
 
 def test_an_episode_that_cannot_be_read_is_told_and_replaced(arm, block_tokenizer, monkeypatch):
