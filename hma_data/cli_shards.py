@@ -3,16 +3,40 @@
 Only what is light is imported here; each verb imports what it needs.
 """
 
+from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hma_data.console import human_bytes, print_json, print_table
+from hma_data.console import Update, human_bytes, print_json, print_table, progress
 
-shards_app = typer.Typer(no_args_is_help=True, help="Look at shard sets and verify them.")
+if TYPE_CHECKING:
+    from hma_data.shards.manifest import Manifest
 
+shards_app = typer.Typer(
+    no_args_is_help=True, help="Look at shard sets, verify them, and make others of them."
+)
+
+Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; default: one a core.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder of the new shard set.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+class Layout(StrEnum):
+    memmap = "memmap"
+
+
+class Together(StrEnum):
+    episode = "episode"
+    instruction = "instruction"
+    source = "source"
+
+
+def _in(update: Update, unit: float = 1) -> Callable[[int, int], None]:
+    """A progress display that counts in `unit`."""
+    return lambda done, total: update(done / unit, total=total / unit)
 
 
 @shards_app.command("info")
@@ -58,7 +82,12 @@ def shards_info(folder: Annotated[Path, typer.Argument(help="A shard set.")], js
 
 @shards_app.command("verify")
 def shards_verify(
-    folders: Annotated[list[Path], typer.Argument(help="Shard sets.")], json: Json = False
+    folders: Annotated[list[Path], typer.Argument(help="Shard sets.")],
+    workers: Workers = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Sizes and footers only: no hashes, no rows.")
+    ] = False,
+    json: Json = False,
 ) -> None:
     """Every hash, row count and invariant.
 
@@ -66,14 +95,17 @@ def shards_verify(
     """
     from hma_data.shards.verify import verify
 
-    found = {str(folder): verify(folder) for folder in folders}
+    found = {}
+    with progress("verify", unit="MB") as update:
+        for folder in folders:
+            found[str(folder)] = verify(folder, workers=workers, quick=quick, on_progress=_in(update, 1e6))
     if json:
         print_json(found)
     else:
-        for folder, problems in found.items():
+        for folder_name, problems in found.items():
             for problem in problems:
                 print(problem)
-            print(f"{folder}: {f'{len(problems)} problems' if problems else 'sound'}")
+            print(f"{folder_name}: {f'{len(problems)} problems' if problems else 'sound'}")
     raise typer.Exit(1 if any(found.values()) else 0)
 
 
@@ -94,3 +126,156 @@ def shards_preview(
 
     shown = preview(folder, out or Path(f"{folder.name}-preview"), episodes=episodes, weights=weights)
     print(f"wrote {shown.sheet} and {shown.video} ({len(shown.episodes)} episodes)")
+
+
+def _report(out: Path, manifest: "Manifest", json: bool) -> None:
+    values = manifest.to_json()
+    if json:
+        print_json({"out": str(out), **values["totals"], "splits": values["splits"]})
+        return
+    splits = ", ".join(f"{name} {split['episodes']:,}" for name, split in manifest.splits.items())
+    totals = values["totals"]
+    print(
+        f"{out}: {totals['episodes']:,} episodes ({splits}), {totals['frames']:,} frames, "
+        f"{human_bytes(totals['bytes'])} in {len(manifest.shards)} shards"
+    )
+
+
+@shards_app.command("merge")
+def shards_merge(
+    folders: Annotated[list[Path], typer.Argument(help="Shard sets of one embodiment and tokenizer.")],
+    out: Out,
+    workers: Workers = None,
+    json: Json = False,
+) -> None:
+    """One set of several; every episode keeps its split.
+
+    Example: hma shards merge shards/monday shards/tuesday --out shards/week
+    """
+    from hma_data.engines.local import usable_cores
+    from hma_data.shards.remake import merge
+
+    with progress("merge") as update:
+        manifest = merge(folders, out, workers or usable_cores(), _in(update))
+    _report(out, manifest, json)
+
+
+@shards_app.command("split")
+def shards_split(
+    folder: Annotated[Path, typer.Argument(help="A shard set.")],
+    out: Out,
+    val_fraction: Annotated[
+        float, typer.Option("--val-fraction", help="Share of episodes for validation.")
+    ] = 0.05,
+    seed: Annotated[int, typer.Option("--seed", help="Of the split.")] = 0,
+    by: Annotated[
+        Together, typer.Option("--by", help="What stays together in one split.")
+    ] = Together.episode,
+    workers: Workers = None,
+    json: Json = False,
+) -> None:
+    """The same episodes, divided anew into train and val.
+
+    Example: hma shards split shards/my_arm --val-fraction 0.1 --out shards/my_arm_10
+    """
+    from hma_data.engines.local import usable_cores
+    from hma_data.shards.remake import split
+
+    with progress("split") as update:
+        manifest = split(
+            folder,
+            out,
+            val_fraction=val_fraction,
+            seed=seed,
+            by=by.value,
+            workers=workers or usable_cores(),
+            on_progress=_in(update),
+        )
+    _report(out, manifest, json)
+
+
+@shards_app.command("restat")
+def shards_restat(
+    folder: Annotated[Path, typer.Argument(help="A shard set.")], workers: Workers = None, json: Json = False
+) -> None:
+    """Compute the statistics again and write the manifest anew; the shards are not touched.
+
+    Example: hma shards restat shards/my_arm
+    """
+    from hma_data.shards.manifest import Manifest
+    from hma_data.shards.restat import restat
+
+    with progress("restat", unit="MB") as update:
+        problems = restat(folder, workers=workers, on_progress=_in(update, 1e6))
+    for problem in problems:
+        typer.echo(problem, err=True)
+    _report(folder, Manifest.load(folder), json)
+    raise typer.Exit(1 if problems else 0)
+
+
+@shards_app.command("export")
+def shards_export(
+    folder: Annotated[Path, typer.Argument(help="A shard set.")],
+    out: Annotated[Path, typer.Option("--out", help="New folder; one for each split is made in it.")],
+    to: Annotated[
+        Layout, typer.Option("--to", help="memmap: the layout of the paper's code.")
+    ] = Layout.memmap,
+    split: Annotated[
+        str | None, typer.Option("--split", help="Only this split, straight into --out.")
+    ] = None,
+    camera: Annotated[str | None, typer.Option("--camera", help="Which; default: the first.")] = None,
+) -> None:
+    """Flat files as the paper's code reads them: video.bin, actions, segment_ids.bin, metadata.json.
+
+    Example: hma shards export shards/my_arm --to memmap --out flat/my_arm
+    """
+    from hma_data.shards.memmap import export
+
+    with progress(f"export to {to.value}") as update:
+        places = export(folder, out, split=split, camera=camera, on_progress=_in(update))
+    for place in places:
+        print(f"wrote {place}")
+
+
+@shards_app.command("import")
+def shards_import(
+    folder: Annotated[Path, typer.Argument(help="Flat files: one folder, or one with train and val.")],
+    out: Out,
+    origin: Annotated[
+        Layout, typer.Option("--from", help="memmap: the layout of the paper's code.")
+    ] = Layout.memmap,
+    embodiment: Annotated[
+        str | None, typer.Option("--embodiment", "-e", help="Registry id or YAML, where the folder has none.")
+    ] = None,
+    tokenizer: Annotated[
+        str | None, typer.Option("--tokenizer", help="That made the tokens, where the folder does not say.")
+    ] = None,
+    weights: Annotated[str | None, typer.Option("--weights", help="The tokenizer's weights.")] = None,
+    val_fraction: Annotated[
+        float, typer.Option("--val-fraction", help="For validation, where the folder has no split.")
+    ] = 0.05,
+    seed: Annotated[int, typer.Option("--seed", help="Of the split.")] = 0,
+    workers: Workers = None,
+    json: Json = False,
+) -> None:
+    """A shard set from flat files of the paper's code, or of `hma shards export`.
+
+    Example: hma shards import flat/my_arm --from memmap --out shards/my_arm
+    """
+    from hma_data.embodiment import find
+    from hma_data.engines.local import usable_cores
+    from hma_data.shards.memmap_import import import_memmap
+    from hma_data.tokenizers.base import get_tokenizer
+
+    with progress(f"import from {origin.value}") as update:
+        manifest = import_memmap(
+            folder,
+            out,
+            embodiment=find(embodiment) if embodiment else None,
+            tokenizer=get_tokenizer(tokenizer, weights=weights).spec if tokenizer else None,
+            val_fraction=val_fraction,
+            seed=seed,
+            workers=workers or usable_cores(),
+            on_progress=_in(update),
+        )
+    _report(out, manifest, json)

@@ -310,6 +310,7 @@ def _check_alike(first: ShardSet, other: ShardSet) -> None:
     pairs = {
         "embodiment": (first.embodiment.id, other.embodiment.id),
         "content of the embodiment's YAML": (first.embodiment.digest, other.embodiment.digest),
+        "stride": (first.embodiment.stride, other.embodiment.stride),
         "tokenizer": (f"{first.spec.name} {first.spec.digest}", f"{other.spec.name} {other.spec.digest}"),
         "cameras": (first.manifest.cameras, other.manifest.cameras),
         "--frames": (_settings(first).frames, _settings(other).frames),

@@ -1,0 +1,174 @@
+"""The layout of the paper's code: whole splits as flat files that numpy maps into memory.
+
+    <out>/<split>/video.bin            (N, h, w) uint32 ids, (N, c, h, w) float16 latents, or
+                                       (N, H, W, 3) uint8 pixels
+                  actions/actions.bin  (N, A) float32
+                  segment_ids.bin      (N,) int32: the episode of each row, rising
+                  metadata.json        shapes, dtype, rate and name, as liruiw/HMA writes and reads them
+                  hma/                 what that layout has no place for: episodes.parquet, embodiment.yaml,
+                                       timestamp.bin, state.bin, masks
+
+N rows of a split; all numbers little-endian.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from hma_data.errors import OutputError, UsageError
+from hma_data.files import sync_folder, write_atomic
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.schema import token_column
+from hma_data.tokenizers.base import TokenizerSpec
+
+METADATA, VIDEO, ACTIONS, SEGMENTS = "metadata.json", "video.bin", "actions/actions.bin", "segment_ids.bin"
+EXTRA = "hma"
+EXTRA_DTYPES = {"timestamp": "<f8", "state": "<f4", "action_known": "|b1", "state_known": "|b1"}
+OnProgress = Callable[[int, int], None]
+
+
+def quiet(done: int, total: int) -> None:
+    """No progress display."""
+
+
+def export(
+    folder: Path,
+    out: Path,
+    *,
+    split: str | None = None,
+    camera: str | None = None,
+    on_progress: OnProgress = quiet,
+) -> list[Path]:
+    """Write the splits of a shard set as flat files; each folder appears when it is whole.
+
+    Args:
+        split: only this one, into `out` itself; None writes each split that has episodes into a folder below.
+        camera: which, where the set has several; None takes the first.
+
+    Returns:
+        the folders written.
+
+    Raises:
+        UsageError: no such split or camera.
+        OutputError: a folder is there already, or cannot be written.
+    """
+    shards = ShardSet(folder)
+    cameras = shards.manifest.cameras
+    if camera is not None and camera not in cameras:
+        raise UsageError("--camera", f"{camera!r} is not in {folder}", f"its cameras: {', '.join(cameras)}")
+    have = [name for name, counts in shards.manifest.splits.items() if counts["episodes"]]
+    if split is not None and split not in have:
+        raise UsageError("--split", f"{folder} has no {split!r}", f"its splits: {', '.join(have)}")
+    places = {split: out} if split else {name: out / name for name in have}
+    for place in places.values():
+        if place.exists() and (not place.is_dir() or any(place.iterdir())):
+            raise OutputError(place, "is there already", "choose a new --out, or delete it")
+    total = sum(shards.manifest.splits[name]["frames"] for name in places)
+    done = 0
+    for name, place in places.items():
+        for rows in _export_split(shards, name, place, cameras.index(camera) if camera else 0):
+            done += rows
+            on_progress(done, total)
+    return list(places.values())
+
+
+def _export_split(shards: ShardSet, split: str, place: Path, camera: int) -> Iterator[int]:
+    """Write beside, then rename; yields the rows of each episode."""
+    part = place.with_name(f".{place.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        (part / "actions").mkdir(parents=True)
+        (part / EXTRA).mkdir()
+        yield from _write_rows(shards, split, part, camera)
+        sync_folder(part)
+        if place.exists():
+            place.rmdir()  # empty, as was seen before
+        part.rename(place)
+    except OSError as fault:
+        reason = fault.strerror or str(fault)
+        raise OutputError(
+            place, f"cannot be written: {reason}", "free space or choose another --out"
+        ) from fault
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_rows(shards: ShardSet, split: str, part: Path, camera: int) -> Iterator[int]:
+    spec, columns = shards.spec, [name for name in shards.columns() if name != "episode_index"]
+    tokens = token_column(spec)[0]
+    table = shards.episodes.filter(pc.equal(shards.episodes["split"], split))
+    reader = EpisodeReader(shards, columns)
+    dtypes = {tokens: video_dtype(spec), "action": "<f4", **EXTRA_DTYPES}
+    paths = {tokens: VIDEO, "action": ACTIONS} | {name: f"{EXTRA}/{name}.bin" for name in EXTRA_DTYPES}
+    files = {name: (part / paths[name]).open("wb") for name in columns}
+    segments: list[int] = []
+    try:
+        for row in table.to_pylist():
+            length = row["length"]
+            values = reader.rows(row["shard"], row["row_start"] + camera * length, length)
+            for name in columns:
+                stored = values[name]
+                if name == tokens:
+                    stored = _as_video(stored, spec)
+                files[name].write(np.ascontiguousarray(stored, dtypes[name]).tobytes())
+            segments.append(length)
+            yield length
+    finally:
+        for file in files.values():
+            file.close()
+    ids = np.repeat(np.arange(len(segments)), segments).astype("<i4")
+    (part / SEGMENTS).write_bytes(ids.tobytes())
+    pq.write_table(table, part / EXTRA / "episodes.parquet")
+    write_atomic(part / EXTRA / "embodiment.yaml", shards.embodiment.to_yaml())
+    values = _metadata(shards, sum(segments), camera)
+    write_atomic(part / METADATA, json.dumps(values, indent=1) + "\n")
+
+
+def video_dtype(spec: TokenizerSpec) -> str:
+    """Of video.bin: what the paper's loaders expect."""
+    if spec.kind == "discrete":
+        return "<u4"
+    return "|u1" if spec.dtype == "uint8" else "<f2"
+
+
+def _as_video(rows: NDArray[Any], spec: TokenizerSpec) -> NDArray[Any]:
+    """(N, width) -> (N, h, w), (N, c, h, w); pixels (N, H, W, 3)."""
+    h, w = spec.grid
+    if spec.kind == "discrete":
+        return rows.reshape(-1, h, w)
+    frames = rows.reshape(-1, spec.channels or 1, h, w)
+    return frames.transpose(0, 2, 3, 1) if spec.dtype == "uint8" else frames
+
+
+def _metadata(shards: ShardSet, rows: int, camera: int) -> dict[str, Any]:
+    """metadata.json: the paper's fields, then ours."""
+    spec, embodiment, plan = shards.spec, shards.embodiment, shards.manifest.plan
+    h, w = spec.grid
+    discrete = spec.kind == "discrete"
+    return {
+        "token_dtype": str(np.dtype(video_dtype(spec))),
+        "action_dim": embodiment.action_dim * shards.manifest.frame_stride,
+        "s": h,
+        "h": h,
+        "w": w,
+        "vocab_size": spec.vocab_size,
+        "hz": embodiment.rate_hz / shards.manifest.frame_stride,
+        "encoder_name_or_path": spec.name,
+        "encoder_type": "magvit" if discrete else "temporalvae",
+        "num_images": rows,
+        "name": embodiment.id,
+        "latent_channels": None if discrete else spec.channels,
+        "quantized": discrete,
+        "stride": shards.row_stride,
+        "camera": shards.manifest.cameras[camera],
+        "frames": plan.get("frames", "all"),
+        "source": shards.manifest.source,
+        "tokenizer": spec.to_json(),
+    }
