@@ -1,26 +1,29 @@
 """Bags as a source: ROS 1, ROS 2 (sqlite3, MCAP) and plain MCAP, without ROS.
 
-A bag is an episode; a folder of bags holds many. One pass over the bag gathers times and numbers
-of the topics the embodiment names; pictures are read again when asked for, so memory does not grow
-with the size of a bag. Streams keep their own clocks; `align` brings them together.
+A bag is an episode, or with `source.segments` several; a folder of bags holds many. One pass over
+an episode gathers times and numbers of the topics the embodiment names; pictures are read again when
+asked for, so memory does not grow with the size of a bag. Streams keep their own clocks; `align`
+brings them together.
 """
 
+import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 from hma_data.embodiment import Embodiment
-from hma_data.episode import Episode, Signal, Stream
+from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag, find_bags
-from hma_data.sources.bags.container import Channel, damaged
-from hma_data.sources.bags.fields import Column, Field, missing_topic, parse_key
-from hma_data.sources.bags.messages import decode
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.opened import parted
 from hma_data.sources.bags.pictures import picture_kind
+from hma_data.sources.bags.reading import Reading
 from hma_data.sources.bags.report import report
-from hma_data.sources.bags.streams import camera_stream
-from hma_data.sources.bags.track import Track
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values, local_path
-from hma_data.spec import Camera, Component
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, local_path
+from hma_data.spec import Segments
+
+PART = re.compile(r"[0-9]{4,9}")
 
 
 def open() -> "RosbagSource":
@@ -36,25 +39,43 @@ class RosbagSource:
         return report(uri, local_path(uri), _bags(uri), episodes)
 
     def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """See Source. A bag that cannot be read has no frames here; `read` says why."""
+        """See Source. A bag that cannot be read has no frames here; `read` says why.
+
+        With an embodiment that parts bags, an episode of the bag `run` is `run/0000`, `run/0001` …
+        """
         root = local_path(uri)
-        return [_ref(name, path, root, embodiment) for name, path in _bags(uri).items()]
+        found: list[EpisodeRef] = []
+        for name, path in _bags(uri).items():
+            if embodiment and embodiment.source.segments:
+                found += _part_refs(name, path, root, embodiment, embodiment.source.segments)
+            else:
+                found.append(_ref(name, path, root, embodiment))
+        return found
 
     def episode_ids(self, uri: str) -> list[str]:
-        """See Source."""
+        """See Source: whole bags, whatever an embodiment may part them into."""
         return list(_bags(uri))
 
     def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
-        """See Source.
+        """See Source. A bag's own id reads the whole of it, also where the embodiment parts bags.
 
         Raises:
-            SourceError: no such bag.
-            EpisodeError: the bag is damaged, or lacks what the embodiment names.
+            SourceError: no such bag, or no such episode in it.
+            EpisodeError: the bag is damaged, holds no episode, or lacks what the embodiment names.
         """
-        bags = _bags(uri)
-        if episode_id not in bags:
+        bags, root, segments = _bags(uri), local_path(uri), embodiment.source.segments
+        if episode_id in bags:
+            path = bags[episode_id]
+            bag = parted(path, root, embodiment, segments)[0] if segments else Bag(path, root)
+            return Reading(bag, episode_id, embodiment).episode()
+        name, number = _part_of(episode_id)
+        if not segments or name not in bags:
             raise SourceError(uri, f"has no bag {episode_id!r}", f"it has {', '.join(list(bags)[:10])}")
-        return _Reading(Bag(bags[episode_id], local_path(uri)), episode_id, embodiment).episode()
+        bag, table = parted(bags[name], root, embodiment, segments)
+        if not 0 <= number < len(table.segments):
+            held = f"{name} holds {_part_id(name, 0)} to {_part_id(name, len(table.segments) - 1)}"
+            raise SourceError(uri, f"has no episode {episode_id!r}", held)
+        return Reading(bag, episode_id, embodiment, table, number).episode()
 
 
 def _bags(uri: str) -> dict[str, Path]:
@@ -75,6 +96,31 @@ def _ref(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> Ep
     return EpisodeRef(name, frames, fingerprint=fingerprint)
 
 
+def _part_id(name: str, number: int) -> str:
+    return f"{name}/{number:04d}"
+
+
+def _part_of(episode_id: str) -> tuple[str, int]:
+    """The bag of that episode, and its number; -1 where it names none."""
+    name, _, digits = episode_id.rpartition("/")
+    return name, int(digits) if PART.fullmatch(digits) else -1
+
+
+def _part_refs(
+    name: str, path: Path, root: Path, embodiment: Embodiment, segments: Segments
+) -> list[EpisodeRef]:
+    """The episodes of one bag; one without frames where none can be told, of which `read` says why."""
+    try:
+        bag, table = parted(path, root, embodiment, segments)
+        fingerprint = bag.fingerprint()
+    except (EpisodeError, OSError):
+        return [replace(_ref(name, path, root, embodiment), frames=0)]
+    return [
+        EpisodeRef(_part_id(name, i), len(segment), None, fingerprint, group=name, left_out=table.left_out)
+        for i, segment in enumerate(table.segments)
+    ]
+
+
 def _frames(counts: Counter[Channel], embodiment: Embodiment | None) -> int:
     """Pictures of the primary camera; without an embodiment, of the camera that has most."""
     topics: Counter[str] = Counter()
@@ -82,86 +128,3 @@ def _frames(counts: Counter[Channel], embodiment: Embodiment | None) -> int:
         if embodiment or picture_kind(channel.type):
             topics[channel.topic] += count
     return topics[embodiment.primary_camera.key] if embodiment else max(topics.values(), default=0)
-
-
-class _Reading:
-    """One pass over one bag for one embodiment."""
-
-    def __init__(self, bag: Bag, episode_id: str, embodiment: Embodiment) -> None:
-        self._bag, self._id, self._embodiment = bag, episode_id, embodiment
-        self._where = str(bag.path)
-        self._counts: Counter[str] = Counter()
-        for channel, count in bag.counts().items():
-            self._counts[channel.topic] += count
-        self._tracks: dict[str, Track] = {}
-        self._instruction = ""
-
-    def episode(self) -> Episode:
-        """The pass, and what came of it."""
-        embodiment = self._embodiment
-        for camera in embodiment.cameras:
-            if camera.key not in self._counts:
-                raise missing_topic(camera.key, self._counts, self._where)
-            self._track(camera.key)
-        actions = self._columns(embodiment.action.components)
-        states = self._columns(embodiment.state.components if embodiment.state else ())
-        self._scan(self._instruction_field())
-        notes = self._bag.notes()
-        return Episode(
-            id=self._id,
-            streams={camera.name: self._stream(camera) for camera in embodiment.cameras},
-            actions=tuple(self._signal(column) for column in actions),
-            states=tuple(self._signal(column) for column in states),
-            rate_stamped=False,
-            instruction=self._instruction or notes.get("instruction", ""),
-            success={"true": True, "false": False}.get(notes.get("success", "").lower()),
-            source=self._where,
-            metadata={"clocks": self._clocks(), "notes": notes},
-        )
-
-    def _track(self, topic: str) -> Track:
-        return self._tracks.setdefault(topic, Track(topic))
-
-    def _columns(self, components: tuple[Component, ...]) -> list[Column]:
-        columns = []
-        for component in components:
-            field = parse_key(component.key, self._counts, self._where)
-            column = Column(component, field, self._where)
-            self._track(field.topic).columns.append(column)
-            columns.append(column)
-        return columns
-
-    def _instruction_field(self) -> Field | None:
-        key = self._embodiment.source.instruction
-        return parse_key(key, self._counts, self._where) if key else None
-
-    def _scan(self, instruction: Field | None) -> None:
-        topics = frozenset(self._tracks) | ({instruction.topic} if instruction else frozenset())
-        for place, record in self._bag.records(topics):
-            topic = record.channel.topic
-            message = decode(record.channel, record.data, self._where)
-            if instruction and topic == instruction.topic and not self._instruction:
-                self._instruction = str(instruction.value(message, self._where))
-            if topic in self._tracks:
-                self._tracks[topic].add(record.channel, record.log_ns, place, message)
-        for topic, track in self._tracks.items():
-            if not len(track):
-                raise EpisodeError(self._where, f"{topic} has no messages")
-            if len(track) != self._counts[topic]:
-                fault = f"its index counts {self._counts[topic]} messages of {topic}, it holds {len(track)}"
-                raise damaged(self._bag.path, fault)
-
-    def _signal(self, column: Column) -> Signal:
-        track, rows = self._tracks[column.field.topic], column.rows()
-        order = track.order(rows)
-        clock = column.component.stamp or self._embodiment.sync.stamp
-        values = component_values(column.component, column.values()[order], self._where)
-        return Signal(track.seconds(clock)[rows[order]], values)
-
-    def _stream(self, camera: Camera) -> Stream:
-        clock = camera.stamp or self._embodiment.sync.stamp
-        return camera_stream(self._bag, self._tracks[camera.key], clock)
-
-    def _clocks(self) -> dict[str, str]:
-        """Topic -> header or receive: whose times it has where none are forced."""
-        return {topic: "header" if track.stamped else "receive" for topic, track in self._tracks.items()}

@@ -4,6 +4,7 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -12,15 +13,17 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.bags.container import (
     MAX_CHUNK,
     Channel,
+    ChunkCache,
     Container,
     Data,
     Record,
+    Wanted,
     damaged,
     reading,
     unzstd,
 )
-from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
+from hma_data.sources.bags.mcap_records import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.ros1 import Ros1File
 from hma_data.sources.bags.sqlite import MAGIC as SQLITE_MAGIC
 from hma_data.sources.bags.sqlite import SqliteFile
@@ -65,11 +68,13 @@ class Bag:
             _refuse_link(item, root or path)
         self._paths = paths
         self._files: list[Container] | None = None
+        self._counts: Counter[Channel] | None = None
 
     def files(self) -> list[Container]:
         """Its files in recording order; packed ones (.zstd) are unpacked to a temporary folder first."""
         if self._files is None:
-            self._files = [_container(self._plain(path)) for path in self._paths]
+            chunks = ChunkCache()
+            self._files = [_container(self._plain(path), chunks) for path in self._paths]
         return self._files
 
     def notes(self) -> dict[str, str]:
@@ -82,6 +87,11 @@ class Bag:
 
     def counts(self) -> Counter[Channel]:
         """Messages of each channel, from indexes where there are any."""
+        if self._counts is None:
+            self._counts = self._count()
+        return self._counts.copy()
+
+    def _count(self) -> Counter[Channel]:
         if any(path.suffix == ".zstd" for path in self._paths):
             return self._stated_counts()
         total: Counter[Channel] = Counter()
@@ -92,11 +102,27 @@ class Bag:
 
     def records(self, topics: frozenset[str] | None = None) -> Iterator[tuple[Place, Record]]:
         """The messages of those topics (of all, with None), file by file."""
+        return self.wanted(Wanted(topics))
+
+    def wanted(self, wanted: Wanted) -> Iterator[tuple[Place, Record]]:
+        """The wanted messages, file by file; a part of the time costs about its own bytes."""
+        if self._message_packed:
+            wanted = replace(wanted, heads=frozenset())
         for number, file in enumerate(self.files()):
-            for record in file.records(topics):
-                if self._message_packed:
-                    record = record._replace(data=self._unpack(record.data))
-                yield Place(number, *record.place), record
+            for record in file.records(wanted):
+                yield Place(number, *record.place), self._plain_record(record)
+
+    def before(self, topics: frozenset[str], log_ns: int) -> list[tuple[Place, Record]]:
+        """Of each topic the last message received before that time, from the last file that has one."""
+        found: dict[str, tuple[Place, Record]] = {}
+        for number, file in reversed(list(enumerate(self.files()))):
+            missing = topics - found.keys()
+            for topic, record in file.before(missing, log_ns).items() if missing else ():
+                found[topic] = (Place(number, *record.place), self._plain_record(record))
+        return sorted(found.values(), key=lambda item: item[0])
+
+    def _plain_record(self, record: Record) -> Record:
+        return record._replace(data=self._unpack(record.data)) if self._message_packed else record
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
         """The data of the messages at those places, in that order."""
@@ -108,6 +134,16 @@ class Bag:
     def fingerprint(self) -> str:
         """Changes when a byte does; see EpisodeRef."""
         return "-".join(file_fingerprint(path) for path in self._paths)
+
+    def state(self) -> tuple[tuple[str, ...], ...]:
+        """Equal only while no file of the bag changes; for what is kept of it in memory."""
+        found = []
+        with reading(self.path):
+            for path in [*self._paths, *(item for item in map(_log, self._paths) if item.is_file())]:
+                stat = path.stat()
+                facts = (stat.st_size, stat.st_mtime_ns, stat.st_ino, file_fingerprint(path))
+                found.append((str(path), *map(str, facts)))
+        return tuple(found)
 
     def _unpack(self, data: Data) -> bytes:
         with reading(self.path):
@@ -193,12 +229,17 @@ def _refuse_link(path: Path, root: Path) -> None:
         )
 
 
-def _container(path: Path) -> Container:
+def _log(path: Path) -> Path:
+    """Where sqlite3 keeps what is not merged yet."""
+    return path.with_name(path.name + "-wal")
+
+
+def _container(path: Path, chunks: ChunkCache) -> Container:
     magic = first_bytes(path, 16)
     if magic.startswith(b"#ROSBAG"):
-        return Ros1File(path)
+        return Ros1File(path, chunks)
     if magic.startswith(MCAP_MAGIC):
-        return McapFile(path)
+        return McapFile(path, chunks)
     if magic.startswith(SQLITE_MAGIC):
         return SqliteFile(path)
     if not magic:

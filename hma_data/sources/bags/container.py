@@ -20,6 +20,8 @@ from hma_data.errors import EpisodeError
 
 MAX_CHUNK = 512 << 20  # bytes; a chunk that unpacks to more is a bomb or an error
 CACHED_BYTES = 64 << 20
+FOREVER = 2**64
+HEAD = 64  # bytes: the stamp of a message is within them
 FAULTS = (
     struct.error, ValueError, LookupError, OverflowError, RecursionError, EOFError, OSError, RuntimeError,
     MemoryError, sqlite3.Error,
@@ -56,6 +58,37 @@ class Record(NamedTuple):
     place: Place
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """Which messages are asked of a container.
+
+    Attributes:
+        topics: None for all.
+        first_ns, last_ns: received from the one to the other, both included.
+        heads: topics of whose messages the first HEAD bytes will do; more may come.
+        checked: whether checksums must be looked at where only heads are read.
+    """
+
+    topics: frozenset[str] | None = None
+    first_ns: int = 0
+    last_ns: int = FOREVER
+    heads: frozenset[str] = frozenset()
+    checked: bool = True
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a part of the recording's time is asked for."""
+        return self.first_ns > 0 or self.last_ns < FOREVER
+
+    def topic(self, name: str) -> bool:
+        """Whether messages of that topic are asked for."""
+        return self.topics is None or name in self.topics
+
+    def time(self, log_ns: int) -> bool:
+        """Whether a message received then is asked for."""
+        return self.first_ns <= log_ns <= self.last_ns
+
+
 class Container(Protocol):
     """One file of a bag. Every method raises EpisodeError when the file is damaged."""
 
@@ -65,8 +98,12 @@ class Container(Protocol):
         """Messages of each channel, from the index where there is one; channels without any included."""
         ...
 
-    def records(self, topics: frozenset[str] | None = None) -> Iterator[Record]:
-        """The messages of those topics (of all, with None) in the file's order."""
+    def records(self, wanted: Wanted) -> Iterator[Record]:
+        """Those messages, in the file's order."""
+        ...
+
+    def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
+        """Of each topic the last message received before that time; topics without one are left out."""
         ...
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
@@ -100,7 +137,7 @@ def decompress(codec: str, data: Data, size: int) -> bytes:
     if size > MAX_CHUNK:
         raise ValueError(f"a chunk claims {size:,} bytes, more than {MAX_CHUNK:,}")
     if codec in ("", "none"):
-        unpacked = bytes(data)
+        unpacked = data if isinstance(data, bytes) else bytes(data)
     elif codec == "bz2":
         unpacked = bz2.BZ2Decompressor().decompress(data, size + 1)
     elif codec == "lz4":
@@ -177,22 +214,20 @@ def read_exact(file: BinaryIO, size: int) -> bytes:
 
 
 class ChunkCache:
-    """The chunks unpacked last, at most CACHED_BYTES of them (and always one).
+    """The chunks of a bag unpacked last, at most CACHED_BYTES of them (and always one)."""
 
-    Args:
-        load: the chunk at an offset of the open file, unpacked.
-    """
+    def __init__(self) -> None:
+        self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()
+        self._bytes = 0
 
-    def __init__(self, load: Callable[[BinaryIO, int], bytes]) -> None:
-        self._load = load
-        self._chunks: OrderedDict[int, bytes] = OrderedDict()
-
-    def get(self, file: BinaryIO, offset: int) -> bytes:
-        """The chunk at that offset."""
-        if offset in self._chunks:
-            self._chunks.move_to_end(offset)
-            return self._chunks[offset]
-        chunk = self._chunks[offset] = self._load(file, offset)
-        while len(self._chunks) > 1 and sum(map(len, self._chunks.values())) > CACHED_BYTES:
-            self._chunks.popitem(last=False)
+    def get(self, path: Path, offset: int, load: Callable[[], bytes]) -> bytes:
+        """The chunk at that offset of that file, from `load` where it is not kept."""
+        key = (path, offset)
+        chunk = self._chunks.pop(key, b"")
+        self._bytes -= len(chunk)
+        chunk = chunk or load()
+        self._chunks[key] = chunk
+        self._bytes += len(chunk)
+        while len(self._chunks) > 1 and self._bytes > CACHED_BYTES:
+            self._bytes -= len(self._chunks.popitem(last=False)[1])
         return chunk

@@ -7,6 +7,7 @@ read through `child` and `field_names`.
 
 import dataclasses
 import json
+import struct
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any
@@ -15,10 +16,12 @@ import numpy as np
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.container import FAULTS, Channel, Data
+from hma_data.sources.bags.services import event_definitions, is_service_event
 
 Decode = Callable[[Data], Any]
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
+TIME = "builtin_interfaces/msg/Time"
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
 
 
@@ -37,6 +40,41 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
     except (*FAULTS, TypeError) as fault:
         kind = channel.type or channel.encoding
         raise EpisodeError(where, f"a message on {channel.topic} is not a {kind}: {_line(fault)}") from fault
+
+
+def head_stamp(channel: Channel) -> Callable[[Data], int] | None:
+    """What reads a ROS message's own time, in nanoseconds, from its first HEAD bytes.
+
+    None where the time is not at a fixed place there; `decode` is needed then.
+    """
+    try:
+        return _head_stamp(channel)
+    except (*FAULTS, TypeError, AssertionError, SyntaxError, AttributeError):
+        return None  # `decode` meets it again and says what it is
+
+
+@lru_cache(maxsize=256)
+def _head_stamp(channel: Channel) -> Callable[[Data], int] | None:
+    if channel.encoding not in ("ros1", "cdr"):
+        return None
+    store, kind = _ros_store(channel)
+    fields = [(name, spec[1]) for name, spec in store.fielddefs[kind][1]]
+    at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes on its encoding
+    if fields and fields[0] == ("header", "std_msgs/msg/Header"):
+        fields = [(name, spec[1]) for name, spec in store.fielddefs["std_msgs/msg/Header"][1]]
+        if fields[0][0] == "seq":
+            fields, at = fields[1:], at + 4
+    elif {name for name, _ in fields[1:]} & {"header", "timestamp"}:
+        return None
+    if not fields or fields[0] not in [(name, TIME) for name in ("stamp", "timestamp")]:
+        return None
+    return partial(_time_at, at, channel.encoding == "cdr")
+
+
+def _time_at(at: int, cdr: bool, data: Data) -> int:
+    big = cdr and not data[1] & 1
+    seconds, nanoseconds = struct.unpack_from(">iI" if big else "<iI", data, at)
+    return int(seconds * 10**9 + nanoseconds)
 
 
 def _line(fault: BaseException) -> str:
@@ -62,23 +100,29 @@ def _decoder(channel: Channel) -> Decode:
 
 def _ros_decoder(channel: Channel) -> Decode:
     from rosbags.serde import SerdeError
+
+    store, kind = _ros_store(channel)
+    read = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
+    return _telling(partial(read, typename=kind), SerdeError)
+
+
+@lru_cache(maxsize=256)
+def _ros_store(channel: Channel) -> tuple[Any, str]:
+    """A store that knows the channel's type, and its name there."""
     from rosbags.typesys import Stores, TypesysError, get_typestore
     from rosbags.typesys.msg import normalize_msgtype
 
     kind = normalize_msgtype(channel.type)
-    if channel.schema.strip():
-        store = get_typestore(Stores.EMPTY)
+    stores = [get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.LATEST)]
+    if is_service_event(channel) or channel.schema.strip():
+        stores = [get_typestore(Stores.EMPTY)]
         try:
-            store.register(_definitions(channel, kind))
+            stores[0].register(_definitions(channel, kind))
         except TypesysError as fault:
             raise ValueError(f"the definition of {channel.type} cannot be read: {_line(fault)}") from fault
-        stores = [store]
-    else:
-        stores = [get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.LATEST)]
     for store in stores:
         if kind in store.types:
-            read = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
-            return _telling(partial(read, typename=kind), SerdeError)
+            return store, kind
     raise ValueError(
         f"the bag does not carry the definition of {channel.type}, and it is not one of ROS 2's own types: "
         "record with ROS 2 Iron or later, or convert the bag to MCAP with its definitions"
@@ -101,6 +145,8 @@ def _definitions(channel: Channel, kind: str) -> Any:
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     text = channel.schema.decode("utf-8")
+    if is_service_event(channel) and channel.schema_encoding != "ros2idl":
+        return event_definitions(channel.type, kind, text)
     if channel.schema_encoding in ("ros1msg", "ros2msg"):
         return get_types_from_msg(text, kind)
     if channel.schema_encoding != "ros2idl":

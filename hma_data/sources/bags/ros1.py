@@ -6,35 +6,47 @@ Indexed or not (a recorder that was killed leaves no index), chunks plain, bz2 o
 import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 from hma_data.sources.bags.container import (
+    FOREVER,
+    HEAD,
     Channel,
     ChunkCache,
     Data,
     Fields,
     Place,
     Record,
+    Wanted,
     damaged,
     decompress,
     read_exact,
     reading,
 )
+from hma_data.sources.bags.pieces import Piece, last_before, overlapping
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, BAG, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x05, 0x06, 0x07
+MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
+HEADER_BYTES = 1 << 16  # a record's header is no longer
+SAMPLE_BYTES = 12  # an entry of an index record: time, offset
 TIME = struct.Struct("<II")
 Header = dict[str, memoryview]
 
 
 class Ros1File:
-    """One ROS 1 bag; see Container."""
+    """One ROS 1 bag; see Container.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        chunks: where unpacked chunks are kept; shared by the files of a bag.
+    """
+
+    def __init__(self, path: Path, chunks: ChunkCache | None = None) -> None:
         self.path = path
-        self._chunks = ChunkCache(_load_chunk)
+        self._chunks = chunks or ChunkCache()
+        self._surveyed: _Index | None = None
 
     def counts(self) -> Counter[Channel]:
         """See Container."""
@@ -42,22 +54,40 @@ class Ros1File:
             index = self._index(file)
             if index:
                 return index.counts()
-        return Counter(record.channel for record in self.records())
+        return Counter(record.channel for record in self.records(Wanted()))
 
-    def records(self, topics: frozenset[str] | None = None) -> Iterator[Record]:
-        """See Container; chunks without a wanted topic are not unpacked where an index says so."""
+    def records(self, wanted: Wanted) -> Iterator[Record]:
+        """See Container; chunks without a wanted message are not unpacked where an index says so."""
         with reading(self.path), self.path.open("rb") as file:
-            index = self._index(file)
-            channels = dict(index.channels) if index else {}
-            for at in index.chunks_with(topics) if index else _scan(file, channels):
-                yield from _in_chunk(_load_chunk(file, at), at, channels, topics)
+            index = self._survey(file) if wanted.bounded else self._index(file)
+            channels = index.channels if index else {}
+            found = (piece.at for piece in overlapping(index.pieces(), wanted)) if index else None
+            for at in found or _scan(file, channels):
+                yield from _in_chunk(file, at, channels, wanted)
+
+    def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
+        """See Container."""
+        with reading(self.path), self.path.open("rb") as file:
+            index = self._survey(file)
+            return last_before(
+                index.pieces(),
+                topics,
+                log_ns,
+                lambda piece, wanted: _in_chunk(file, piece.at, index.channels, wanted),
+            )
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
             for chunk_at, at in places:
-                view = memoryview(self._chunks.get(file, chunk_at))
-                yield _split(view, at)[1]
+                chunk = self._chunks.get(self.path, chunk_at, partial(_load_chunk, file, chunk_at))
+                yield _split(memoryview(chunk), at)[1]
+
+    def _survey(self, file: BinaryIO) -> "_Index":
+        """The index, made from the chunks where the recorder left none."""
+        if self._surveyed is None:
+            self._surveyed = self._index(file) or _made_index(file)
+        return self._surveyed
 
     def _index(self, file: BinaryIO) -> "_Index | None":
         """The index at the file's end; None where the recorder left none."""
@@ -79,31 +109,47 @@ class Ros1File:
 
 
 @dataclass
-class _Index:
-    """Connections by number, and for each chunk's offset how many messages of each it holds."""
+class _ChunkInfo:
+    """When the messages of a chunk were received, and how many there are of each connection."""
 
-    channels: dict[int, Channel]
-    chunks: dict[int, dict[int, int]]
+    first_ns: int
+    last_ns: int
+    counts: dict[int, int]
+
+
+@dataclass
+class _Index:
+    """Connections by number, and what is in the chunk at each offset."""
+
+    channels: dict[int, Channel] = field(default_factory=dict)
+    chunks: dict[int, _ChunkInfo] = field(default_factory=dict)
+    _pieces: list[Piece] = field(default_factory=list)
 
     def counts(self) -> Counter[Channel]:
         total: Counter[Channel] = Counter(dict.fromkeys(self.channels.values(), 0))
-        for counts in self.chunks.values():
-            for number, count in counts.items():
+        for info in self.chunks.values():
+            for number, count in info.counts.items():
                 total[_declared(self.channels, number)] += count
         return total
 
-    def chunks_with(self, topics: frozenset[str] | None) -> list[int]:
-        return sorted(
-            at
-            for at, counts in self.chunks.items()
-            if topics is None or any(_declared(self.channels, number).topic in topics for number in counts)
-        )
+    def pieces(self) -> list[Piece]:
+        """Of chunks the offset is told, not the end."""
+        if not self._pieces:
+            kinds: dict[frozenset[str], frozenset[str]] = {}
+            for at, info in sorted(self.chunks.items()):
+                topics = frozenset(_declared(self.channels, number).topic for number in info.counts)
+                held = kinds.setdefault(topics, topics)
+                self._pieces.append(Piece(at, at, info.first_ns, info.last_ns, held))
+        return self._pieces
 
 
 def _record(file: BinaryIO, at: int) -> tuple[Header, int, int]:
     """Header of the record at `at`, size and place of its content; the file stands there."""
     file.seek(at)
-    header = _header(read_exact(file, int.from_bytes(read_exact(file, 4), "little")))
+    length = int.from_bytes(read_exact(file, 4), "little")
+    if length > HEADER_BYTES:
+        raise ValueError(f"a record's header claims {length:,} bytes")
+    header = _header(read_exact(file, length))
     size = int.from_bytes(read_exact(file, 4), "little")
     return header, size, file.tell()
 
@@ -123,6 +169,13 @@ def _number(header: Header, name: str) -> int:
     if name not in header:
         raise ValueError(f"a record lacks {name}")
     return int.from_bytes(header[name], "little")
+
+
+def _time(header: Header, name: str) -> int:
+    if name not in header:
+        raise ValueError(f"a record lacks {name}")
+    seconds, nanoseconds = TIME.unpack(header[name])
+    return int(seconds * 10**9 + nanoseconds)
 
 
 def _learn(channels: dict[int, Channel], header: Header, content: Data) -> None:
@@ -145,7 +198,7 @@ def _declared(channels: dict[int, Channel], number: int) -> Channel:
 
 
 def _read_index(file: BinaryIO, at: int, connections: int, chunks: int) -> _Index:
-    index = _Index({}, {})
+    index = _Index()
     for _ in range(connections + chunks):
         header, size, content_at = _record(file, at)
         content = read_exact(file, size)
@@ -156,19 +209,66 @@ def _read_index(file: BinaryIO, at: int, connections: int, chunks: int) -> _Inde
         elif kind == CHUNK_INFO:
             fields = Fields(content)
             counts = {fields.number(4): fields.number(4) for _ in range(_number(header, "count"))}
-            index.chunks[_number(header, "chunk_pos")] = counts
+            first_ns, last_ns = _time(header, "start_time"), _time(header, "end_time")
+            index.chunks[_number(header, "chunk_pos")] = _ChunkInfo(first_ns, last_ns, counts)
         else:
             raise ValueError(f"the index holds a record of kind {kind}")
     return index
 
 
-def _scan(file: BinaryIO, channels: dict[int, Channel]) -> Iterator[int]:
-    """Offsets of the chunks of a bag without index, to the file's end; connections between are learnt."""
+def _made_index(file: BinaryIO) -> _Index:
+    """The index of a bag without one, from the index records behind its chunks, else from the messages."""
+    index, followed = _Index(), set()
+    chunk_at = 0
+    for at, header, size in _records(file):
+        kind = _number(header, "op")
+        if kind == CONNECTION:
+            _learn(index.channels, header, read_exact(file, size))
+        elif kind == CHUNK:
+            chunk_at = at
+            index.chunks[at] = _ChunkInfo(FOREVER, -1, {})
+        elif kind == INDEX and chunk_at:
+            _count(index.chunks[chunk_at], header, read_exact(file, size))
+            followed.add(chunk_at)
+    for at, info in index.chunks.items():
+        if at not in followed or not info.counts.keys() <= index.channels.keys():
+            index.chunks[at] = _counted(file, at, index.channels)
+    return index
+
+
+def _count(info: _ChunkInfo, header: Header, entries: Data) -> None:
+    """Takes an index record: times and offsets of a connection's messages in the chunk before it."""
+    if len(entries) % SAMPLE_BYTES or not entries:
+        raise ValueError("an index record has half an entry")
+    times = [s * 10**9 + ns for s, ns, _ in struct.iter_unpack("<III", entries)]
+    info.first_ns, info.last_ns = min(info.first_ns, *times), max(info.last_ns, *times)
+    number = _number(header, "conn")
+    info.counts[number] = info.counts.get(number, 0) + len(times)
+
+
+def _counted(file: BinaryIO, at: int, channels: dict[int, Channel]) -> _ChunkInfo:
+    info = _ChunkInfo(FOREVER, -1, {})
+    for record in _in_chunk(file, at, channels, Wanted()):
+        info.first_ns, info.last_ns = min(info.first_ns, record.log_ns), max(info.last_ns, record.log_ns)
+        number = next(number for number, channel in channels.items() if channel == record.channel)
+        info.counts[number] = info.counts.get(number, 0) + 1
+    return info
+
+
+def _records(file: BinaryIO) -> Iterator[tuple[int, Header, int]]:
+    """Offset, header and size of content of the records to the file's end; the file stands at the content."""
     at, end = len(MAGIC), file.seek(0, 2)
     while at < end:
         header, size, content_at = _record(file, at)
         if content_at + size > end:
             raise EOFError(f"the file ends {content_at + size - end:,} bytes before a record does")
+        yield at, header, size
+        at = content_at + size
+
+
+def _scan(file: BinaryIO, channels: dict[int, Channel]) -> Iterator[int]:
+    """Offsets of the chunks of a bag without index, to the file's end; connections between are learnt."""
+    for at, header, size in _records(file):
         kind = _number(header, "op")
         if kind == CONNECTION:
             _learn(channels, header, read_exact(file, size))
@@ -176,7 +276,6 @@ def _scan(file: BinaryIO, channels: dict[int, Channel]) -> Iterator[int]:
             yield at
         elif kind == MESSAGE:
             raise ValueError("a message outside a chunk")
-        at = content_at + size
 
 
 def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
@@ -193,25 +292,61 @@ def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
 
 
 def _in_chunk(
-    chunk: bytes, chunk_at: int, channels: dict[int, Channel], topics: frozenset[str] | None
+    file: BinaryIO, chunk_at: int, channels: dict[int, Channel], wanted: Wanted
 ) -> Iterator[Record]:
-    view, at = memoryview(chunk), 0
+    header, size, at = _chunk_head(file, chunk_at)
+    if wanted.heads and bytes(header["compression"]) == b"none":
+        yield from _walk(file, chunk_at, at, at + size, channels, wanted)
+        return
+    view, at = memoryview(_load_chunk(file, chunk_at)), 0
     while at < len(view):
         place = (chunk_at, at)
         head, content, at = _split(view, at)
-        header = _header(head)
-        kind = _number(header, "op")
-        if kind == CONNECTION:
-            _learn(channels, header, content)
-        elif kind == MESSAGE:
-            channel = _declared(channels, _number(header, "conn"))
-            if topics is None or channel.topic in topics:
-                seconds, nanoseconds = TIME.unpack(header["time"])
-                yield Record(channel, seconds * 10**9 + nanoseconds, content, place)
+        channel, log_ns = _take(_header(head), content, channels, wanted)
+        if channel:
+            yield Record(channel, log_ns, content, place)
+
+
+def _walk(
+    file: BinaryIO, chunk_at: int, at: int, end: int, channels: dict[int, Channel], wanted: Wanted
+) -> Iterator[Record]:
+    """The messages of a chunk that is not packed, without reading more of them than is wanted."""
+    begin = at
+    while at < end:
+        header, size, content_at = _record(file, at)
+        if content_at + size > end:
+            raise ValueError("a record reaches beyond its chunk")
+        content = read_exact(file, size) if _number(header, "op") == CONNECTION else b""
+        channel, log_ns = _take(header, content, channels, wanted)
+        if channel:
+            data = read_exact(file, min(size, HEAD) if channel.topic in wanted.heads else size)
+            yield Record(channel, log_ns, data, (chunk_at, at - begin))
+        at = content_at + size
+
+
+def _take(
+    header: Header, content: Data, channels: dict[int, Channel], wanted: Wanted
+) -> tuple[Channel | None, int]:
+    """Channel and time of a wanted message; learns a connection; None for anything else."""
+    kind = _number(header, "op")
+    if kind == CONNECTION:
+        _learn(channels, header, content)
+    elif kind == MESSAGE:
+        channel = _declared(channels, _number(header, "conn"))
+        log_ns = _time(header, "time")
+        if wanted.topic(channel.topic) and wanted.time(log_ns):
+            return channel, log_ns
+    return None, 0
+
+
+def _chunk_head(file: BinaryIO, at: int) -> tuple[Header, int, int]:
+    """Header of the chunk at that offset, size and place of its content; the file stands there."""
+    header, size, content_at = _record(file, at)
+    if _number(header, "op") != CHUNK:
+        raise ValueError(f"there is no chunk at {at:,}, where the index says one is")
+    return header, size, content_at
 
 
 def _load_chunk(file: BinaryIO, at: int) -> bytes:
-    header, size, _ = _record(file, at)
-    if _number(header, "op") != CHUNK:
-        raise ValueError(f"there is no chunk at {at:,}, where the index says one is")
+    header, size, _ = _chunk_head(file, at)
     return decompress(str(header["compression"], "ascii"), read_exact(file, size), _number(header, "size"))

@@ -12,9 +12,20 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from hma_data.sources.bags.container import Channel, Data, Place, Record, damaged, reading
+from hma_data.sources.bags.container import (
+    HEAD,
+    Channel,
+    Data,
+    Place,
+    Record,
+    Wanted,
+    damaged,
+    reading,
+)
+from hma_data.sources.bags.pieces import take_last
 
 MAGIC = b"SQLite format 3\x00"
+LATEST = 2**63 - 1  # of an sqlite3 integer
 
 
 class SqliteFile:
@@ -32,26 +43,66 @@ class SqliteFile:
                 total[self._channel(channels, topic_id)] += count
         return total
 
-    def records(self, topics: frozenset[str] | None = None) -> Iterator[Record]:
+    def records(self, wanted: Wanted) -> Iterator[Record]:
         """See Container."""
         with reading(self.path), closing(self._open()) as base:
             channels = self._channels(base)
-            wanted = [i for i, channel in channels.items() if topics is None or channel.topic in topics]
-            query = "SELECT id, topic_id, timestamp, data FROM messages"
-            if topics is not None:
-                query += f" WHERE topic_id IN ({', '.join('?' * len(wanted))})"
-            rows = base.execute(query + " ORDER BY id", wanted if topics is not None else ())
-            for row_id, topic_id, log_ns, data in rows:
-                if not isinstance(log_ns, int) or not isinstance(data, bytes):
-                    raise ValueError(f"message {row_id} has no time or no data")
-                yield Record(self._channel(channels, topic_id), log_ns, data, (0, row_id))
+            for row_id, topic_id, log_ns in self._rows(base, channels, wanted):
+                channel = self._channel(channels, topic_id)
+                data = self._data(base, row_id, HEAD if channel.topic in wanted.heads else None)
+                if not isinstance(log_ns, int):
+                    raise ValueError(f"message {row_id} has no time")
+                yield Record(channel, log_ns, data, (0, row_id))
+
+    def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
+        """See Container."""
+        found: dict[str, Record] = {}
+        query = (
+            "SELECT id, topic_id, timestamp FROM messages WHERE timestamp < ? AND topic_id = ? "
+            "ORDER BY timestamp DESC, id DESC LIMIT 1"
+        )
+        with reading(self.path), closing(self._open()) as base:
+            for topic_id, channel in self._channels(base).items():
+                rows = base.execute(query, (min(log_ns, LATEST), topic_id)) if channel.topic in topics else ()
+                take_last(
+                    found,
+                    (Record(channel, at, self._data(base, row, None), (0, row)) for row, _, at in rows),
+                )
+        return found
+
+    def _rows(
+        self, base: sqlite3.Connection, channels: dict[int, Channel], wanted: Wanted
+    ) -> Iterator[tuple[int, int, Any]]:
+        """id, topic and time of the wanted messages; data is left out, for sorting would gather it."""
+        ids = [number for number, channel in channels.items() if wanted.topic(channel.topic)]
+        conditions, values = [], []
+        if wanted.topics is not None:
+            conditions.append(f"topic_id IN ({', '.join('?' * len(ids))})")
+            values += ids
+        if wanted.bounded:
+            conditions.append("timestamp BETWEEN ? AND ?")
+            values += [wanted.first_ns, min(wanted.last_ns, LATEST)]
+        where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
+        return base.execute(f"SELECT id, topic_id, timestamp FROM messages{where} ORDER BY id", values)
+
+    def _data(self, base: sqlite3.Connection, row_id: int, limit: int | None) -> bytes:
+        """A message's bytes, or the first of them, without reading the others."""
+        if limit is None:
+            return self._payload(base, row_id)
+        with base.blobopen("messages", "data", row_id, readonly=True) as blob:
+            return blob.read(limit)
+
+    def _payload(self, base: sqlite3.Connection, row_id: int) -> bytes:
+        (data,) = base.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone() or (None,)
+        if not isinstance(data, bytes):
+            raise ValueError(f"message {row_id} has no data")
+        return data
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
         """See Container."""
         with reading(self.path), closing(self._open()) as base:
             for _, row_id in places:
-                (data,) = base.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone()
-                yield data
+                yield self._payload(base, row_id)
 
     def _open(self) -> sqlite3.Connection:
         """A connection that writes nothing, not even a lock, unless there is a log still to be read."""
@@ -86,7 +137,10 @@ class SqliteFile:
         for topic_id, topic, kind, encoding in base.execute(
             "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
         ):
-            schema_encoding, schema = definitions.get(kind, ("", ""))
+            service = str(kind).removesuffix(
+                "_Event"
+            )  # rosbag2 keeps the definition of a service's events there
+            schema_encoding, schema = definitions.get(kind) or definitions.get(service) or ("", "")
             channels[topic_id] = Channel(
                 str(topic), str(kind), str(encoding), str(schema_encoding), str(schema).encode()
             )

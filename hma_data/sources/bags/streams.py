@@ -21,8 +21,13 @@ from hma_data.video import Images
 BLOCK = 64  # video messages fetched at a time
 
 
-def camera_stream(bag: Bag, track: Track, clock: str) -> Stream:
+def camera_stream(bag: Bag, track: Track, clock: str, shown: tuple[int, int] | None = None) -> Stream:
     """The camera whose topic was tracked.
+
+    Args:
+        clock: header or receive.
+        shown: from which to before which of the pictures, in order of receipt; all by default. What video
+            needs to be decoded may come before.
 
     Raises:
         EpisodeError: the topic holds no pictures, or video that never begins.
@@ -36,26 +41,36 @@ def camera_stream(bag: Bag, track: Track, clock: str) -> Stream:
             where, f"holds {types}, not pictures", "name a topic of pictures as the camera's key"
         )
     order = track.order()
+    begin, stop = shown or (0, len(order))
     if kind != VIDEO:
+        order = order[begin:stop]
         messages = Messages(bag, track.channels, track.places()[order], where)
         return StillStream(track.seconds(clock)[order], messages, kind)
-    order, keyframes = _from_first_keyframe(track, order, where)
+    first, keyframes = _decodable(track, order, begin, where)
+    begin = max(begin, first)
+    order, keyframes = order[first:stop], keyframes[first:stop]
+    if begin >= stop:
+        raise EpisodeError(where, f"the {track.codec} video has no key frame before frame {stop}")
     messages = Messages(bag, track.channels, track.places()[order], where)
-    return VideoStream(track.seconds(clock)[order], messages, keyframes, track.codec)
+    times = track.seconds(clock)[order[begin - first :]]
+    return VideoStream(times, messages, keyframes, track.codec)
 
 
-def _from_first_keyframe(
-    track: Track, order: NDArray[np.int64], where: str
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The messages that can be decoded: what comes before the first key frame cannot."""
+def _decodable(
+    track: Track, order: NDArray[np.int64], begin: int, where: str
+) -> tuple[int, NDArray[np.bool_]]:
+    """Where decoding has to begin for the message `begin`, and the key frames in order of receipt.
+
+    What comes before the first key frame cannot be decoded.
+    """
     keyframes = track.keyframes()
     if keyframes is None:  # then only the beginning is sure to be one
-        return order, np.arange(len(order)) == 0
+        return 0, np.arange(len(order)) == 0
     keyframes = keyframes[order]
     if not keyframes.any():
         raise EpisodeError(where, f"the {track.codec} video has no key frame")
-    first = int(np.argmax(keyframes))
-    return order[first:], keyframes[first:]
+    earlier = np.flatnonzero(keyframes[: begin + 1])
+    return int(earlier[-1] if len(earlier) else np.argmax(keyframes)), keyframes
 
 
 class Messages:
@@ -95,26 +110,32 @@ class StillStream:
 
 
 class VideoStream:
-    """A camera of video; see episode.Stream."""
+    """A camera of video; see episode.Stream.
+
+    Args:
+        timestamps: (T,) of the pictures shown, the last of the messages.
+        keyframes: (M,) of all messages; those before the pictures shown are there to be decoded.
+    """
 
     def __init__(
         self, timestamps: Floats, messages: Messages, keyframes: NDArray[np.bool_], codec: str
     ) -> None:
         self.timestamps = timestamps
-        self._messages = messages
+        self._messages, self._count = messages, len(keyframes)
+        self._lead = len(keyframes) - len(timestamps)
         self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where)
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """See episode.Stream."""
-        wanted = [int(i) for i in indices]
+        wanted = [int(i) + self._lead for i in indices]
         found = self._decoder.frames(wanted)
         distinct = list(found)
         stacked = _stack([found[i] for i in distinct], self._messages.where)
         return stacked[[distinct.index(i) for i in wanted]]
 
     def _from(self, start: int) -> Iterator[bytes]:
-        for block in range(start, len(self.timestamps), BLOCK):
-            for message in self._messages.read(range(block, min(block + BLOCK, len(self.timestamps)))):
+        for block in range(start, self._count, BLOCK):
+            for message in self._messages.read(range(block, min(block + BLOCK, self._count))):
                 yield payload(message)
 
 

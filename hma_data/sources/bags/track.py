@@ -3,6 +3,7 @@
 T messages of a topic; times are float64 seconds, the clock of a topic is `header` or `receive`.
 """
 
+import struct
 from array import array
 from typing import Any
 
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 from hma_data.episode import Floats
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Place
-from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.container import Channel, Data
 from hma_data.sources.bags.fields import Column
-from hma_data.sources.bags.messages import child, stamp_ns
+from hma_data.sources.bags.messages import child, head_stamp, stamp_ns
 from hma_data.sources.bags.pictures import VIDEO, payload, picture_kind
 from hma_data.sources.bags.video import is_keyframe
 
@@ -41,16 +42,34 @@ class Track:
     def __len__(self) -> int:
         return len(self._log_ns)
 
+    def add_head(self, channel: Channel, log_ns: int, place: Place, data: Data) -> None:
+        """Takes the next message, of which only the time it carries in its first bytes is wanted.
+
+        Raises:
+            EpisodeError: there is none.
+        """
+        stamp = head_stamp(channel)
+        try:
+            own_ns = stamp(data) if stamp else 0
+        except (struct.error, IndexError) as fault:
+            raise EpisodeError(
+                self.topic, f"a message is not a {channel.type}: it has {len(data)} bytes"
+            ) from fault
+        self._take(channel, log_ns, place, own_ns)
+
     def add(self, channel: Channel, log_ns: int, place: Place, message: Any) -> None:
         """Takes the next message; None for one that could not be decoded keeps its time of receipt."""
-        if channel not in self.channels:
-            self.channels.append(channel)
         for column in self.columns:
             column.add(message, len(self))
         if message is not None and picture_kind(channel.type) == VIDEO:
             self._keyframes.append(self._is_keyframe(message))
+        self._take(channel, log_ns, place, stamp_ns(message))
+
+    def _take(self, channel: Channel, log_ns: int, place: Place, own_ns: int) -> None:
+        if channel not in self.channels:
+            self.channels.append(channel)
         self._log_ns.append(min(log_ns, INT64.max))
-        self._stamp_ns.append(min(max(stamp_ns(message), INT64.min), INT64.max))
+        self._stamp_ns.append(min(max(own_ns, INT64.min), INT64.max))
         self._places.extend((*place, self.channels.index(channel)))
 
     def _is_keyframe(self, message: Any) -> bool | None:
@@ -62,8 +81,12 @@ class Track:
 
     def order(self, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """Order of receipt: of all messages, or of those rows (then an index into `rows`)."""
-        received = np.frombuffer(self._log_ns, np.int64)
+        received = self.received()
         return np.argsort(received if rows is None else received[rows], kind="stable")
+
+    def received(self) -> NDArray[np.int64]:
+        """(T,) nanoseconds of receipt, as the messages lie in the file."""
+        return np.frombuffer(self._log_ns, np.int64)
 
     @property
     def stamped(self) -> bool:

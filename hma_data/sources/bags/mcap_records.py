@@ -1,0 +1,190 @@
+"""Records of MCAP files: frames, declarations, chunks, messages. See https://mcap.dev/spec
+
+Chunks that are not packed need not be read whole: their records are walked in the file itself.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import BinaryIO, NamedTuple
+
+from hma_data.sources.bags.container import (
+    HEAD,
+    Channel,
+    Data,
+    Fields,
+    Place,
+    Record,
+    Wanted,
+    decompress,
+    read_exact,
+)
+
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
+STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
+FRAME = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+LOOSE = -1  # in a place: the message is in no chunk
+CODEC_BYTES = 32  # a codec's name is no longer
+
+
+class Declared:
+    """Schemas and channels met so far."""
+
+    def __init__(self) -> None:
+        self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        self.channels: dict[int, Channel] = {}
+
+    def learn(self, opcode: int, data: Data) -> None:
+        """Takes a schema or channel record."""
+        fields = Fields(data)
+        number = fields.number(2)
+        if opcode == SCHEMA:
+            self._schemas[number] = (fields.text(), fields.text(), bytes(fields.block()))
+        elif opcode == CHANNEL:
+            schema_id, topic, encoding = fields.number(2), fields.text(), fields.text()
+            if schema_id and schema_id not in self._schemas:
+                raise ValueError(f"channel {number} of {topic} names schema {schema_id}, which is not there")
+            name, kind, schema = self._schemas.get(schema_id, ("", "", b""))
+            self.channels[number] = Channel(topic, name, encoding, kind, schema)
+
+    def channel(self, number: int) -> Channel:
+        """The channel of that number."""
+        if number not in self.channels:
+            raise ValueError(f"a message is on channel {number}, which is not declared")
+        return self.channels[number]
+
+
+class ChunkHead(NamedTuple):
+    """What a chunk says of itself; its records lie at `at`, `packed` bytes that unpack to `size`."""
+
+    first_ns: int
+    last_ns: int
+    size: int
+    checksum: int
+    codec: str
+    at: int
+    packed: int
+
+
+def frame(file: BinaryIO, at: int) -> tuple[int, int]:
+    """Opcode and length of the record at `at`; the file stands at its content."""
+    file.seek(at)
+    opcode, length = FRAME.unpack(read_exact(file, FRAME.size))
+    return opcode, length
+
+
+def frames(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, int, int]]:
+    """(opcode, offset, length) of the records from `at` to `end`; the file stands at the content."""
+    while at < end:
+        opcode, length = frame(file, at)
+        following = at + FRAME.size + length
+        if following > end:
+            raise EOFError(f"the file ends {following - end:,} bytes before a record does")
+        yield opcode, at, length
+        at = following
+
+
+def between(file: BinaryIO, at: int, end: int, declared: Declared, wanted: Wanted) -> Iterator[Record]:
+    """The wanted messages from offset `at` to `end` of the data section."""
+    for opcode, offset, length in frames(file, at, end):
+        if opcode in (DATA_END, FOOTER):
+            return
+        if opcode == CHUNK:
+            yield from _in_chunk(file, offset, length, declared, wanted)
+        elif opcode in (SCHEMA, CHANNEL):
+            declared.learn(opcode, read_exact(file, length))
+        elif opcode == MESSAGE:
+            record = _loose(file, length, (LOOSE, offset), declared, wanted)
+            if record:
+                yield record
+
+
+def message_head(body: Data) -> tuple[int, int]:
+    """Number of the channel, and log time."""
+    if len(body) < MESSAGE_HEAD.size:
+        raise ValueError("a message ends too soon")
+    channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(body)
+    return channel, log_ns
+
+
+def chunk_head(file: BinaryIO, length: int) -> ChunkHead:
+    """Of the chunk whose content begins where the file stands."""
+    start = file.tell()
+    fields = Fields(read_exact(file, min(length, 40 + CODEC_BYTES)))
+    first_ns, last_ns = fields.number(8), fields.number(8)
+    size, checksum = fields.number(8), fields.number(4)
+    codec = fields.text()
+    packed = fields.number(8)
+    at = start + 8 + 8 + 8 + 4 + 4 + len(codec.encode()) + 8
+    if at + packed > start + length:
+        raise ValueError("a record ends too soon")
+    return ChunkHead(first_ns, last_ns, size, checksum, codec, at, packed)
+
+
+def load_chunk(file: BinaryIO, at: int) -> bytes:
+    """The records of the chunk at that offset, unpacked."""
+    opcode, length = frame(file, at)
+    if opcode != CHUNK:
+        raise ValueError(f"there is no chunk at {at:,}")
+    return _unpack(file, chunk_head(file, length))
+
+
+def _unpack(file: BinaryIO, head: ChunkHead) -> bytes:
+    file.seek(head.at)
+    chunk = decompress(head.codec, read_exact(file, head.packed), head.size)
+    if head.checksum and zlib.crc32(chunk) != head.checksum:
+        raise ValueError("a chunk's checksum does not fit its content")
+    return chunk
+
+
+def _in_chunk(file: BinaryIO, at: int, length: int, declared: Declared, wanted: Wanted) -> Iterator[Record]:
+    head = chunk_head(file, length)
+    plain = head.codec in ("", "none") and head.packed == head.size
+    if plain and wanted.heads and not (head.checksum and wanted.checked):
+        yield from _walk(file, at, head, declared, wanted)
+        return
+    yield from _in_records(_unpack(file, head), at, declared, wanted)
+
+
+def _in_records(chunk: bytes, chunk_at: int, declared: Declared, wanted: Wanted) -> Iterator[Record]:
+    view, at, size = memoryview(chunk), 0, len(chunk)
+    while at < size:
+        opcode, length = FRAME.unpack_from(view, at)
+        start, following = at + FRAME.size, at + FRAME.size + length
+        if following > size:
+            raise ValueError("a record reaches beyond its chunk")
+        if opcode == MESSAGE:
+            number, log_ns = message_head(view[start:following])
+            channel = declared.channel(number)
+            if wanted.topic(channel.topic) and wanted.time(log_ns):
+                yield Record(channel, log_ns, view[start + MESSAGE_HEAD.size : following], (chunk_at, at))
+        elif opcode in (SCHEMA, CHANNEL):
+            declared.learn(opcode, view[start:following])
+        at = following
+
+
+def _walk(
+    file: BinaryIO, chunk_at: int, head: ChunkHead, declared: Declared, wanted: Wanted
+) -> Iterator[Record]:
+    """The messages of a chunk that is not packed, without reading more of them than is wanted."""
+    for opcode, offset, length in frames(file, head.at, head.at + head.size):
+        if opcode == MESSAGE:
+            record = _loose(file, length, (chunk_at, offset - head.at), declared, wanted)
+            if record:
+                yield record
+        elif opcode in (SCHEMA, CHANNEL):
+            declared.learn(opcode, read_exact(file, length))
+
+
+def _loose(file: BinaryIO, length: int, place: Place, declared: Declared, wanted: Wanted) -> Record | None:
+    """The message whose content begins where the file stands, if it is wanted."""
+    head = read_exact(file, min(length, MESSAGE_HEAD.size + HEAD))
+    number, log_ns = message_head(head)
+    channel = declared.channel(number)
+    if not (wanted.topic(channel.topic) and wanted.time(log_ns)):
+        return None
+    if channel.topic not in wanted.heads and length > len(head):
+        head += read_exact(file, length - len(head))
+    return Record(channel, log_ns, memoryview(head)[MESSAGE_HEAD.size :], place)

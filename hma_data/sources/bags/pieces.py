@@ -1,0 +1,68 @@
+"""Where in a bag file which messages are: what lets a part of its time be read alone.
+
+A piece is a run of a file's records, a chunk or messages outside of chunks, of which is known when
+its messages were received and of which topics they are. A file has some thousands of them.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from hma_data.sources.bags.container import Record, Wanted
+
+
+class Piece(NamedTuple):
+    """Records from offset `at` to `end`.
+
+    Attributes:
+        first_ns, last_ns: earliest and latest receipt of its messages.
+        topics: of them; None where the file does not tell.
+    """
+
+    at: int
+    end: int
+    first_ns: int
+    last_ns: int
+    topics: frozenset[str] | None
+
+    def holds(self, topics: frozenset[str] | None) -> bool:
+        """Whether a message of those topics can be in it."""
+        return topics is None or self.topics is None or not self.topics.isdisjoint(topics)
+
+
+Load = Callable[[Piece, Wanted], Iterator[Record]]
+
+
+def overlapping(pieces: Sequence[Piece], wanted: Wanted) -> Iterator[Piece]:
+    """The pieces in which wanted messages can be, in the file's order."""
+    for piece in pieces:
+        within = piece.first_ns <= wanted.last_ns and piece.last_ns >= wanted.first_ns
+        if within and piece.holds(wanted.topics):
+            yield piece
+
+
+def last_before(
+    pieces: Sequence[Piece], topics: frozenset[str], log_ns: int, load: Load
+) -> dict[str, Record]:
+    """Of each topic the last message received before that time; looks back no further than it must."""
+    found: dict[str, Record] = {}
+    earlier = (piece for piece in pieces if piece.first_ns < log_ns and piece.holds(topics))
+    for piece in sorted(earlier, key=lambda piece: piece.last_ns, reverse=True):
+        newest = min(piece.last_ns, log_ns - 1)
+        missing = frozenset(t for t in topics if t not in found or found[t].log_ns < newest)
+        if not missing:
+            break
+        if piece.holds(missing):
+            take_last(found, load(piece, Wanted(missing, last_ns=log_ns - 1)))
+    return found
+
+
+def take_last(found: dict[str, Record], records: Iterator[Record]) -> None:
+    """Puts the last message of each topic into `found`, with a copy of its bytes."""
+    newest: dict[str, Record] = {}
+    for record in records:
+        topic = record.channel.topic
+        if topic not in newest or newest[topic].log_ns <= record.log_ns:
+            newest[topic] = record
+    for topic, record in newest.items():
+        if topic not in found or found[topic].log_ns <= record.log_ns:
+            found[topic] = record._replace(data=bytes(record.data))

@@ -1,0 +1,187 @@
+"""Bags that hold several episodes: a camera, commands, a rare gripper, and what marks the episodes.
+
+The camera ticks at 10 Hz with header stamps, received 5 ms late; everything else has no header.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.writer import CompressionType, IndexType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from hma_data.embodiment import Embodiment
+from tests.data.bag_files import START_NS, arm
+
+LATE_NS = 5_000_000
+CAMERA, COMMAND, GRIPPER, STATE, TASK = "/cam", "/command", "/gripper", "/state", "/task"
+TYPES = {
+    CAMERA: "sensor_msgs/msg/Image",
+    COMMAND: "std_msgs/msg/Float64",
+    GRIPPER: "std_msgs/msg/Float64",
+    STATE: "std_msgs/msg/Bool",
+    TASK: "std_msgs/msg/String",
+}
+
+
+class Said(NamedTuple):
+    """A message: received so many seconds after the start."""
+
+    topic: str
+    at_s: float
+    value: Any
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a bag holds.
+
+    Attributes:
+        times: (T,) of the pictures, seconds after the start; their stamps too.
+        pictures: (T, 8, 8, 3).
+        said: the other messages.
+        stamps: of the pictures where they are not their times.
+    """
+
+    times: np.ndarray
+    pictures: np.ndarray
+    said: list[Said] = field(default_factory=list)
+    stamps: np.ndarray | None = None
+
+    def messages(self) -> list[Said]:
+        """All, in order of receipt."""
+        pictures = [Said(CAMERA, float(t) + LATE_NS / 1e9, i) for i, t in enumerate(self.times)]
+        return sorted([*pictures, *self.said], key=lambda item: item.at_s)
+
+
+def make_run(frames: int = 60, pause_after: tuple[int, ...] = (), side: int = 8, **more: Any) -> Run:
+    """Pictures at 10 Hz, with pauses of 3 s; commands at 25 Hz all along, the gripper told once."""
+    times = np.arange(frames) / 10
+    for i in pause_after:
+        times[i:] += 3.0
+    pictures = np.random.default_rng(0).integers(0, 256, (frames, side, side, 3), dtype=np.uint8)
+    said = [Said(COMMAND, t, t) for t in np.arange(0, times[-1] + 0.1, 0.04).round(3).tolist()]
+    said += [Said(GRIPPER, -0.05, 0.7), *more.pop("said", [])]
+    return Run(times, pictures, said, **more)
+
+
+def _ns(at_s: float) -> int:
+    return START_NS + round(at_s * 1e9)
+
+
+def _message(store: Any, run: Run, item: Said) -> Any:
+    types = store.types
+    if item.topic != CAMERA:
+        return types[TYPES[item.topic]](item.value)
+    stamps = run.times if run.stamps is None else run.stamps
+    seconds, nanoseconds = divmod(_ns(float(stamps[item.value])), 10**9)
+    header_type = types["std_msgs/msg/Header"]
+    more = {"seq": 0} if "seq" in header_type.__dataclass_fields__ else {}
+    stamp = types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
+    header = header_type(stamp=stamp, frame_id="c", **more)
+    side = run.pictures.shape[1]
+    data = run.pictures[item.value].reshape(-1)
+    return types[TYPES[CAMERA]](header, side, side, "rgb8", 0, side * 3, data)
+
+
+def _used(run: Run) -> list[str]:
+    return [topic for topic in TYPES if any(item.topic == topic for item in run.messages())]
+
+
+def ros1(folder: Path, run: Run, compression: str | None = None, chunk: int = 4096) -> Path:
+    """A ROS 1 bag of many small chunks."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = Ros1Writer(folder / "run.bag")
+    writer.chunk_threshold = chunk
+    if compression:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    with writer:
+        made = {t: writer.add_connection(t, TYPES[t], typestore=store) for t in _used(run)}
+        for item in run.messages():
+            data = store.serialize_ros1(_message(store, run, item), TYPES[item.topic])
+            writer.write(made[item.topic], _ns(item.at_s), data)
+    return folder / "run.bag"
+
+
+def ros1_without_index(folder: Path, run: Run) -> Path:
+    """As a recorder that was killed leaves it."""
+    path = ros1(folder, run)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    data = data[: int.from_bytes(data[at : at + 8], "little")]
+    data[at : at + 8] = bytes(8)
+    path.write_bytes(data)
+    return path
+
+
+def sqlite(folder: Path, run: Run) -> Path:
+    """A ROS 2 bag folder."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Ros2Writer(folder / "run", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        made = {t: writer.add_connection(t, TYPES[t], typestore=store) for t in _used(run)}
+        for item in run.messages():
+            data = store.serialize_cdr(_message(store, run, item), TYPES[item.topic])
+            writer.write(made[item.topic], _ns(item.at_s), data)
+    return folder / "run"
+
+
+def mcap(folder: Path, run: Run, more: list[tuple[str, str, str, float, bytes]] = [], **options: Any) -> Path:  # noqa: B006
+    """An MCAP file; `more` are messages already encoded: topic, type, definition, seconds, bytes."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    items = []
+    for item in run.messages():
+        kind = TYPES[item.topic]
+        data = bytes(store.serialize_cdr(_message(store, run, item), kind))
+        items.append((item.topic, kind, "", item.at_s, data))
+    channels: dict[str, int] = {}
+    with (folder / "run.mcap").open("wb") as file:
+        writer = McapWriter(file, chunk_size=options.pop("chunk_size", 4096), **options)
+        writer.start()
+        for topic, kind, text, at_s, data in sorted([*items, *more], key=lambda item: item[3]):
+            if topic not in channels:
+                text = text or store.generate_msgdef(kind, ros_version=2)[0]
+                schema = writer.register_schema(kind, "ros2msg", text.encode())
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channels[topic], _ns(at_s), data, _ns(at_s))
+        writer.finish()
+    return folder / "run.mcap"
+
+
+PLAIN, ZSTD = CompressionType.NONE, CompressionType.ZSTD
+KINDS: dict[str, Callable[[Path, Run], Path]] = {
+    "ros1": ros1,
+    "ros1-lz4": lambda d, r: ros1(d, r, "LZ4"),
+    "ros1-without-index": ros1_without_index,
+    "sqlite": sqlite,
+    "mcap-zstd": lambda d, r: mcap(d, r, compression=ZSTD),
+    "mcap-plain": lambda d, r: mcap(d, r, compression=PLAIN),
+    "mcap-without-chunks": lambda d, r: mcap(d, r, use_chunking=False),
+    "mcap-without-indexes": lambda d, r: mcap(
+        d,
+        r,
+        index_types=IndexType.NONE,
+        repeat_channels=False,
+        use_summary_offsets=False,
+        use_statistics=False,
+    ),
+}
+
+
+def parted(segments: str, more: str = "") -> Embodiment:
+    """An embodiment whose bags are parted so."""
+    return arm(f"""
+id: parted
+kind: real
+frequency_hz: 10
+action:
+  space: mixed
+  components: [{{key: {COMMAND}.data, dims: 1}}, {{key: {GRIPPER}.data, dims: 1}}]
+cameras: [{{name: cam, key: {CAMERA}}}]
+source: {{format: rosbag, segments: {segments}{more}}}
+""")

@@ -1,0 +1,284 @@
+"""Several episodes in one bag: by pauses, by messages, by calls of a service."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hma_data.align import to_clip
+from hma_data.embodiment import Embodiment
+from hma_data.errors import EpisodeError, SourceError
+from tests.data.bag_files import SOURCE, START_NS
+from tests.data.bag_parts import KINDS, STATE, TASK, Said, make_run, mcap, parted, ros1
+
+GAP = "{gap_s: 1}"
+RECORDING = "{start: {key: /state.data, equals: true}, stop: {key: /state.data, equals: false}}"
+
+
+def states(*changes: tuple[float, bool]) -> list[Said]:
+    """The state published at 5 Hz for seven seconds, changing at those times."""
+    said = []
+    for at in np.arange(0, 7, 0.2).tolist():
+        value = [value for since, value in ((-1, False), *changes) if since <= at + 1e-6][-1]
+        said.append(Said(STATE, at + 0.01, value))
+    return said
+
+
+def lengths(path: Path, embodiment: Embodiment) -> list[int]:
+    return [ref.frames for ref in SOURCE.index(str(path), embodiment)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_pause_parts_every_kind_of_bag(kind: str, tmp_path: Path) -> None:
+    run = make_run(60, pause_after=(25, 40))
+    path = KINDS[kind](tmp_path, run)
+    refs = SOURCE.index(str(path), parted(GAP))
+    assert [(ref.id, ref.frames, ref.group) for ref in refs] == [
+        ("run/0000", 25, "run"), ("run/0001", 15, "run"), ("run/0002", 20, "run"),
+    ]  # fmt: skip
+    assert len({ref.fingerprint for ref in refs}) == 1 and refs[0].fingerprint
+    for ref, (begin, stop) in zip(refs, [(0, 25), (25, 40), (40, 60)], strict=True):
+        episode = SOURCE.read(str(path), ref.id, parted(GAP))
+        stream = episode.streams["cam"]
+        np.testing.assert_array_equal(stream.frames(range(stop - begin)), run.pictures[begin:stop])
+        np.testing.assert_allclose(stream.timestamps, START_NS / 1e9 + run.times[begin:stop], atol=1e-6)
+        assert episode.id == ref.id
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("segments", [GAP, RECORDING])
+def test_an_episode_in_a_bag_is_that_part_of_the_whole(kind: str, segments: str, tmp_path: Path) -> None:
+    """Commands in force, also one said long before, are those of the bag read as one episode."""
+    run = make_run(60, pause_after=(30,), said=states((1.0, True), (2.4, False), (6.2, True)))
+    path = KINDS[kind](tmp_path, run)
+    embodiment = parted(segments)
+    whole = to_clip(SOURCE.read(str(path), "run", embodiment), embodiment)
+    assert len(whole) == 60
+    for ref in SOURCE.index(str(path), embodiment):
+        episode = SOURCE.read(str(path), ref.id, embodiment)
+        first = episode.metadata["segment"]["first_frame"]
+        clip = to_clip(episode, embodiment)
+        assert len(clip) == ref.frames
+        np.testing.assert_array_equal(clip.actions, whole.actions[first : first + ref.frames])
+        np.testing.assert_array_equal(clip.actions[:, 1], np.float32(0.7))
+        np.testing.assert_array_equal(clip.frames_at("cam", np.arange(2)), run.pictures[first : first + 2])
+
+
+def test_start_and_stop_are_the_moments_at_which_a_value_becomes_theirs(tmp_path: Path) -> None:
+    path = ros1(tmp_path, make_run(60, said=states((1.0, True), (2.4, False), (4.0, True))))
+    refs = SOURCE.index(str(path), parted(RECORDING))
+    assert [ref.frames for ref in refs] == [
+        14,
+        19,
+    ]  # pictures received between 1.01 and 2.41 s, and from 4.01 s
+    assert {ref.left_out for ref in refs} == {27}
+    facts = SOURCE.read(str(path), "run/0001", parted(RECORDING)).metadata["segment"]
+    assert facts["frames_left_out"] == 27 and facts["frames_in_bag"] == 60
+    assert (facts["number"], facts["of"], facts["first_frame"], facts["frames"]) == (1, 2, 41, 19)
+
+
+@pytest.mark.parametrize(
+    ("segments", "expected", "left_out"),
+    [
+        ("{start: {key: /task}}", [20, 30], 10),  # what comes before the first start is in none
+        ("{stop: {key: /task}}", [10, 20, 30], 0),
+        ("{start: {key: /task.data, equals: go}}", [30], 30),
+        ("{start: {key: /task.data, equals: wait}, stop: {key: /task.data, equals: go}}", [20], 40),
+        ("{start: {key: /task}, gap_s: 1}", [20, 15, 15], 10),
+        ("{gap_s: 10}", [60], 0),
+    ],
+)
+def test_markers_and_pauses_part_as_their_description_says(
+    segments: str, expected: list[int], left_out: int, tmp_path: Path
+) -> None:
+    said = [Said(TASK, 0.99, "wait"), Said(TASK, 2.99, "go")]
+    path = ros1(tmp_path, make_run(60, pause_after=(45,), said=said))
+    refs = SOURCE.index(str(path), parted(segments))
+    assert [ref.frames for ref in refs] == expected
+    assert {ref.left_out for ref in refs} == {left_out}
+
+
+def test_a_clock_that_begins_anew_parts_episodes_and_keeps_commands_apart(tmp_path: Path) -> None:
+    times = np.arange(40) / 10
+    stamps = np.concatenate([times[:20] + 100, times[:20]])
+    run = make_run(40, stamps=stamps)
+    stamped = (
+        parted(GAP, "").to_yaml().replace("key: /command.data", "key: /command.data\n    stamp: receive")
+    )
+    path = ros1(tmp_path, run)
+    episode = SOURCE.read(str(path), "run/0001", Embodiment.from_yaml(stamped))
+    np.testing.assert_allclose(episode.streams["cam"].timestamps, START_NS / 1e9 + stamps[20:], atol=1e-6)
+    assert lengths(path, parted(GAP)) == [20, 20]
+
+
+def test_receive_times_part_where_the_embodiment_says_so(tmp_path: Path) -> None:
+    run = make_run(40, pause_after=(20,), stamps=np.arange(40) / 10)  # stamped without the pause
+    path = ros1(tmp_path, run)
+    forced = parted(GAP).to_yaml() + "\nsync: {stamp: receive}\n"
+    assert lengths(path, parted(GAP)) == [40]
+    assert lengths(path, Embodiment.from_yaml(forced)) == [20, 20]
+
+
+@pytest.mark.parametrize(
+    ("segments", "says"),
+    [
+        (RECORDING, r"/state\.data never becomes True, it is False"),
+        ("{start: {key: /task}}", r"no topic for /task"),
+        ("{start: {key: /state.dato, equals: true}}", r"no field 'dato'.*data"),
+        ("{start: {key: /state.data, equals: on}}", r"never becomes True|cannot equal"),
+        ("{start: {key: /command.data, equals: go}}", r"is 0\.0, which cannot equal 'go'"),
+        ("{start: {key: /late}}", "no topic for /late"),
+    ],
+)
+def test_a_bag_without_an_episode_is_told_with_what_came(segments: str, says: str, tmp_path: Path) -> None:
+    path = ros1(tmp_path, make_run(20, said=states()))
+    embodiment = parted(segments)
+    (ref,) = SOURCE.index(str(path), embodiment)
+    assert (ref.id, ref.frames) == ("run", 0)
+    with pytest.raises(EpisodeError, match=says) as fault:
+        SOURCE.read(str(path), ref.id, embodiment)
+    assert "\n" not in str(fault.value)
+
+
+def test_a_marker_after_the_last_picture_begins_no_episode(tmp_path: Path) -> None:
+    path = ros1(tmp_path, make_run(20, said=[Said(TASK, 50.0, "go")]))
+    with pytest.raises(EpisodeError, match="no episode in it holds a picture of /cam"):
+        SOURCE.read(str(path), "run", parted("{start: {key: /task}}"))
+
+
+def test_an_episode_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
+    path = ros1(tmp_path, make_run(20, pause_after=(10,)))
+    for name in ("run/0002", "run/1", "run/-001", "other/0000", "run/x", "run/"):
+        with pytest.raises(SourceError, match=f"has no (episode|bag) '{name}'"):
+            SOURCE.read(str(path), name, parted(GAP))
+    unparted = Embodiment.from_yaml(parted(GAP).to_yaml().replace("  segments:\n    gap_s: 1.0\n", ""))
+    with pytest.raises(SourceError, match="has no bag 'run/0000'"):
+        SOURCE.read(str(path), "run/0000", unparted)
+
+
+def test_each_episode_has_the_instruction_said_nearest_to_its_beginning(tmp_path: Path) -> None:
+    said = [Said(TASK, 0.0, "reach"), Said(TASK, 4.9, "push"), Said(TASK, 10.1, "pull")]
+    path = ros1(tmp_path, make_run(60, pause_after=(20, 40), said=said))
+    embodiment = parted(GAP, ", instruction: /task.data")
+    refs = SOURCE.index(str(path), embodiment)
+    told = [SOURCE.read(str(path), ref.id, embodiment).instruction for ref in refs]
+    assert told == ["reach", "push", "pull"]
+
+
+# -- services
+
+
+def event(kind: int, at_s: float, data: bool | None, success: bool | None = None) -> bytes:
+    """A std_srvs/srv/SetBool_Event in CDR, as the ROS middleware lays it out."""
+    seconds, nanoseconds = divmod(START_NS + round(at_s * 1e9), 10**9)
+    body = struct.pack("<B3xiI16s4xq", kind, seconds, nanoseconds, bytes(range(16)), round(at_s * 10))
+    body += struct.pack("<I", 0) if data is None else struct.pack("<IB3x", 1, data)
+    if success is None:
+        return b"\x00\x01\x00\x00" + body + struct.pack("<I", 0)
+    return b"\x00\x01\x00\x00" + body + struct.pack("<IB3xI", 1, success, 1) + b"\x00"
+
+
+def calls(
+    kinds: tuple[int, ...], *made: tuple[float, bool], contents: bool = True
+) -> list[tuple[str, str, str, float, bytes]]:
+    """Each call as those of its events that were recorded, 1 ms apart."""
+    definition = "bool data\n---\nbool success\nstring message\n"
+    found = []
+    for at_s, value in made:
+        for i, kind in enumerate(kinds):
+            asked, answered = contents and kind < 2, contents and kind >= 2
+            data = event(kind, at_s, value if asked else None, True if answered else None)
+            said = ("/record/_service_event", "std_srvs/srv/SetBool_Event", definition, at_s + i / 1e3, data)
+            found.append(said)
+    return found
+
+
+@pytest.mark.parametrize("kinds", [(1, 2), (0, 3), (0, 1, 2, 3)])
+def test_every_call_of_a_service_counts_once(kinds: tuple[int, ...], tmp_path: Path) -> None:
+    made = calls(kinds, (0.99, True), (2.99, True), contents=False)
+    path = mcap(tmp_path, make_run(60), made)
+    assert lengths(path, parted("{start: {key: /record/_service_event}}")) == [20, 30]
+
+
+@pytest.mark.parametrize("kinds", [(1, 2), (0, 3), (0, 1, 2, 3)])
+@pytest.mark.parametrize("key", ["request[0].data", "request.data"])
+def test_what_a_service_was_asked_starts_and_stops(kinds: tuple[int, ...], key: str, tmp_path: Path) -> None:
+    path = mcap(tmp_path, make_run(60), calls(kinds, (0.99, True), (1.99, False), (2.99, True), (3.99, True)))
+    topic = f"/record/_service_event.{key}"
+    both = f"{{start: {{key: '{topic}', equals: true}}, stop: {{key: '{topic}', equals: false}}}}"
+    assert lengths(path, parted(both)) == [10, 10, 20]
+
+
+def test_a_service_that_was_never_called_is_told(tmp_path: Path) -> None:
+    path = mcap(tmp_path, make_run(20), calls((1, 2), (0.5, False)))
+    wanted = parted("{start: {key: '/record/_service_event.request[0].data', equals: true}}")
+    with pytest.raises(EpisodeError, match=r"never becomes True, it is False"):
+        SOURCE.read(str(path), "run", wanted)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_events_of_a_real_bag_are_decoded_by_their_services_definition(kind: str, real_data: Path) -> None:
+    from hma_data.sources.bags.bag import Bag
+    from hma_data.sources.bags.messages import decode
+
+    path = real_data / "ros2/rosbag2/rosbag2_cpp/test/rosbag2_cpp/bags" / f"topics_and_services.{kind}"
+    found = [
+        decode(record.channel, record.data, "")
+        for _, record in Bag(path).records(frozenset({"/add_two_ints/_service_event"}))
+    ]
+    assert [message.info.event_type for message in found] == [1, 2] * 3
+    assert [(m.request[0].a, m.request[0].b) for m in found[::2]] == [(1, 3), (2, 3), (3, 3)]
+    assert [m.response[0].sum for m in found[1::2]] == [4, 5, 6]
+
+
+# -- cost
+
+
+def read_bytes() -> int:
+    """What this process has read from files so far."""
+    for line in Path("/proc/self/io").read_text().splitlines():
+        if line.startswith("rchar"):
+            return int(line.split()[1])
+    raise AssertionError
+
+
+needs_io = pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="counts of bytes read need Linux")
+LONG = tuple(range(10, 100, 10))
+INDEXED = [kind for kind in KINDS if "index" not in kind]
+
+
+def written(kind: str, folder: Path) -> tuple[Path, int]:
+    path = KINDS[kind](folder, make_run(100, pause_after=LONG, side=160))
+    files = [path] if path.is_file() else list(path.iterdir())
+    return path, sum(file.stat().st_size for file in files)
+
+
+@needs_io
+@pytest.mark.parametrize("kind", INDEXED)
+def test_an_episode_costs_about_its_own_bytes(kind: str, tmp_path: Path) -> None:
+    path, size = written(kind, tmp_path)
+    refs = SOURCE.index(str(path), parted(GAP))
+    assert len(refs) == 10
+    before = read_bytes()
+    stream = SOURCE.read(str(path), refs[6].id, parted(GAP)).streams["cam"]
+    stream.frames(range(10))
+    assert read_bytes() - before < size / 2  # a tenth is read twice, and what is around it
+
+
+@needs_io
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap-plain", "mcap-without-chunks"])
+def test_finding_the_episodes_reads_no_pictures(kind: str, tmp_path: Path) -> None:
+    path, size = written(kind, tmp_path)
+    before = read_bytes()
+    assert len(SOURCE.index(str(path), parted(GAP))) == 10
+    assert read_bytes() - before < size / 3
+
+
+def test_a_bag_that_changes_is_parted_anew(tmp_path: Path) -> None:
+    path = ros1(tmp_path, make_run(40, pause_after=(20,)))
+    assert lengths(path, parted(GAP)) == [20, 20]
+    path.unlink()
+    ros1(tmp_path, make_run(40, pause_after=(30,)))
+    assert lengths(path, parted(GAP)) == [30, 10]
