@@ -1,16 +1,16 @@
-"""The data verbs of `hma`: inspect, doctor, mixture; the others in modules of their own.
+"""The data verbs of `hma`: mixture; the others in modules of their own.
 
 Only what is light is imported here; each verb imports what it needs.
 """
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from hma_data.cli_bench import bench
 from hma_data.cli_convert import convert
+from hma_data.cli_inspect import doctor, inspect
 from hma_data.cli_registry import registry_app
 from hma_data.cli_shards import shards_app
 from hma_data.cli_tokenizer import tokenizer_app
@@ -29,100 +29,6 @@ def mount(app: typer.Typer) -> None:
     app.command("mixture")(mixture)
     app.add_typer(tokenizer_app, name="tokenizer")
     app.command("bench")(bench)
-
-
-# -- recordings
-
-
-def inspect(
-    uri: Annotated[str, typer.Argument(help="A recording: file, folder or URI.")],
-    embodiment: Annotated[
-        str | None, typer.Option("--embodiment", "-e", help="Check against this embodiment.")
-    ] = None,
-    json: Json = False,
-) -> None:
-    """What is in a recording.
-
-    Example: hma inspect ./demo.hdf5
-    """
-    from hma_data.inspect import inspect_recording
-
-    report = inspect_recording(uri, embodiment)
-    if json:
-        print_json(report)
-    else:
-        _print_inspection(report)
-    raise typer.Exit(1 if report["problems"] else 0)
-
-
-def _print_inspection(report: dict[str, Any]) -> None:
-    facts = [f"{report['format']}", f"{report['episodes']:,} episodes"]
-    if report["frames"]:
-        facts.append(f"{report['frames']:,} frames")
-    if report["hz"]:
-        facts.append(f"{report['hz']:g} Hz")
-    if report["robot"]:
-        facts.append(report["robot"])
-    print(f"{report['uri']}: " + ", ".join(facts))
-    if report["lengths"]:
-        lengths = sorted(report["lengths"])
-        print(f"episode lengths: {lengths[0]} to {lengths[-1]}, median {lengths[len(lengths) // 2]}")
-    rows = [
-        [
-            key["key"],
-            key["kind"],
-            "×".join(map(str, key["shape"])) or "1",
-            key["dtype"],
-            key["codec"],
-            key["hz"],
-            key["jitter_ms"],
-            key["count"],
-            " ".join(key["names"] or [])[:60] or None,
-        ]
-        for key in report["keys"]
-    ]
-    print_table(["key", "kind", "shape", "dtype", "codec", "Hz", "jitter ms", "count", "names"], rows)
-    for name, value in report["facts"].items():
-        print(f"{name}: {value}")
-    for name, value in report.get("embodiment", {}).items():
-        print(f"{name}: {value}")
-    for problem in report["problems"]:
-        print(f"problem: {problem}")
-
-
-class Severity(StrEnum):
-    info = "info"
-    warn = "warn"
-    error = "error"
-
-
-def doctor(
-    target: Annotated[str, typer.Argument(help="A recording, or the folder of a shard set.")],
-    embodiment: Annotated[
-        str | None, typer.Option("--embodiment", "-e", help="Look into the episodes as this robot's.")
-    ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, help="How many are looked into.")] = 20,
-    fail_on: Annotated[
-        Severity, typer.Option("--fail-on", help="Exit with 1 from this severity on.")
-    ] = Severity.error,
-    json: Json = False,
-) -> None:
-    """Health checks: what of a recording or shard set will hurt training.
-
-    Example: hma doctor ./demo.hdf5 -e my_arm.yaml --fail-on warn
-    """
-    from hma_data.doctor import SEVERITIES, examine
-
-    found = examine(target, embodiment, episodes)
-    if json:
-        print_json({"target": target, "findings": [finding.to_json() for finding in found]})
-    else:
-        for finding in found:
-            remedy = f" — {finding.remedy}" if finding.remedy else ""
-            print(f"{finding.severity:5} {finding.check}: {finding.message}{remedy}")
-        print(f"{target}: {sum(finding.severity != 'info' for finding in found)} findings")
-    worst = max((SEVERITIES.index(finding.severity) for finding in found), default=-1)
-    raise typer.Exit(1 if worst >= SEVERITIES.index(fail_on.value) else 0)
 
 
 # -- mixture

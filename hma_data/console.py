@@ -4,9 +4,11 @@ Shared by the data and model verbs. rich is imported when something is shown.
 """
 
 import json
+import shutil
 import sys
+import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
@@ -24,6 +26,7 @@ def print_json(values: Any) -> None:
     print(json.dumps(values, indent=1, ensure_ascii=False, default=str))
 
 
+MAX_TITLE = 40  # of a line; a longer one pushes its text to the right
 MANY_ROWS = 500  # laying out more than this with rich takes seconds
 
 
@@ -75,6 +78,27 @@ def _cell(value: Any) -> str:
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{value:,}"
     return str(value)
+
+
+def print_lines(lines: Iterable[tuple[str, str]]) -> None:
+    """Pairs of a title and a text, the texts below each other; on a terminal folded to its width."""
+    pairs = list(lines)
+    width = min(max((len(title) for title, _ in pairs), default=0), MAX_TITLE)
+    room = shutil.get_terminal_size().columns - width - 2 if sys.stdout.isatty() else 0
+    last = ""
+    for title, text in pairs:
+        folded = textwrap.wrap(text, room) if room > 20 else [text]
+        for i, part in enumerate(folded or [""]):
+            shown = title if i == 0 and title != last else ""
+            print(f"{shown:{width}}  {part}")
+        last = title
+
+
+def human_number(value: float | None) -> str | None:
+    """Three digits: 0.00123, 12.3, 1.23e+09."""
+    if value is None:
+        return None
+    return f"{value:.0f}" if float(value).is_integer() and abs(value) < 1e6 else f"{value:.3g}"
 
 
 def human_bytes(count: float) -> str:

@@ -1,14 +1,14 @@
 """Health checks of recordings and shard sets: what will hurt training, by severity.
 
 Of a recording, what its own inspection finds; with an embodiment, also what a sample of its episodes
-shows once they are read and aligned. Of a shard set, its integrity and what its statistics show.
+shows once they are read and aligned as this robot's. Of a shard set, its integrity and what its
+statistics show.
 """
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,42 +17,22 @@ from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment, find
 from hma_data.episode import Clip
 from hma_data.errors import HMAError
-from hma_data.sources.base import detect, open_source
+from hma_data.sources.base import SAMPLE, Inspection, detect, open_source
+from hma_data.sources.findings import SEVERITIES, Finding, Severity
+from hma_data.sources.survey import sampled
+from hma_data.spec import Camera
 
-Severity = Literal["error", "warn", "info"]
-SEVERITIES: tuple[Severity, ...] = ("info", "warn", "error")
 WINDOW = 12  # frames of the model's window, by default
-PAIRS = 16  # neighbouring pictures compared in an episode
+LOOKS = ("blank", "still", "colour", "size")  # checks of pictures, which matter for cameras that are used
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One thing a check found.
-
-    Attributes:
-        check: its name, stable for programs.
-        severity: error: unusable or wrong; warn: look before training; info: good to know.
-        message: what was met, with the numbers.
-        remedy: what to do; may be empty.
-    """
-
-    check: str
-    severity: Severity
-    message: str
-    remedy: str = ""
-
-    def to_json(self) -> dict[str, str]:
-        """Plain values for `--json`."""
-        return asdict(self)
-
-
-def examine(target: str, embodiment: str | None = None, sample: int = 20) -> list[Finding]:
+def examine(target: str, embodiment: str | None = None, sample: int = SAMPLE) -> list[Finding]:
     """Everything the checks find, worst first.
 
     Args:
         target: a recording, or the folder of a shard set.
-        embodiment: id or YAML; needed to look into a recording's episodes.
-        sample: how many episodes are read, evenly spaced.
+        embodiment: id or YAML; with it a recording's episodes are read and aligned as this robot's.
+        sample: how many episodes are looked into, evenly spaced.
 
     Raises:
         RegistryError: no such embodiment.
@@ -70,41 +50,68 @@ def examine(target: str, embodiment: str | None = None, sample: int = 20) -> lis
 def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Finding]:
     try:
         source = open_source(robot.source.format if robot else detect(uri))
-        inspection = source.inspect(uri)
+        inspection = source.inspect(uri, sample)
     except HMAError as fault:
         yield Finding("readable", "error", str(fault))
         return
-    for problem in inspection.problems:
-        yield Finding("recording", "warn", problem)
     if not inspection.episodes:
         yield Finding("episodes", "error", "the recording has no episodes")
     elif robot is None:
-        yield Finding("looked-into", "info", "episodes were not read", "give --embodiment to look into them")
+        yield from inspection.findings
     else:
-        yield from _episodes(uri, robot, sample)
+        yield from _for_robot(inspection, robot)
+        yield from _episodes(uri, robot, sample, inspection)
 
 
-def _episodes(uri: str, robot: Embodiment, sample: int) -> Iterator[Finding]:
+def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
+    """What the inspection found, weighed by what this robot uses; constants are told by its names later."""
+    cameras = {camera.key: camera for camera in robot.cameras}
+    for finding in inspection.findings:
+        if finding.check == "constant":
+            continue
+        if finding.check in LOOKS:
+            camera = cameras.get(finding.key)
+            if camera is None or (finding.check == "colour" and camera.color == "bgr"):
+                continue
+            finding = replace(finding, message=f"camera {camera.name}, {finding.message}")
+        yield replace(finding, severity="warn") if finding.check == "blank" else finding
+    for info in inspection.keys:
+        if info.key in cameras:
+            yield from _as_stated(cameras[info.key], info.shape, info.swapped)
+
+
+def _as_stated(camera: Camera, shape: tuple[int, ...], swapped: str | None) -> Iterator[Finding]:
+    """A camera's size and colours against its YAML."""
+    if camera.size and len(shape) == 3 and tuple(shape[:2]) != tuple(camera.size):
+        said = f"camera {camera.name} is {list(shape[:2])} pixels, its YAML says {list(camera.size)}"
+        yield Finding("size", "info", said, key=camera.key)
+    if camera.color == "bgr" and swapped == "no":
+        said = f"camera {camera.name} is stored in order, red first; its YAML says bgr"
+        yield Finding("colour", "warn", said, "color: rgb", camera.key)
+
+
+def _episodes(uri: str, robot: Embodiment, sample: int, inspection: Inspection) -> Iterator[Finding]:
     source = open_source(robot.source.format)
     names = source.episode_ids(uri)
-    chosen = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, sample).astype(int))]
+    chosen = [names[i] for i in sampled(len(names), sample)]
     refused: Counter[str] = Counter()
     clips: list[Clip] = []
-    pictures: list[Pictured] = []
     for name in chosen:
         try:
             clip = to_clip(source.read(uri, name, robot), robot)
-            pictures += [_pictured(clip, camera.name) for camera in robot.cameras]
+            for camera in robot.cameras:  # that they can be decoded; the inspection looked at them
+                clip.frames_at(camera.name, np.array([len(clip) - 1]))
             clips.append(clip)
         except HMAError as fault:
             refused[fault.fault] += 1
     for reason, count in refused.most_common(5):
         severity: Severity = "warn" if clips else "error"
-        yield Finding("usable", severity, f"{count} of {len(chosen)} episodes looked at: {reason}")
+        said = f"{count} of {len(chosen)} episodes looked at: {reason}"
+        yield Finding("usable", severity, said, numbers={"refused": count, "looked_at": len(chosen)})
     if clips:
-        yield from _times(clips, robot)
-        yield from _numbers(np.concatenate([clip.known_actions for clip in clips]), robot)
-        yield from _looks(pictures, robot)
+        told = any(one.check == "gaps" and one.key == robot.primary_camera.key for one in inspection.findings)
+        yield from (one for one in _times(clips, robot) if not (told and one.check == "gaps"))
+        yield from _numbers(np.concatenate([clip.actions for clip in clips]), robot)
 
 
 def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
@@ -153,63 +160,6 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 def _columns(wrong: NDArray[np.bool_]) -> list[int]:
     return [int(i) for i in np.flatnonzero(wrong.any(axis=0))]
-
-
-@dataclass(frozen=True)
-class Pictured:
-    """What neighbouring pictures of one camera in one episode look like.
-
-    Attributes:
-        still: share of neighbours that are the same, byte for byte.
-        spread: standard deviation over all values.
-        red, blue: means.
-        size: (height, width).
-    """
-
-    camera: str
-    still: float
-    spread: float
-    red: float
-    blue: float
-    size: tuple[int, int]
-
-
-def _pictured(clip: Clip, camera: str) -> Pictured:
-    firsts = np.unique(np.linspace(0, max(len(clip) - 2, 0), PAIRS).astype(int))
-    both = np.unique(np.concatenate([firsts, np.minimum(firsts + 1, len(clip) - 1)]))
-    frames = clip.frames_at(camera, both)
-    place = {int(frame): i for i, frame in enumerate(both)}
-    pairs = [(place[int(i)], place[int(i) + 1]) for i in firsts if int(i) + 1 in place]
-    same = [np.array_equal(frames[a], frames[b]) for a, b in pairs]
-    height, width = frames.shape[1:3]
-    means = frames.mean(axis=(0, 1, 2))
-    share = float(np.mean(same)) if same else 0.0
-    return Pictured(camera, share, float(frames.std()), float(means[0]), float(means[2]), (height, width))
-
-
-def _looks(seen: list[Pictured], robot: Embodiment) -> Iterator[Finding]:
-    for camera in robot.cameras:
-        mine = [look for look in seen if look.camera == camera.name]
-        sizes = sorted({look.size for look in mine})
-        if len(sizes) > 1:
-            yield Finding("size", "warn", f"camera {camera.name} has pictures of several sizes: {sizes}")
-        elif camera.size and sizes and sizes[0] != camera.size:
-            said = f"camera {camera.name} is {list(sizes[0])} pixels, its YAML says {list(camera.size)}"
-            yield Finding("size", "info", said)
-        flat = sum(look.spread < 2 for look in mine)
-        if flat:
-            said = f"camera {camera.name} shows nothing (one colour) in {flat} of {len(mine)} episodes"
-            yield Finding("blank", "warn", said, "is it another camera's key?")
-        still = float(np.mean([look.still for look in mine]))
-        if still > 0.5:
-            said = f"camera {camera.name}: {still:.0%} of neighbouring pictures are the same"
-            yield Finding("still", "warn", said, "the camera may run slower than frequency_hz")
-        red, blue = (float(np.mean([getattr(look, side) for look in mine])) for side in ("red", "blue"))
-        swapped = blue > 1.25 * red if camera.color == "rgb" else red > 1.25 * blue
-        if swapped and max(red, blue) > 20:
-            said = f"camera {camera.name} is bluish (red {red:.0f}, blue {blue:.0f})"
-            other = "bgr" if camera.color == "rgb" else "rgb"
-            yield Finding("colour", "info", said, f"look at a preview: color: {other}?")
 
 
 # -- shard sets

@@ -93,6 +93,7 @@ class KeyInfo:
         constant: whether a vector never changes in the episodes looked at.
         still: which values of a vector never change in them.
         low, high: least and greatest finite number met.
+        swapped: of pictures, whether red and blue changed places: sure, hint, no; None where nobody can tell.
         skew_ms: of a stream with a clock of its own: p50, p95 and max from the first camera's frames.
     """
 
@@ -111,6 +112,7 @@ class KeyInfo:
     low: float | None = None
     high: float | None = None
     skew_ms: tuple[float, float, float] | None = None
+    swapped: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """What the first bytes of a picture, and a column of times, tell of a recording; for `inspect`."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 
 HEAD = 65536  # bytes in which a JPEG's start of frame is looked for
 UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # times since 1970 from, seconds a unit
+TIMES = re.compile(r"(.*/)?(time_?stamps?|times?|stamps?|t)(_s|_sec|_ns)?")
 STEPS_S = (1e-4, 5.0)  # between samples of a recording
 
 
@@ -39,3 +41,25 @@ def seconds_a_unit(values: NDArray[Any]) -> float | None:
             return unit if STEPS_S[0] <= step * unit <= STEPS_S[1] else None
     counted = np.array_equal(times, np.round(times))  # frame numbers, or times in another unit
     return 1.0 if not counted and STEPS_S[0] <= step <= STEPS_S[1] else None
+
+
+def is_times(key: str, shape: tuple[int, ...]) -> bool:
+    """Whether a key of one number a sample is called as a column of times is."""
+    return shape in ((), (1,)) and bool(TIMES.fullmatch(key.lower()))
+
+
+def seconds_of(values: NDArray[Any]) -> NDArray[np.float64] | None:
+    """A column of times (T,) in seconds; None where its unit is not clear.
+
+    Stamps may repeat or go back here; the unit is taken from those in order.
+    """
+    times = np.asarray(values).reshape(-1)
+    if times.dtype.kind not in "fiu" or len(times) < 3:
+        return None
+    rising = np.unique(times[np.isfinite(times)] if times.dtype.kind == "f" else times)
+    unit = seconds_a_unit(rising)
+    if unit is None:
+        return None
+    origin = rising[0]  # taken off before the numbers become floats: nanoseconds since 1970 do not fit one
+    shifted = times - origin if times.dtype.kind == "f" else times.astype(np.int64) - np.int64(origin)
+    return shifted.astype(np.float64) * unit

@@ -1,32 +1,36 @@
 """What is in HDF5 recordings, without an embodiment: keys, lengths, what looks wrong."""
 
 import math
-import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import h5py
 import numpy as np
 
-from hma_data.errors import EpisodeError, HMAError
+from hma_data.errors import HMAError
+from hma_data.sources import clocks, looks
 from hma_data.sources.base import Inspection, KeyInfo
-from hma_data.sources.facts import one_channel, seconds_a_unit
-from hma_data.sources.findings import Finding
+from hma_data.sources.facts import is_times, one_channel, seconds_a_unit, seconds_of
 from hma_data.sources.hdf5 import TEXT_KEYS, as_rgb, encoded, environment, picture_kind
 from hma_data.sources.hdf5_file import OpenFiles, child, explained, numbers, rows, text, walk
 from hma_data.sources.hdf5_layout import WHOLE_FILE, Place, Places
+from hma_data.sources.survey import MAX_VALUES, Survey, sampled
 from hma_data.video import decode_image
 
-LENGTHS, COMPARED, SHOWN = (
-    1_000,
-    50,
-    5,
-)  # episodes whose length is told, whose keys are compared; problems a kind
-_LARGEST_NUMBERS = 10_000_000
-_TIMES = re.compile(r"(.*/)?(time_?stamps?|times?|stamps?|t)(_s|_sec|_ns)?")
+LENGTHS = 1_000  # episodes whose length is told and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
 _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
+
+
+@dataclass
+class _First:
+    """What the first episode that can be read says of all."""
+
+    keys: dict[str, KeyInfo] = field(default_factory=dict)
+    facts: dict[str, str] = field(default_factory=dict)
+    rate: float | None = None
+    robots: Any = None
 
 
 def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspection:
@@ -36,48 +40,93 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
         SourceError: nothing that can be read.
     """
     found = places.all(uri)
-    keys: dict[str, KeyInfo] = {}
-    lengths: list[int] = []
-    problems: list[str] = []
-    facts: dict[str, str] = {}
-    rate: float | None = None
-    robots: Any = None
-    damaged = 0
-    for i, (episode_id, place) in enumerate(found.items()):
-        if i >= LENGTHS:
-            break
+    order = list(found)
+    chosen = {order[i] for i in sampled(len(order), episodes)}
+    survey, first = Survey(len(order)), _First()
+    lengths: dict[str, int] = {}
+    pairs = max(1, looks.PAIRS // len(chosen))
+    for name in [*order[:LENGTHS], *(name for name in order[LENGTHS:] if name in chosen)]:
+        place = found[name]
         try:
             with explained(place):
                 group = places.group(place)
                 sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
-                lengths.append(_length(sizes))
-                if not keys:
-                    said = environment(files.get(place.file))
-                    robots = said.get("robots")
-                    keys = {info.key: info for info in _keys(group, place)}
-                    facts = _facts(group, said, place)
-                    rate, facts["rate"], facts["timestamps"] = _rate(group, said, keys, str(place))
-                    problems += _value_problems(group, keys, str(place))
-                if i < COMPARED:
-                    problems += _shape_problems(episode_id, sizes, keys)
+                lengths[name] = _length(sizes)
+                if not first.keys:
+                    _tell(first, group, files, place)
+                series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
+                survey.lengths(name, lengths[name], sizes, series)
+                if name in chosen:
+                    survey.episode(name)
+                    _look(name, group, first, survey, pairs)
         except HMAError as fault:
-            damaged += 1
-            problems += [str(fault)] if damaged <= SHOWN else []
-    if damaged > SHOWN:
-        problems.append(f"{damaged} of the first {min(len(found), LENGTHS):,} episodes cannot be read")
-    keys = {key: replace(info, hz=rate if info.count else None) for key, info in keys.items()}
+            survey.fault(name, fault)
+    keys = tuple(
+        survey.key(replace(info, hz=first.rate if info.count else None)) for info in first.keys.values()
+    )
+    robots = first.robots
     return Inspection(
         format="hdf5",
         uri=uri,
         episodes=len(found),
-        keys=tuple(keys.values()),
-        frames=sum(lengths) if len(lengths) == len(found) else None,
-        lengths=tuple(lengths),
-        hz=rate,
+        keys=keys,
+        frames=sum(lengths.values()) if len(lengths) == len(found) else None,
+        lengths=tuple(lengths[name] for name in order[:LENGTHS] if name in lengths),
+        hz=first.rate,
         robot=robots if isinstance(robots, str) else ", ".join(map(str, robots)) if robots else None,
-        findings=tuple(Finding("recording", "warn", said) for said in problems),
-        facts={name: fact for name, fact in facts.items() if fact},
+        facts={name: fact for name, fact in first.facts.items() if fact},
+        looked_at=len(survey.looked),
+        findings=survey.findings(keys),
+        checks=survey.checks(),
     )
+
+
+def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: Place) -> None:
+    said = environment(files.get(place.file))
+    first.robots = said.get("robots")
+    first.keys = {info.key: info for info in _keys(group, place)}
+    first.facts = _facts(group, said, place)
+    first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
+
+
+def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: int) -> None:
+    """One episode's numbers, times and some pictures."""
+    for key, info in first.keys.items():
+        item = group.get(key)
+        if not isinstance(item, h5py.Dataset) or not item.shape or not item.shape[0]:
+            continue
+        where = f"{name} {key}"
+        try:
+            with explained(where):
+                if info.kind == "camera":
+                    _pictures(name, key, item, info, survey, pairs)
+                elif info.kind == "vector" and item.size <= MAX_VALUES:
+                    _values(name, key, numbers(group, key, name), info, survey, first.rate)
+        except HMAError as fault:
+            survey.fault(where, fault)
+
+
+def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, stated_hz: float | None) -> None:
+    survey.numbers(name, key, values)
+    seconds = seconds_of(values) if is_times(key, info.shape) else None
+    if seconds is not None:
+        clock = survey.times(name, key, seconds)
+        survey.made.add("rate")
+        for found in clocks.drift(f"{name}: {key}", clock.hz, stated_hz):
+            survey.note(found)
+
+
+def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int) -> None:
+    indices = looks.choose(item.shape[0], pairs)
+    found = rows(item, indices)
+    if info.codec == "raw":
+        survey.pictures(name, key, as_rgb(found), indices, info.codec)
+        return
+    pictures = [
+        decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, indices, strict=True)
+    ]
+    for start, frames in looks.stacked(pictures):
+        survey.pictures(name, key, frames, indices[start : start + len(frames)], info.codec)
 
 
 def _length(sizes: dict[str, int]) -> int:
@@ -129,7 +178,9 @@ def _rate(
 ) -> tuple[float | None, str, str]:
     """Hz, what says so, and the key of times in seconds where there is one."""
     stated, holder = _stated_rate(group, said)
-    key = next((key for key, info in keys.items() if _is_times(key, info)), None)
+    key = next(
+        (key for key, info in keys.items() if info.kind == "vector" and is_times(key, info.shape)), None
+    )
     if key is None:
         return stated, holder, ""
     values = numbers(group, key, where).reshape(-1)
@@ -139,10 +190,6 @@ def _rate(
     measured = 1 / (float(np.median(np.diff(values.astype(np.float64)))) * unit)
     seconds = key if unit == 1.0 else ""
     return (stated, holder, seconds) if stated else (measured, f"measured from {key}", seconds)
-
-
-def _is_times(key: str, info: KeyInfo) -> bool:
-    return info.kind == "vector" and info.shape == (1,) and bool(_TIMES.fullmatch(key.lower()))
 
 
 def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None, str]:
@@ -189,33 +236,3 @@ def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | N
 def _is_grey(shape: tuple[int, ...]) -> bool:
     """Of raw pictures (T, H, W), (T, H, W, C) or (T, C, H, W)."""
     return len(shape) == 3 or (shape[3] if shape[3] in (1, 3, 4) else shape[1]) == 1
-
-
-def _shape_problems(episode_id: str, sizes: dict[str, int], keys: dict[str, KeyInfo]) -> list[str]:
-    """Keys one episode has and another lacks, and series of different length."""
-    length = _length(sizes)
-    series = {key for key, info in keys.items() if info.kind in ("camera", "vector")}
-    odd = [f"{key} has {sizes[key]}" for key in sorted(series & set(sizes)) if sizes[key] != length]
-    absent = sorted(series - set(sizes))
-    found = [f"{episode_id}: has no {', '.join(absent)}"] if absent else []
-    return found + ([f"{episode_id}: of {length} frames, {', '.join(odd[:8])}"] if odd else [])
-
-
-def _value_problems(group: h5py.Group, keys: dict[str, KeyInfo], where: str) -> list[str]:
-    """Numbers of the first episode that are not finite, and actions that never change."""
-    found = []
-    for key, info in keys.items():
-        if info.kind != "vector" or np.prod(info.shape, dtype=float) * (info.count or 0) > _LARGEST_NUMBERS:
-            continue
-        try:
-            values = numbers(group, key, where).reshape(info.count or 0, -1)
-        except EpisodeError as fault:
-            found.append(str(fault))
-            continue
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
-            found.append(f"{where}: {key} holds values that are not finite")
-        if key.rsplit("/", 1)[-1] in ("action", "actions") and len(values) > 1:
-            still = np.flatnonzero((values == values[0]).all(axis=0))
-            if len(still):
-                found.append(f"{where}: {key} never changes in dims {', '.join(map(str, still))}")
-    return found

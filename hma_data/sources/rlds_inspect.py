@@ -3,55 +3,104 @@
 import logging
 import math
 
-import numpy as np
-
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.sources import looks
 from hma_data.sources.base import EpisodeRef, Inspection, KeyInfo
+from hma_data.sources.facts import is_times, seconds_of
 from hma_data.sources.findings import Finding
 from hma_data.sources.rlds_steps import MAX_VECTOR, Steps, is_camera
+from hma_data.sources.survey import Survey, sampled
 from hma_data.sources.tfds_folder import Folder, open_folder
 
-INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20
+INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20  # whose lengths are told
 
 log = logging.getLogger(__name__)
 
 
 def inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
-    """See Source.inspect. Reads up to 1,000 episodes or 256 MiB.
+    """See Source.inspect. Lengths are those of up to 1,000 episodes or 256 MiB.
 
     Raises:
         SourceError: nothing readable there.
     """
     folder = open_folder(uri)
-    lengths: list[int] = []
-    problems = list(folder.problems)
-    odd: dict[str, str] = {}
-    first: Steps | None = None
-    budget = INSPECTED_BYTES
-    for ref in refs[:INSPECTED_EPISODES]:
-        if budget < 0:
-            break
-        try:
-            steps = Steps(folder, folder.example(ref.id)[0], ref.id)
-            budget -= steps.example.size
-            lengths.append(steps.count)
-            odd = oddities(steps) | odd
-            first = first or steps
-        except EpisodeError as fault:
-            problems.append(str(fault))
+    survey = Survey(len(refs))
+    for problem in folder.problems:
+        survey.note(Finding("files", "warn", problem))
+    chosen = sampled(len(refs), episodes)
+    lengths, first = _survey(folder, refs, chosen, survey)
     if first is None:
-        raise SourceError(uri, f"holds no readable episode: {problems[-1]}", "copy its files again")
-    seen = len(lengths) == len(refs)
+        raise SourceError(uri, f"holds no readable episode: {_why(survey, folder)}", "copy its files again")
+    keys = tuple(survey.key(key_info(first, key)) for key in folder.step_features)
     return Inspection(
         format="rlds",
         uri=uri,
         episodes=len(refs),
-        keys=tuple(key_info(first, key) for key in folder.step_features),
-        frames=sum(lengths) if seen else None,
-        lengths=tuple(lengths),
-        findings=tuple(Finding("recording", "warn", said) for said in (*problems, *odd.values())),
+        keys=keys,
+        frames=sum(lengths) if len(lengths) == len(refs) else None,
+        lengths=lengths,
         facts=facts(folder),
+        looked_at=len(survey.looked),
+        findings=survey.findings(keys),
+        checks=survey.checks(),
     )
+
+
+def _survey(
+    folder: Folder, refs: list[EpisodeRef], chosen: list[int], survey: Survey
+) -> tuple[tuple[int, ...], Steps | None]:
+    """Lengths of the episodes read, and the first of them; those chosen are looked into."""
+    wanted = set(chosen)
+    others = (
+        [] if folder.remote else [i for i in range(min(len(refs), INSPECTED_EPISODES)) if i not in wanted]
+    )
+    lengths: dict[int, int] = {}
+    first: Steps | None = None
+    budget = INSPECTED_BYTES
+    pairs = max(1, looks.PAIRS // max(len(chosen), 1))
+    for i in [*chosen, *others]:
+        if budget < 0 and i not in wanted:
+            break
+        name = refs[i].id
+        try:
+            steps = Steps(folder, folder.example(name)[0], name)
+        except EpisodeError as fault:
+            survey.fault(name, fault)
+            continue
+        budget -= steps.example.size
+        lengths[i] = steps.count
+        first = first or steps
+        if i in wanted:
+            survey.episode(name)
+            _look(steps, survey, pairs)
+    if budget < 0:
+        lengths = {i: lengths[i] for i in sorted(lengths)}
+    return tuple(lengths[i] for i in sorted(lengths)), first
+
+
+def _look(steps: Steps, survey: Survey, pairs: int) -> None:
+    """One episode's numbers, times and some pictures."""
+    for key, feature in steps.features.items():
+        try:
+            if is_camera(feature):
+                indices = looks.choose(steps.count, pairs)
+                decode = steps.decoder(key)
+                for start, frames in looks.stacked([decode(int(i)) for i in indices]):
+                    chosen = indices[start : start + len(frames)]
+                    survey.pictures(steps.name, key, frames, chosen, _codec(steps, key))
+            elif feature.kind == "number" and 0 < (feature.width or 0) <= MAX_VECTOR:
+                values = steps.numbers(key)
+                survey.numbers(steps.name, key, values)
+                seconds = seconds_of(values) if is_times(key, values.shape[1:]) else None
+                if seconds is not None:
+                    survey.times(steps.name, key, seconds)
+        except EpisodeError as fault:
+            survey.fault(f"{steps.name} {key}", fault)
+
+
+def _why(survey: Survey, folder: Folder) -> str:
+    said = [str(one) for one in survey.findings(())]
+    return said[-1] if said else f"{folder.uri} is empty"
 
 
 def facts(folder: Folder) -> dict[str, str]:
@@ -69,7 +118,7 @@ def key_info(steps: Steps, key: str) -> KeyInfo:
     """One key as this episode holds it."""
     feature = steps.features[key]
     shape = tuple(size or 0 for size in (*feature.nesting[1:], *feature.shape))
-    kind, codec, constant = "other", None, False
+    kind, codec = "other", None
     try:
         if is_camera(feature):
             kind, shape, codec = "camera", steps.decoder(key)(0).shape, _codec(steps, key)
@@ -78,13 +127,11 @@ def key_info(steps: Steps, key: str) -> KeyInfo:
         elif feature.kind == "text":
             kind = "text"
         elif feature.kind == "number":
-            values = steps.numbers(key)
-            shape = values.shape[1:]
-            constant = len(values) > 1 and bool((values == values[0]).all())
+            shape = steps.numbers(key).shape[1:]
             kind = "vector" if math.prod(shape) <= MAX_VECTOR else "other"
     except EpisodeError as fault:
         log.warning("%s", fault)  # listed as features.json states it
-    return KeyInfo(key, kind, shape, feature.dtype, codec=codec, count=steps.count, constant=constant)
+    return KeyInfo(key, kind, shape, feature.dtype, codec=codec, count=steps.count)
 
 
 def _codec(steps: Steps, key: str) -> str:
@@ -95,23 +142,3 @@ def _codec(steps: Steps, key: str) -> str:
     if head.startswith(b"\xff\xd8"):
         return "jpeg"
     return "png" if head.startswith(b"\x89PNG") else steps.features[key].codec or "unknown"
-
-
-def oddities(steps: Steps) -> dict[str, str]:
-    """What looks wrong in an episode that can be read: key -> a sentence."""
-    found = {}
-    for key, feature in steps.features.items():
-        if (
-            feature.kind != "number"
-            or feature.dtype[:5] != "float"
-            or not 0 < (feature.width or 0) <= MAX_VECTOR
-        ):
-            continue
-        try:
-            bad = ~np.isfinite(steps.numbers(key))
-        except EpisodeError as fault:
-            found[key] = str(fault)
-            continue
-        if bad.any():
-            found[key] = f"{steps.name}: {key} is not finite at step {int(np.argwhere(bad)[0, 0])}"
-    return found

@@ -1,9 +1,10 @@
 """What `hma inspect` tells of bags: topics with rates and jitter, keys as a YAML would name them.
 
-Every bag is counted by its index; the first that can be read is measured message by message, up
-to a limit.
+Every bag is counted by its index. A sample of them is read message by message, up to a limit over
+all: the first that can be read tells the keys, each adds its times and numbers.
 """
 
+from array import array
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,20 +14,44 @@ import numpy as np
 
 from hma_data.episode import Floats
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.sources import looks
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.fields import Field, parse_key
 from hma_data.sources.bags.messages import child, decode, field_names, is_list, is_message, numbers
 from hma_data.sources.bags.pictures import VIDEO, codec, is_grey, picture_kind
 from hma_data.sources.bags.streams import camera_stream
 from hma_data.sources.bags.track import Track
 from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
+from hma_data.sources.clocks import Clock, clock_of, skew
 from hma_data.sources.findings import Finding
+from hma_data.sources.survey import Survey, sampled
 
-MAX_BYTES = 1 << 30  # of messages measured
+MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
 MAX_LENGTHS = 1000
+MAX_FIELDS = 64  # numeric keys of a topic whose values are looked at
+MAX_WIDTH = 4096  # wider than this is a map or a cloud, no action or state
+LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # no streams
 APART_S = 1.0  # header stamps further than this from receive times are worth a word
-PAUSE, PAUSE_S = 10, 0.5  # median intervals, and seconds
+
+
+@dataclass
+class _Values:
+    """The numbers at one key, message by message; those of another width than the first are left out."""
+
+    place: Field
+    width: int = 0
+    held: array[float] = field(default_factory=lambda: array("d"))
+
+    def add(self, message: Any, where: str) -> None:
+        try:
+            found = numbers(self.place.value(message, where))
+        except (EpisodeError, TypeError):
+            return  # a list that is empty or shorter in this message
+        self.width = self.width or len(found)
+        if found and len(found) == self.width:
+            self.held.extend(found)
 
 
 @dataclass
@@ -38,14 +63,34 @@ class _Topic:
     sample: Any = None
     named: int = 0
     fault: str = ""
-    problems: list[str] = field(default_factory=list)
+    values: list[_Values] = field(default_factory=list)
 
-    def look_at(self, message: Any) -> None:
+    def look_at(self, message: Any, where: str) -> None:
         """Two publishers of one JointState topic name different joints."""
         named = child(message, "name") if "name" in field_names(message) else ""
         count = len(named) if is_list(named) else 0
-        if self.sample is None or count > self.named:
+        first = self.sample is None
+        if first or count > self.named:
             self.sample, self.named = message, count
+        if first and not picture_kind(self.track.channels[0].type):
+            topic = self.track.topic
+            keys = [key for key in _values(topic, message) if key.kind == "vector"][:MAX_FIELDS]
+            narrow = [key.key for key in keys if key.shape[0] <= MAX_WIDTH]
+            self.values = [_Values(parse_key(key, (topic,), where)) for key in narrow]
+        for value in self.values:
+            value.add(message, where)
+
+
+@dataclass
+class _Budget:
+    """What may still be read."""
+
+    bytes: int = MAX_BYTES
+    messages: int = MAX_MESSAGES
+
+    @property
+    def spent(self) -> bool:
+        return self.bytes < 0 or self.messages < 0
 
 
 def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspection:
@@ -54,55 +99,63 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
     Raises:
         SourceError: none of them can be read.
     """
+    survey = Survey(len(bags), alone=len(bags) == 1, by_field=True)
     counted: dict[str, Counter[Channel]] = {}
-    faults: list[str] = []
-    measured: tuple[Bag, dict[str, _Topic], bool] | None = None
+    opened: dict[str, Bag] = {}
     for name, path in bags.items():
         try:
-            bag = Bag(path, root)
-            counted[name] = bag.counts()
-            if measured is None and counted[name].total():
-                measured = (bag, *_measure(bag))
+            opened[name] = Bag(path, root)
+            counted[name] = opened[name].counts()
         except EpisodeError as fault:
-            counted.pop(name, None)
-            faults.append(str(fault))
-    if measured is None:
-        detail = faults[0] if faults else "no bag holds a message"
-        raise SourceError(uri, f"nothing to inspect: {detail}")
-    return _inspection(uri, measured, counted, len(bags), faults)
+            survey.fault(name, fault)
+    full = [name for name in counted if counted[name].total()]
+    for name in set(counted) - set(full):
+        survey.note(Finding("readable", "info", f"{opened[name].path}: holds no messages"))
+    telling: _Telling | None = None
+    budget = _Budget()
+    for name in [full[i] for i in sampled(len(full), episodes)] if full else []:
+        try:
+            looked = _Telling(name, opened[name], counted[name], survey, budget)
+        except EpisodeError as fault:
+            survey.fault(name, fault)
+            continue
+        survey.episode(name)
+        telling = telling or looked
+        if budget.spent:
+            break
+    if telling is None:
+        faults = [str(one) for one in survey.findings(()) if one.severity != "info"]
+        raise SourceError(uri, f"nothing to inspect: {faults[0] if faults else 'no bag holds a message'}")
+    return _inspection(uri, telling, counted, survey, len(bags), budget)
 
 
 def _inspection(
     uri: str,
-    measured: tuple[Bag, dict[str, _Topic], bool],
+    telling: "_Telling",
     counted: dict[str, Counter[Channel]],
+    survey: Survey,
     episodes: int,
-    faults: list[str],
+    budget: _Budget,
 ) -> Inspection:
-    bag, topics, whole = measured
-    counts = bag.counts()
-    for topic in topics.values():
-        topic.count = sum(count for channel, count in counts.items() if channel.topic == topic.track.topic)
-    keys = [key for topic in topics.values() for key in _keys(bag, topic)]
+    keys = tuple(survey.key(key) for key in telling.keys)
     cameras = [key for key in keys if key.kind == "camera"]
     lengths = tuple(_length(counts, cameras) for counts in counted.values()) if cameras else ()
-    facts = {"measured": str(bag.path)}
-    if not whole:
+    facts = {"keys and rates of": str(telling.bag.path)}
+    if budget.spent:
         facts["measured up to"] = f"{MAX_MESSAGES:,} messages or {MAX_BYTES >> 20:,} MiB; counts are whole"
     return Inspection(
         format="rosbag",
         uri=uri,
         episodes=episodes,
-        keys=tuple(keys),
-        frames=sum(lengths) if cameras and not faults else None,
+        keys=keys,
+        frames=sum(lengths) if cameras and len(counted) == episodes else None,
         lengths=lengths[:MAX_LENGTHS],
         hz=cameras[0].hz if cameras else None,
-        robot=bag.notes().get("robot") or None,
-        findings=tuple(
-            Finding("recording", "warn", said)
-            for said in (*faults, *(line for topic in topics.values() for line in topic.problems))
-        ),
+        robot=telling.bag.notes().get("robot") or None,
         facts=facts,
+        looked_at=len(survey.looked),
+        findings=survey.findings(keys),
+        checks=survey.checks(),
     )
 
 
@@ -110,83 +163,120 @@ def _length(counts: Counter[Channel], cameras: list[KeyInfo]) -> int:
     return sum(count for channel, count in counts.items() if channel.topic == cameras[0].key)
 
 
-def _measure(bag: Bag) -> tuple[dict[str, _Topic], bool]:
-    """Topics by name, and whether the bag was read to its end."""
-    topics = {name: _Topic(Track(name)) for name in sorted({channel.topic for channel in bag.counts()})}
-    read = messages = 0
-    for place, record in bag.records():
-        read, messages = read + len(record.data), messages + 1
-        if read > MAX_BYTES or messages > MAX_MESSAGES:
-            return topics, False
-        topic = topics.setdefault(record.channel.topic, _Topic(Track(record.channel.topic)))
-        try:
-            message = None if topic.fault else decode(record.channel, record.data, str(bag.path))
-            topic.track.add(record.channel, record.log_ns, place, message)
-            topic.look_at(message)
-        except EpisodeError as fault:
-            topic.fault = fault.fault
-            topic.track.add(record.channel, record.log_ns, place, None)
-    return topics, True
+class _Telling:
+    """One bag, read once: its keys, and into the survey its numbers, times, skew and some pictures.
 
-
-# -- times
-
-
-def _times(topic: _Topic) -> Floats:
-    """Sorted by receipt; faults in them are noted as problems."""
-    track, name = topic.track, topic.track.topic
-    if topic.fault:
-        topic.problems.append(topic.fault)
-    times = track.seconds("header")[track.order()]
-    steps = np.diff(times)
-    twice, back = int(np.sum(steps == 0)), int(np.sum(steps < 0))
-    if twice:
-        topic.problems.append(f"{name}: {twice} stamps are the one before again")
-    if back:
-        topic.problems.append(f"{name}: {back} stamps go back in time; stamp: receive would not")
-    if track.frozen:
-        topic.problems.append(f"{name}: header stamps never move; receive times are used")
-    if track.stamped:
-        apart = float(np.median(np.abs(track.seconds("header") - track.seconds("receive"))))
-        if apart > APART_S:
-            topic.problems.append(f"{name}: header stamps are {apart:.3g} s from receive times")
-    period = float(np.median(steps)) if len(steps) else 0.0
-    if period > 0 and steps.max() > max(PAUSE * period, PAUSE_S):
-        at = int(np.argmax(steps))
-        topic.problems.append(f"{name}: pauses for {steps[at]:.3g} s after {times[at] - times.min():.3g} s")
-    return times
-
-
-def _rate(times: Floats) -> tuple[float | None, float | None]:
-    """Hz and jitter_ms, the standard deviation of the intervals.
-
-    The rate is of the median interval, which a pause does not change; of the mean one where bursts
-    make them differ by half.
+    Raises:
+        EpisodeError: the bag is damaged.
     """
-    steps = np.diff(times)
-    if len(steps) < 2 or steps.sum() <= 0:
-        return None, None
-    median, mean = float(np.median(steps)), float(np.mean(steps))
-    period = median if 1 / 1.5 < median / mean < 1.5 else mean
-    return 1 / period, float(np.std(steps) * 1e3)
+
+    def __init__(
+        self, name: str, bag: Bag, counts: Counter[Channel], survey: Survey, budget: _Budget
+    ) -> None:
+        self.bag, self._name, self._survey = bag, name, survey
+        self._frozen: list[str] = []
+        self._topics = {topic: _Topic(Track(topic)) for topic in sorted({at.topic for at in counts})}
+        for channel, count in counts.items():
+            self._topics[channel.topic].count += count
+        self._measure(budget)
+        self.keys = [key for topic in self._topics.values() for key in self._keys(topic)]
+        if self._frozen:
+            said = f"{', '.join(self._frozen[:8])}: header stamps never move; receive times are used"
+            survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
+        self._skew()
+
+    def _measure(self, budget: _Budget) -> None:
+        where = str(self.bag.path)
+        for place, record in self.bag.records():
+            budget.bytes, budget.messages = budget.bytes - len(record.data), budget.messages - 1
+            if budget.spent:
+                return
+            topic = self._topics.setdefault(record.channel.topic, _Topic(Track(record.channel.topic)))
+            try:
+                message = None if topic.fault else decode(record.channel, record.data, where)
+                topic.track.add(record.channel, record.log_ns, place, message)
+                if message is not None:
+                    topic.look_at(message, where)
+            except EpisodeError as fault:
+                topic.fault = fault.fault
+                topic.track.add(record.channel, record.log_ns, place, None)
+
+    def _keys(self, topic: _Topic) -> list[KeyInfo]:
+        if not len(topic.track):
+            return [KeyInfo(topic.track.topic, "other", (), "", count=0)]
+        if topic.fault:
+            self._survey.note(Finding("readable", "warn", topic.fault, key=topic.track.topic))
+        stated = topic.track.channels[0]
+        kind = picture_kind(stated.type)
+        times = topic.track.seconds("header")[topic.track.order()]
+        clock = clock_of(times) if topic.track.topic in LOGS else self._times(topic, times, bool(kind))
+        found: list[KeyInfo] = []
+        if not topic.fault:
+            found = [self._camera(topic, kind)] if kind else _values(topic.track.topic, topic.sample)
+        found = found or [KeyInfo(topic.track.topic, "other", (), stated.type or stated.encoding)]
+        for value in topic.values:
+            if value.held:
+                read = np.frombuffer(value.held, np.float64).reshape(-1, value.width)
+                self._survey.numbers(self._name, value.place.key, read)
+        about = _about(topic, times, stated.type or stated.encoding)
+        return [
+            replace(key, hz=clock.hz, count=topic.count, jitter_ms=clock.jitter_ms, topic=about)
+            for key in found
+        ]
+
+    def _times(self, topic: _Topic, times: Floats, camera: bool) -> Clock:
+        """Into the survey, with what only messages with two times can show."""
+        track, name = topic.track, topic.track.topic
+        self._survey.made.add("stamps")
+        self._frozen += [name] if track.frozen else []
+        if track.stamped:
+            apart = float(np.median(np.abs(track.seconds("header") - track.seconds("receive"))))
+            if apart > APART_S:
+                said = f"{name}: header stamps are {apart:.3g} s from receive times"
+                self._survey.note(Finding("stamps", "warn", said, key=name, numbers={"seconds": apart}))
+        return self._survey.times(self._name, name, times, camera)
+
+    def _camera(self, topic: _Topic, kind: str) -> KeyInfo:
+        name = topic.track.topic
+        stored = topic.track.codec if kind == VIDEO else codec(topic.sample, kind)
+        try:
+            stream = camera_stream(self.bag, topic.track, "receive")
+            keyframes = topic.track.keyframes() if kind == VIDEO else None
+            indices = looks.choose(len(stream.timestamps), _PAIRS, _starts(keyframes))
+            frames = stream.frames(indices)
+        except EpisodeError as fault:
+            self._survey.note(Finding("readable", "warn", f"{name}: {fault.fault}", key=name))
+            return KeyInfo(name, "other", (), topic.track.channels[0].type)
+        self._survey.pictures(self._name, name, frames, indices, stored)
+        channels = 1 if is_grey(topic.sample, kind) else 3
+        return KeyInfo(name, "camera", (*frames.shape[1:3], channels), "uint8", codec=stored)
+
+    def _skew(self) -> None:
+        """Of each stream that a YAML could name, from the frames of the first camera."""
+        topics = {key.topic.name: key.kind for key in self.keys if key.topic and key.kind in _STREAMS}
+        cameras = [name for name, kind in topics.items() if kind == "camera"]
+        if not cameras:
+            return
+        primary = self._topics[cameras[0]].track.seconds("header")
+        period_s = float(np.median(np.diff(np.sort(primary)))) if len(primary) > 1 else 0.0
+        for name in topics:
+            if name != cameras[0]:
+                found = skew(self._topics[name].track.seconds("header"), primary)
+                self._survey.skew(name, found, period_s)
+
+
+_STREAMS, _PAIRS = ("camera", "vector"), 4
+
+
+def _starts(keyframes: Any) -> Any:
+    """For each frame that of the keyframe before it, counted from the first; None where it is not known."""
+    if keyframes is None or not keyframes.any():
+        return None
+    shown = keyframes[int(np.argmax(keyframes)) :]
+    return np.maximum.accumulate(np.where(shown, np.arange(len(shown)), 0))
 
 
 # -- keys
-
-
-def _keys(bag: Bag, topic: _Topic) -> list[KeyInfo]:
-    if not len(topic.track):
-        return [KeyInfo(topic.track.topic, "other", (), "", count=0)]
-    times = _times(topic)
-    hz, jitter_ms = _rate(times)
-    stated = topic.track.channels[0]
-    kind = picture_kind(stated.type)
-    found: list[KeyInfo] = []
-    if not topic.fault:
-        found = [_camera(bag, topic, kind)] if kind else _values(topic.track.topic, topic.sample)
-    found = found or [KeyInfo(topic.track.topic, "other", (), stated.type or stated.encoding)]
-    about = _about(topic, times, stated.type or stated.encoding)
-    return [replace(key, hz=hz, count=topic.count, jitter_ms=jitter_ms, topic=about) for key in found]
 
 
 def _about(topic: _Topic, times: Floats, kind: str) -> TopicInfo:
@@ -201,18 +291,6 @@ def _about(topic: _Topic, times: Floats, kind: str) -> TopicInfo:
         delay_ms=delay_ms,
         goes_back=bool(len(steps) and steps.min() < 0),
     )
-
-
-def _camera(bag: Bag, topic: _Topic, kind: str) -> KeyInfo:
-    name = topic.track.topic
-    try:
-        height, width = camera_stream(bag, topic.track, "receive").frames([0]).shape[1:3]
-    except EpisodeError as fault:
-        topic.problems.append(f"{name}: {fault.fault}")
-        return KeyInfo(name, "other", (), topic.track.channels[0].type)
-    stored = topic.track.codec if kind == VIDEO else codec(topic.sample, kind)
-    channels = 1 if is_grey(topic.sample, kind) else 3
-    return KeyInfo(name, "camera", (height, width, channels), "uint8", codec=stored)
 
 
 def _values(key: str, value: Any) -> list[KeyInfo]:
