@@ -2,7 +2,8 @@
 
 A first pass over the packets (nothing is decoded) gives the exact time of every frame and where
 the keyframes are. Reading then keeps one decoder positioned: it decodes on when the next frame
-asked for is ahead within its group, and seeks when it lies behind or past another keyframe.
+asked for is ahead within its group, and seeks when it lies behind or past another keyframe. A file
+whose keyframes or times are not what the container says is decoded from its beginning.
 
 PyAV's wheel brings its codecs, AV1 among them. OpenCV is not used here: it returns no frames
 for AV1 and no error.
@@ -30,6 +31,9 @@ _OPTIONS = {
     "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,gif,mpeg,mpegts,flv,ogg,asf",
 }
 
+_REFRESHED = ("h264", "hevc")  # codecs whose "keyframe" may be a frame from which a refresh begins
+_INTRA = 1  # FFmpeg's AV_PICTURE_TYPE_I
+
 
 @dataclass(frozen=True)
 class FrameTable:
@@ -43,6 +47,8 @@ class FrameTable:
         width, height: pixels, as stored.
         codec: h264, av1, hevc, vp9, …
         hz: rate the file states; None when it states none.
+        counted: the container's times are those of packets, not of frames (B-frames in AVI), so that
+            frames are known by the order they are decoded in alone.
     """
 
     times: Floats
@@ -53,6 +59,7 @@ class FrameTable:
     height: int
     codec: str
     hz: float | None
+    counted: bool = False
 
     def __len__(self) -> int:
         return len(self.times)
@@ -76,6 +83,7 @@ def _cached_table(path: str, size: int, changed: int) -> FrameTable:
     with opened(path) as (container, stream):
         shown: list[int] = []
         keyframes: list[tuple[int, int]] = []
+        delays: set[int | None] = set()
         for packet in container.demux(stream):
             if packet.size == 0:
                 continue
@@ -84,14 +92,18 @@ def _cached_table(path: str, size: int, changed: int) -> FrameTable:
                 raise EpisodeError(path, "its frames carry no times", "rewrite it as MP4")
             if packet.is_corrupt:
                 raise EpisodeError(path, f"is damaged or cut off at frame {len(shown)}")
+            delays.add(None if packet.pts is None or packet.dts is None else packet.pts - packet.dts)
             if packet.is_keyframe:
                 keyframes.append((stamp, stamp if packet.dts is None else packet.dts))
             if not packet.is_discard:  # an edit list may hide frames, which are decoded but not shown
                 shown.append(stamp)
-        return _table(path, stream, shown, keyframes)
+        counted = bool(stream.codec_context.has_b_frames) and len(delays) == 1
+        return _table(path, stream, shown, keyframes, counted)
 
 
-def _table(path: str, stream: Any, shown: list[int], keyframes: list[tuple[int, int]]) -> FrameTable:
+def _table(
+    path: str, stream: Any, shown: list[int], keyframes: list[tuple[int, int]], counted: bool
+) -> FrameTable:
     stamps = np.sort(np.array(shown, np.int64))
     if not len(stamps) or not keyframes:
         raise EpisodeError(path, "has no frames")
@@ -109,6 +121,7 @@ def _table(path: str, stream: Any, shown: list[int], keyframes: list[tuple[int, 
         height=stream.height,
         codec=stream.codec.canonical_name,
         hz=float(rate) if rate else None,
+        counted=counted,
     )
 
 
@@ -128,6 +141,8 @@ class VideoFile:
         self._container: Any = None
         self._decoder: Iterator[Any] = iter(())
         self._next = 0  # index of the frame the decoder gives next
+        self._entry = -1  # index of the keyframe that was last sought
+        self._counts, self._seeks = False, True  # whether frames are counted; whether keyframes are sought
         self._reformatter: Any = None
 
     def __len__(self) -> int:
@@ -171,6 +186,29 @@ class VideoFile:
             self.close()
 
     def _picture(self, index: int) -> Images:
+        try:
+            frame = self._frame(index)
+        except EpisodeError:
+            if self._counts:
+                raise
+            self._count()
+            frame = self._frame(index)
+        if frame.is_corrupt:
+            raise EpisodeError(self.path, f"frame {index} is damaged")
+        return self._to_rgb(frame)
+
+    def _count(self) -> None:
+        """From here on know frames by their order alone, the file having as many as its packets tell."""
+        self._reopen()
+        given = sum(1 for _ in self._decoder)
+        if given != len(self):
+            raise EpisodeError(self.path, f"gives {given} frames, its packets tell of {len(self)}")
+        self._counts, self._seeks = True, False
+        self._reopen()
+
+    def _frame(self, index: int) -> Any:
+        if self.table.counted and not self._counts:
+            self._count()
         self._position(index)
         frame = self._decode_up_to(index)
         if frame is None:  # the file's seek went past it: once more from the beginning
@@ -178,13 +216,14 @@ class VideoFile:
             frame = self._decode_up_to(index)
         if frame is None:
             raise EpisodeError(self.path, f"frame {index} of {len(self)} cannot be decoded")
-        if frame.is_corrupt:
-            raise EpisodeError(self.path, f"frame {index} is damaged")
-        return self._to_rgb(frame)
+        return frame
 
     def _decode_up_to(self, index: int) -> Any:
         for frame in self._decoder:
-            found = self._index_of(frame)
+            found = self._next if self._counts else self._index_of(frame)
+            if found == self._entry and self.table.codec in _REFRESHED and frame.pict_type != _INTRA:
+                self._seeks = False  # a refresh spread over many frames: what follows is not whole
+                return None
             self._next = found + 1
             if found >= index:
                 return frame if found == index else None
@@ -194,11 +233,14 @@ class VideoFile:
         """Bring the decoder before that frame."""
         if self._container is None or self._process != os.getpid():
             self._reopen()
-        if index < self._next or self.table.keys[index] > self._next:
+        if not self._seeks:
+            if index < self._next:
+                self._reopen()
+        elif index < self._next or self.table.keys[index] > self._next:
             stream = self._container.streams.best("video")
             self._container.seek(int(self.table.seek_stamps[index]), stream=stream, backward=True)
             self._decoder = self._container.decode(stream)
-            self._next = int(self.table.keys[index])
+            self._next = self._entry = int(self.table.keys[index])
 
     def _reopen(self) -> None:
         from av.video.reformatter import VideoReformatter
@@ -208,7 +250,7 @@ class VideoFile:
         stream = _video_stream(self._container, str(self.path))
         stream.codec_context.thread_count = self._threads
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
-        self._decoder, self._next = self._container.decode(stream), 0
+        self._decoder, self._next, self._entry = self._container.decode(stream), 0, -1
         self._reformatter = VideoReformatter()  # one for all frames: making it costs a third of the time
 
     def _index_of(self, frame: Any) -> int:
@@ -242,7 +284,7 @@ def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
 def _open(path: str) -> Any:
     import av
 
-    return av.open(path, options=_OPTIONS)
+    return av.open(path, container_options=_OPTIONS)  # given to streams too, PyAV crashes on FLV
 
 
 def _video_stream(container: Any, path: str) -> Any:
