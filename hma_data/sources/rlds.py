@@ -16,6 +16,7 @@ from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Pictures, Signal, rate_times
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
+from hma_data.sources.fetching import info, mark
 from hma_data.sources.rlds_steps import (
     Steps,
     described,
@@ -29,10 +30,9 @@ from hma_data.sources.rlds_steps import (
 )
 from hma_data.sources.tf_example import Example
 from hma_data.sources.tfds_folder import Folder, Shard, episode_id, open_folder
-from hma_data.sources.tfrecord import framing, read_record
 from hma_data.spec import Component, Vector
 
-SAMPLED_SHARDS = 16  # whose first record is read to estimate lengths
+SAMPLED_SHARDS, SAMPLED_REMOTE = 16, 2  # whose first record is read to estimate lengths
 
 log = logging.getLogger(__name__)
 
@@ -132,11 +132,10 @@ def _refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float
 
 def _remote_refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
     """Without a look at each record, from what the file system knows of the shard."""
-    info = folder.files.info(shard.path)
-    marks = [str(info.get(key)) for key in ("size", "etag", "ETag", "md5Hash", "crc32c")]
-    fingerprint = hashlib.sha256(" ".join(marks).encode()).hexdigest()[:24]
+    found = info(folder.files, shard.path)
+    fingerprint = hashlib.sha256(mark(found).encode()).hexdigest()[:24]
     records = shard.records or 1
-    frames = max(1, round(rate * info["size"] / records))
+    frames = max(1, round(rate * found["size"] / records))
     return [
         EpisodeRef(episode_id(split, shard.first + position), frames, own, fingerprint)
         for position in range(records)
@@ -147,13 +146,13 @@ def steps_per_byte(folder: Folder, split: str) -> float:
     """Steps a byte of record, from the first record of some of a split's shards; 0 when none can be read."""
     shards = folder.splits[split]
     steps = size = 0
-    for shard in shards[:: math.ceil(len(shards) / SAMPLED_SHARDS)]:
+    sampled = SAMPLED_REMOTE if folder.remote else SAMPLED_SHARDS
+    for shard in shards[:: math.ceil(len(shards) / sampled)]:
         name = episode_id(split, shard.first)
         try:
-            frames = framing(folder.files, shard.path, limit=1)
-            if not len(frames):
+            if not len(folder.framing(shard, 1)):
                 continue
-            data = read_record(folder.files, shard.path, frames, 0, name)
+            data = folder.records(shard).read(0, name)
             steps += Steps(folder, Example(data, name), name).count
             size += len(data)
         except EpisodeError as fault:

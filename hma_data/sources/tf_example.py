@@ -17,7 +17,7 @@ KINDS = {1: "bytes", 2: "float", 3: "int"}  # field numbers of Feature's lists
 Span = tuple[int, int]
 
 
-class _WireError(ValueError):
+class WireError(ValueError):
     """The bytes are not the protobuf message they should be."""
 
 
@@ -37,7 +37,7 @@ class Example:
         self._data, self._where = data, where
         try:
             self._lists = dict(_features(data))
-        except (_WireError, UnicodeDecodeError) as fault:
+        except (WireError, UnicodeDecodeError) as fault:
             raise EpisodeError(where, f"is not a tf.train.Example: {fault}") from fault
 
     def __contains__(self, name: str) -> bool:
@@ -89,7 +89,7 @@ class Example:
     def _varints(self, name: str, start: int, stop: int) -> NDArray[np.int64]:
         try:
             return varints(np.frombuffer(self._data, np.uint8, stop - start, start))
-        except _WireError as fault:
+        except WireError as fault:
             raise EpisodeError(self._where, f"{name}: {fault}") from fault
 
     def _list(self, name: str) -> tuple[str, Span]:
@@ -102,8 +102,8 @@ class Example:
         if found not in (kind, "empty"):
             raise EpisodeError(self._where, f"{name} is a list of {found}, not of {kind}")
         try:
-            return [(wire, span) for number, wire, span in _fields(self._data, start, stop) if number == 1]
-        except _WireError as fault:
+            return [(wire, span) for number, wire, span in fields(self._data, start, stop) if number == 1]
+        except WireError as fault:
             raise EpisodeError(self._where, f"{name}: {fault}") from fault
 
 
@@ -117,11 +117,11 @@ def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:
     if len(last) == len(data):
         return data.astype(np.int64)
     if not len(last) or last[-1] != len(data) - 1:
-        raise _WireError("its last varint is cut off")
+        raise WireError("its last varint is cut off")
     first = np.concatenate([[0], last[:-1] + 1])
     lengths = last - first + 1
     if lengths.max() > 10:
-        raise _WireError("a varint is longer than ten bytes")
+        raise WireError("a varint is longer than ten bytes")
     values = np.zeros(len(last), np.uint64)
     for place in range(int(lengths.max())):
         longer = np.flatnonzero(lengths > place)
@@ -132,10 +132,10 @@ def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 def _features(data: bytes) -> Iterator[tuple[str, tuple[str, Span]]]:
     """(name, (kind, where its list lies)) of each feature: Example.features.feature entries."""
-    for number, wire, (start, stop) in _fields(data, 0, len(data)):
+    for number, wire, (start, stop) in fields(data, 0, len(data)):
         if number != 1 or wire != BYTES:
             continue
-        for entry, entry_wire, span in _fields(data, start, stop):
+        for entry, entry_wire, span in fields(data, start, stop):
             if entry == 1 and entry_wire == BYTES:
                 yield _entry(data, *span)
 
@@ -143,37 +143,45 @@ def _features(data: bytes) -> Iterator[tuple[str, tuple[str, Span]]]:
 def _entry(data: bytes, start: int, stop: int) -> tuple[str, tuple[str, Span]]:
     """A map entry: key 1, value 2."""
     name, value = "", ("empty", (start, start))
-    for number, wire, span in _fields(data, start, stop):
+    for number, wire, span in fields(data, start, stop):
         if wire == BYTES and number == 1:
             name = data[slice(*span)].decode()
         elif wire == BYTES and number == 2:
-            for kind, kind_wire, inner in _fields(data, *span):
+            for kind, kind_wire, inner in fields(data, *span):
                 if kind in KINDS and kind_wire == BYTES:
                     value = (KINDS[kind], inner)
     return name, value
 
 
-def _fields(data: bytes, position: int, end: int) -> Iterator[tuple[int, int, Span]]:
-    """(field number, wire type, span of its payload) of each field of a message."""
+def fields(data: bytes, position: int, end: int) -> Iterator[tuple[int, int, Span]]:
+    """(field number, wire type, span of its payload) of each field of a message.
+
+    Raises:
+        WireError: it is no message.
+    """
     while position < end:
-        tag, position = _varint(data, position, end)
+        tag, position = varint(data, position, end)
         wire, start = tag & 7, position
         if wire == BYTES:
-            length, start = _varint(data, position, end)
+            length, start = varint(data, position, end)
             position = start + length
         elif wire == VARINT:
-            position = _varint(data, position, end)[1]
+            position = varint(data, position, end)[1]
         elif wire in (FIXED32, FIXED64):
             position += 4 if wire == FIXED32 else 8
         else:
-            raise _WireError(f"wire type {wire} at byte {start}")
+            raise WireError(f"wire type {wire} at byte {start}")
         if position > end:
-            raise _WireError(f"the field at byte {start} reaches beyond its message")
+            raise WireError(f"the field at byte {start} reaches beyond its message")
         yield tag >> 3, wire, (start, position)
 
 
-def _varint(data: bytes, position: int, end: int) -> tuple[int, int]:
-    """(value, position after it)."""
+def varint(data: bytes, position: int, end: int) -> tuple[int, int]:
+    """(value, position after it).
+
+    Raises:
+        WireError: it is cut off, or longer than ten bytes.
+    """
     value = shift = 0
     while position < end and shift < 70:
         byte = data[position]
@@ -182,4 +190,4 @@ def _varint(data: bytes, position: int, end: int) -> tuple[int, int]:
         if byte < 0x80:
             return value, position
         shift += 7
-    raise _WireError(f"no varint at byte {position}")
+    raise WireError(f"no varint at byte {position}")

@@ -17,20 +17,30 @@ from typing import Any
 
 import fsspec
 
-from hma_data.errors import EpisodeError, HMAError, MissingDependencyError, SourceError
+from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
+from hma_data.sources.fetching import attempt, fetch_whole, is_listless, is_local
+from hma_data.sources.record_file import RecordFile, open_records
+from hma_data.sources.record_index import EMPTY, Framing
 from hma_data.sources.tf_example import Example
 from hma_data.sources.tfds_features import Feature, read_features
-from hma_data.sources.tfrecord import Framing, framing, read_record
 
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
-NAMED = re.compile(r"(?:.*-)?(?P<split>\w+)\.tfrecord(?:-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?)?")
-NO_LISTING = ("http", "https")
-PACKAGES = {"gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp"}
+FORMATS = ("tfrecord", "array_record")
+NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
+NAMED = (  # the suffix before the number, as TFDS writes it, or after
+    re.compile(rf"(?P<stem>.+)\.(?:tfrecord|array_record)(?:{NUMBER})?"),
+    re.compile(rf"(?P<stem>.+?)[-_]{NUMBER[1:]}\.(?:tfrecord|array_record)"),
+)
+LONGEST_JSON = 64 << 20  # bytes of a description; more is a mistake
+PACKAGES = {
+    "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",
+    "hf": "huggingface_hub", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One TFRecord file of a split.
+    """One TFRecord or ArrayRecord file of a split.
 
     Attributes:
         path: on the folder's file system.
@@ -52,6 +62,7 @@ class Folder:
     Attributes:
         uri: as given.
         files: fsspec file system of the paths.
+        root: the folder, on it.
         features: leaves of features.json by name.
         splits: name -> the shards that are there, in order.
         name, version: of the dataset, empty when not stated.
@@ -60,6 +71,7 @@ class Folder:
 
     uri: str
     files: Any
+    root: str
     features: dict[str, Feature]
     splits: dict[str, tuple[Shard, ...]]
     name: str = ""
@@ -79,15 +91,17 @@ class Folder:
     @property
     def remote(self) -> bool:
         """Whether every look into a file is a request over the network."""
-        return not _is_local(self.files)
+        return not is_local(self.files)
 
-    def framing(self, shard: Shard) -> Framing:
-        """Where the shard's records lie.
+    def framing(self, shard: Shard, limit: int = -1) -> Framing:
+        """Where the shard's records lie; of a remote shard the first `limit` at least, -1 for all.
 
         Raises:
             SourceError: it cannot be read, or has more records than dataset_info.json says.
         """
-        frames = framing(self.files, shard.path)
+        if self.leaves(shard):
+            return replace(EMPTY, fault="is a link to a file outside the dataset's folder", whole=True)
+        frames = self.records(shard).framing(limit)
         if shard.records is not None and len(frames) > shard.records:
             raise SourceError(
                 shard.path,
@@ -95,6 +109,18 @@ class Folder:
                 "write dataset_info.json again, or remove it: the records are then counted",
             )
         return frames
+
+    def records(self, shard: Shard) -> RecordFile:
+        """The shard's file.
+
+        Raises:
+            SourceError: it is not there, or the file system does not answer.
+        """
+        return open_records(self.files, shard.path)
+
+    def leaves(self, shard: Shard) -> bool:
+        """Whether the shard is a link to something outside the dataset's folder."""
+        return not self.remote and _leaves(shard.path, self.root)
 
     def example(self, episode_id: str) -> tuple[Example, str]:
         """The record of an episode, parsed; and the path of its shard.
@@ -110,15 +136,13 @@ class Folder:
             )
         shard = shards[max(0, bisect_right([item.first for item in shards], int(index)) - 1)]
         position = int(index) - shard.first
-        frames = self.framing(shard)
         if not 0 <= position < self.counted(shard):
             raise EpisodeError(episode_id, f"lies in no shard of {self.uri}")
+        frames = self.framing(shard, position + 1)
         if position >= len(frames):
             fault = frames.fault or f"ends after {len(frames)} of {shard.records} records"
             raise EpisodeError(episode_id, f"{shard.path}: {fault}")
-        return Example(
-            read_record(self.files, shard.path, frames, position, episode_id), episode_id
-        ), shard.path
+        return Example(self.records(shard).read(position, episode_id), episode_id), shard.path
 
     def counted(self, shard: Shard) -> int:
         """How many episodes the shard should have; a record cut off at the end counts."""
@@ -153,14 +177,11 @@ def _remote(uri: str, pid: int) -> Folder:
 
 def _find(uri: str) -> Folder:
     files, path = _file_system(uri)
-    try:
-        only = path if not _listless(files) and files.isfile(path) else ""
-        root = _version_folder(uri, files, files._parent(path) if only else path)
-        stamps = [_stamp(files, f"{root}/{name}") for name in ("", "features.json", "dataset_info.json")]
-    except HMAError:
-        raise
-    except Exception as fault:  # file systems raise what they like
-        raise SourceError(uri, f"cannot be read: {fault}", "check the path and your access to it") from fault
+    is_file = not is_listless(files) and attempt(files, uri, lambda: files.isfile(path))
+    only = path if is_file else ""
+    above = files._parent(path) if only else path
+    root = attempt(files, uri, lambda: _version_folder(uri, files, above))
+    stamps = [_stamp(files, f"{root}/{name}") for name in ("", "features.json", "dataset_info.json")]
     return _open(uri, files, root, only, tuple(stamps), os.getpid())
 
 
@@ -175,19 +196,10 @@ def _file_system(uri: str) -> tuple[Any, str]:
     return files, path.rstrip("/")
 
 
-def _listless(files: Any) -> bool:
-    protocol = files.protocol if isinstance(files.protocol, str) else files.protocol[0]
-    return protocol in NO_LISTING
-
-
-def _is_local(files: Any) -> bool:
-    return "file" in files.protocol
-
-
 def _stamp(files: Any, path: str) -> str:
     """Changes when a local file or folder does."""
     try:
-        return str(Path(path).stat().st_mtime_ns) if _is_local(files) else ""
+        return str(Path(path).stat().st_mtime_ns) if is_local(files) else ""
     except FileNotFoundError:
         return "none"
 
@@ -196,11 +208,11 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
     """The folder with features.json, at most two below `path` (configuration and version)."""
     if files.isfile(f"{path}/features.json"):
         return path
-    if not files.exists(path) and not _listless(files):
+    if not files.exists(path) and not is_listless(files):
         raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
     found = (
         []
-        if _listless(files)
+        if is_listless(files)
         else files.glob(f"{path}/*/features.json") + files.glob(f"{path}/*/*/features.json")
     )
     if len(found) == 1:
@@ -210,7 +222,7 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
         raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
     raise SourceError(
         uri,
-        "cannot be reached, or has no features.json" if _listless(files) else "has no features.json",
+        "cannot be reached, or has no features.json" if is_listless(files) else "has no features.json",
         "records cannot be understood without; copy it from where they are from, or write it with TFDS",
     )
 
@@ -218,9 +230,14 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
 @lru_cache(maxsize=64)
 def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], pid: int) -> Folder:
     """See `open_folder`; kept while the folder is unchanged, and not across a fork."""
-    features = read_features(_text(files, f"{root}/features.json"), f"{root}/features.json")
-    info = _info(files, f"{root}/dataset_info.json")
-    listing = None if _listless(files) else sorted(files.find(root, maxdepth=2))
+    described = _text(files, root, "features.json")
+    if described is None:
+        raise SourceError(uri, "has no features.json", "copy it from where the records are from")
+    features = read_features(described, f"{root}/features.json")
+    info = _info(files, root)
+    listing = (
+        None if is_listless(files) else attempt(files, uri, lambda: sorted(files.find(root, maxdepth=2)))
+    )
     if only:
         listing = [only]
     shards, problems = _stated_shards(root, info, listing)
@@ -228,34 +245,55 @@ def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], p
         shards, more = _named_shards(root, listing or [], info)
         problems += more
     folder = Folder(
-        uri, files, features, {}, str(info.get("name", "")), str(info.get("version", "")), tuple(problems)
+        uri,
+        files,
+        root,
+        features,
+        {},
+        str(info.get("name", "")),
+        str(info.get("version", "")),
+        tuple(problems),
     )
     splits = {split: _placed(folder, items) for split, items in shards.items()}
     if not any(splits.values()):
-        raise SourceError(uri, "holds no TFRecord file", "names are like name-train.tfrecord-00000-of-00001")
+        raise SourceError(
+            uri, "holds no TFRecord or ArrayRecord file", "names are like name-train.tfrecord-00000-of-00001"
+        )
     return replace(folder, splits={split: items for split, items in splits.items() if items})
 
 
-def _text(files: Any, path: str) -> str:
+def _text(files: Any, root: str, name: str) -> str | None:
+    """A description in the folder, None where it has none."""
+    path = f"{root}/{name}"
+    if is_local(files) and _leaves(path, root):
+        raise SourceError(path, "is a link to a file outside its folder", "copy the file in")
+    data = fetch_whole(files, path, LONGEST_JSON)
     try:
-        text: str = files.cat_file(path).decode()
-    except Exception as fault:  # file systems raise what they like
-        raise SourceError(path, f"cannot be read: {fault}") from fault
-    return text
+        return None if data is None else data.decode()
+    except UnicodeDecodeError as fault:
+        raise SourceError(path, f"is not text: {fault}", "copy it again") from fault
 
 
-def _info(files: Any, path: str) -> dict[str, Any]:
+def _leaves(path: str, root: str) -> bool:
+    """Whether a local path leads out of its folder; into the files of the Hugging Face Hub's cache it may."""
+    inside, target = Path(root).resolve(), Path(path).resolve()
+    hub = next((above.parent for above in inside.parents if above.name == "snapshots"), None)
+    homes = (inside, hub / "blobs") if hub else (inside,)
+    return not any(target.is_relative_to(home) for home in homes)
+
+
+def _info(files: Any, root: str) -> dict[str, Any]:
     """dataset_info.json, empty when there is none."""
-    if not files.isfile(path):
-        return {}
+    path = f"{root}/dataset_info.json"
+    text = _text(files, root, "dataset_info.json")
     try:
-        info = json.loads(_text(files, path))
-    except ValueError as fault:
+        info = {} if text is None else json.loads(text)
+    except (ValueError, RecursionError) as fault:
         raise SourceError(path, f"is not JSON: {fault}", "write it again, or remove it") from fault
     if not isinstance(info, dict) or not isinstance(info.get("splits", []), list):
         raise SourceError(path, "is not what TFDS writes", "write it again, or remove it")
-    form = info.get("fileFormat") or info.get("file_format") or "tfrecord"
-    if form != "tfrecord":
+    form = info.get("fileFormat") or info.get("file_format") or FORMATS[0]
+    if form not in FORMATS:
         raise SourceError(
             path, f"states the file format {form!r}", "convert it to tfrecord with tensorflow_datasets"
         )
@@ -302,7 +340,7 @@ def _shard_name(template: str, info: dict[str, Any], split: str, number: int, sh
     values = {
         "DATASET": str(info.get("name", "")),
         "SPLIT": split,
-        "FILEFORMAT": "tfrecord",
+        "FILEFORMAT": str(info.get("fileFormat") or info.get("file_format") or FORMATS[0]),
         "SHARD_INDEX": place,
         "NUM_SHARDS": total,
         "SHARD_X_OF_Y": f"{place}-of-{total}",
@@ -323,12 +361,13 @@ def _named_shards(
     totals: dict[str, int] = {}
     for path in listing:
         inside = path[len(root) + 1 :]
-        match = NAMED.fullmatch(inside.rsplit("/", 1)[-1])
+        match = next((found for form in NAMED if (found := form.fullmatch(inside.rsplit("/", 1)[-1]))), None)
         if not match:
             continue
-        split = inside.rsplit("/", 1)[0] if "/" in inside else match["split"]
-        number = int(match["shard"] or len(shards.get(split, ())))
-        totals[split] = max(totals.get(split, 0), int(match["shards"] or 0))
+        split = inside.rsplit("/", 1)[0] if "/" in inside else _split_of(match["stem"], info, stated)
+        parts = match.groupdict()
+        number = int(parts["shard"] or len(shards.get(split, ())))
+        totals[split] = max(totals.get(split, 0), int(parts["shards"] or 0))
         counts = stated.get(split, [])
         records = counts[number] if number < len(counts) else None
         shards.setdefault(split, []).append(Shard(path, number, records, sum(counts[:number])))
@@ -338,6 +377,17 @@ def _named_shards(
         if totals[split] > len(items)
     ]
     return {split: sorted(items, key=lambda item: item.number) for split, items in shards.items()}, problems
+
+
+def _split_of(stem: str, info: dict[str, Any], stated: Iterable[str]) -> str:
+    """The split a file's name tells, train of toy-train; it may have hyphens itself."""
+    for split in sorted(stated, key=len, reverse=True):
+        if stem == split or stem.endswith(f"-{split}"):
+            return split
+    name = str(info.get("name", ""))
+    if name and stem.startswith(f"{name}-"):
+        return stem[len(name) + 1 :]
+    return stem.rsplit("-", 1)[-1]
 
 
 def _placed(folder: Folder, shards: list[Shard]) -> tuple[Shard, ...]:

@@ -268,7 +268,8 @@ def test_texts_are_equal(written, truth):
 ROBOT = {
     "id": "toy", "kind": "real", "frequency_hz": 5,
     "action": {"space": "mixed", "components": [
-        {"key": "numbers/float64_zlib_1", "dims": 3}, {"key": "pair", "dims": 6}, {"key": "is_last", "dims": 1}]},
+        {"key": "numbers/float64_zlib_1", "dims": 3}, {"key": "pair", "dims": 6},
+        {"key": "is_last", "dims": 1}]},
     "cameras": [{"name": "primary", "key": "observation/png"}],
     "source": {"format": "rlds"},
 }  # fmt: skip
