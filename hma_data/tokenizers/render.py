@@ -4,7 +4,8 @@
 
 Needs, in an environment of its own (their versions of MuJoCo exclude others): gym-aloha,
 gymnasium-robotics, metaworld, mujoco; and Debian's libosmesa6. Scenes come from the simulators'
-own tasks after random actions; each picture has its own camera, lights and colours.
+own tasks after random actions; each picture has its own camera, lights and colours. With
+`--package robosuite` come pictures to look at afterwards: no robosuite scene is trained on.
 """
 
 import argparse
@@ -47,13 +48,25 @@ SCENES: dict[str, list[str]] = {
     ],
     "gym-aloha": ["gym_aloha/AlohaTransferCube-v0", "gym_aloha/AlohaInsertion-v0"],
 }
+HELD_OUT: dict[str, list[str]] = {
+    "robosuite": ["PickPlaceCan/Panda", "Door/Sawyer", "NutAssemblySquare/Panda", "Wipe/UR5e"],
+}
 
 
-def _make(package: str, task: str) -> tuple[Any, Callable[[], tuple[Any, Any]]]:
+def _make_robosuite(task: str, seed: int) -> Any:
+    suite, wrappers = import_module("robosuite"), import_module("robosuite.wrappers")
+    name, robot = task.split("/")
+    quiet = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False}
+    return wrappers.GymWrapper(suite.make(name, robots=robot, seed=seed, **quiet))
+
+
+def _make(package: str, task: str, seed: int) -> tuple[Any, Callable[[], tuple[Any, Any]]]:
     """An environment, and what gives its MuJoCo model and data."""
     import gymnasium
 
-    if package == "metaworld":
+    if package == "robosuite":
+        env = _make_robosuite(task, seed)
+    elif package == "metaworld":
         metaworld = import_module("metaworld")
         benchmark = metaworld.MT1(task, seed=1)
         env = benchmark.train_classes[task]()
@@ -68,6 +81,9 @@ def _make(package: str, task: str) -> tuple[Any, Callable[[], tuple[Any, Any]]]:
         if package == "gym-aloha":
             physics = env._env.physics
             return physics.model.ptr, physics.data.ptr
+        if package == "robosuite":
+            simulation = env.unwrapped.sim
+            return simulation.model._model, simulation.data._data
         return env.model, env.data
 
     return env, handles
@@ -105,9 +121,11 @@ def render(package: str, count: int, seed: int) -> Iterator[NDArray[np.uint8]]:
     """`count` pictures (256, 256, 3) uint8 RGB of a package's scenes."""
     mujoco = import_module("mujoco")
     rng = np.random.default_rng([seed, len(package)])
-    tasks = SCENES[package]
+    tasks = (SCENES | HELD_OUT)[package]
+    option = mujoco.MjvOption()
+    option.geomgroup[0] = package != "robosuite"  # where robosuite keeps what only collides
     for index, task in enumerate(tasks):
-        env, handles = _make(package, task)
+        env, handles = _make(package, task, seed)
         env.reset(seed=seed)
         env.action_space.seed(seed)
         model, data = handles()
@@ -118,7 +136,7 @@ def render(package: str, count: int, seed: int) -> Iterator[NDArray[np.uint8]]:
                     env.step(env.action_space.sample())
                 if made % 3 == 2:
                     _randomize(model, rng)
-                renderer.update_scene(data, _camera(model, data, rng))
+                renderer.update_scene(data, _camera(model, data, rng), option)
                 yield renderer.render().copy()
         env.close()
 
@@ -131,7 +149,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--pictures", type=int, default=120, help="a package")
     parser.add_argument("--seed", type=int, default=20)
-    parser.add_argument("--package", choices=sorted(SCENES), action="append")
+    parser.add_argument("--package", choices=sorted(SCENES | HELD_OUT), action="append")
     arguments = parser.parse_args()
     for package in arguments.package or SCENES:
         folder = arguments.out / package

@@ -32,7 +32,7 @@ done
 
 python3.12 -m venv "$downloads/simulators"
 pip=("$downloads/simulators/bin/python" -m pip install --quiet)
-"${pip[@]}" gym-aloha==0.1.5 mujoco==3.3.2 robosuite==1.5.2 packaging PettingZoo imageio jinja2
+"${pip[@]}" gym-aloha==0.1.5 mujoco==3.3.2 robosuite==1.5.2 packaging PettingZoo imageio jinja2 h5py
 # Their declared bounds on MuJoCo exclude one another; all three run with 3.3.2.
 "${pip[@]}" --no-deps gymnasium-robotics==1.4.2 metaworld==3.1.1 mujoco==3.3.2
 MUJOCO_GL=osmesa PYTHONPATH=$repo "$downloads/simulators/bin/python" -W ignore \
