@@ -102,13 +102,11 @@ def to_clip(episode: Episode, embodiment: Embodiment) -> Clip:
 
 def _shared_index(episode: Episode, embodiment: Embodiment) -> Clip:
     """RLDS, HDF5, LeRobot: frame i, action i and state i belong together."""
-    lengths = {name: len(stream.timestamps) for name, stream in episode.streams.items()}
-    for name, signal, _, _ in _signals(episode, embodiment):
-        lengths[name] = len(signal.values)
-    if len(set(lengths.values())) != 1:
-        raise EpisodeError(
-            episode.id, "its streams differ in length: " + ", ".join(f"{k} {v}" for k, v in lengths.items())
-        )
+    lengths = [(name, len(stream.timestamps)) for name, stream in episode.streams.items()]
+    lengths += [(name, len(signal.values)) for name, signal, _, _ in _signals(episode, embodiment)]
+    if len({length for _, length in lengths}) != 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths)
+        raise EpisodeError(episode.id, f"its streams differ in length: {told}")
     times = episode.streams[embodiment.primary_camera.name].timestamps
     _check_times(episode.id, embodiment.primary_camera.name, times)
     shift = embodiment.sync.action_shift
@@ -152,29 +150,23 @@ def _signals(
 ) -> list[tuple[str, Signal, tuple[Component, ...], str]]:
     """Each signal of actions, then states: a name, the signal, its components, its method.
 
-    The name is the component's key; where several have one key but other times, also what it is of.
+    The name is the component's key, as the YAML has it; before a key that cameras or actions have, what it
+    is of. Components of one key share a name.
     """
-    sync, taken = embodiment.sync, dict.fromkeys(episode.streams, None)
-    found: list[tuple[str, Signal, tuple[Component, ...], str]] = []
-    named: dict[str, tuple[Floats, str]] = {}
+    sync, taken = embodiment.sync, {*episode.streams}
     vectors: tuple[tuple[str, tuple[Signal, ...], Vector | None, str], ...] = (
         ("action", episode.actions, embodiment.action, sync.actions),
         ("state", episode.states, embodiment.state, sync.states),
     )
+    found: list[tuple[str, Signal, tuple[Component, ...], str]] = []
     for kind, signals, vector, method in vectors:
         parts = vector.components if vector else ()
-        single = len(signals) == len(parts)
+        apart = len(signals) == len(parts)
         for i, signal in enumerate(signals):
-            key = parts[i].key if single else kind if len(signals) == 1 else f"{kind} {i}"
-            for name in (key, f"{kind} {key}", f"{kind} {i} {key}"):
-                clock = named.get(name)
-                same = (
-                    clock is not None and clock[1] == method and np.array_equal(clock[0], signal.timestamps)
-                )
-                if name not in taken and (clock is None or same):
-                    break
-            named[name] = (signal.timestamps, method)
-            found.append((name, signal, (parts[i],) if single else parts, method))
+            own = parts[i : i + 1] if apart else parts
+            key = own[0].key if apart else kind
+            found.append((f"{kind} {key}" if key in taken else key, signal, own, method))
+        taken |= {name for name, *_ in found}
     return found
 
 
@@ -205,9 +197,10 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     limit = sync.max_skew_ms and sync.max_skew_ms + 1e3 * rounding(grid, frames)
     pieces, marks = [], []
     for name, signal, parts, method in signals:
-        values, known, skew[name] = _moved(signal, parts, method, grid)
+        values, known, off = _moved(signal, parts, method, grid)
+        skew[name] = np.maximum(skew.get(name, off), off)
         if limit and sync.beyond == "mask":
-            near = skew[name] <= limit
+            near = off <= limit
             known = near if known is None else known & near
         pieces.append(values)
         marks.append(known)

@@ -1,5 +1,7 @@
 """Alignment against a reference that looks at one target time after the other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -359,18 +361,24 @@ def test_skew_is_told_by_the_key_of_the_component() -> None:
     assert clip.skew_ms["b"].max() == pytest.approx(90)
 
 
-def test_two_components_of_one_topic_share_a_name_and_another_clock_has_its_own() -> None:
+def test_components_of_one_key_share_a_name_and_a_state_of_it_says_so() -> None:
     values = embodiment().to_dict()
     values["action"]["components"] = [
         {"key": "/arm.q", "dims": 1, "slice": [0, 1]},
         {"key": "/arm.q", "dims": 2, "slice": [1, 3]},
     ]
     values["state"] = {"components": [{"key": "/arm.q", "dims": 1, "slice": [0, 1]}]}
-    robot = Embodiment.from_values(values, "shared")
-    clip = to_clip(episode(STEADY, STEADY, FAST, FAST, FAST), robot)
-    assert list(clip.skew_ms) == ["front", "wrist", "/arm.q", "state /arm.q"]
-    clip = to_clip(episode(STEADY, STEADY, FAST, STEADY, FAST), robot)
-    assert list(clip.skew_ms) == ["front", "wrist", "/arm.q", "action /arm.q", "state /arm.q"]
+    values["cameras"][1]["name"] = "a"
+    clip = to_clip(
+        replace(episode(STEADY, STEADY, FAST, STEADY + 0.02, FAST), streams=named("front", "a")),
+        Embodiment.from_values(values, "shared"),
+    )
+    assert list(clip.skew_ms) == ["front", "a", "/arm.q", "state /arm.q"]
+    assert clip.skew_ms["/arm.q"].max() == pytest.approx(80)  # of the later one
+
+
+def named(*names: str) -> dict[str, Pictures]:
+    return {name: Pictures(STEADY, lambda i: np.zeros((2, 2, 3), np.uint8)) for name in names}
 
 
 # -- numbers that would be moved too far

@@ -56,3 +56,15 @@ def test_json_gives_the_same_statistics_back() -> None:
     stats = Stats.of(np.random.default_rng(2).normal(size=(3000, 4)))
     again = Stats.from_json(json.loads(json.dumps(stats.to_json())))
     assert again.summary() == stats.summary()
+
+
+def test_statistics_of_no_rows_are_zeros_and_change_nothing() -> None:
+    nothing = Stats.of(np.zeros((0, 3), np.float32))
+    assert Stats.empty(3).merge(nothing).count == 0
+    for stats in (nothing, Stats.from_json(json.loads(json.dumps(nothing.to_json())))):
+        said = stats.summary()
+        assert said["count"] == 0 and said["quantiles"]["q50"] == [0.0] * 3
+        assert all(said[name] == [0.0] * 3 for name in ("mean", "std", "min", "max"))
+    rows = np.random.default_rng(3).normal(size=(70, 3))
+    alone = Stats.of(rows).summary()
+    assert Stats.empty(3).merge(Stats.of(rows)).merge(nothing).summary() == alone
