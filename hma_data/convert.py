@@ -274,6 +274,11 @@ class _Conversion:
         job = Job(
             self.uri, self._embodiment, name, self._weights, self._device, self._out.absolute(), plan.facts
         )
+        if self._engine == "ray":
+            from hma_data.engines.ray import run as run_ray
+
+            gpus = 1.0 if self._device.startswith("cuda") else 0.0
+            return run_ray(todo, MakeWork(job), self._workers, on_event, self._limits, gpus)
         make_work = MakeWork(job, None if self._workers else self._tokenizer)
         return run_local(todo, make_work, self._workers, on_event, self._limits)
 

@@ -1,5 +1,6 @@
 """Engines: every unit is done once, whatever happens to the processes that do them."""
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -60,10 +61,14 @@ class MakeWork:
 def trouble(kind: str) -> None:
     if kind == "hang":
         time.sleep(600)
+    elif kind == "nap":
+        time.sleep(1.5)
     elif kind == "memory":
         raise MemoryError
     elif kind == "error":
         raise TokenizerError("weights", "are wrong")
+    elif kind == "SIGSEGV":
+        ctypes.string_at(0)  # here and now, in this thread
     else:
         os.kill(os.getpid(), getattr(signal, kind))
 
