@@ -16,7 +16,9 @@ from typing import Any, Protocol
 from hma_data.errors import UsageError
 
 BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
+    "convert": "hma_data.bench.convert",
     "registry": "hma_data.bench.registry",
+    "sources": "hma_data.bench.sources",
 }
 
 
@@ -97,7 +99,14 @@ def _processor() -> str:
 
 
 def peak_rss_mib() -> float:
-    """The most memory this process has held, in MiB."""
+    """The most memory this process has held, in MiB; not what its parent held before it was started."""
     import resource
 
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return round(int(line.split()[1]) / 1024, 1)
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
