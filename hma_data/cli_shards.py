@@ -202,15 +202,11 @@ def shards_restat(
 
     Example: hma shards restat shards/my_arm
     """
-    from hma_data.shards.manifest import Manifest
     from hma_data.shards.restat import restat
 
     with progress("restat", unit="MB") as update:
-        problems = restat(folder, workers=workers, on_progress=_in(update, 1e6))
-    for problem in problems:
-        typer.echo(problem, err=True)
-    _report(folder, Manifest.load(folder), json)
-    raise typer.Exit(1 if problems else 0)
+        manifest = restat(folder, workers=workers, on_progress=_in(update, 1e6))
+    _report(folder, manifest, json)
 
 
 @shards_app.command("export")

@@ -8,7 +8,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -245,23 +245,47 @@ class Gathered:
         return {name: stats.summary() for name, stats in self.stats.items()}
 
 
-def finish(
+@dataclass(frozen=True)
+class Derived:
+    """Everything of a set that follows from its shards, before it is written.
+
+    Attributes:
+        manifest: its `files` are filled in when the others are written.
+        episodes: episodes.parquet.
+        quarantine: quarantine.jsonl.
+    """
+
+    manifest: Manifest
+    episodes: pa.Table
+    quarantine: str
+
+    def write(self, folder: Path) -> Manifest:
+        """All files but the shards; the manifest comes last."""
+        with atomic_path(folder / EPISODES) as part:
+            pq.write_table(self.episodes, part, compression="zstd")
+        write_atomic(folder / QUARANTINE, self.quarantine)
+        write_atomic(folder / EMBODIMENT, self.manifest.embodiment.to_yaml())
+        files = {name: file_sha256(folder / name) for name in (EPISODES, QUARANTINE, EMBODIMENT)}
+        manifest = replace(self.manifest, files=files)
+        write_atomic(folder / MANIFEST, manifest.to_text())
+        return manifest
+
+
+def derive(
     folder: Path,
     names: Sequence[str],
     embodiment: Embodiment,
     tokenizer: TokenizerSpec,
     plan: dict[str, Any],
     source: str,
-    stats: dict[str, dict[str, Any]] | None = None,
     hashes: Mapping[str, str] | None = None,
-) -> Manifest:
-    """Derive and write everything that is not a shard; the manifest comes last.
+) -> Derived:
+    """What a set's shards say together; nothing is written.
 
     Args:
         folder: of the shard set.
         names: of the shards, in plan order; all are there.
         source: URI the recordings came from.
-        stats: the summary to state instead of the footers' own.
         hashes: sha256 of shards that need not be read for it.
 
     Raises:
@@ -273,23 +297,30 @@ def finish(
         files.append(file)
         gathered.add(footer)
     episodes = gathered.episodes()
-    with atomic_path(folder / EPISODES) as part:
-        pq.write_table(episodes, part, compression="zstd")
-    write_atomic(folder / QUARANTINE, gathered.quarantine())
-    write_atomic(folder / EMBODIMENT, embodiment.to_yaml())
     manifest = Manifest(
         plan=plan,
         embodiment=embodiment,
         tokenizer=tokenizer,
         shards=tuple(files),
         splits={split: split_totals(episodes, files, split) for split in SPLITS},
-        stats=stats or gathered.summaries(),
+        stats=gathered.summaries(),
         quarantined=len(gathered.refused),
         source=source,
-        files={name: file_sha256(folder / name) for name in (EPISODES, QUARANTINE, EMBODIMENT)},
     )
-    write_atomic(folder / MANIFEST, manifest.to_text())
-    return manifest
+    return Derived(manifest, episodes, gathered.quarantine())
+
+
+def finish(
+    folder: Path,
+    names: Sequence[str],
+    embodiment: Embodiment,
+    tokenizer: TokenizerSpec,
+    plan: dict[str, Any],
+    source: str,
+    hashes: Mapping[str, str] | None = None,
+) -> Manifest:
+    """Derive and write everything that is not a shard; see `derive`."""
+    return derive(folder, names, embodiment, tokenizer, plan, source, hashes).write(folder)
 
 
 def _described(

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from hma_data.errors import HMAError, ShardError
 from hma_data.files import file_sha256
 from hma_data.output import locked
 from hma_data.plan import digest
-from hma_data.shards.check import REMAKE, same_stats
+from hma_data.shards.check import REMAKE
 from hma_data.shards.manifest import (
     EMBODIMENT,
     EPISODES,
@@ -23,7 +24,7 @@ from hma_data.shards.manifest import (
     SPLITS,
     Gathered,
     Manifest,
-    finish,
+    derive,
     seal_problem,
 )
 from hma_data.shards.schema import Footer, read_footer
@@ -38,35 +39,31 @@ def restat(
     *,
     workers: int | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[str]:
+) -> Manifest:
     """Write the manifest and what else follows from the shards; the shards are not touched.
 
     A manifest that is whole says which shards belong and what they hash to; without one, the shards
     themselves must show that none is missing.
 
-    Returns:
-        what is wrong with the shards all the same, a line each.
-
     Raises:
-        ShardError: a shard is missing or damaged, or nothing tells whether all are there.
+        ShardError: a shard is missing or damaged, or nothing tells whether all are there; nothing is written.
     """
     if not folder.is_dir():
         raise ShardError(folder, "is not a folder", "give the --out of an hma convert")
     with locked(folder):
         known = _whole_manifest(folder)
-        if known:
-            names, plan, source, embodiment = _as_stated(folder, known)
-        else:
-            names, plan, source, embodiment = _as_found(folder)
+        names, plan, source, embodiment = _as_stated(folder, known) if known else _as_found(folder)
         spec = TokenizerSpec.from_json(plan["tokenizer"])
-        manifest = finish(folder, names, embodiment, spec, plan, source)
+        derived = derive(folder, names, embodiment, spec, plan, source)
+        manifest = derived.manifest
         problems, rows = check_rows(folder, manifest, workers, on_progress)
-        own = {name: stats.summary() for name, stats in rows.items()}
-        strided = plan.get("frames") == "strided"  # footers know the steps after an episode's last row too
-        if own and not strided and any(not same_stats(own[name], manifest.stats[name]) for name in own):
-            hashes = {shard.path: shard.sha256 for shard in manifest.shards}
-            finish(folder, names, embodiment, spec, plan, source, own, hashes)
-        return problems
+        if problems:
+            more = f", and {len(problems) - 1} more problems" if len(problems) > 1 else ""
+            raise ShardError("", problems[0] + more)
+        if plan.get("frames") != "strided":  # else footers know the steps after an episode's last row too
+            stats = {name: merged.summary() for name, merged in rows.items()}
+            derived = replace(derived, manifest=replace(manifest, stats=stats or manifest.stats))
+        return derived.write(folder)
 
 
 Found = tuple[list[str], dict[str, Any], str, Embodiment]

@@ -58,6 +58,7 @@ class ShardWriter:
             use_dictionary=["camera"] if "camera" in self._schema.names else False,
             column_encoding=encodings(self._schema),
             write_statistics=["episode_index", "frame_index"],
+            write_page_checksum=True,  # a damaged page is known even where the manifest is lost
             store_schema=True,
         )
         return self

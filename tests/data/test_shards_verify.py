@@ -297,3 +297,20 @@ def test_restat_refuses_a_damaged_shard(sound: Path) -> None:
     shard.write_bytes(shard.read_bytes()[:-30])
     with pytest.raises(ShardError, match="shard-00001"):
         restat(sound)
+
+
+def test_a_damaged_page_is_known_where_the_manifest_is_lost(sound: Path) -> None:
+    (sound / MANIFEST).unlink()
+    shard = sound / "train" / "shard-00001.parquet"
+    columns = pq.read_metadata(shard).row_group(0)
+    tokens = next(
+        columns.column(i)
+        for i in range(columns.num_columns)
+        if columns.column(i).path_in_schema.startswith("tokens")
+    )
+    data = bytearray(shard.read_bytes())
+    data[tokens.data_page_offset + tokens.total_compressed_size - 1] ^= 4
+    shard.write_bytes(data)
+    with pytest.raises(ShardError, match="shard-00001"):
+        restat(sound)
+    assert not (sound / MANIFEST).exists()
