@@ -1,10 +1,10 @@
-"""`magvit2`: Open-MAGVIT2, the discrete tokenizer of the paper's release.
+"""`magvit2`, `magvit2-plain`: Open-MAGVIT2, the discrete tokenizer of the paper's release.
 
 256×256 pictures, 16×16 ids of 18 bits, two digits of 512. Loads 1X's `magvit2.ckpt` (the default),
 TencentARC's checkpoints, and plain safetensors of `encoder.*` and `decoder.*`; widths, levels and
-blocks are read off the weights. Where a checkpoint holds averaged weights (`model_ema.*`) these are
-used. The paper's own loader never sees them: it copies the plain weights over the average. To get its
-ids from a checkpoint that holds both, name a file without `model_ema.*`.
+blocks are read off the weights. Some checkpoints, 1X's among them, hold averaged weights
+(`model_ema.*`) beside the plain ones: `magvit2` uses the average. The paper's own loader never sees
+it, as it copies the plain weights over the average: `magvit2-plain` gives that loader's ids.
 """
 
 from collections.abc import Mapping
@@ -39,11 +39,13 @@ AVERAGED = "model_ema."
 FOREIGN = ("quant_conv.", "post_quant_conv.", "quantize.embedding")
 
 
-def choose_weights(tensors: Mapping[str, torch.Tensor], where: object) -> Tensors:
+def choose_weights(tensors: Mapping[str, torch.Tensor], where: object, *, averaged: bool = True) -> Tensors:
     """The parameters of encoder and decoder in a checkpoint, under their plain names.
 
-    A trainer's prefix is taken off, averaged weights are preferred, and what belongs to the loss (the
-    discriminator) is left out.
+    A trainer's prefix is taken off, and what belongs to the loss (the discriminator) is left out.
+
+    Args:
+        averaged: whether the averaged weights are taken where there are any.
 
     Raises:
         TokenizerError: there is no such network in it, or only part of it is averaged.
@@ -57,15 +59,15 @@ def choose_weights(tensors: Mapping[str, torch.Tensor], where: object) -> Tensor
     if foreign:
         raise TokenizerError(where, f"has {foreign[0]}: not the weights of {WHAT}", "name other weights")
     plain = {name: t for name, t in named.items() if name.startswith(("encoder.", "decoder."))}
-    if not any(name.startswith(AVERAGED) for name in named):
+    if not averaged or not any(name.startswith(AVERAGED) for name in named):
         return plain
-    averaged = {name: AVERAGED + name.replace(".", "") for name in plain}
-    missing = [key for key in averaged.values() if key not in named]
+    keys = {name: AVERAGED + name.replace(".", "") for name in plain}
+    missing = [key for key in keys.values() if key not in named]
     if missing:
         raise TokenizerError(
             where, f"its averaged weights lack {missing[0]} ({len(missing)} in all)", "fetch it again"
         )
-    return {name: named[key] for name, key in averaged.items()}
+    return {name: named[key] for name, key in keys.items()}
 
 
 def derive_config(tensors: Mapping[str, torch.Tensor], where: object) -> Magvit2Config:
@@ -106,13 +108,13 @@ def check_config(config: Magvit2Config, stated: Mapping[str, Any], where: object
             )
 
 
-def read_network(path: Path) -> Magvit2:
-    """The network of a weights' file.
+def read_network(path: Path, *, averaged: bool = True) -> Magvit2:
+    """The network of a weights' file, with its averaged weights or the plain ones.
 
     Raises:
         TokenizerError: it cannot be read, or holds another network.
     """
-    tensors = choose_weights(read_tensors(path), path)
+    tensors = choose_weights(read_tensors(path), path, averaged=averaged)
     config = derive_config(tensors, path)
     check_config(config, read_config(path.parent), path)
     with torch.device("meta"):
@@ -121,18 +123,19 @@ def read_network(path: Path) -> Magvit2:
     return network
 
 
-def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
+def load(name: str, *, weights: str | None, device: str, averaged: bool) -> NetworkTokenizer:
     """The tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
 
     Args:
         weights: a file, a folder with one of `FILES`, or `hf://…`; None takes 1X's from the hub.
+        averaged: whether the averaged weights are taken where there are any.
 
     Raises:
         TokenizerError: the weights cannot be had or used, or there is no such device.
     """
     place = open_device(name, device)
     path = one_file(find_weights(name, weights), FILES, name)
-    network = read_network(path)
+    network = read_network(path, averaged=averaged)
     config = network.config
     spec = TokenizerSpec(
         name=name,

@@ -269,6 +269,16 @@ def test_averaged_weights_are_preferred(tmp_path):
     assert all(torch.equal(p, average[name]) for name, p in network.named_parameters())
 
 
+def test_the_plain_weights_beside_an_average_can_be_had(tmp_path):
+    state, average = magvit2_state(seed=1), magvit2_state(seed=2)
+    shadow = {"model_ema." + name.replace(".", ""): tensor for name, tensor in average.items()}
+    torch.save({"state_dict": {**state, **shadow}}, tmp_path / "a.ckpt")
+    both = [get_tokenizer(name, weights=str(tmp_path / "a.ckpt")) for name in ("magvit2", "magvit2-plain")]
+    for tokenizer, expected in zip(both, (average, state), strict=True):
+        assert all(torch.equal(p, expected[name]) for name, p in tokenizer.network.named_parameters())
+    assert both[0].spec.digest != both[1].spec.digest
+
+
 def test_averaged_weights_must_be_whole(tmp_path):
     state = magvit2_state()
     shadow = {"model_ema." + name.replace(".", ""): tensor for name, tensor in state.items()}
