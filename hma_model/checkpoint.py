@@ -42,10 +42,14 @@ SAMPLE = "sample.png"  # optional, shown in the model card
 
 @dataclass(frozen=True)
 class ActionStats:
-    """Mean and standard deviation (A,) of the raw actions, as `stats.json` states them."""
+    """Mean and standard deviation (A,) of the raw actions, as `stats.json` states them.
+
+    `zero_variance` is "divide" in an imported released model; see `ActionSpace`.
+    """
 
     mean: list[float]
     std: list[float]
+    zero_variance: str = "zero"
 
 
 @dataclass(frozen=True)
@@ -381,8 +385,13 @@ def digest(tokenizer: Mapping[str, Any]) -> str:
 
 
 def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -> None:
-    """Raise CheckpointError naming the difference unless the model was trained on this tokenizer."""
+    """Raise CheckpointError naming the difference unless the model was trained on this tokenizer.
+
+    Which weights it had is not compared where the model does not know, as those of the release do not.
+    """
     ours, theirs = dict(config.tokenizer), spec.to_json()
+    if not ours.get("weights_sha256"):
+        ours["weights_sha256"] = theirs["weights_sha256"]
     differing = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
     if differing:
         key = differing[0]
@@ -402,8 +411,9 @@ def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
     """
     try:
         action = stats["action"]
-        return ActionStats([float(v) for v in action["mean"]], [float(v) for v in action["std"]])
-    except (KeyError, TypeError, ValueError) as fault:
+        rule = str(action.get("zero_variance", "zero"))
+        return ActionStats([float(v) for v in action["mean"]], [float(v) for v in action["std"]], rule)
+    except (AttributeError, KeyError, TypeError, ValueError) as fault:
         raise CheckpointError(where, "lacks action.mean or action.std as lists of numbers") from fault
 
 
@@ -418,6 +428,7 @@ def _write_embodiment(model: "HMA", home: Path, trunk: str, tokenizer: str, give
 
 
 def _facts(embodiment: Embodiment) -> dict[str, Any]:
+    unstated = embodiment.frequency_hz == "unknown" and not embodiment.sync.rate_hz
     return {
         "format_version": FORMAT_VERSION,
         "id": embodiment.id,
@@ -428,7 +439,7 @@ def _facts(embodiment: Embodiment) -> dict[str, Any]:
         "action_dim": embodiment.action_dim,
         "stride": embodiment.stride,
         "chunk_dim": embodiment.chunk_dim,
-        "effective_hz": embodiment.effective_hz,
+        "effective_hz": None if unstated else embodiment.effective_hz,
         "license": embodiment.license,
     }
 

@@ -273,6 +273,46 @@ def hub_list(
         print_table(list(rows[0]) if rows else ["embodiment"], [list(row.values()) for row in rows])
 
 
+@hub_app.command("import")
+def hub_import(
+    source: Annotated[str, typer.Argument(help="A released checkpoint: a folder, or org/name on the hub.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the new checkpoint.")],
+    embodiment: Embodiments = None,
+    grid: Annotated[tuple[int, int] | None, typer.Option("--grid", help="h w, if not square.")] = None,
+    tokenizer: Annotated[str | None, typer.Option("--tokenizer", help="Default the paper's.")] = None,
+    revision: Annotated[str | None, typer.Option("--revision", help="Branch, tag or commit.")] = None,
+    json: Json = False,
+) -> None:
+    """Bring a checkpoint of the paper's release into our layout.
+
+    Example: hma hub import liruiw/hma-base-disc --out hma-base-disc
+    """
+    from hma_model import hub
+
+    made = hub.import_released(
+        source, out, embodiments=embodiment, grid=grid, tokenizer=tokenizer, revision=revision
+    )
+    if json:
+        print_json({"out": str(made.folder), "embodiments": list(made.embodiments)})
+    else:
+        print(f"imported to {made.folder}: {len(made.embodiments)} embodiments")
+
+
+@hub_app.command("export")
+def hub_export(
+    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint, or a run's folder.")],
+    out: Annotated[Path, typer.Option("--out", help="A new folder: config.json, model.safetensors.")],
+    embodiment: Embodiments = None,
+) -> None:
+    """Write a checkpoint in the layout of the paper's release, for its code to read.
+
+    Example: hma hub export runs/first --out released
+    """
+    from hma_model import hub
+
+    print(f"exported to {hub.export_released(checkpoint, out, embodiments=embodiment)}")
+
+
 mount(app)
 app.add_typer(hub_app, name="hub")
 

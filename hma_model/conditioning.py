@@ -116,12 +116,16 @@ def condition(model: "HMA", slots: Slots | None, groups: Groups, positions: Tens
         groups: the batch's embodiments.
         positions: (T,) int64, the frames' times.
     """
+    config, absent = model.config, rows_at(model.trunk.absent, positions)
+    if slots is None and config.absent_action == "skip":
+        return Conditioning()
+    if slots is None and config.absent_action == "tokens":
+        batch = sum(size for _, size in groups.parts)
+        return Conditioning(tokens=absent.expand(batch, len(positions), -1))
     if slots is None:
-        if model.config.absent_action == "skip":
-            return Conditioning()
         slots = unknown(model, groups, len(positions))
     chunks, known = groups.sort(slots.chunks), groups.sort(slots.known).unsqueeze(-1)
-    absent = rows_at(model.trunk.absent, positions)
+    shown = torch.ones_like(known) if config.absent_action == "tokens" else known
     embeddings, modulations, outs = [], [], []
     for name, span in groups.spans():
         stem = model.stem(name)
@@ -129,8 +133,8 @@ def condition(model: "HMA", slots: Slots | None, groups: Groups, positions: Tens
         if chunks.shape[-1] < width:
             fault = f"chunks of {chunks.shape[-1]} values where {name} has {width}"
             raise HMAError("actions", fault, "flatten stride x action_dim values into a chunk")
-        embedded = stem(chunks[span, :, :width].masked_fill(~known[span], 0))
-        embedding = torch.where(known[span], embedded, absent)
+        embedded = stem(chunks[span, :, :width].masked_fill(~shown[span], 0))
+        embedding = torch.where(shown[span], embedded, absent)
         embeddings.append(embedding)
         if stem.modulation is None:
             continue
@@ -139,9 +143,10 @@ def condition(model: "HMA", slots: Slots | None, groups: Groups, positions: Tens
         if out is not None:
             outs.append((embedding.shape[0], *out))
     embedding = _cat(embeddings, 0)
+    tokens = torch.where(known, embedding, absent) if config.appended_tokens else None
     if model.trunk.modulation is not None:
         modulations = [model.trunk.modulation(embedding)]
-    return Conditioning(embedding, _cat(modulations, 1) if modulations else None, outs or None)
+    return Conditioning(embedding, _cat(modulations, 1) if modulations else None, outs or None, tokens)
 
 
 def _cat(parts: list[Tensor], dim: int) -> Tensor:

@@ -22,7 +22,9 @@ _CHOICES = {
     "time_position": ("rotary", "learned"),
     "action_alignment": ("previous", "current"),
     "modulation_out": ("trunk", "embodiment"),
-    "absent_action": ("embedding", "skip"),
+    "absent_action": ("embedding", "skip", "tokens"),
+    "add_at": ("input", "layers"),
+    "norms": ("before", "qk"),
     "action_loss": ("mse", "diffusion"),
     "action_target": ("normalized", "raw"),
 }
@@ -63,13 +65,16 @@ class HMAConfig:
     shared_modulation: bool = False  # False: modulation weights per embodiment (paper); True: in the trunk
     modulation_out: str = "trunk"  # whose the projection after the modulated norm is; released: embodiment
     action_tokens: int = 1  # copies of the action embedding put after a frame's tokens (concat)
-    absent_action: str = (
-        "embedding"  # without any actions: a learned embedding, or skip conditioning (released)
-    )
+    add_at: str = "input"  # where embeddings are added (add); "layers": in every block (released)
+    # Without any actions: a learned "embedding" stands for each; "skip": no conditioning (released);
+    # "tokens": only learned action tokens (released, actions predicted too). With "tokens" a chunk hidden
+    # among others is hidden in the action tokens alone, and modulation sees it, as in the released code.
+    absent_action: str = "embedding"
     action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
 
     time_position: str = "rotary"  # relative, so that a cache may roll; "learned": absolute (released)
     rotary_base: float = 100.0  # longest wavelength over the shortest; windows are short
+    norms: str = "before"  # before spatial attention and the MLP; "qk": none there (released with qk_norm)
     temporal_norm: bool = True  # norm before temporal attention; the released code has none
     final_norm: bool = True  # norm after the last block; the released code has none
     qkv_bias: bool = False
@@ -129,8 +134,15 @@ class HMAConfig:
 
     @property
     def appended_tokens(self) -> int:
-        """Action tokens after each frame's own."""
+        """Action tokens after each frame's own, where there are actions."""
         return self.action_tokens if "concat" in self.conditioning else 0
+
+    @property
+    def absent_tokens(self) -> int:
+        """Action tokens after each frame's own in a pass without any actions."""
+        if self.absent_action == "embedding":
+            return self.appended_tokens
+        return self.action_tokens if self.absent_action == "tokens" else 0
 
     @property
     def vocab_size(self) -> int:
@@ -215,6 +227,8 @@ def _check_sets(config: HMAConfig) -> None:
     weights = list(config.objectives.values())
     if not weights or min(weights) < 0 or not 0 < sum(weights) < math.inf:
         raise _refuse("objectives", config.objectives, "weights of at least 0 that do not all vanish")
+    if config.norms == "qk" and not config.qk_norm:
+        raise _refuse("norms", "qk", "before, as qk_norm is off")
     if config.shared_modulation and config.modulation_out == "embodiment":
         raise _refuse("modulation_out", "embodiment", "trunk, as shared_modulation is on")
 
@@ -247,6 +261,8 @@ class ActionSpace:
         stride: actions in a chunk.
         mean, std: (A,) of the raw actions.
         normalize: (A,) False for dims that pass through as they are.
+        zero_variance: what dims that never vary become: "zero"; "divide": they are divided by std + 1e-10
+            like any other (released).
 
     Raises:
         RecipeError: lengths differ from action_dim, or statistics are not finite.
@@ -258,6 +274,7 @@ class ActionSpace:
     mean: tuple[float, ...]
     std: tuple[float, ...]
     normalize: tuple[bool, ...]
+    zero_variance: str = "zero"
 
     def __post_init__(self) -> None:
         if self.action_dim < 1 or self.stride < 1:
@@ -268,6 +285,8 @@ class ActionSpace:
             if len(getattr(self, name)) != self.action_dim:
                 fault = f"{name} has {len(getattr(self, name))} values where the action has {self.action_dim}"
                 raise RecipeError(self.id, fault, "recompute the statistics of this embodiment")
+        if self.zero_variance not in ("zero", "divide"):
+            raise RecipeError(self.id, f"zero_variance is {self.zero_variance!r}", "give zero or divide")
         if not all(map(math.isfinite, (*self.mean, *self.std))) or min(self.std) < 0:
             raise RecipeError(self.id, "action statistics are not finite", "recompute them on clean data")
 
@@ -278,7 +297,7 @@ class ActionSpace:
 
     def agrees_with(self, other: "ActionSpace") -> bool:
         """Equal up to the rounding of statistics to float32, as a stem keeps them."""
-        sizes = ("id", "action_dim", "stride", "normalize")
+        sizes = ("id", "action_dim", "stride", "normalize", "zero_variance")
         return all(getattr(self, name) == getattr(other, name) for name in sizes) and all(
             np.allclose(getattr(self, name), getattr(other, name), rtol=1e-6, atol=1e-30)
             for name in ("mean", "std")
@@ -291,4 +310,6 @@ class ActionSpace:
         mean = np.zeros(dims) if stats is None else np.asarray(stats.mean, dtype=np.float64)
         std = np.ones(dims) if stats is None else np.asarray(stats.std, dtype=np.float64)
         mask = np.asarray(embodiment.normalize_mask, dtype=bool)
-        return cls(embodiment.id, dims, embodiment.stride, *(tuple(a.tolist()) for a in (mean, std, mask)))
+        center, spread, normalize = (tuple(array.tolist()) for array in (mean, std, mask))
+        rule = getattr(stats, "zero_variance", "zero")
+        return cls(embodiment.id, dims, embodiment.stride, center, spread, normalize, rule)

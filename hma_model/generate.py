@@ -141,7 +141,7 @@ class Rollout:
 
     def _cache(self) -> Cache:
         if self.cache is None:
-            appended = 0 if self._skips() else self.config.appended_tokens
+            appended = self.config.absent_tokens if self.passive else self.config.appended_tokens
             like = self.model.trunk.position.detach()
             if torch.is_autocast_enabled(like.device.type):
                 like = like.to(torch.get_autocast_dtype(like.device.type))
@@ -159,7 +159,7 @@ class Rollout:
         return condition(self.model, None if self._skips() else slots, self.sorted, positions)
 
     def _skips(self) -> bool:
-        return self.passive and self.config.absent_action == "skip"
+        return self.passive and self.config.absent_action != "embedding"
 
     def _slots_of(self, actions: Tensor | None, frames: int) -> Slots:
         """The chunk in force at each known frame; aligned with the current one, the last waits for `step`."""
@@ -181,7 +181,7 @@ class Rollout:
 
     def _take(self, chunk: Tensor | None, following: Tensor | None) -> None:
         """Put the chunk at the frame it conditions, and a slot for the new frame."""
-        if self.begun and self.config.absent_action == "skip" and self.passive != (chunk is None):
+        if self.begun and self.config.absent_action != "embedding" and self.passive != (chunk is None):
             raise HMAError("step", "actions came or went during a rollout", "give them always or never")
         self.passive = self.passive and chunk is None
         self.begun = True

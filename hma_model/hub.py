@@ -220,6 +220,32 @@ def from_pretrained(
     return checkpoints.load(folder, ids, str(device))
 
 
+def import_released(
+    source: str | Path,
+    out: str | Path,
+    *,
+    embodiments: Iterable[str] | None = None,
+    grid: tuple[int, int] | None = None,
+    tokenizer: str | None = None,
+    revision: str | None = None,
+) -> Checkpoint:
+    """Bring a checkpoint of the paper's release into our layout; see `hma_model.released_import`."""
+    from hma_model import released_import
+
+    return released_import.import_released(
+        source, out, embodiments=embodiments, grid=grid, tokenizer=tokenizer, revision=revision
+    )
+
+
+def export_released(
+    checkpoint: str | Path, out: str | Path, *, embodiments: Iterable[str] | None = None
+) -> Path:
+    """Write a checkpoint in the paper's released layout; see `hma_model.released_export`."""
+    from hma_model import released_export
+
+    return released_export.export_released(checkpoint, out, embodiments=embodiments)
+
+
 def push_model(model: "HMA", target: str | Path, embodiments: Iterable[str] | None = None) -> str:
     """See `HMA.push_to_hub`: YAML, statistics and cards are those the model was loaded with.
 
@@ -236,7 +262,8 @@ def push_model(model: "HMA", target: str | Path, embodiments: Iterable[str] | No
             cards[name] = {key: known.card(name).get(key, {}) for key in ("data", "metrics", "training")}
         else:
             yaml[name] = _registered(name)
-            stats[name] = {"action": {"mean": list(space.mean), "std": list(space.std)}}
+            action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
+            stats[name] = {"action": action}
     with tempfile.TemporaryDirectory() as folder:
         checkpoints.save(
             model,

@@ -259,7 +259,7 @@ class HMA(nn.Module):
         """
         groups, count = Groups.of(embodiment, len(frames)), frames.shape[1]
         clock = self.clock(count)
-        slots = unknown(self, groups, count)
+        slots = None if self.config.absent_action == "tokens" else unknown(self, groups, count)
         if actions is not None:
             slots = align(self.config, actions, action_mask, count)
         conditioning = condition(self, slots, groups, clock.positions)
@@ -359,7 +359,11 @@ class HMA(nn.Module):
     def action_features(self, features: Tensor) -> Tensor:
         """(B, T, N, D) -> (B, T, D): the mean of the action tokens, or without any, of the frame's own."""
         own = self.config.tokens_per_frame
-        return (features[:, :, own:] if features.shape[2] > own else features).mean(2)
+        if features.shape[2] > own:
+            return features[:, :, own:].mean(2)
+        if self.config.absent_action == "tokens":  # the released code takes as many of the frame's last
+            return features[:, :, -self.config.action_tokens :].mean(2)
+        return features.mean(2)
 
     def _require(self, kind: str, name: str) -> None:
         if self.config.kind != kind:

@@ -1,45 +1,64 @@
-"""The paper's released weights in our modules: their configuration and their names, mapped.
+"""The configuration of the paper's released checkpoints in ours, and ours in theirs.
 
-The released layout differs from our default in what `config_from_released` sets: no norm before temporal
-attention nor after the last block, copies of the action embedding appended to every frame, a projection per
-embodiment after the modulated norm, chunk k at frame k, learned positions over time and space, and action
-heads trained on raw actions.
+The released layout differs from our default in what `_LAYOUT` sets: no norm before temporal attention nor
+after the last block, chunk k at frame k, learned positions over time and space, and action heads trained on
+raw actions. Its `action_network` says by substrings how actions enter: "concat" appends copies of the
+embedding to every frame, and one of "mlp" (added in every block), "cross_attention" and "modulate" acts in
+the blocks.
 
-D width, T frames, S tokens of a frame, K = stride * action dim, c channels, p patch side.
+D width, T frames, S tokens of a frame.
 """
 
 import math
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-from torch import Tensor
-
-from hma_data.errors import CheckpointError
+from hma_data.errors import CheckpointError, RecipeError
 from hma_model.config import HMAConfig
 
-State = dict[str, Tensor]
-
-_STEM = {"model.0": "input", "model.1": "norm", "model.3": "output"}
-_BLOCK = {
-    "norm1": "space_norm",
-    "spatial_attn.qkv": "space.qkv",
-    "spatial_attn.proj": "space.proj",
-    "temporal_attn.qkv": "time.qkv",
-    "temporal_attn.proj": "time.proj",
-    "norm2": "mlp_norm",
-    "mlp.fc1": "mlp.fc1",
-    "mlp.fc2": "mlp.fc2",
+LATENT_SCALE = 0.18215  # what the released loader multiplies stored latents by
+_WHERE = "config.json"
+_LAYOUT: dict[str, Any] = {
+    "modulation_out": "embodiment",
+    "action_alignment": "current",
+    "action_target": "raw",
+    "time_position": "learned",
+    "temporal_norm": False,
+    "final_norm": False,
+    "add_at": "layers",
 }
-_DIFFUSION = {
-    "time_embed.mlp.0": "level_in",
-    "time_embed.mlp.2": "level_out",
-    "cond_embed": "condition",
-    "input_proj": "input",
-    "final_layer.adaLN_modulation.1": "modulation",
-    "final_layer.linear": "output",
+# What a released file that does not state a field means by it.
+_DEFAULTS: dict[str, Any] = {
+    "T": 12,
+    "S": 256,
+    "image_vocab_size": 262144,
+    "use_mup": False,
+    "num_factored_vocabs": 1,
+    "max_corrupt_rate": 0.2,
+    "non_mlm_ratio": 0.2,
+    "num_prompt_frames": 4,
+    "action_network": "mlp",
+    "jointly_predict_actions": False,
+    "jointly_predict_states": True,
+    "action_token_size": 64,
+    "action_loss_weight": 0.5,
+    "qkv_bias": False,
+    "proj_bias": True,
+    "qk_norm": True,
+    "mlp_ratio": 4.0,
+    "mlp_drop": 0.0,
+    "mlp_bias": True,
 }
-_DIFFUSION_BLOCK = {"in_ln": "norm", "mlp.0": "fc1", "mlp.2": "fc2", "adaLN_modulation.1": "modulation"}
+_CONTINUOUS_DEFAULTS: dict[str, Any] = {
+    "image_vocab_size": None,
+    "action_loss_weight": 1.0,
+    "patch_size": 1,
+    "vae_embed_dim": 4,
+    "diffloss_d": 4,
+    "diffloss_w": 1024,
+    "num_sampling_steps": "100",
+    "diffusion_batch_mul": 1,
+}
 
 
 def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | None = None) -> HMAConfig:
@@ -50,212 +69,208 @@ def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | No
         case: may give `grid`, the tokenizer's (h, w), where a frame is not square.
 
     Raises:
-        CheckpointError: the configuration asks for what no released checkpoint has, or lacks a field.
+        CheckpointError: the configuration asks for what the released code cannot do or does wrongly, lacks a
+            field, or has a value that is not allowed.
     """
+    continuous = bool(config.get("Diffusion", config.get("image_vocab_size", 0) is None))
+    given = {key: value for key, value in config.items() if value is not None}
+    values = _DEFAULTS | (_CONTINUOUS_DEFAULTS if continuous else {}) | given
     try:
-        continuous = bool(config.get("Diffusion", config.get("image_vocab_size") is None))
-        network = str(config["action_network"])
-        if sorted(network.split("+")) != ["concat", "modulate"] or config["qk_norm"]:
-            fault = f"action_network {network!r} with qk_norm {config['qk_norm']} was never released"
-            raise CheckpointError(
-                "config.json", fault, "only concat+modulate without qk_norm can be imported"
-            )
-        side = math.isqrt(config["S"])
-        grid = tuple((case or {}).get("grid", (side, side)))
-        if math.prod(grid) != config["S"]:
-            raise CheckpointError("config.json", f"S is {config['S']}, which is no square", "name the grid")
-        shared = {
-            "layers": config["num_layers"],
-            "width": config["d_model"],
-            "heads": config["num_heads"],
-            "mlp_ratio": config["mlp_ratio"],
-            "dropout": config["mlp_drop"],
-            "frames": config["T"],
-            "grid": grid,
-            "action_tokens": config["action_token_size"],
-            "qkv_bias": config["qkv_bias"],
-            "proj_bias": config["proj_bias"],
-            "mlp_bias": config["mlp_bias"],
-            "mup": config["use_mup"],
-            "action_loss_weight": config["action_loss_weight"],
-        }
-        own = _continuous(config) if continuous else _discrete(config)
+        shared = _shared(values, continuous)
+        shared["grid"] = _grid(values["S"], (case or {}).get("grid"))
+        own = _continuous(values) if continuous else _discrete(values)
+        return HMAConfig(**_LAYOUT, **shared, **own)
     except KeyError as error:
-        raise CheckpointError(
-            "config.json", f"lacks {error.args[0]}", "is it a released checkpoint?"
-        ) from error
-    return HMAConfig(**shared, **own, **_LAYOUT)
+        raise CheckpointError(_WHERE, f"lacks {error.args[0]}", "is it a released checkpoint?") from error
+    except RecipeError as error:
+        fault = f"{error.where.removeprefix('model.')}: {error.fault}"
+        raise CheckpointError(_WHERE, fault, "is it a released checkpoint?") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        fault = f"has a value of the wrong type: {error}"
+        raise CheckpointError(_WHERE, fault, "is it a released checkpoint?") from error
 
 
-_LAYOUT: dict[str, Any] = {
-    "conditioning": ("concat", "modulation"),
-    "modulation_out": "embodiment",
-    "absent_action": "skip",
-    "action_alignment": "current",
-    "action_target": "raw",
-    "time_position": "learned",
-    "temporal_norm": False,
-    "final_norm": False,
-}
-
-
-def _discrete(config: Mapping[str, Any]) -> dict[str, Any]:
+def _shared(values: Mapping[str, Any], continuous: bool) -> dict[str, Any]:
+    joint, mup = bool(values["jointly_predict_actions"]), bool(values["use_mup"])
+    if mup and continuous and values["d_model"] != 256:
+        fault = f"is continuous with use_mup and width {values['d_model']}"
+        raise CheckpointError(_WHERE, fault, "the released code makes such a model only at width 256")
+    conditioning = _conditioning(str(values["action_network"]))
+    objective = "forward" if not joint else "full" if values["jointly_predict_states"] else "policy"
     return {
-        "kind": "discrete",
-        "factored": (config["factored_vocab_size"],) * config["num_factored_vocabs"],
-        "corrupt_max": config["max_corrupt_rate"],
-        "history_probability": config["non_mlm_ratio"],
-        "history_frames": config["num_prompt_frames"],
+        "layers": values["num_layers"],
+        "width": values["d_model"],
+        "heads": values["num_heads"],
+        "mlp_ratio": float(values["mlp_ratio"]),
+        "dropout": float(values["mlp_drop"]),
+        "frames": values["T"],
+        "conditioning": conditioning,
+        "action_tokens": values["action_token_size"],
+        "absent_action": "tokens" if joint else "skip",
+        "qkv_bias": bool(values["qkv_bias"]),
+        "proj_bias": bool(values["proj_bias"]),
+        "mlp_bias": bool(values["mlp_bias"]),
+        "qk_norm": bool(values["qk_norm"]),
+        "norms": "qk" if values["qk_norm"] else "before",
+        "mup": mup,
+        "action_loss_weight": float(values["action_loss_weight"]),
+        "objectives": {objective: 1.0},
     }
 
 
-def _continuous(config: Mapping[str, Any]) -> dict[str, Any]:
+def _conditioning(network: str) -> tuple[str, ...]:
+    """What an action_network means, by the substrings that the released code looks for."""
+    if "cross_attention" in network and "mlp" not in network:
+        fault = f"action_network {network!r}: the released cross-attention mixes up rows and samples"
+        raise CheckpointError(_WHERE, fault, "it cannot be imported")
+    if "resampler" in network:
+        fault = f"action_network {network!r}: the released code has no resampler"
+        raise CheckpointError(_WHERE, fault, "it cannot be imported")
+    found = ["concat"] if "concat" in network else []
+    if "mlp" in network:
+        found.append("add")
+    elif "modulate" in network:
+        found.append("modulation")
+    if not found:
+        fault = f"action_network {network!r} uses actions in no way that is known"
+        raise CheckpointError(_WHERE, fault, "known are mlp, modulate, concat and concat+modulate")
+    return tuple(found)
+
+
+def _grid(tokens: int, grid: Any) -> tuple[int, int]:
+    side = math.isqrt(tokens)
+    height, width = (side, side) if grid is None else (int(part) for part in grid)
+    if height * width != tokens:
+        fault = f"S is {tokens}, which is not {height} x {width}"
+        raise CheckpointError(_WHERE, fault, "name the grid")
+    return height, width
+
+
+def _discrete(values: Mapping[str, Any]) -> dict[str, Any]:
+    vocab, digits = values["image_vocab_size"], values["num_factored_vocabs"]
+    size = round(vocab ** (1 / digits))
+    if size**digits != vocab:
+        raise CheckpointError(_WHERE, f"image_vocab_size {vocab} is no power of {digits} equal digits")
+    return {
+        "kind": "discrete",
+        "factored": (size,) * digits,
+        "corrupt_max": values["max_corrupt_rate"],
+        "history_probability": values["non_mlm_ratio"],
+        "history_frames": values["num_prompt_frames"],
+    }
+
+
+def _continuous(values: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "kind": "continuous",
-        "channels": config["vae_embed_dim"],
-        "patch": config["patch_size"],
-        "latent_scale": 0.18215,
+        "channels": values["vae_embed_dim"],
+        "patch": values["patch_size"],
+        "latent_scale": LATENT_SCALE,
         "action_loss": "diffusion",
-        "diffusion_depth": config["diffloss_d"],
-        "diffusion_width": config["diffloss_w"],
-        "diffusion_sample_steps": int(config["num_sampling_steps"]),
-        "diffusion_repeats": config["diffusion_batch_mul"],
+        "diffusion_depth": values["diffloss_d"],
+        "diffusion_width": values["diffloss_w"],
+        "diffusion_sample_steps": _sample_steps(str(values["num_sampling_steps"])),
+        "diffusion_repeats": values["diffusion_batch_mul"],
         "diffusion_variance": True,
     }
 
 
-def state_from_released(
-    state: Mapping[str, Tensor], config: HMAConfig
-) -> tuple[State, dict[str, tuple[State, State]]]:
-    """A released state, divided and renamed.
+def _sample_steps(text: str) -> int:
+    """Steps of a respacing: a number, ddim and a number, numbers that add up, or nothing for all."""
+    return sum(int(part) for part in text.removeprefix("ddim").split(",")) if text else 1000
 
-    Args:
-        state: the released names and tensors.
-        config: from `config_from_released`.
 
-    Returns:
-        What `HMA.load_trunk` takes, and per embodiment the stem and head for `HMA.load_embodiment`; float32.
+def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
+    """The released `config.json` of a configuration, without its action domains.
 
     Raises:
-        CheckpointError: a tensor is missing.
+        CheckpointError: the released layout cannot express it; it names everything that stands against it.
     """
-    source = {name: tensor.float() for name, tensor in state.items()}
-    domains = sorted({name.split(".")[1] for name in source if name.startswith("action_mlp.")})
-    try:
-        trunk = _trunk(source, config)
-        parts = {domain: (_stem(source, domain, config), _head(source, domain, config)) for domain in domains}
-    except KeyError as error:
-        raise CheckpointError("released weights", f"lack {error.args[0]}", "is the file complete?") from error
-    return trunk, parts
-
-
-def _take(source: State, old: str, new: str) -> State:
-    """The weight and, if there is one, the bias of a module under its new name."""
-    names = {f"{new}.weight": source[f"{old}.weight"]}
-    if f"{old}.bias" in source:
-        names[f"{new}.bias"] = source[f"{old}.bias"]
-    return names
-
-
-def _trunk(source: State, config: HMAConfig) -> State:
-    tokens = config.tokens_per_frame + config.appended_tokens
-    # the released table of the continuous model is longer than its frames; only its first rows are used
-    trunk = {
-        "trunk.position": source["pos_embed_TSC"][0, :, :tokens],
-        "trunk.absent": source["action_mask_tokens"][0, :, 0],
+    faults = _inexpressible(config)
+    if faults:
+        raise CheckpointError(
+            where,
+            f"the released layout cannot express {'; '.join(faults)}",
+            "the released code cannot read it",
+        )
+    concat = "concat+" if "concat" in config.conditioning else ""
+    inside = (
+        "modulate" if "modulation" in config.conditioning else "mlp" if "add" in config.conditioning else ""
+    )
+    joint = config.absent_action == "tokens"
+    values = {
+        "num_layers": config.layers,
+        "num_heads": config.heads,
+        "d_model": config.width,
+        "T": config.frames,
+        "S": math.prod(config.grid),
+        "image_vocab_size": config.vocab_size if config.kind == "discrete" else None,
+        "use_mup": config.mup,
+        "num_factored_vocabs": len(config.factored) if config.kind == "discrete" else 2,
+        "max_corrupt_rate": config.corrupt_max,
+        "non_mlm_ratio": config.history_probability,
+        "num_prompt_frames": config.history_frames,
+        "action_network": f"{concat}{inside}".strip("+"),
+        "jointly_predict_actions": joint,
+        "jointly_predict_states": set(config.objectives) != {"policy"},
+        "action_token_size": config.action_tokens,
+        "action_loss_weight": config.action_loss_weight,
+        "qkv_bias": config.qkv_bias,
+        "proj_bias": config.proj_bias,
+        "qk_norm": config.qk_norm,
+        "mlp_ratio": config.mlp_ratio,
+        "mlp_drop": config.dropout,
+        "mlp_bias": config.mlp_bias,
     }
-    for layer in range(config.layers):
-        for old, new in _BLOCK.items():
-            trunk |= _take(source, f"decoder.layers.{layer}.{old}", f"trunk.blocks.{layer}.{new}")
-    return trunk | (_latents(source, config) if config.kind == "continuous" else _tokens(source, config))
+    return values | (_continuous_fields(config) if config.kind == "continuous" else {})
 
 
-def _tokens(source: State, config: HMAConfig) -> State:
-    ends = {"trunk.embed.mask": source["token_embed.mask_token_embed"][0]}
-    for digit in range(len(config.factored)):
-        ends[f"trunk.embed.digits.{digit}"] = source[f"token_embed.factored_embeds.{digit}.weight"]
-    return ends | _take(source, "out_x_proj", "readout.linear")
-
-
-def _latents(source: State, config: HMAConfig) -> State:
-    ends = {
-        "trunk.embed.mask": source["mask_token"].flatten(),
-        "trunk.embed.linear.weight": _channels_first(source["token_embed.weight"], config),
-        "readout.position": source["diffusion_pos_embed_learned"][0].unflatten(0, (config.frames, -1)),
-    }
-    for old, new in (
-        ("z_proj_ln", "trunk.embed_norm"),
-        ("out_x_proj", "readout.proj"),
-        ("decoder_norm", "readout.norm"),
-    ):
-        ends |= _take(source, old, new)
-    return ends | _patch_diffusion(source, config)
-
-
-def _channels_first(values: Tensor, config: HMAConfig) -> Tensor:
-    """Reorder the last axis from a patch's pixels by channels to channels by pixels."""
-    return values.unflatten(-1, (config.patch**2, config.channels)).mT.flatten(-2)
-
-
-def _patch_diffusion(source: State, config: HMAConfig) -> State:
-    """The video's diffusion head; its inputs and outputs are patches, so they are reordered too."""
-    head = _diffusion(source, "diffloss.net", "readout.diffusion", config)
-    prefix = "readout.diffusion"
-    head[f"{prefix}.input.weight"] = _channels_first(head[f"{prefix}.input.weight"], config)
-    weight, bias = head[f"{prefix}.output.weight"], head[f"{prefix}.output.bias"]
-    halves = (2, -1)  # the noise, then its variance
-    weight = _channels_first(weight.unflatten(0, halves).movedim(-1, 0), config).movedim(0, -1).flatten(0, 1)
-    bias = _channels_first(bias.unflatten(0, halves), config).flatten()
-    return head | {f"{prefix}.output.weight": weight.contiguous(), f"{prefix}.output.bias": bias}
-
-
-def _diffusion(source: State, old: str, new: str, config: HMAConfig) -> State:
-    names: State = {}
-    for theirs, ours in _DIFFUSION.items():
-        names |= _take(source, f"{old}.{theirs}", f"{new}.{ours}")
-    for block in range(config.diffusion_depth):
-        for theirs, ours in _DIFFUSION_BLOCK.items():
-            names |= _take(source, f"{old}.res_blocks.{block}.{theirs}", f"{new}.blocks.{block}.{ours}")
-    return names
-
-
-def _stem(source: State, domain: str, config: HMAConfig) -> State:
-    mean = source[f"action_preprocessor.{domain}.mean"]
-    stem = {
-        "normalizer.mean": mean,
-        "normalizer.std": source[f"action_preprocessor.{domain}.std"],
-        "normalizer.normalize": torch.ones_like(mean, dtype=torch.bool),
-    }
-    for old, new in _STEM.items():
-        stem |= _take(source, f"action_mlp.{domain}.{old}", new)
-    return stem | _modulation(source, domain, config)
-
-
-def _modulation(source: State, domain: str, config: HMAConfig) -> State:
-    """The layers' modulations stacked; the first two maps are kept (in, out)."""
-
-    def stack(name: str) -> Tensor:
-        keys = [f"decoder.layers.{layer}.action_projectors.{domain}.{name}" for layer in range(config.layers)]
-        return torch.stack([source[key] for key in keys])
-
+def _continuous_fields(config: HMAConfig) -> dict[str, Any]:
     return {
-        "modulation.weight_in": stack("adaLN_modulation.0.weight").mT.contiguous(),
-        "modulation.bias_in": stack("adaLN_modulation.0.bias").unsqueeze(1),
-        "modulation.weight": stack("adaLN_modulation.2.weight").mT.contiguous(),
-        "modulation.bias": stack("adaLN_modulation.2.bias").unsqueeze(1),
-        "modulation.out_weight": stack("linear_out.weight"),
-        "modulation.out_bias": stack("linear_out.bias"),
+        "Diffusion": True,
+        "patch_size": config.patch,
+        "vae_embed_dim": config.channels,
+        "diffloss_d": config.diffusion_depth,
+        "diffloss_w": config.diffusion_width,
+        "num_sampling_steps": str(config.diffusion_sample_steps),
+        "diffusion_batch_mul": config.diffusion_repeats,
     }
 
 
-def _head(source: State, domain: str, config: HMAConfig) -> State:
-    """Their only readout serves as both of ours; a diffusion head was given the features as they are."""
-    if config.action_loss == "diffusion":
-        weight, bias = torch.eye(config.width), torch.zeros(config.width)
-        head = _diffusion(source, f"action_diff_losses.{domain}.net", "diffusion", config)
-    else:
-        weight, bias = (source[f"action_out_projectors.{domain}.{name}"] for name in ("weight", "bias"))
-        head = {}
-    for readout in ("policy", "inverse"):
-        head |= {f"{readout}.weight": weight.clone(), f"{readout}.bias": bias.clone()}
-    return head
+def _inexpressible(config: HMAConfig) -> list[str]:
+    """Each field and value that the released code has no equal of."""
+    fixed = ("time_position", "action_alignment", "temporal_norm", "final_norm")
+    faults = [f"{name} {getattr(config, name)!r}" for name in fixed if getattr(config, name) != _LAYOUT[name]]
+    if config.absent_action == "embedding":
+        faults.append("absent_action 'embedding'")
+    inside = set(config.conditioning) - {"concat"}
+    if "cross_attention" in inside or len(inside) > 1 or ("add" in inside and config.add_at != "layers"):
+        faults.append(f"conditioning {'+'.join(config.conditioning)} (add_at {config.add_at})")
+    if config.qk_norm != (config.norms == "qk"):
+        faults.append(f"qk_norm {config.qk_norm} with norms {config.norms!r}")
+    if math.isqrt(math.prod(config.grid)) ** 2 != math.prod(config.grid):
+        faults.append(f"a frame of {math.prod(config.grid)} tokens, which is no square")
+    trained = {name for name, weight in config.objectives.items() if weight > 0}
+    if "inverse" in trained:
+        faults.append("objective inverse")
+    if trained & {"policy", "full"} and config.absent_action != "tokens":
+        faults.append(f"objectives {', '.join(sorted(trained))} with absent_action {config.absent_action!r}")
+    if config.mup and config.base_width != 256:
+        faults.append(f"base_width {config.base_width}")
+    return faults + (_not_continuous(config) if config.kind == "continuous" else _not_discrete(config))
+
+
+def _not_discrete(config: HMAConfig) -> list[str]:
+    faults = [f"action_loss {config.action_loss!r}"] if config.action_loss != "mse" else []
+    return faults + ([f"unequal digits {config.factored}"] if len(set(config.factored)) > 1 else [])
+
+
+def _not_continuous(config: HMAConfig) -> list[str]:
+    faults = [f"action_loss {config.action_loss!r}"] if config.action_loss != "diffusion" else []
+    if config.latent_scale != LATENT_SCALE:
+        faults.append(f"latent_scale {config.latent_scale}")
+    if config.diffusion_train_steps != 1000:
+        faults.append(f"diffusion_train_steps {config.diffusion_train_steps}")
+    if config.mup and config.width != 256:
+        faults.append(f"muP at width {config.width} in a continuous model")
+    return faults

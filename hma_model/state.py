@@ -46,4 +46,5 @@ def space_of_stem(embodiment: str, stem: Mapping[str, Tensor]) -> ActionSpace:
             f"{embodiment}: stem", f"missing {error.args[0]}", "is it a stem's state?"
         ) from error
     values = tuple(mean.tolist()), tuple(std.tolist()), tuple(mask.bool().tolist())
-    return ActionSpace(embodiment, mean.numel(), chunk_dim // mean.numel(), *values)
+    rule = "divide" if "normalizer.divide" in stem else "zero"
+    return ActionSpace(embodiment, mean.numel(), chunk_dim // mean.numel(), *values, zero_variance=rule)

@@ -16,19 +16,23 @@ from hma_model.config import ActionSpace, HMAConfig
 class Normalizer(nn.Module):
     """Raw actions to zero mean and unit variance, and back.
 
-    Dims that never vary become 0 and come back as their mean; dims marked not to be normalised pass through.
+    Dims that never vary become 0 and come back as their mean, unless the action space says "divide"; dims
+    marked not to be normalised pass through.
     The statistics stay float32 whatever the model is cast to.
     """
 
     mean: Tensor
     std: Tensor
     normalize: Tensor
+    divide: Tensor | None
 
     def __init__(self, space: ActionSpace) -> None:
         super().__init__()
         self.register_buffer("mean", torch.tensor(space.mean, dtype=torch.float32))
         self.register_buffer("std", torch.tensor(space.std, dtype=torch.float32))
         self.register_buffer("normalize", torch.tensor(space.normalize, dtype=torch.bool))
+        released = space.zero_variance == "divide"  # in the state only where it is so
+        self.register_buffer("divide", torch.tensor(True) if released else None)
 
     def forward(self, actions: Tensor) -> Tensor:
         """(..., K) raw -> (..., K) normalised, float32."""
@@ -44,9 +48,13 @@ class Normalizer(nn.Module):
         return actions.float().unflatten(-1, (-1, self.mean.numel()))
 
     def _affine(self) -> tuple[Tensor, Tensor, Tensor]:
-        varies = self.std > 1e-6 * self.mean.abs() + 1e-9  # a constant's float32 rounding is no variance
-        scale = torch.where(varies, self.std, 0.0)
-        inverse = torch.where(varies, 1 / self.std.clamp(min=1e-9), 0.0)
+        if self.divide is not None:
+            scale = self.std + 1e-10
+            inverse = 1 / scale
+        else:
+            varies = self.std > 1e-6 * self.mean.abs() + 1e-9  # a constant's float32 rounding is no variance
+            scale = torch.where(varies, self.std, 0.0)
+            inverse = torch.where(varies, 1 / self.std.clamp(min=1e-9), 0.0)
         one, zero = torch.ones_like(scale), torch.zeros_like(scale)
         return (
             torch.where(self.normalize, self.mean, zero),

@@ -25,6 +25,7 @@ class Conditioning:
 
     Attributes:
         embedding: (B, T, D) of the chunk in force at each frame; None without conditioning.
+        tokens: (B, T, D) what is put after each frame's own tokens; None for nothing.
         modulation: (L, B, T, 2D) shift and gain.
         out: per group of samples, in batch order, its size and the embodiment's projections after the
             modulated norm (L, D, D) and (L, D); None when the trunk has them.
@@ -33,13 +34,13 @@ class Conditioning:
     embedding: Tensor | None = None
     modulation: Tensor | None = None
     out: list[tuple[int, Tensor, Tensor]] | None = None
+    tokens: Tensor | None = None
 
     def last(self) -> "Conditioning":
         """Of the last frame alone."""
-        if self.embedding is None:
-            return self
+        embedding, tokens = (None if x is None else x[:, -1:] for x in (self.embedding, self.tokens))
         modulation = None if self.modulation is None else self.modulation[:, :, -1:]
-        return Conditioning(self.embedding[:, -1:], modulation, self.out)
+        return Conditioning(embedding, modulation, self.out, tokens)
 
 
 @dataclass
@@ -223,18 +224,19 @@ class Block(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         width = config.width
-        self.space_norm = nn.LayerNorm(width)
+        self.space_norm = nn.LayerNorm(width) if config.norms == "before" else nn.Identity()
         self.space = Attention(config)
         self.modulation_out: nn.Linear | None = None
         if "modulation" in config.conditioning and config.modulation_out == "trunk":
             self.modulation_out = nn.Linear(width, width)
+        self.adds = "add" in config.conditioning and config.add_at == "layers"
         self.action: ActionAttention | None = None
         if "cross_attention" in config.conditioning:
             self.action_norm = nn.LayerNorm(width)
             self.action = ActionAttention(config)
         self.time_norm = nn.LayerNorm(width) if config.temporal_norm else nn.Identity()
         self.time = TemporalAttention(config)
-        self.mlp_norm = nn.LayerNorm(width)
+        self.mlp_norm = nn.LayerNorm(width) if config.norms == "before" else nn.Identity()
         self.mlp = MLP(config)
 
     def forward(
@@ -243,6 +245,8 @@ class Block(nn.Module):
         """(B, T, N, D) -> the same shape."""
         frames = self.space_norm(x).flatten(0, 1)
         x = x + self.space.merge(*self.space.project(frames, None)).view(x.shape)
+        if self.adds and conditioning.embedding is not None:
+            x = x + conditioning.embedding.unsqueeze(2)
         if conditioning.modulation is not None:
             x = x + self.modulate(x, conditioning, layer)
         if self.action is not None and conditioning.embedding is not None:
@@ -275,7 +279,7 @@ class Trunk(nn.Module):
         self.config = config
         self.checkpointing = False
         learned = config.time_position == "learned"
-        tokens = config.tokens_per_frame + config.appended_tokens
+        tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
         self.embed = LatentEmbedding(config) if config.kind == "continuous" else TokenEmbedding(config)
         self.position = nn.Parameter(
             torch.randn(config.frames if learned else 1, tokens, config.width) * 0.02
@@ -295,7 +299,7 @@ class Trunk(nn.Module):
         self, x: Tensor, conditioning: Conditioning, clock: Clock, caches: list[LayerCache] | None = None
     ) -> Tensor:
         """Embedded tokens (B, T, S, D) -> features (B, T, N, D), action tokens after the frame's own."""
-        x = self.embed_norm(self.join(x, conditioning.embedding, clock))
+        x = self.embed_norm(self.join(x, conditioning, clock))
         for layer, block in enumerate(self.blocks):
             cache = None if caches is None else caches[layer]
             if self.checkpointing and self.training and torch.is_grad_enabled():
@@ -304,12 +308,13 @@ class Trunk(nn.Module):
                 x = block(x, conditioning, layer, clock, cache)
         return self.norm(x)
 
-    def join(self, x: Tensor, embedding: Tensor | None, clock: Clock) -> Tensor:
-        """Add or append the action embeddings (B, T, D), and add the positions."""
-        if embedding is not None and "add" in self.config.conditioning:
+    def join(self, x: Tensor, conditioning: Conditioning, clock: Clock) -> Tensor:
+        """Add or append the action embeddings, and add the positions."""
+        embedding, config = conditioning.embedding, self.config
+        if embedding is not None and "add" in config.conditioning and config.add_at == "input":
             x = x + embedding.unsqueeze(2)
-        if embedding is not None and self.config.appended_tokens:
-            copies = embedding.unsqueeze(2).expand(-1, -1, self.config.appended_tokens, -1)
+        if conditioning.tokens is not None:
+            copies = conditioning.tokens.unsqueeze(2).expand(-1, -1, config.action_tokens, -1)
             x = torch.cat([x, copies.to(x.dtype)], dim=2)
         return x + rows_at(self.position, clock.positions)[:, : x.shape[2]]
 

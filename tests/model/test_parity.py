@@ -1,4 +1,7 @@
-"""The network against the paper's released code, on weights and outputs in its layout."""
+"""The network against the paper's released code: weights in its layout, inputs and outputs it computed.
+
+Everything goes the way a user's checkpoint goes: imported to a folder, loaded from it.
+"""
 
 import json
 from pathlib import Path
@@ -9,27 +12,36 @@ import torch
 from safetensors.torch import load_file
 
 from hma_data.errors import CheckpointError
+from hma_model import hub
 from hma_model.model import HMA
-from hma_model.released import config_from_released, state_from_released
+from hma_model.released import config_from_released
+from hma_model.released_state import state_from_released
 
 pytestmark = pytest.mark.real
 
 
-def _load(folder: Path) -> tuple[HMA, dict[str, torch.Tensor], list[str]]:
-    config = json.loads((folder / "config.json").read_text())
+@pytest.fixture(scope="module")
+def imported(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The folders of the three imported checkpoints, by name."""
+    out = tmp_path_factory.mktemp("imported")
+    names = ("discrete", "discrete_mup", "continuous")
+    return {
+        name: hub.import_released(real_data / "parity" / name, out / name).folder
+        for name in names
+        if (real_data / "parity" / name).is_dir()
+    }
+
+
+def _io(folder: Path) -> tuple[dict[str, torch.Tensor], list[str]]:
     case = json.loads((folder / "case.json").read_text())
-    model = HMA(config_from_released(config, case)).eval()
-    trunk, parts = state_from_released(load_file(folder / "model.safetensors"), model.config)
-    model.load_trunk(trunk)
-    for embodiment, (stem, head) in parts.items():
-        model.load_embodiment(embodiment, stem, head)
     with np.load(folder / "io.npz") as arrays:
-        return model, {name: torch.from_numpy(arrays[name]) for name in arrays}, case["domains"]
+        return {name: torch.from_numpy(arrays[name]) for name in arrays}, case["domains"]
 
 
 @pytest.mark.parametrize("name", ["discrete", "discrete_mup"])
-def test_logits_equal_the_released_code(real_data: Path, name: str) -> None:
-    model, io, embodiments = _load(real_data / "parity" / name)
+def test_logits_equal_the_released_code(imported: dict[str, Path], real_data: Path, name: str) -> None:
+    io, embodiments = _io(real_data / "parity" / name)
+    model = HMA.from_pretrained(str(imported[name]), embodiments=embodiments)
     for embodiment in embodiments:
         with torch.no_grad():
             logits = model.video_logits(io[f"{embodiment}.tokens"], io[f"{embodiment}.actions"], embodiment)
@@ -37,9 +49,10 @@ def test_logits_equal_the_released_code(real_data: Path, name: str) -> None:
         assert (logits - expected).abs().max() < 1e-4
 
 
-def test_conditions_equal_the_released_code(real_data: Path) -> None:
-    model, io, embodiments = _load(real_data / "parity" / "continuous")
+def test_conditions_equal_the_released_code(imported: dict[str, Path], real_data: Path) -> None:
+    io, embodiments = _io(real_data / "parity" / "continuous")
     for embodiment in embodiments:
+        model = HMA.from_pretrained(str(imported["continuous"]), embodiments=[embodiment])
         latents = io[f"{embodiment}.latents"].permute(0, 1, 4, 2, 3)
         with torch.no_grad():
             z = model.video_conditions(
@@ -48,8 +61,11 @@ def test_conditions_equal_the_released_code(real_data: Path) -> None:
         assert (z - io[f"{embodiment}.z"].permute(0, 2, 3, 4, 1)).abs().max() < 1e-4
 
 
-def test_embodiments_of_one_released_model_may_share_a_batch(real_data: Path) -> None:
-    model, io, embodiments = _load(real_data / "parity" / "discrete")
+def test_embodiments_of_one_released_model_may_share_a_batch(
+    imported: dict[str, Path], real_data: Path
+) -> None:
+    io, embodiments = _io(real_data / "parity" / "discrete")
+    model = HMA.from_pretrained(str(imported["discrete"]))
     widest = max(io[f"{e}.actions"].shape[-1] for e in embodiments)
     pads = [(0, widest - io[f"{e}.actions"].shape[-1]) for e in embodiments]
     actions = torch.stack(
@@ -65,6 +81,38 @@ def test_embodiments_of_one_released_model_may_share_a_batch(real_data: Path) ->
     for row, name in enumerate(embodiments * 2):
         expected = io[f"{name}.logits"][row // 2].unflatten(0, (2, 512)).permute(2, 3, 4, 0, 1)
         assert (mixed[row] - expected).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("name", ["discrete", "discrete_mup", "continuous"])
+def test_an_imported_checkpoint_exports_to_the_same_tensors(
+    imported: dict[str, Path], real_data: Path, tmp_path: Path, name: str
+) -> None:
+    hub.export_released(imported[name], tmp_path / "out")
+    before = load_file(real_data / "parity" / name / "model.safetensors")
+    after = load_file(tmp_path / "out" / "model.safetensors")
+    config = json.loads((real_data / "parity" / name / "config.json").read_text())
+    used = (
+        16 + config["action_token_size"]
+    )  # of the continuous model's table, which is longer than its frames
+    for state in (before, after):
+        state["pos_embed_TSC"] = state["pos_embed_TSC"][:, :, :used]
+    assert before.keys() == after.keys()
+    for key, tensor in before.items():
+        assert torch.allclose(tensor.float(), after[key], atol=1e-6), key
+
+
+def test_statistics_and_sizes_of_each_domain_are_carried(imported: dict[str, Path], real_data: Path) -> None:
+    from hma_model.checkpoint import Checkpoint
+
+    case = json.loads((real_data / "parity" / "discrete" / "case.json").read_text())
+    state = load_file(real_data / "parity" / "discrete" / "model.safetensors")
+    checkpoint = Checkpoint.open(imported["discrete"])
+    for domain, dims, stride in zip(case["domains"], case["action_dims"], case["strides"]):
+        embodiment = checkpoint.embodiment(domain)
+        assert (embodiment.action_dim, embodiment.stride) == (dims, stride)
+        for part in ("mean", "std"):
+            expected = state[f"action_preprocessor.{domain}.{part}"].float().tolist()
+            assert checkpoint.stats(domain)["action"][part] == expected
 
 
 def test_a_missing_released_tensor_is_named(real_data: Path) -> None:

@@ -1,0 +1,331 @@
+"""The tensors of the paper's released checkpoints under our names, and ours under theirs.
+
+Most modules are only renamed (`_renamed`). The rest: a patch's values lie channels first in ours and pixels
+first in theirs; the modulation of all layers is stacked in ours, its maps kept (in, out); the released action
+heads read the pooled features directly, so our readout before a diffusion head is the identity or folded
+into the head.
+
+D width, T frames, S tokens of a frame, K = stride * action dim, c channels, p patch side.
+"""
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from hma_data.errors import CheckpointError
+from hma_model.config import HMAConfig
+
+State = dict[str, Tensor]
+Parts = dict[str, tuple[State, State]]
+
+_STEM = {"model.0": "input", "model.1": "norm", "model.3": "output"}
+_BLOCK = {
+    "norm1": "space_norm",
+    "spatial_attn.qkv": "space.qkv",
+    "spatial_attn.proj": "space.proj",
+    "temporal_attn.qkv": "time.qkv",
+    "temporal_attn.proj": "time.proj",
+    "norm2": "mlp_norm",
+    "mlp.fc1": "mlp.fc1",
+    "mlp.fc2": "mlp.fc2",
+}
+_DIFFUSION = {
+    "time_embed.mlp.0": "level_in",
+    "time_embed.mlp.2": "level_out",
+    "cond_embed": "condition",
+    "input_proj": "input",
+    "final_layer.adaLN_modulation.1": "modulation",
+    "final_layer.linear": "output",
+}
+_DIFFUSION_BLOCK = {"in_ln": "norm", "mlp.0": "fc1", "mlp.2": "fc2", "adaLN_modulation.1": "modulation"}
+_MODULATION = {"adaLN_modulation.0": "_in", "adaLN_modulation.2": ""}
+
+
+def domains_of(state: Mapping[str, Tensor]) -> list[str]:
+    """The embodiments of a released state, in its own names."""
+    return sorted({name.split(".")[1] for name in state if name.startswith("action_mlp.")})
+
+
+def state_from_released(state: Mapping[str, Tensor], config: HMAConfig) -> tuple[State, Parts]:
+    """A released state, divided and renamed.
+
+    Args:
+        state: the released names and tensors.
+        config: from `config_from_released`.
+
+    Returns:
+        What `HMA.load_trunk` takes, and per embodiment the stem and head for `HMA.load_embodiment`; float32.
+
+    Raises:
+        CheckpointError: a tensor is missing.
+    """
+    source = {name: tensor.float() for name, tensor in state.items()}
+    try:
+        trunk = _trunk(source, config)
+        parts = {
+            name: (_stem(source, name, config), _head(source, name, config)) for name in domains_of(state)
+        }
+    except KeyError as error:
+        raise CheckpointError("released weights", f"lack {error.args[0]}", "is the file complete?") from error
+    return trunk, parts
+
+
+def state_to_released(
+    trunk: Mapping[str, Tensor], parts: Mapping[str, tuple[State, State]], config: HMAConfig
+) -> State:
+    """The released names and tensors of a trunk and of embodiments' (stem, head), by the released names.
+
+    The configuration must be one that `config_to_released` takes. Tensors may be on the meta device.
+    """
+    released = _back(trunk, _renamed(config))
+    released |= _positions_back(trunk, config)
+    if config.qk_norm:
+        for layer in range(config.layers):
+            for theirs, ours in (("spatial_attn", "space"), ("temporal_attn", "time")):
+                prefix = f"decoder.layers.{layer}.{theirs}.norm"
+                released |= _move(trunk, f"trunk.blocks.{layer}.{ours}.q_norm", prefix)
+    released |= _patches_back(trunk, config) if config.kind == "continuous" else _digits_back(trunk, config)
+    for name, (stem, head) in parts.items():
+        released |= _stem_back(stem, trunk, name, config) | _head_back(head, stem, name, config)
+    return {name: tensor.float().contiguous() for name, tensor in released.items()}
+
+
+def _renamed(config: HMAConfig) -> dict[str, str]:
+    """Modules of the trunk that are only renamed: theirs -> ours."""
+    names = {}
+    for layer in range(config.layers):
+        for theirs, ours in _BLOCK.items():
+            if config.norms == "before" or not theirs.startswith("norm"):
+                names[f"decoder.layers.{layer}.{theirs}"] = f"trunk.blocks.{layer}.{ours}"
+    if config.kind == "discrete":
+        return names | {"out_x_proj": "readout.linear"}
+    names |= {"z_proj_ln": "trunk.embed_norm", "out_x_proj": "readout.proj", "decoder_norm": "readout.norm"}
+    return names | _diffusion("diffloss.net", "readout.diffusion", config)
+
+
+def _diffusion(theirs: str, ours: str, config: HMAConfig) -> dict[str, str]:
+    names = {f"{theirs}.{old}": f"{ours}.{new}" for old, new in _DIFFUSION.items()}
+    for block in range(config.diffusion_depth):
+        for old, new in _DIFFUSION_BLOCK.items():
+            names[f"{theirs}.res_blocks.{block}.{old}"] = f"{ours}.blocks.{block}.{new}"
+    return names
+
+
+def _move(source: Mapping[str, Tensor], old: str, new: str) -> State:
+    """The weight and, if there is one, the bias of a module under its new name."""
+    names = {f"{new}.weight": source[f"{old}.weight"]}
+    if f"{old}.bias" in source:
+        names[f"{new}.bias"] = source[f"{old}.bias"]
+    return names
+
+
+def _forth(source: Mapping[str, Tensor], names: Mapping[str, str]) -> State:
+    return {key: value for old, new in names.items() for key, value in _move(source, old, new).items()}
+
+
+def _back(source: Mapping[str, Tensor], names: Mapping[str, str]) -> State:
+    return _forth(source, {ours: theirs for theirs, ours in names.items()})
+
+
+# -- the trunk
+
+
+def _trunk(source: State, config: HMAConfig) -> State:
+    tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
+    # the released table has rows for all pixels and action tokens; only the first ones are used
+    trunk = _forth(source, _renamed(config)) | {
+        "trunk.position": source["pos_embed_TSC"][0, :, :tokens],
+        "trunk.absent": source["action_mask_tokens"][0, :, 0],
+    }
+    if config.qk_norm:
+        for layer in range(config.layers):
+            for theirs, ours in (("spatial_attn", "space"), ("temporal_attn", "time")):
+                norm = f"decoder.layers.{layer}.{theirs}.norm"
+                for own in ("q_norm", "k_norm"):
+                    trunk |= _move(source, norm, f"trunk.blocks.{layer}.{ours}.{own}")
+    return trunk | (
+        _latents(source, trunk, config) if config.kind == "continuous" else _tokens(source, config)
+    )
+
+
+def _tokens(source: State, config: HMAConfig) -> State:
+    ends = {"trunk.embed.mask": source["token_embed.mask_token_embed"][0]}
+    for digit in range(len(config.factored)):
+        ends[f"trunk.embed.digits.{digit}"] = source[f"token_embed.factored_embeds.{digit}.weight"]
+    return ends
+
+
+def _digits_back(trunk: Mapping[str, Tensor], config: HMAConfig) -> State:
+    ends = {"token_embed.mask_token_embed": trunk["trunk.embed.mask"].unsqueeze(0)}
+    for digit in range(len(config.factored)):
+        ends[f"token_embed.factored_embeds.{digit}.weight"] = trunk[f"trunk.embed.digits.{digit}"]
+    return ends
+
+
+def _positions_back(trunk: Mapping[str, Tensor], config: HMAConfig) -> State:
+    position = trunk["trunk.position"]
+    rows = math.prod(config.grid) + config.action_tokens
+    unused = position.new_zeros(position.shape[0], rows - position.shape[1], config.width)
+    return {
+        "pos_embed_TSC": torch.cat([position, unused], dim=1).unsqueeze(0),
+        "action_mask_tokens": trunk["trunk.absent"][None, :, None],
+    }
+
+
+def _latents(source: State, renamed: State, config: HMAConfig) -> State:
+    """Ends of the continuous model; the diffusion head's inputs and outputs are patches, so reordered too."""
+    prefix = "readout.diffusion"
+    halves = renamed[f"{prefix}.output.weight"].unflatten(0, (2, -1))  # the noise, then its variance
+    weight = _channels_first(halves.movedim(-1, 0), config).movedim(0, -1).flatten(0, 1)
+    bias = _channels_first(renamed[f"{prefix}.output.bias"].unflatten(0, (2, -1)), config).flatten()
+    return {
+        "trunk.embed.mask": source["mask_token"].flatten(),
+        "trunk.embed.linear.weight": _channels_first(source["token_embed.weight"], config),
+        "readout.position": source["diffusion_pos_embed_learned"][0].unflatten(0, (config.frames, -1)),
+        f"{prefix}.input.weight": _channels_first(renamed[f"{prefix}.input.weight"], config),
+        f"{prefix}.output.weight": weight.contiguous(),
+        f"{prefix}.output.bias": bias,
+    }
+
+
+def _patches_back(trunk: Mapping[str, Tensor], config: HMAConfig) -> State:
+    theirs, prefix = "diffloss.net", "readout.diffusion"
+    weight, bias = _with_variance(
+        trunk[f"{prefix}.output.weight"], trunk[f"{prefix}.output.bias"], config.patch_dim
+    )
+    halves = weight.unflatten(0, (2, -1)).movedim(-1, 0)
+    return {
+        "mask_token": trunk["trunk.embed.mask"].view(1, 1, -1),
+        "token_embed.weight": _pixels_first(trunk["trunk.embed.linear.weight"], config),
+        "diffusion_pos_embed_learned": trunk["readout.position"].flatten(0, 1).unsqueeze(0),
+        f"{theirs}.input_proj.weight": _pixels_first(trunk[f"{prefix}.input.weight"], config),
+        f"{theirs}.final_layer.linear.weight": _pixels_first(halves, config).movedim(0, -1).flatten(0, 1),
+        f"{theirs}.final_layer.linear.bias": _pixels_first(bias.unflatten(0, (2, -1)), config).flatten(),
+    }
+
+
+def _channels_first(values: Tensor, config: HMAConfig) -> Tensor:
+    """Reorder the last axis from a patch's pixels by channels to channels by pixels."""
+    return values.unflatten(-1, (config.patch**2, config.channels)).mT.flatten(-2)
+
+
+def _pixels_first(values: Tensor, config: HMAConfig) -> Tensor:
+    """Reorder the last axis from a patch's channels by pixels to pixels by channels."""
+    return values.unflatten(-1, (config.channels, config.patch**2)).mT.flatten(-2)
+
+
+def _with_variance(weight: Tensor, bias: Tensor, values: int) -> tuple[Tensor, Tensor]:
+    """An output layer with variance outputs; where there are none they say the middle of their range."""
+    if len(bias) == 2 * values:
+        return weight, bias
+    return torch.cat([weight, torch.zeros_like(weight)]), torch.cat([bias, torch.zeros_like(bias)])
+
+
+# -- an embodiment
+
+
+def _stem(source: State, domain: str, config: HMAConfig) -> State:
+    mean = source[f"action_preprocessor.{domain}.mean"]
+    stem = {
+        "normalizer.mean": mean,
+        "normalizer.std": source[f"action_preprocessor.{domain}.std"],
+        "normalizer.normalize": torch.ones_like(mean, dtype=torch.bool),
+        "normalizer.divide": torch.tensor(True),
+    }
+    for old, new in _STEM.items():
+        stem |= _move(source, f"action_mlp.{domain}.{old}", new)
+    return stem | (_modulation(source, domain, config) if "modulation" in config.conditioning else {})
+
+
+def _modulation(source: State, domain: str, config: HMAConfig) -> State:
+    def stack(name: str) -> Tensor:
+        keys = [f"decoder.layers.{layer}.action_projectors.{domain}.{name}" for layer in range(config.layers)]
+        return torch.stack([source[key] for key in keys])
+
+    stacked = {
+        "modulation.out_weight": stack("linear_out.weight"),
+        "modulation.out_bias": stack("linear_out.bias"),
+    }
+    for old, suffix in _MODULATION.items():
+        stacked[f"modulation.weight{suffix}"] = stack(f"{old}.weight").mT.contiguous()
+        stacked[f"modulation.bias{suffix}"] = stack(f"{old}.bias").unsqueeze(1)
+    return stacked
+
+
+def _stem_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HMAConfig) -> State:
+    """Dims that pass through get mean 0 and std 1; those that never vary, which ours set to 0, no weight."""
+    mean, std = stem["normalizer.mean"].float(), stem["normalizer.std"].float()
+    plain, still = ~stem["normalizer.normalize"], _still(stem)
+    weight = stem["input.weight"]
+    columns = still.repeat(weight.shape[1] // len(mean))
+    released = {
+        f"action_preprocessor.{domain}.mean": mean.masked_fill(plain, 0.0),
+        f"action_preprocessor.{domain}.std": std.masked_fill(plain | still, 1.0),
+    }
+    for old, new in _STEM.items():
+        released |= _move(stem, new, f"action_mlp.{domain}.{old}")
+    released[f"action_mlp.{domain}.model.0.weight"] = weight.masked_fill(columns, 0.0)
+    return released | (
+        _modulation_back(stem, trunk, domain, config) if "modulation" in config.conditioning else {}
+    )
+
+
+def _still(stem: State) -> Tensor:
+    """(A,) bool: dims that `Normalizer` sets to 0."""
+    mean, std, normalize = (stem[f"normalizer.{name}"] for name in ("mean", "std", "normalize"))
+    if "normalizer.divide" in stem:
+        return torch.zeros_like(normalize)
+    return ~(std > 1e-6 * mean.abs() + 1e-9) & normalize
+
+
+def _modulation_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HMAConfig) -> State:
+    """What the embodiments share in ours, each gets for itself."""
+    source, prefix = (trunk, "trunk.modulation") if config.shared_modulation else (stem, "modulation")
+    released = {}
+    for layer in range(config.layers):
+        theirs = f"decoder.layers.{layer}.action_projectors.{domain}"
+        for old, suffix in _MODULATION.items():
+            released[f"{theirs}.{old}.weight"] = source[f"{prefix}.weight{suffix}"][layer].mT
+            released[f"{theirs}.{old}.bias"] = source[f"{prefix}.bias{suffix}"][layer, 0]
+        if config.modulation_out == "trunk":
+            released |= _move(trunk, f"trunk.blocks.{layer}.modulation_out", f"{theirs}.linear_out")
+        else:
+            released[f"{theirs}.linear_out.weight"] = stem["modulation.out_weight"][layer]
+            released[f"{theirs}.linear_out.bias"] = stem["modulation.out_bias"][layer]
+    return released
+
+
+def _head(source: State, domain: str, config: HMAConfig) -> State:
+    """Their only readout serves as both of ours; a diffusion head was given the features as they are."""
+    if config.action_loss == "diffusion":
+        weight, bias = torch.eye(config.width), torch.zeros(config.width)
+        head = _forth(source, _diffusion(f"action_diff_losses.{domain}.net", "diffusion", config))
+    else:
+        weight, bias = (source[f"action_out_projectors.{domain}.{name}"] for name in ("weight", "bias"))
+        head = {}
+    for readout in ("policy", "inverse"):
+        head |= {f"{readout}.weight": weight.clone(), f"{readout}.bias": bias.clone()}
+    return head
+
+
+def _head_back(head: State, stem: State, domain: str, config: HMAConfig) -> State:
+    weight, bias = head["policy.weight"].float(), head["policy.bias"].float()
+    if config.action_loss == "diffusion":
+        theirs = f"action_diff_losses.{domain}.net"
+        released = _back(head, _diffusion(theirs, "diffusion", config))
+        into = head["diffusion.condition.weight"].float()
+        released[f"{theirs}.cond_embed.weight"] = into @ weight
+        released[f"{theirs}.cond_embed.bias"] = head["diffusion.condition.bias"].float() + into @ bias
+        values = stem["input.weight"].shape[1]
+        output = _with_variance(head["diffusion.output.weight"], head["diffusion.output.bias"], values)
+        return released | dict(
+            zip((f"{theirs}.final_layer.linear.weight", f"{theirs}.final_layer.linear.bias"), output)
+        )
+    if config.action_target == "normalized":  # the released heads give raw actions
+        mean, std = stem["normalizer.mean"].float(), stem["normalizer.std"].float()
+        plain, steps = ~stem["normalizer.normalize"], len(bias) // len(mean)
+        scale = std.masked_fill(_still(stem), 0.0).masked_fill(plain, 1.0).repeat(steps)
+        weight, bias = weight * scale[:, None], bias * scale + mean.masked_fill(plain, 0.0).repeat(steps)
+    return {f"action_out_projectors.{domain}.weight": weight, f"action_out_projectors.{domain}.bias": bias}

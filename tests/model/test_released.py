@@ -1,0 +1,361 @@
+"""Released checkpoints in and out, without the released code: every layout there and back, and bad ones."""
+
+import json
+import pickle
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from typer.testing import CliRunner
+
+from hma_data.embodiment import find
+from hma_data.errors import CheckpointError, HMAError
+from hma_model import hub
+from hma_model.checkpoint import Checkpoint, require_tokenizer
+from hma_model.cli import app
+from hma_model.config import ActionSpace, HMAConfig
+from hma_model.files import to_json
+from hma_model.model import HMA
+from hma_model.released import config_from_released, config_to_released
+from hma_model.released_state import state_to_released
+from tests.model.network_parts import small_batch, small_config
+from tests.test_cli import fails, hma
+
+RELEASED: dict[str, Any] = {
+    "time_position": "learned", "action_alignment": "current", "temporal_norm": False, "final_norm": False,
+    "absent_action": "skip", "add_at": "layers", "modulation_out": "embodiment", "base_width": 256,
+    "factored": (6, 6), "action_target": "raw",
+}  # fmt: skip
+CONTINUOUS = {"kind": "continuous", "action_loss": "diffusion", "latent_scale": 0.18215}
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "concat+modulate": {"conditioning": ("concat", "modulation"), "action_tokens": 3},
+    "modulate": {"conditioning": ("modulation",)},
+    "concat": {"conditioning": ("concat",), "action_tokens": 1},
+    "mlp": {"conditioning": ("add",)},
+    "joint": {"conditioning": ("concat", "modulation"), "action_tokens": 3, "absent_action": "tokens",
+              "objectives": {"full": 1.0}},
+    "joint modulate": {"absent_action": "tokens", "action_tokens": 2, "objectives": {"full": 1.0}},
+    "qk norm": {"qk_norm": True, "norms": "qk"},
+    "mup": {"mup": True},
+    "continuous": CONTINUOUS,
+    "continuous joint": CONTINUOUS | {"absent_action": "tokens", "objectives": {"full": 1.0}},
+}  # fmt: skip
+
+
+def _model(seed: int = 0, **changes: Any) -> HMA:
+    """A model in a layout that the release has, everything stirred."""
+    torch.manual_seed(seed)
+    model = HMA(small_config(**(RELEASED | changes)))
+    model.add_embodiment(ActionSpace("arm", 3, 2, (1.0, -2.0, 0.5), (2.0, 0.5, 0.0), (True,) * 3, "divide"))
+    model.add_embodiment(ActionSpace("pusher", 2, 1, (0.0, 3.0), (1.0, 1e-8), (True, True), "divide"))
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+        for name, parameter in model.named_parameters():
+            if ".k_norm." in name:
+                parameter.copy_(model.get_parameter(name.replace(".k_norm.", ".q_norm.")))
+        if model.config.action_loss == "diffusion":
+            for name in model.embodiments:
+                model.head(name).policy.weight.copy_(torch.eye(model.config.width))
+                model.head(name).policy.bias.zero_()
+    return model.eval()
+
+
+def _write(model: HMA, folder: Path, **config: Any) -> Path:
+    """The model in the released layout, as the release's own code would have written it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = {name: (model.stem_state(name), model.head_state(name)) for name in model.embodiments}
+    save_file(state_to_released(model.trunk_state(), parts, model.config), folder / "model.safetensors")
+    values = config_to_released(model.config, folder) | {
+        "action_domains": list(model.embodiments),
+        "d_actions": [space.chunk_dim for space in model.embodiments.values()],
+    }
+    (folder / "config.json").write_bytes(to_json(values | config))
+    return folder
+
+
+def _outputs(model: HMA) -> list[torch.Tensor]:
+    outputs = []
+    for name, space in model.embodiments.items():
+        batch = small_batch(model.config, [name, name])
+        mean = torch.tensor(space.mean).repeat(space.stride)
+        for actions in (mean.expand(2, model.config.frames, -1), None):
+            with torch.no_grad():
+                if model.config.kind == "discrete":
+                    outputs.append(model.video_logits(batch.tokens, actions, name))
+                    outputs.append(model.predict_actions(batch.tokens, name, actions))
+                else:
+                    mask = torch.rand(2, model.config.frames, 8, 8, generator=torch.Generator()) < 0.3
+                    outputs.append(model.video_conditions(batch.latents, mask, actions, name))
+                    generator = torch.Generator().manual_seed(1)
+                    chunks = model.predict_actions(batch.latents, name, actions, generator=generator)
+                    outputs.append(chunks)
+    return outputs
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_layout_comes_in_and_goes_out_without_loss(tmp_path: Path, layout: str) -> None:
+    model = _model(**LAYOUTS[layout])
+    source = _write(model, tmp_path / "released")
+    hub.import_released(source, tmp_path / "ours")
+    imported = HMA.from_pretrained(str(tmp_path / "ours"))
+    for expected, found in zip(_outputs(model), _outputs(imported), strict=True):
+        assert torch.allclose(expected, found, atol=1e-5)
+    hub.export_released(tmp_path / "ours", tmp_path / "again")
+    before, after = (load_file(folder / "model.safetensors") for folder in (source, tmp_path / "again"))
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[key], after[key]) for key in before)
+
+
+def test_configurations_survive_the_release() -> None:
+    for layout, changes in LAYOUTS.items():
+        config = small_config(**(RELEASED | changes))
+        values = json.loads(json.dumps(config_to_released(config, layout)))
+        again = config_from_released(values)
+        changed = {
+            field.name
+            for field in fields(config)
+            if getattr(config, field.name) != getattr(again, field.name)
+        }
+        unused = {"factored"} if config.kind == "continuous" else {"diffusion_depth", "diffusion_width"}
+        assert changed <= unused | {"diffusion_variance", "diffusion_sample_steps"}, layout
+
+
+@pytest.mark.parametrize("suffix", ["pytorch_model.bin", "nested.bin", "wrapped.safetensors"])
+def test_other_files_of_weights_come_in(tmp_path: Path, suffix: str) -> None:
+    model = _model()
+    source = _write(model, tmp_path / "released")
+    state = load_file(source / "model.safetensors")
+    (source / "model.safetensors").unlink()
+    if suffix == "pytorch_model.bin":
+        torch.save(state, source / suffix)
+    elif suffix == "nested.bin":
+        torch.save({"state_dict": state}, source / suffix)
+    else:
+        save_file({f"module.{key}": value for key, value in state.items()}, source / suffix)
+    path = source if suffix == "pytorch_model.bin" else source / suffix
+    made = hub.import_released(path, tmp_path / "ours")
+    assert made.embodiments == ("arm", "pusher")
+
+
+def test_a_model_without_action_domains_comes_in(tmp_path: Path) -> None:
+    model = HMA(small_config(**RELEASED)).eval()
+    source = _write(model, tmp_path / "released", action_domains=None, d_actions=None)
+    assert hub.import_released(source, tmp_path / "ours").embodiments == ()
+    imported = HMA.from_pretrained(str(tmp_path / "ours"))
+    tokens = small_batch(model.config, ["arm"]).tokens
+    with torch.no_grad():
+        assert torch.equal(
+            imported.video_logits(tokens, None, "arm"), model.video_logits(tokens, None, "arm")
+        )
+
+
+def test_only_the_domains_asked_for_are_taken(tmp_path: Path) -> None:
+    source = _write(_model(), tmp_path / "released")
+    assert hub.import_released(source, tmp_path / "ours", embodiments=["pusher"]).embodiments == ("pusher",)
+    with pytest.raises(CheckpointError, match=r"no domain 'dog'.*arm, pusher"):
+        hub.import_released(source, tmp_path / "ours", embodiments=["dog"])
+
+
+def test_a_domain_of_the_registry_gets_its_yaml_but_the_released_normalisation(tmp_path: Path) -> None:
+    known = find("language_table")
+    model = _model()
+    dims = known.action_dim
+    space = ActionSpace(known.id, dims, 3, (0.5,) * dims, (2.0,) * dims, (True,) * dims, "divide")
+    model.add_embodiment(space)
+    hub.import_released(_write(model, tmp_path / "released"), tmp_path / "ours")
+    checkpoint = Checkpoint.open(tmp_path / "ours")
+    found = checkpoint.embodiment(known.id)
+    assert found.stride == 3 and found.normalize_mask.all() and found.source == known.source
+    assert checkpoint.embodiment("arm").frequency_hz == "unknown"
+    assert HMA.from_pretrained(str(tmp_path / "ours")).embodiments[known.id] == space
+
+
+def test_names_that_are_no_ids_become_ones(tmp_path: Path) -> None:
+    model = _model()
+    source = _write(model, tmp_path / "released")
+    state = {
+        k.replace(".pusher.", ".Pusher V2."): v for k, v in load_file(source / "model.safetensors").items()
+    }
+    save_file(state, source / "model.safetensors")
+    values = json.loads((source / "config.json").read_text()) | {"action_domains": ["arm", "Pusher V2"]}
+    (source / "config.json").write_text(json.dumps(values))
+    made = hub.import_released(source, tmp_path / "ours")
+    assert made.embodiments == ("arm", "pusher_v2")
+    assert made.card("pusher_v2")["data"]["released_domain"] == "Pusher V2"
+
+
+def test_the_tokenizer_is_the_papers_where_the_sizes_are(tmp_path: Path) -> None:
+    from hma_data.tokenizers.base import TokenizerSpec
+
+    model = _model(factored=(512, 512), grid=(16, 16), layers=1, frames=2)
+    source = _write(model, tmp_path / "released")
+    config = hub.import_released(source, tmp_path / "ours").config
+    assert config.tokenizer["name"] == "magvit2" and config.tokenizer["image_size"] == 256
+    shards = TokenizerSpec(
+        "magvit2", 1, "discrete", 256, (16, 16), 2**18, (512, 512), weights_sha256="f" * 64
+    )
+    require_tokenizer(config, shards, "shards")
+    assert (
+        hub.import_released(source, tmp_path / "fsq", tokenizer="fsq-16").config.tokenizer["name"] == "fsq-16"
+    )
+    with pytest.raises(CheckpointError, match="fsq-8"):
+        hub.import_released(source, tmp_path / "no", tokenizer="fsq-8")
+
+
+# -- what is refused
+
+
+def _truncate(folder: Path) -> None:
+    path = folder / "model.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _edit(change: Any) -> Any:
+    def edit(folder: Path) -> None:
+        state = load_file(folder / "model.safetensors")
+        change(state)
+        save_file(state, folder / "model.safetensors")
+
+    return edit
+
+
+def _configure(**changes: Any) -> Any:
+    def configure(folder: Path) -> None:
+        values = json.loads((folder / "config.json").read_text())
+        values = {key: value for key, value in (values | changes).items() if value != "gone"}
+        (folder / "config.json").write_text(json.dumps(values))
+
+    return configure
+
+
+def _pickle(folder: Path) -> None:
+    (folder / "model.safetensors").unlink()
+    (folder / "pytorch_model.bin").write_bytes(pickle.dumps({"a": Path("x")}))
+
+
+def _saved(value: Any) -> Any:
+    def write(folder: Path) -> None:
+        (folder / "model.safetensors").unlink()
+        torch.save(value, folder / "pytorch_model.bin")
+
+    return write
+
+
+def _noise(folder: Path) -> None:
+    _saved({})(folder)
+    (folder / "pytorch_model.bin").write_bytes(b"x" * 99)
+
+
+def _another(folder: Path) -> None:
+    save_file({"encoder.conv_in.weight": torch.zeros(3)}, folder / "model.safetensors")
+
+
+BAD = {
+    "truncated": (_truncate, "not whole safetensors"),
+    "missing key": (_edit(lambda s: s.pop("out_x_proj.bias")), r"lacks out_x_proj\.bias"),
+    "missing statistics": (_edit(lambda s: s.pop("action_preprocessor.arm.mean")), "preprocessor.arm.mean"),
+    "extra key": (_edit(lambda s: s.update(lora=torch.zeros(2))), "has unknown lora"),
+    "another shape": (_edit(lambda s: s.update(pos_embed_TSC=torch.zeros(1, 9, 17, 32))), "pos_embed_TSC is"),
+    "not finite": (_edit(lambda s: s["out_x_proj.bias"].fill_(float("nan"))), "not finite"),
+    "negative std": (_edit(lambda s: s["action_preprocessor.arm.std"].fill_(-1.0)), "negative"),
+    "another architecture": (_another, "lack the domains arm, pusher"),
+    "another architecture, no domains named": (
+        lambda f: (_another(f), _configure(action_domains=None)(f)),
+        "not the model that config.json describes: lacks .* and .* more",
+    ),
+    "pickle of objects": (_pickle, "holds more than tensors"),
+    "pickle of a list": (_saved([torch.zeros(2)]), "no state dict"),
+    "empty": (_saved({}), "no state dict"),
+    "a file of noise": (_noise, "damaged"),
+    "no weights": (lambda f: (f / "model.safetensors").unlink(), "has no model.safetensors or pytorch_model"),
+    "no config": (lambda f: (f / "config.json").unlink(), "config.json"),
+    "broken config": (lambda f: (f / "config.json").write_text("{"), "not valid JSON"),
+    "config of something else": (_configure(d_model="gone"), "lacks d_model"),
+    "config with text for a number": (_configure(num_layers="two"), "wrong type"),
+    "config of another width": (_configure(d_model=64), "shapes differ"),
+    "config of more layers": (_configure(num_layers=3), "lacks decoder.layers.2"),
+    "heads that do not divide": (_configure(num_heads=5), "heads"),
+    "another vocabulary": (_configure(image_vocab_size=64), "factored_embeds"),
+    "no power": (_configure(image_vocab_size=37), "no power of 2"),
+    "no square": (_configure(S=15), "S is 15"),
+    "cross attention": (_configure(action_network="cross_attention"), "cross_attention"),
+    "resampler": (_configure(action_network="resampler_concat"), "resampler"),
+    "no actions at all": (_configure(action_network="none"), "uses actions in no way"),
+    "another conditioning": (_configure(action_network="concat"), "has unknown decoder.layers.0.action_proj"),
+    "continuous config": (_configure(Diffusion=True, vae_embed_dim=4), "is not the model"),
+    "ours": (_configure(library="hma-toolkit"), "already"),
+    "domain that is not there": (_configure(action_domains=["arm", "dog"]), "lack the domains dog"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_release_is_refused_in_one_line_and_nothing_written(tmp_path: Path, case: str) -> None:
+    spoil, message = BAD[case]
+    source = _write(_model(), tmp_path / "released")
+    spoil(source)
+    with pytest.raises(HMAError, match=message) as error:
+        hub.import_released(source, tmp_path / "ours")
+    assert len(str(error.value)) < 600 and "\n" not in str(error.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["released"]
+
+
+def test_a_folder_that_is_no_checkpoint_is_not_replaced(tmp_path: Path) -> None:
+    source = _write(_model(), tmp_path / "released")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years")
+    with pytest.raises(CheckpointError, match="is no checkpoint"):
+        hub.import_released(source, tmp_path / "mine")
+    hub.import_released(source, tmp_path / "ours")
+    with pytest.raises(CheckpointError, match="is there already"):
+        hub.export_released(tmp_path / "ours", tmp_path / "mine")
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"time_position": "rotary"}, "time_position 'rotary'"),
+        ({"temporal_norm": True, "final_norm": True}, "temporal_norm True; final_norm True"),
+        ({"action_alignment": "previous"}, "action_alignment 'previous'"),
+        ({"absent_action": "embedding"}, "absent_action 'embedding'"),
+        ({"conditioning": ("cross_attention",)}, "conditioning cross_attention"),
+        ({"conditioning": ("add", "modulation")}, r"conditioning add\+modulation"),
+        ({"conditioning": ("add",), "add_at": "input"}, "add_at input"),
+        ({"qk_norm": True}, "qk_norm True with norms 'before'"),
+        ({"grid": (4, 5)}, "20 tokens, which is no square"),
+        ({"objectives": {"inverse": 1.0}}, "objective inverse"),
+        ({"objectives": {"policy": 1.0}}, "objectives policy"),
+        ({"mup": True, "base_width": 64}, "base_width 64"),
+        ({"factored": (6, 4)}, r"unequal digits \(6, 4\)"),
+        ({"action_loss": "diffusion"}, "action_loss 'diffusion'"),
+        (CONTINUOUS | {"latent_scale": 1.0}, "latent_scale 1.0"),
+        (CONTINUOUS | {"mup": True}, "muP at width 32"),
+    ],
+)
+def test_what_the_release_cannot_express_is_named(change: dict[str, Any], named: str) -> None:
+    with pytest.raises(CheckpointError, match=named):
+        config_to_released(small_config(**(RELEASED | change)), "model")
+
+
+def test_our_default_names_everything_against_it() -> None:
+    with pytest.raises(CheckpointError) as error:
+        config_to_released(HMAConfig(), "model")
+    assert str(error.value).count(";") == 4
+
+
+def test_the_command_line_imports_and_exports(tmp_path: Path) -> None:
+    source = _write(_model(), tmp_path / "released")
+    here = CliRunner()
+    done = here.invoke(
+        app, ["hub", "import", str(source), "--out", str(tmp_path / "ours"), "-e", "arm", "--json"]
+    )
+    assert json.loads(done.stdout)["embodiments"] == ["arm"]
+    done = here.invoke(app, ["hub", "export", str(tmp_path / "ours"), "--out", str(tmp_path / "again")])
+    assert done.exit_code == 0
+    assert not any(".pusher." in name for name in load_file(tmp_path / "again" / "model.safetensors"))
+    failed = hma("hub", "import", str(tmp_path / "nowhere"), "--out", str(tmp_path / "x"))
+    fails(failed, 1, "nowhere")
