@@ -122,13 +122,21 @@ def is_array_record(path: str) -> bool:
 
 
 def open_records(files: Any, path: str) -> RecordFile:
-    """The file, kept for the process while its size and date stay the same.
+    """The file, kept for the process: a local one while size and date stay the same, a remote one for good.
 
     Raises:
         SourceError: it is not there, or the file system does not answer.
     """
+    if not is_local(files):
+        return _open_remote(files, path, os.getpid())
     found = info(files, path)
     return _open(files, path, found["size"], mark(found), os.getpid())
+
+
+@lru_cache(maxsize=4096)
+def _open_remote(files: Any, path: str, pid: int) -> RecordFile:
+    found = info(files, path)
+    return RecordFile(files, path, found["size"], mark(found))
 
 
 @lru_cache(maxsize=4096)

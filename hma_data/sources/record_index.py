@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,7 +107,8 @@ def save_index(path: str, mark: str, frames: Framing) -> None:
         part.replace(place)
     except OSError as fault:
         log.info("%s: the index of %s is not kept: %s", place, path, fault)
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def drop_index(path: str, mark: str) -> None:

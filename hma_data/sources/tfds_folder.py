@@ -27,9 +27,9 @@ from hma_data.sources.tfds_features import Feature, read_features
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 FORMATS = ("tfrecord", "array_record")
 NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
-NAMED = (  # the suffix before the number, as TFDS writes it, or after
-    re.compile(rf"(?P<stem>.+)\.(?:tfrecord|array_record)(?:{NUMBER})?"),
+NAMED = (  # the suffix after the number, or before it as TFDS writes it
     re.compile(rf"(?P<stem>.+?)[-_]{NUMBER[1:]}\.(?:tfrecord|array_record)"),
+    re.compile(rf"(?P<stem>.+)\.(?:tfrecord|array_record)(?:{NUMBER})?"),
 )
 LONGEST_JSON = 64 << 20  # bytes of a description; more is a mistake
 PACKAGES = {
