@@ -127,8 +127,9 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
     if short:
         said = f"{short} of {len(clips)} episodes are shorter than a window, {needed} frames"
         yield Finding("length", "warn", said, "a higher target_hz, or fewer frames a window")
-    for stream in clips[0].skew_ms:
-        late = float(np.percentile(np.concatenate([clip.skew_ms[stream] for clip in clips]), 95))
+    for stream in dict.fromkeys(name for clip in clips for name in clip.skew_ms):
+        moved = [clip.skew_ms[stream] for clip in clips if stream in clip.skew_ms]
+        late = float(np.percentile(np.concatenate(moved), 95))
         if period > 0 and late > 1e3 * period:
             yield Finding("skew", "warn", f"{stream} was moved by {late:.1f} ms or more in 5 % of frames")
 
