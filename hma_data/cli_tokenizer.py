@@ -45,6 +45,8 @@ def tokenizer_train(
         list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Dotted overrides.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="The weights' file.")] = Path("tokenizer.safetensors"),
+    device: Annotated[str, typer.Option("--device", help="cpu, cuda, mps.")] = "cpu",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Threads that draw crops ahead.")] = 0,
 ) -> None:
     """Train a tokenizer; run it again to go on.
 
@@ -60,7 +62,14 @@ def tokenizer_train(
         if not key or not equals:
             raise UsageError(text, "is not key=value")
         changes[key] = parse_yaml(value, text, RecipeError)
-    facts = train(recipe, out, changes, report=lambda line: typer.echo(line, err=True))
+    facts = train(
+        recipe,
+        out,
+        changes,
+        device=device,
+        workers=workers,
+        report=lambda line: typer.echo(line, err=True),
+    )
     print(f"wrote {out}: " + ", ".join(f"{key} {value}" for key, value in facts.items()))
 
 

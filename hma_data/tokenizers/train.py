@@ -5,7 +5,7 @@
 The loss is what can be had without a pretrained network: squared and absolute error, gradients at
 several scales, and SSIM. Before the first step the network is the best linear code of patches
 (their principal components); the rest starts at zero and learns what is left. A weights' file is
-written now and then, and the state of the run beside it: running it again goes on.
+written now and then, and the state of the run beside it: running it again goes on, on any device.
 
 B crops, S side of a crop, C latent channels.
 """
@@ -14,8 +14,11 @@ import hashlib
 import math
 import platform
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,7 @@ from hma_data.tokenizers.embedded import save_weights
 from hma_data.tokenizers.eval import ssim_map
 from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig
 from hma_data.tokenizers.muon import Muon
+from hma_data.tokenizers.network import open_device
 from hma_data.tokenizers.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
 from hma_data.tokenizers.vae_network import FORMAT as VAE_FORMAT
 from hma_data.tokenizers.vae_network import VaeAutoencoder, VaeConfig
@@ -103,26 +107,27 @@ def _autoencoder(recipe: TokenizerRecipe) -> Autoencoder:
 class Run:
     """A training under way: network, averaged weights, optimizers, and the step it has reached."""
 
-    def __init__(self, recipe: TokenizerRecipe, pools: list[Pool]) -> None:
+    def __init__(self, recipe: TokenizerRecipe, pools: list[Pool], device: torch.device) -> None:
         self.recipe, self.pools, self.step, self.seconds = recipe, pools, 0, 0.0
         torch.manual_seed(recipe.seed)
         network = _autoencoder(recipe)
         start_linear(network, self.batch(START, 256))
-        self.network: Autoencoder = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.device = device
+        self.network: Autoencoder = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = {name: p.detach().clone() for name, p in self.network.named_parameters()}
         self.optimizers = _optimizers(self.network, recipe.training)
 
     def batch(self, step: int, count: int) -> Tensor:
-        """(B, 3, S, S) crops of a step."""
+        """(B, 3, S, S) crops of a step, in the CPU's memory."""
         crops = draw_batch(self.pools, self.recipe.training.crop, count, self.recipe.seed, step)
         return torch.from_numpy(crops).permute(0, 3, 1, 2)
 
-    def advance(self) -> float:
-        """One step; the mean squared error of its crops, pixels in [0, 1]."""
-        training, started = self.recipe.training, time.monotonic()
+    def advance(self, crops: Tensor) -> float:
+        """One step on its crops; their mean squared error, pixels in [0, 1]."""
+        training = self.recipe.training
         for optimizer, highest in zip(self.optimizers, (training.learning_rate, training.adam_learning_rate)):
             optimizer.param_groups[0]["lr"] = highest * training.rate(self.step)
-        crops = self.batch(self.step, training.batch)
+        crops = crops.to(self.device)
         generator = torch.Generator().manual_seed((self.recipe.seed * 1_000_003 + self.step) % 2**63)
         made, latents = self.network(crops, generator)
         loss, squared = reconstruction_loss(made, crops, self.recipe.loss)
@@ -136,7 +141,6 @@ class Run:
         with torch.no_grad():
             for name, parameter in self.network.named_parameters():
                 self.average[name].lerp_(parameter, 1 - decay)
-        self.seconds += time.monotonic() - started
         return float(squared)
 
     def write_weights(self, path: Path, facts: dict[str, Any]) -> None:
@@ -236,6 +240,8 @@ def train(
     out: Path,
     overrides: dict[str, Any] | None = None,
     *,
+    device: str = "cpu",
+    workers: int = 0,
     report: Callable[[str], None] = print,
     report_every: int = 100,
 ) -> dict[str, Any]:
@@ -245,6 +251,8 @@ def train(
         recipe_path: YAML, see `hma_data.tokenizers.recipe.TokenizerRecipe`.
         out: the weights' file, rewritten at every report; `<out>.state` holds the run until it ends.
         overrides: values to replace in the recipe, by dotted key.
+        device: where the network is trained: cpu, cuda, mps.
+        workers: threads that draw crops ahead; 0 draws them in turn. The crops are the same.
         report: takes a line of progress.
         report_every: steps between reports.
 
@@ -255,12 +263,14 @@ def train(
     Raises:
         RecipeError: the recipe is not valid, its corpus is not there, or the state beside `out`
             is another training's.
+        TokenizerError: there is no such device.
     """
+    place = open_device("tokenizer train", device)
     recipe = load_recipe(recipe_path, overrides)
     torch.set_num_threads(recipe.training.threads)
     pools, corpus_sha256 = load_pools(list(recipe.sources), Path(recipe.corpus).expanduser(), recipe.seed)
     report("pictures: " + ", ".join(f"{pool.name} {len(pool.pictures)}" for pool in pools))
-    run, state = Run(recipe, pools), out.with_name(out.name + ".state")
+    run, state = Run(recipe, pools, place), out.with_name(out.name + ".state")
     if state.exists():
         run.resume(state)
         report(f"going on from step {run.step}")
@@ -269,27 +279,52 @@ def train(
         "recipe_sha256": recipe.digest(),
         "corpus_sha256": corpus_sha256,
         "seed": recipe.seed,
-        "machine": f"{platform.machine()}, {recipe.training.threads} thread, torch {torch.__version__}",
+        "machine": _machine(place, recipe.training.threads),
     }
     # Far below zero the slope of silu is a denormal number; with those a step takes seven times as long.
     torch.set_flush_denormal(True)
     try:
-        _advance(run, out, facts, report, report_every)
+        _advance(run, out, facts, workers, report, report_every)
     finally:
         torch.set_flush_denormal(False)
     state.unlink(missing_ok=True)
     return facts
 
 
+def _machine(device: torch.device, threads: int) -> str:
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{threads} thread"
+    return f"{platform.machine()}, {name}, torch {torch.__version__}"
+
+
+def _crops(run: Run, workers: int) -> Iterator[Tensor]:
+    """The crops of every step that is left, in order, drawn ahead by threads."""
+    count, steps = run.recipe.training.batch, iter(range(run.step, run.recipe.training.steps))
+    if not workers:
+        yield from (run.batch(step, count) for step in steps)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        ahead = deque(pool.submit(run.batch, step, count) for step in islice(steps, 2 * workers))
+        while ahead:
+            yield ahead.popleft().result()
+            ahead.extend(pool.submit(run.batch, step, count) for step in islice(steps, 1))
+
+
 def _advance(
-    run: Run, out: Path, facts: dict[str, Any], report: Callable[[str], None], report_every: int
+    run: Run,
+    out: Path,
+    facts: dict[str, Any],
+    workers: int,
+    report: Callable[[str], None],
+    report_every: int,
 ) -> None:
     """Take all the steps; now and then write weights and state, and report."""
     errors: list[float] = []
-    steps = run.recipe.training.steps
-    while run.step < steps:
-        errors.append(run.advance())
-        if run.step % report_every == 0 or run.step == steps:
+    last = time.monotonic()
+    for crops in _crops(run, workers):
+        errors.append(run.advance(crops))
+        now = time.monotonic()
+        run.seconds, last = run.seconds + now - last, now
+        if run.step % report_every == 0 or run.step == run.recipe.training.steps:
             psnr = round(-10 * math.log10(sum(errors) / len(errors)), 2)
             facts |= {"steps": run.step, "train_psnr_db": psnr, "seconds": round(run.seconds)}
             errors.clear()

@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from hma_data.errors import RecipeError
+from hma_data.errors import RecipeError, TokenizerError
 from hma_data.shipped import shipped
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.corpus import DrawnSource, draw_batch, draw_scene, load_pools
@@ -78,6 +78,19 @@ def test_training_again_gives_the_same_weights(tmp_path):
     one, two = load_file(tmp_path / "a"), load_file(tmp_path / "b")
     assert all(torch.equal(one[name], two[name]) for name in one)
     assert {**facts[0], "seconds": 0} == {**facts[1], "seconds": 0}
+
+
+def test_crops_drawn_ahead_train_the_same_weights(tmp_path):
+    recipe = write_recipe(tmp_path)
+    for workers in (0, 1, 3):
+        train(recipe, tmp_path / str(workers), workers=workers, report=lambda _: None)
+    alone, one, many = (load_file(tmp_path / name) for name in ("0", "1", "3"))
+    assert all(torch.equal(alone[name], one[name]) and torch.equal(alone[name], many[name]) for name in alone)
+
+
+def test_a_device_that_is_not_there_is_refused_before_anything_is_read(tmp_path):
+    with pytest.raises(TokenizerError, match="abacus"):
+        train(tmp_path / "gone.yaml", tmp_path / "w", device="abacus")
 
 
 def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path):
