@@ -7,6 +7,7 @@ T frames of an episode, A values of a vector.
 """
 
 import hashlib
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
@@ -195,6 +196,8 @@ def detect(uri: str) -> str:
     """
     if "://" in uri and not uri.startswith("file://"):
         return "lerobot" if uri.startswith("hf://") else "rlds"
+    if _names_a_dataset(uri):
+        return "lerobot"
     path = local_path(uri)
     files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())[:2000]
     names = {item.name for item in files}
@@ -215,6 +218,13 @@ def detect(uri: str) -> str:
         "expected RLDS (features.json, *.tfrecord*), HDF5, a ROS bag or MCAP, "
         "a LeRobotDataset (meta/info.json), or videos of hands",
     )
+
+
+def _names_a_dataset(uri: str) -> bool:
+    """Whether it reads NAME/DATASET[@REVISION] of the Hub, and nothing of this machine is meant by it."""
+    path = Path(uri).expanduser()
+    found = re.fullmatch(r"\w[\w.-]*/\w[\w-]*(\.\d[\w.-]*)?(@[\w./-]+)?", uri)
+    return bool(found) and not path.exists() and not path.parent.exists()
 
 
 def _is_bag(path: Path) -> bool:
