@@ -84,7 +84,11 @@ class Folder:
 
         with self._reached():
             found = snapshot_download(
-                repo, repo_type="dataset", revision=self.revision, allow_patterns="meta/*"
+                repo,
+                repo_type="dataset",
+                revision=self.revision,
+                allow_patterns="meta/*",
+                ignore_patterns=["meta/stats.*", "meta/episodes_stats.*"],
             )
         self.revision = Path(found).name  # later files come from the same commit
         return Path(found)
