@@ -87,7 +87,7 @@ def rate(times: Floats) -> tuple[float | None, float | None]:
 def _lost(steps: Floats, period: float) -> int:
     """By intervals that are whole multiples of the median one; pauses are told apart."""
     usual = steps[steps <= max(PAUSE * period, PAUSE_S)]
-    return int(np.sum(np.maximum(np.rint(usual / period) - 1, 0)))
+    return max(int(np.sum(np.rint(usual / period) - 1)), 0)  # a late frame is not a lost one
 
 
 def findings(key: str, clock: Clock, camera: bool = False, episode: str = "") -> Iterator[Finding]:

@@ -19,6 +19,7 @@ from hma_data.sources.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.video_file import VideoFile, frame_table
 
 LENGTHS = 1_000  # told
+LOOKED_FOR = 20_000  # episodes whose files are looked for, spread over all
 CAMERA_BUDGET = 64  # videos opened at most, over all cameras
 
 
@@ -64,13 +65,15 @@ class _Looking:
         self._there = _Files(meta.folder.root)
         self._videos = [name for name, item in meta.features.items() if item.dtype == "video"]
         self._spans: dict[str, dict[int, Span]] = {}
+        indices = list(meta.episodes)
+        self._indices = [indices[i] for i in sampled(len(indices), LOOKED_FOR)]
 
     def look(self) -> None:
         """Which files are there, then into a sample of the episodes that have all of theirs."""
         whole = self._with_rows()
         for key in self._videos:
             whole &= self._with_video(key)
-        order = [index for index in self._meta.episodes if index in whole]
+        order = [index for index in self._indices if index in whole]
         chosen = [order[i] for i in sampled(len(order), self._episodes)] if order else []
         pairs = max(1, looks.PAIRS // max(len(chosen), 1))
         limit = max(1, CAMERA_BUDGET // max(len(self._videos), 1))
@@ -84,7 +87,7 @@ class _Looking:
 
     def _with_rows(self) -> set[int]:
         paths = {}
-        for index in self._meta.episodes:
+        for index in self._indices:
             try:
                 paths[index] = self._meta.data_path(index)
             except EpisodeError as fault:
@@ -93,7 +96,7 @@ class _Looking:
 
     def _with_video(self, key: str) -> set[int]:
         try:
-            self._spans[key] = {index: self._meta.video(index, key) for index in self._meta.episodes}
+            self._spans[key] = {index: self._meta.video(index, key) for index in self._indices}
         except EpisodeError as fault:
             self._survey.note(Finding("files", "warn", str(fault), key=key))
             return set()
@@ -106,7 +109,8 @@ class _Looking:
         missing = {path for path in distinct if not self._there.has(path)}
         if missing:
             first = next(path for path in distinct if path in missing)
-            said = f"{len(missing):,} of {len(distinct):,} {what} are missing, {first} first"
+            part = " looked for" if len(self._indices) < len(self._meta.episodes) else ""
+            said = f"{len(missing):,} of {len(distinct):,} {what}{part} are missing, {first} first"
             numbers = {"missing": len(missing), "files": len(distinct)}
             self._survey.note(Finding("files", "warn", said, key=key, numbers=numbers))
         return {index for index, path in paths.items() if path not in missing}

@@ -1,13 +1,20 @@
 """`hma bench`: its settings and the form of what it prints. No figure is asserted."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hma_data import bench
+from hma_data.align import to_clip
+from hma_data.bench import sources
+from hma_data.bench.recordings import CASES, actions
+from hma_data.bench.scenes import scene
 from hma_data.errors import UsageError
+from hma_data.sources.base import open_source
 
 TOY: Any = SimpleNamespace(
     ABOUT="a toy",
@@ -37,3 +44,32 @@ def test_the_report_has_the_promised_form() -> None:
     said = json.loads(json.dumps(bench.report("toy", TOY.DEFAULTS, TOY.run({"frames": 1}))))
     assert list(said) == ["bench", "machine", "settings", "results"]
     assert said["machine"]["cores"] >= 1 and said["results"] == [{"frames": 1}]
+
+
+@pytest.mark.parametrize(
+    "name", ["rlds-png-256", "hdf5-jpeg-640x480", "mcap-h264-640x480", "lerobot-h264-strided"]
+)
+def test_a_generated_recording_shows_what_was_drawn(name: str, tmp_path: Path) -> None:
+    case = CASES[name]
+    robot, uri = case.embodiment(), str(case.write(tmp_path, 2, 12, 5))
+    source = open_source(robot.source.format)
+    names = source.episode_ids(uri)
+    clip = to_clip(source.read(uri, names[1], robot), robot)
+    drawn = np.stack(list(scene(*case.size, 12, 6)))
+    assert len(names) == 2 and len(clip) == 12
+    error = np.abs(clip.frames_at("main", np.arange(12)).astype(int) - drawn).mean()
+    assert error < 6
+    np.testing.assert_allclose(clip.actions, actions(12, 1), atol=1e-6)
+
+
+def test_sources_are_measured_with_units() -> None:
+    settings = sources.DEFAULTS | {"formats": ["rlds-jpeg-256"], "frames": 8, "episodes": 2}
+    results = sources.run(settings)
+    assert {one["processes"] for one in results} <= {1, 2} and results[0]["frames"] == 8
+    units = ("frames_per_second", "frames_per_cpu_second", "peak_rss_mib", "recorded_bytes_per_frame")
+    assert all(one[unit] > 0 for one in results for unit in units)
+
+
+def test_a_format_that_is_not_there_is_refused() -> None:
+    with pytest.raises(UsageError, match="known: rlds-jpeg-256"):
+        sources.run(sources.DEFAULTS | {"formats": ["vhs"]})

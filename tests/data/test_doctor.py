@@ -1,14 +1,18 @@
 """hma doctor: each defect is found by its check, and a sound recording gives none."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from skimage import data as skimage_data
+from typer.testing import CliRunner
 
 from hma_data.convert import convert
 from hma_data.doctor import Finding, examine
+from hma_model.cli import app
 from tests.conftest import ARM_YAML
 
 LENGTHS = (40, 45, 50)
@@ -100,6 +104,34 @@ def test_degrees_stated_as_radians_are_noticed(tmp_path: Path) -> None:
     in_degrees = set_all("actions", lambda actions: actions * 90)
     found = examined(tmp_path, in_degrees, ARM_YAML.replace("dims: 3", "dims: 3, unit: rad"))
     assert "are these degrees?" in {finding.remedy for finding in found}
+
+
+def test_a_yaml_that_says_bgr_of_pictures_in_order_is_noticed(tmp_path: Path) -> None:
+    photo = skimage_data.chelsea()[:64, :64]  # it was a JPEG once, and its colours still show it
+
+    def photographs(file: h5py.File) -> None:
+        for demo in file["data"].values():
+            del demo["obs/image"]
+            demo["obs/image"] = np.stack([np.roll(photo, i, axis=1) for i in range(len(demo["actions"]))])
+
+    found = examined(tmp_path, photographs, ARM_YAML.replace("key: obs/image", "key: obs/image, color: bgr"))
+    assert [(one.check, one.severity) for one in found] == [("colour", "warn")]
+
+
+def test_a_camera_that_the_robot_does_not_use_is_left_alone(tmp_path: Path) -> None:
+    def damage(file: h5py.File) -> None:
+        for demo in file["data"].values():
+            demo["obs/spare"] = np.zeros((len(demo["actions"]), 16, 16, 3), np.uint8)
+
+    assert examined(tmp_path, damage) == []
+
+
+@pytest.mark.parametrize(("limit", "code"), [("error", 0), ("warn", 1), ("never", 0)])
+def test_the_exit_code_follows_fail_on(tmp_path: Path, limit: str, code: int) -> None:
+    examined(tmp_path, set_all("actions", lambda actions: actions * [1, 0, 1]))
+    done = CliRunner().invoke(app, ["doctor", str(tmp_path / "toy.hdf5"), "--fail-on", limit, "--json"])
+    (finding,) = json.loads(done.stdout)["findings"]
+    assert (done.exit_code, finding["check"], finding["numbers"]["dims"]) == (code, "constant", [1])
 
 
 def test_the_worst_comes_first(tmp_path: Path) -> None:

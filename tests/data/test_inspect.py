@@ -1,0 +1,274 @@
+"""hma inspect: the same checks for every format, each finding one defect and none where there is none."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from skimage import data
+
+from hma_data.inspect import inspect_recording
+from hma_data.sources import clocks
+from hma_data.sources.base import Inspection, open_source
+from hma_data.sources.clocks import clock_of
+from hma_data.sources.looks import Look, choose, ycbcr_share
+from hma_data.sources.survey import CHECKS
+from tests.data.bag_files import make_recording, write_ros1, write_ros2
+from tests.data.rlds_files import TEXT, image, png, tensor, write
+from tests.data.videos import encode as encode_video
+from tests.data.videos import make_v2
+
+# -- one recording in each format
+
+
+def hdf5(folder: Path) -> Path:
+    draw = np.random.default_rng(0)
+    with h5py.File(folder / "demo.hdf5", "w") as file:
+        for i, length in enumerate((20, 22, 24)):
+            group = file.create_group(f"data/demo_{i}")
+            group["actions"] = draw.normal(size=(length, 3))
+            group["obs/image"] = draw.integers(0, 256, (length, 16, 16, 3), np.uint8)
+    return folder / "demo.hdf5"
+
+
+def rlds(folder: Path) -> Path:
+    draw = np.random.default_rng(0)
+    records = []
+    for _ in range(3):
+        pictures = [png(draw.integers(0, 256, (8, 10, 3), np.uint8)) for _ in range(5)]
+        actions = draw.normal(size=15).tolist()
+        record = {"steps/image": pictures, "steps/action": actions, "steps/language_instruction": [b"go"] * 5}
+        records.append(record | {"episode_metadata/file_path": [b"x"]})
+    steps = {"image": image((8, 10, 3)), "action": tensor((3,)), "language_instruction": TEXT}
+    return write(folder / "rlds", {"d-train.tfrecord-00000-of-00001": records}, steps)
+
+
+def bag(folder: Path) -> Path:
+    return write_ros2(folder / "bag", make_recording(), "MCAP")
+
+
+def lerobot(folder: Path) -> Path:
+    return make_v2(folder / "lerobot")
+
+
+def hands(folder: Path) -> Path:
+    (folder / "videos").mkdir()
+    encode_video(folder / "videos/a.mp4", range(24))
+    return folder / "videos"
+
+
+FORMATS: dict[str, Callable[[Path], Path]] = {
+    "hdf5": hdf5, "rlds": rlds, "rosbag": bag, "lerobot": lerobot, "hands": hands,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_answers_the_same_checks(name: str, tmp_path: Path) -> None:
+    report = inspect_recording(str(FORMATS[name](tmp_path)))
+    assert report["format"] == name and list(report["checks"]) == list(CHECKS)
+    assert report["problems"] == [] and report["looked_at"] >= 1
+    assert {"readable", "size", "blank", "colour"} <= {
+        check for check, result in report["checks"].items() if result != "not looked at"
+    }
+    assert json.loads(json.dumps(report)) == json.loads(json.dumps(report, default=str))
+
+
+@pytest.mark.parametrize("name", ["hdf5", "rlds", "rosbag", "lerobot"])
+def test_every_format_tells_the_range_of_its_numbers(name: str, tmp_path: Path) -> None:
+    keys = inspect_recording(str(FORMATS[name](tmp_path)))["keys"]
+    vectors = [key for key in keys if key["kind"] == "vector"]
+    assert vectors and all(key["low"] <= key["high"] for key in vectors)
+
+
+# -- defects
+
+
+def found(inspection: Inspection) -> dict[str, list[str]]:
+    """Messages by check."""
+    said: dict[str, list[str]] = {}
+    for finding in inspection.findings:
+        said.setdefault(finding.check, []).append(str(finding))
+    return said
+
+
+def damaged(tmp_path: Path, damage: Callable[[h5py.File], None], episodes: int = 20) -> dict[str, list[str]]:
+    path = hdf5(tmp_path)
+    with h5py.File(path, "a") as file:
+        damage(file)
+    return found(open_source("hdf5").inspect(str(path), episodes))
+
+
+def test_a_dimension_that_never_changes_in_any_episode_is_told(tmp_path: Path) -> None:
+    def freeze(file: h5py.File) -> None:
+        for demo in file["data"].values():
+            demo["actions"][:, 1] = 3
+
+    assert damaged(tmp_path, freeze)["constant"] == ["actions never changes in dims 1"]
+
+
+def test_a_dimension_that_is_constant_in_one_episode_only_is_not(tmp_path: Path) -> None:
+    def freeze(file: h5py.File) -> None:
+        for i, demo in enumerate(file["data"].values()):
+            demo["actions"][:, 1] = i
+
+    assert "constant" not in damaged(tmp_path, freeze)
+
+
+def test_values_that_are_not_finite_are_counted_over_the_episodes(tmp_path: Path) -> None:
+    def spoil(file: h5py.File) -> None:
+        file["data/demo_0/actions"][4, 2] = np.nan
+        file["data/demo_2/actions"][1] = np.inf
+
+    (said,) = damaged(tmp_path, spoil)["finite"]
+    assert said == "demo_0: actions is not finite at step 4 (4 of 198 values looked at, in 2 episodes)"
+
+
+def test_only_so_many_episodes_are_looked_into(tmp_path: Path) -> None:
+    def spoil(file: h5py.File) -> None:
+        file["data/demo_1/actions"][4, 2] = np.nan
+
+    assert "finite" not in damaged(tmp_path, spoil, episodes=1)
+
+
+def test_a_damaged_episode_is_named_and_the_others_are_told(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    folder.mkdir()
+    for i in range(3):
+        with h5py.File(folder / f"episode_{i}.hdf5", "w") as file:
+            file["action"] = np.random.default_rng(i).normal(size=(9, 2))
+    (folder / "episode_1.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(50))
+    inspection = open_source("hdf5").inspect(str(folder))
+    assert inspection.lengths == (9, 9) and "episode_1.hdf5" in found(inspection)["readable"][0]
+
+
+def test_stamps_of_hdf5_are_checked_against_the_stated_rate(tmp_path: Path) -> None:
+    def stamp(file: h5py.File) -> None:
+        file["data"].attrs["fps"] = 30
+        for demo in file["data"].values():
+            times = 1.7e9 + np.arange(len(demo["actions"])) / 20
+            times[5] = times[4]
+            times[8] = times[6]
+            demo["timestamps"] = times
+
+    said = damaged(tmp_path, stamp)
+    assert (
+        "demo_0: timestamps: 1 stamps are the one before again (and in 2 more episodes)" in said["repeated"]
+    )
+    assert "demo_0: timestamps: 1 stamps go back in time (and in 2 more episodes)" in said["back"]
+    assert "timestamps: ticks at 20 Hz, the recording states 30" in said["rate"][0]
+
+
+def test_a_bag_tells_skew_and_lost_frames(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "run.bag", make_recording())
+    inspection = open_source("rosbag").inspect(str(path))
+    skews = {key.topic.name: key.skew_ms for key in inspection.keys if key.kind == "vector" and key.topic}
+    assert skews and all(skew and 0 <= skew[0] <= skew[1] <= skew[2] for skew in skews.values())
+    assert "skew" in inspection.checks and "skew" not in found(inspection)
+
+
+def test_several_bags_are_looked_into(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_ros1(tmp_path / f"{name}.bag", make_recording())
+    shift = np.zeros(10, np.int64)
+    shift[6:] = 5_000_000_000
+    write_ros1(tmp_path / "d.bag", replace(make_recording(), stamp_shift_ns=shift))
+    inspection = open_source("rosbag").inspect(str(tmp_path))
+    assert inspection.looked_at == 4
+    assert any(said.startswith("d: ") and "pauses for" in said for said in found(inspection)["gaps"])
+
+
+def test_a_still_picture_key_in_lerobot_is_told(tmp_path: Path) -> None:
+    folder = make_v2(tmp_path / "still")
+    for video in folder.rglob("*.mp4"):
+        length = {"0": 12, "1": 9, "2": 15}[video.stem[-1]]
+        encode_video(video, [7] * length)
+    said = found(open_source("lerobot").inspect(str(folder)))
+    assert "100% of neighbouring pictures are the same" in said["still"][0]
+
+
+# -- red and blue
+
+
+def decoded(picture: np.ndarray) -> np.ndarray:
+    """As it comes out of a JPEG."""
+    stored = cv2.imdecode(cv2.imencode(".jpg", picture[..., ::-1])[1], cv2.IMREAD_COLOR)
+    assert stored is not None
+    return np.asarray(stored[..., ::-1], np.uint8)
+
+
+@pytest.mark.parametrize("name", ["astronaut", "coffee", "chelsea"])
+def test_swapped_channels_of_what_once_was_jpeg_are_certain(name: str) -> None:
+    picture = decoded(getattr(data, name)())
+    for order, verdict in ((picture, "no"), (picture[..., ::-1], "sure")):
+        look = Look()
+        look.add(order[None], np.array([0]))
+        assert look.swapped()[0] == verdict
+
+
+def test_pictures_that_never_were_jpeg_are_no_proof() -> None:
+    assert ycbcr_share(data.astronaut().reshape(-1, 3)[::20]) == pytest.approx(0.24, abs=0.04)
+
+
+def test_a_blue_scene_in_jpeg_is_only_a_hint() -> None:
+    look = Look(lossless=False)
+    look.add(data.coffee()[None, ..., ::-1], np.array([0]))
+    assert look.swapped()[0] == "hint"
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    "recording",
+    [
+        "rlds/bridge_dataset",
+        "hdf5/lift_rendered.hdf5",
+        "lerobot/g1_v21",
+        "mcap/custom-camera-model.mcap",
+        "hands",
+    ],
+)
+def test_no_real_camera_is_suspected(real_data: Path, recording: str) -> None:
+    report = inspect_recording(str(real_data / recording), episodes=5)
+    assert report["checks"]["colour"] == "ok"
+
+
+# -- clocks
+
+
+def test_a_clock_counts_what_was_done_to_it() -> None:
+    draw = np.random.default_rng(1)
+    times = np.arange(300) / 30 + draw.normal(scale=0.001, size=300)
+    kept = np.delete(times, [50, 120, 121, 122, 200])
+    kept[20] = kept[19]
+    clock = clock_of(kept)
+    assert (clock.lost, clock.repeated, clock.back) == (5, 1, 0)
+    assert clock.hz == pytest.approx(30, rel=0.02)
+
+
+def test_lost_frames_are_told_for_cameras_alone() -> None:
+    times = np.delete(np.arange(100) / 10, [20, 40, 41, 60])
+    (finding,) = clocks.findings("cam", clock_of(times), camera=True)
+    assert finding.check == "frames" and finding.numbers["lost"] == 4
+    assert not list(clocks.findings("arm", clock_of(times)))
+
+
+def test_events_have_no_pauses() -> None:
+    times = np.cumsum(np.random.default_rng(0).exponential(5.0, 200) ** 2)
+    assert not list(clocks.findings("/button", clock_of(times)))
+
+
+def test_skew_is_the_distance_to_the_nearest_sample() -> None:
+    primary = np.arange(10, dtype=np.float64)
+    other = np.arange(100, dtype=np.float64) / 10 + 0.02
+    assert clocks.skew(other, primary) == pytest.approx((20, 20, 20), abs=1e-6)
+    assert clocks.skew(other + 50, primary) is None
+
+
+@pytest.mark.parametrize(("length", "pairs"), [(1, 4), (2, 4), (30, 3), (5, 100)])
+def test_chosen_frames_lie_in_the_episode(length: int, pairs: int) -> None:
+    chosen = choose(length, pairs)
+    assert len(chosen) <= 2 * pairs and chosen.min() >= 0 and chosen.max() < length
+    assert (np.diff(chosen) > 0).all()
