@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hma_data.bench import BENCHES
 from hma_data.cli import Json, mount
 from hma_data.console import human_seconds, print_json, print_table
 from hma_data.errors import HMAError
@@ -314,6 +315,7 @@ def hub_export(
 
 
 mount(app)
+BENCHES.setdefault("mup", "hma_model.bench_mup")
 app.add_typer(hub_app, name="hub")
 
 
