@@ -31,6 +31,7 @@ from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_
 from hma_data.sources.hdf5_file import (
     MAX_NUMBERS,
     OpenFiles,
+    check_lengths,
     child,
     dataset,
     explained,
@@ -245,7 +246,11 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
     if key and key in group.attrs:
         return text(group.attrs[key])
     if key:
-        return text(member(group, key, where)[()])
+        found = member(group, key, where)
+        if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+            raise EpisodeError(where, f"{key!r} is not a text")
+        check_lengths(found)
+        return text(found[()] if found.size == 1 else found[0] if found.shape else "")
     for holder in (group, group.parent, group.file):
         for name in TEXT_KEYS:
             if name in holder.attrs and (found := text(holder.attrs[name])):
@@ -263,7 +268,10 @@ def _text_row(holder: h5py.Group, name: str) -> str:
     found = child(holder, name)
     if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
         return ""
-    return text(found[()]) if found.size == 1 and found.dtype.kind in "OS" else ""
+    if found.size != 1 or found.dtype.kind not in "OS":
+        return ""
+    check_lengths(found)
+    return text(found[()])
 
 
 def _success(group: h5py.Group) -> bool | None:

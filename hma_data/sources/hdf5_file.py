@@ -5,6 +5,7 @@ datasets are refused, as are sizes no recording has.
 """
 
 import os
+import zlib
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -114,7 +115,16 @@ def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[N
     """Turns what h5py raises on damaged files into one line of ours."""
     try:
         yield
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as fault:
+    except (
+        OSError,
+        zlib.error,
+        KeyError,
+        RuntimeError,
+        ValueError,
+        TypeError,
+        OverflowError,
+        MemoryError,
+    ) as fault:
         lines = str(fault).splitlines() or [type(fault).__name__]
         remedy = "the file may be cut off or damaged"
         if "plugin" in lines[0] or ("filter" in lines[0] and "not registered" in lines[0]):
@@ -182,8 +192,50 @@ def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
     found = dataset(group, key, where)
     if np.prod(found.shape, dtype=float) > MAX_NUMBERS:
         raise EpisodeError(where, f"{key!r} has shape {found.shape}, too large for numbers over time")
+    check_lengths(found)
     values: NDArray[Any] = found[()]
     return values
+
+
+def check_lengths(found: h5py.Dataset) -> None:
+    """That no row of varying length claims more bytes than its file has; HDF5 would make room for them.
+
+    Rows that are compressed by anything but gzip are taken as they are.
+
+    Raises:
+        OSError: one does; `explained` says so in our words.
+    """
+    if not found.dtype.hasobject or not found.size or h5py.check_ref_dtype(found.dtype):
+        return
+    size = Path(found.file.filename).stat().st_size
+    for heads in _row_heads(found):
+        longest = int(heads.max(initial=0))
+        if longest > size:
+            raise OSError(f"a row of {found.name} claims {longest:,} values, the file has {size:,} bytes")
+
+
+def _row_heads(found: h5py.Dataset) -> Iterator[NDArray[np.uint32]]:
+    """The lengths in front of rows of varying length, a chunk at a time."""
+    width = found.id.get_type().get_size()
+    if not found.chunks:
+        offset = found.id.get_offset()
+        pieces = [] if offset is None else [(offset, found.id.get_storage_size(), 0)]
+    else:
+        infos = (found.id.get_chunk_info(i) for i in range(found.id.get_num_chunks()))
+        pieces = [(info.byte_offset, info.size, info.filter_mask) for info in infos]
+    plan = found.id.get_create_plist()
+    filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
+    with Path(found.file.filename).open("rb") as file:
+        for offset, size, skipped in pieces:
+            applied = [code for i, code in enumerate(filters) if not skipped >> i & 1]
+            if applied not in ([], [h5py.h5z.FILTER_DEFLATE]):  # a shuffle is never applied to such rows
+                return
+            file.seek(offset)
+            content = file.read(min(size, MAX_BYTES))
+            if applied:
+                content = zlib.decompressobj().decompress(content, int(np.prod(found.chunks)) * width)
+            values = np.frombuffer(content[: len(content) // width * width], np.uint8).reshape(-1, width)
+            yield np.ascontiguousarray(values[:, :4]).view("<u4")
 
 
 def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
@@ -196,6 +248,7 @@ def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDA
         return np.zeros((0, *found.shape[1:]), found.dtype)
     if not 0 <= wanted.min() <= wanted.max() < len(found):
         raise IndexError(f"{found.name} has {len(found)} rows, asked for {wanted.min()} to {wanted.max()}")
+    check_lengths(found)
     ordered = np.unique(wanted)
     apart = np.diff(ordered) > 1
     if band_bytes(found) > HELD_BYTES:
