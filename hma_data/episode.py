@@ -146,11 +146,20 @@ class Pictures:
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """See Stream."""
-        pictures = [self._decode(int(i)) for i in indices]
-        shapes = {picture.shape for picture in pictures}
-        if len(shapes) > 1:
-            raise EpisodeError("", f"pictures change size within the episode: {sorted(shapes)}")
-        return np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)
+        if not len(indices):
+            return np.zeros((0, 1, 1, 3), np.uint8)
+        first = self._decode(int(indices[0]))
+        if len(indices) == 1:
+            return first[None]
+        pictures = np.empty((len(indices), *first.shape), np.uint8)
+        pictures[0] = first
+        for place, index in enumerate(indices[1:], 1):
+            picture = self._decode(int(index))
+            if picture.shape != first.shape:
+                sizes = sorted({first.shape, picture.shape})
+                raise EpisodeError("", f"pictures change size within the episode: {sizes}")
+            pictures[place] = picture
+        return pictures
 
 
 class Decode(Protocol):

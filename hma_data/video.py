@@ -4,11 +4,14 @@ N pictures, H×W pixels; uint8 RGB everywhere. Resizing happens here and nowhere
 is part of the tokenizer's spec because it changes the tokens.
 """
 
+import os
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episode import Pictures, Stream
 from hma_data.errors import EpisodeError, MissingDependencyError
 from hma_data.spec import Camera
 
@@ -24,6 +27,7 @@ def opencv() -> Any:
         MissingDependencyError: it cannot be imported, usually because a build
             for displays replaced the headless one.
     """
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read once, when it is loaded
     try:
         import cv2
     except ImportError as fault:
@@ -43,7 +47,7 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
     """
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
-    width, height = claimed_size(bytes(buffer[:65536]))
+    width, height = claimed_size(buffer[:65536].tobytes())
     if width * height > MAX_PIXELS:
         raise EpisodeError(where, f"a picture claims {width}×{height} pixels, more than {MAX_PIXELS:,}")
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
@@ -90,6 +94,21 @@ def prepare(frames: Images, camera: Camera, size: int, resize_filter: Filter = "
     return resize(frames, size, camera.resize, resize_filter)
 
 
+def prepared(
+    stream: Stream, indices: Sequence[int], camera: Camera, size: int, resize_filter: Filter = "area"
+) -> Images:
+    """Pictures of a stream -> (n, size, size, 3) RGB, as `prepare` makes them of `stream.frames`.
+
+    Pictures that are kept one by one are made square one by one: large ones are never held together.
+    """
+    if not isinstance(stream, Pictures) or not len(indices):
+        return prepare(stream.frames(indices), camera, size, resize_filter)
+    out = _empty(len(indices), size)
+    for place, index in enumerate(indices):
+        out[place] = prepare(stream.frames([index]), camera, size, resize_filter)[0]
+    return out
+
+
 def resize(
     frames: Images, size: int, rule: str = "short_side_crop", resize_filter: Filter = "area"
 ) -> Images:
@@ -116,10 +135,20 @@ def resize(
         inner_h = inner_w = size
     shrinks = inner_h < height or inner_w < width
     interpolation = cv2.INTER_AREA if resize_filter == "area" and shrinks else cv2.INTER_LINEAR
-    out = np.zeros((len(frames), size, size, 3), np.uint8)
+    bordered = (inner_h, inner_w) != (size, size)
+    out = np.zeros((len(frames), size, size, 3), np.uint8) if bordered else _empty(len(frames), size)
     top, left = (size - inner_h) // 2, (size - inner_w) // 2
-    for i, frame in enumerate(frames):
-        out[i, top : top + inner_h, left : left + inner_w] = cv2.resize(
-            np.ascontiguousarray(frame), (inner_w, inner_h), interpolation=interpolation
-        )
+    for frame, square in zip(frames, out):
+        inner = square[top : top + inner_h, left : left + inner_w]
+        cv2.resize(_packed(frame), (inner_w, inner_h), dst=inner, interpolation=interpolation)
     return out
+
+
+def _packed(frame: Images) -> Images:
+    """The picture as OpenCV takes it: rows may lie apart, pixels may not."""
+    rows, *pixel = frame.strides
+    return frame if rows > 0 and pixel == [3, 1] else np.ascontiguousarray(frame)
+
+
+def _empty(count: int, size: int) -> Images:
+    return np.empty((count, size, size, 3), np.uint8)

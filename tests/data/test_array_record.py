@@ -120,13 +120,6 @@ def test_files_of_the_formats_own_writer(tmp_path, sizes, options):
     assert read_all(path) == contents(SIZES[sizes])
 
 
-def test_the_formats_own_reader_takes_what_is_made_here(tmp_path):
-    module = pytest.importorskip("array_record.python.array_record_module")
-    path = tmp_path / "x.array_record"
-    path.write_bytes(made(contents(SIZES["blocks"]), 2))
-    assert module.ArrayRecordReader(str(path)).read_all() == contents(SIZES["blocks"])
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [("group_size:1,transpose", "transpose"), ("group_size:1,brotli", "brotli"), ("snappy", "snappy")],

@@ -2,20 +2,24 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from hma_data.episode import Pictures
 from hma_data.errors import EpisodeError
 from hma_data.sources.video_file import VideoFile, frame_table
 from hma_data.spec import Camera
-from hma_data.video import prepare
+from hma_data.video import decode_image, prepare, prepared
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
 
 LENGTH = 40
@@ -221,3 +225,109 @@ def test_a_crop_that_leaves_the_picture_is_refused() -> None:
     camera = Camera(name="c", key="k", crop=(4, 0, 8, 8))
     with pytest.raises(EpisodeError, match=r"crop \[4, 0, 8, 8\] leaves the picture of 8×8"):
         prepare(np.zeros((1, 8, 8, 3), np.uint8), camera, 8)
+
+
+@pytest.mark.parametrize("rule", ["short_side_crop", "letterbox", "stretch"])
+@pytest.mark.parametrize("resize_filter", ["area", "linear"])
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (30, 17), (16, 16), (9, 40)])
+@pytest.mark.parametrize(
+    "changes", [{}, {"color": "bgr", "flip": "horizontal", "rotate": 90}, {"crop": [1, 2, 7, 6]}]
+)
+def test_resizing_is_opencvs_on_a_packed_copy_bit_for_bit(
+    rule: str, resize_filter: Any, height: int, width: int, changes: dict[str, Any]
+) -> None:
+    frames = np.random.default_rng(3).integers(0, 256, (3, height, width, 3), np.uint8)
+    camera = Camera.model_validate({"name": "c", "key": "k", "resize": rule, **changes})
+    stream = Pictures(np.arange(3.0), lambda index: frames[index])
+    mine = prepare(frames, camera, 16, resize_filter)
+    np.testing.assert_array_equal(prepared(stream, range(3), camera, 16, resize_filter), mine)
+    np.testing.assert_array_equal(prepared(stream, [2], camera, 16, resize_filter), mine[2:])
+    plain = camera.model_copy(update={"resize": "stretch"})
+    for raw, square in zip(frames, mine):
+        turned = resize_input(raw, plain)
+        side = min(turned.shape[:2])
+        if rule == "short_side_crop":
+            top, left = (turned.shape[0] - side) // 2, (turned.shape[1] - side) // 2
+            turned = turned[top : top + side, left : left + side]
+        scale = 16 / max(turned.shape[:2])
+        inner = (
+            [max(1, round(size * scale)) for size in turned.shape[:2]] if rule == "letterbox" else [16, 16]
+        )
+        shrinks = inner[0] < turned.shape[0] or inner[1] < turned.shape[1]
+        how = cv2.INTER_AREA if resize_filter == "area" and shrinks else cv2.INTER_LINEAR
+        expected = np.zeros((16, 16, 3), np.uint8)
+        top, left = (16 - inner[0]) // 2, (16 - inner[1]) // 2
+        expected[top : top + inner[0], left : left + inner[1]] = cv2.resize(
+            turned.copy(), (inner[1], inner[0]), interpolation=how
+        )
+        np.testing.assert_array_equal(square, expected)
+
+
+def resize_input(raw: np.ndarray, camera: Camera) -> np.ndarray:
+    """The picture as it is handed to the resizing: colours, flip, rotation and crop done."""
+    if camera.color == "bgr":
+        raw = raw[..., ::-1]
+    if camera.flip == "horizontal":
+        raw = raw[:, ::-1]
+    raw = np.rot90(raw, -(camera.rotate or 0) // 90)
+    if camera.crop:
+        x, y, width, height = camera.crop
+        raw = raw[y : y + height, x : x + width]
+    return raw
+
+
+def test_no_pictures_stay_none_and_a_change_of_size_is_an_error() -> None:
+    sizes = [(8, 8, 3), (8, 8, 3), (6, 8, 3)]
+    stream = Pictures(np.arange(3.0), lambda index: np.zeros(sizes[index], np.uint8))
+    assert stream.frames([]).shape[0] == 0
+    assert stream.frames([2]).shape == (1, 6, 8, 3)
+    with pytest.raises(EpisodeError, match="change size within the episode"):
+        stream.frames([0, 1, 2])
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_picture_that_claims_a_huge_size_is_refused_unread(suffix: str) -> None:
+    data = bytearray(cv2.imencode(suffix, np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    if suffix == ".png":
+        data[16:24] = (60_000).to_bytes(4, "big") * 2
+    else:
+        at = data.index(b"\xff\xc0")
+        data[at + 5 : at + 9] = (60_000).to_bytes(2, "big") * 2
+    with pytest.raises(EpisodeError, match="claims 60000×60000 pixels"):
+        decode_image(bytes(data), "e")
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".png", ".jpg"])
+def test_a_huge_size_is_refused_wherever_it_is_claimed(suffix: str) -> None:
+    data = bytearray(cv2.imencode(suffix, np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    if suffix == ".bmp":
+        data[18:26] = (30_000).to_bytes(4, "little") * 2
+    elif suffix == ".jpg":  # behind more metadata than is looked at
+        at = data.index(b"\xff\xc0")
+        data[at + 5 : at + 9] = (30_000).to_bytes(2, "big") * 2
+        data[2:2] = (b"\xff\xe1\xff\xff" + bytes(65533)) * 2
+    else:
+        data[16:24] = (30_000).to_bytes(4, "big") * 2
+    code = (
+        "import sys; from hma_data.video import decode_image; from hma_data.errors import EpisodeError\n"
+        "try: decode_image(sys.stdin.buffer.read(), 'e')\n"
+        "except EpisodeError: sys.exit(7)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], input=bytes(data), capture_output=True, check=False)
+    assert done.returncode == 7, done.stderr.decode()
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_a_damaged_picture_is_a_picture_or_our_error(data: st.DataObject) -> None:
+    suffix = data.draw(st.sampled_from([".png", ".jpg", ".bmp", ".webp", ".tiff"]))
+    content = bytearray(
+        cv2.imencode(suffix, np.random.default_rng(0).integers(0, 256, (9, 7, 3), np.uint8))[1]
+    )
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    content = content[: data.draw(st.integers(0, len(content)))]
+    try:
+        assert decode_image(bytes(content), "e").shape[2] == 3
+    except EpisodeError as fault:
+        assert str(fault)
