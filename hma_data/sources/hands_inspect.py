@@ -86,8 +86,8 @@ def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -
             said = f"{name}: holds {len(file):,} frames, its header states {header.frames:,}"
             numbers = {"frames": len(file), "stated": header.frames}
             survey.note(Finding("frames", "warn", said, key="video", numbers=numbers))
-        indices = looks.choose(len(file), pairs, file.table.keys)
-        survey.pictures(name, "video", file.frames(indices), indices, header.codec)
+        for run in looks.runs(looks.choose(len(file), pairs, file.table.keys)):
+            survey.pictures(name, "video", file.frames(run), run, header.codec)
         file.close()
     except EpisodeError as fault:
         survey.fault(name, fault)

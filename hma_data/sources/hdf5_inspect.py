@@ -117,16 +117,16 @@ def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, sta
 
 
 def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int) -> None:
-    indices = looks.choose(item.shape[0], pairs)
-    found = rows(item, indices)
-    if info.codec == "raw":
-        survey.pictures(name, key, as_rgb(found), indices, info.codec)
-        return
-    pictures = [
-        decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, indices, strict=True)
-    ]
-    for start, frames in looks.stacked(pictures):
-        survey.pictures(name, key, frames, indices[start : start + len(frames)], info.codec)
+    for run in looks.runs(looks.choose(item.shape[0], pairs)):
+        found = rows(item, run)
+        if info.codec == "raw":
+            survey.pictures(name, key, as_rgb(found), run, info.codec)
+            continue
+        pictures = [
+            decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, run, strict=True)
+        ]
+        for start, frames in looks.stacked(pictures):
+            survey.pictures(name, key, frames, run[start : start + len(frames)], info.codec)
 
 
 def _length(sizes: dict[str, int]) -> int:

@@ -149,8 +149,9 @@ class _Looking:
 
     def _stills(self, name: str, key: str, rows: Rows, pairs: int) -> None:
         stream = StillPictures(rows, key, np.zeros(len(rows)), self._meta.folder)
-        indices = looks.choose(len(rows), pairs)
-        self._survey.pictures(name, key, stream.frames(indices), indices, stream.codec())
+        codec = stream.codec()
+        for run in looks.runs(looks.choose(len(rows), pairs)):
+            self._survey.pictures(name, key, stream.frames(run), run, codec)
 
     def _video(self, key: str, index: int, pairs: int) -> None:
         """Counts an episode's video against its rows, and looks at some pictures."""
@@ -167,8 +168,8 @@ class _Looking:
                 self._survey.note(Finding("frames", "warn", said, key=key, numbers=numbers))
             if last > first:
                 indices = first + looks.choose(last - first, pairs, file.table.keys[first:last] - first)
-                frames = file.frames(indices)
-                self._survey.pictures(name, key, frames, indices, file.table.codec)
+                for run in looks.runs(indices):
+                    self._survey.pictures(name, key, file.frames(run), run, file.table.codec)
             file.close()
         except HMAError as fault:
             self._survey.fault(f"{name} {key}", fault)

@@ -34,7 +34,7 @@ class Look:
         lossless: whether they are stored without loss, so that their colours tell how they once were.
         pictures: how many.
         sizes: (height, width) met, and in how many episodes.
-        changes: episodes within which the size changes.
+        changes: how often the size changes within an episode.
         neighbours, same: pairs of neighbouring pictures compared, and equal ones among them.
         blank, episodes: episodes in which it shows one colour, of all looked at.
         red, blue: sums of the means, over `pictures`.
@@ -55,20 +55,26 @@ class Look:
     warm: float = 0.0
     cold: float = 0.0
     colours: list[NDArray[np.uint8]] = field(default_factory=list)
+    _blank: bool = False
+    _size: tuple[int, int] = (0, 0)
 
     def add(self, frames: Images, indices: NDArray[np.int64], again: bool = False) -> None:
         """Takes pictures (n, H, W, 3) of one episode, and which of its frames they are (n,) rising.
 
-        `again` where they are of another size than those before, of the same episode.
+        `again` where they are of the same episode as those before.
         """
-        self.changes, self.episodes = self.changes + again, self.episodes + (not again)
+        if not again:
+            self.episodes, self.blank, self._blank = self.episodes + 1, self.blank + 1, True
         self.pictures += len(frames)
         size = (int(frames.shape[1]), int(frames.shape[2]))
+        self.changes += again and size != self._size
+        self._size = size
         self.sizes[size] = self.sizes.get(size, 0) + 1
         pairs = np.flatnonzero(np.diff(indices) == 1)
         self.neighbours += len(pairs)
         self.same += sum(np.array_equal(frames[i], frames[i + 1]) for i in pairs)
-        self.blank += float(frames.std()) < BLANK
+        if self._blank and float(frames.std()) >= BLANK:
+            self.blank, self._blank = self.blank - 1, False
         for frame in frames:
             pixels = _some(frame)
             self.red += float(pixels[:, 0].mean())
@@ -154,6 +160,11 @@ def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> 
     return np.unique(np.minimum(firsts[:, None] + np.arange(run), length - 1))
 
 
+def runs(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """The chosen frames run by run, which bounds how many pictures are in memory."""
+    return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
+
+
 def stacked(pictures: list[Images]) -> Iterator[tuple[int, Images]]:
     """Runs of pictures of one size as (n, H, W, 3), with the place each begins at."""
     start = 0
@@ -170,7 +181,7 @@ def findings(looks: dict[str, Look]) -> Iterator[Finding]:
             continue
         if len(look.sizes) > 1:
             said = ", ".join(f"{width}×{height}" for height, width in sorted(look.sizes))
-            part = f"; it changes within {look.changes} episodes" if look.changes else ""
+            part = "; it changes within episodes" if look.changes else ""
             worst: Severity = "warn" if look.changes else "info"
             yield Finding("size", worst, f"{key}: pictures of several sizes, {said}{part}", key=key)
         if look.blank:

@@ -84,11 +84,7 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
     for key, feature in steps.features.items():
         try:
             if is_camera(feature):
-                indices = looks.choose(steps.count, pairs)
-                decode = steps.decoder(key)
-                for start, frames in looks.stacked([decode(int(i)) for i in indices]):
-                    chosen = indices[start : start + len(frames)]
-                    survey.pictures(steps.name, key, frames, chosen, _codec(steps, key))
+                _pictures(steps, key, survey, pairs)
             elif feature.kind == "number" and 0 < (feature.width or 0) <= MAX_VECTOR:
                 values = steps.numbers(key)
                 survey.numbers(steps.name, key, values)
@@ -97,6 +93,13 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
                     survey.times(steps.name, key, seconds)
         except EpisodeError as fault:
             survey.fault(f"{steps.name} {key}", fault)
+
+
+def _pictures(steps: Steps, key: str, survey: Survey, pairs: int) -> None:
+    decode, codec = steps.decoder(key), _codec(steps, key)
+    for run in looks.runs(looks.choose(steps.count, pairs)):
+        for start, frames in looks.stacked([decode(int(i)) for i in run]):
+            survey.pictures(steps.name, key, frames, run[start : start + len(frames)], codec)
 
 
 def _why(survey: Survey, folder: Folder) -> str:

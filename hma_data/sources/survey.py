@@ -60,7 +60,8 @@ class _Numbers:
     infinite: int = 0
     values: int = 0
     episodes: int = 0
-    first: str = ""
+    first: str = ""  # where one that is not finite was met
+    last: str = ""  # the episode in which one was met last
 
 
 @dataclass
@@ -119,8 +120,8 @@ class Survey:
         if odd:
             self._odd.append((name, length, odd))
 
-    def numbers(self, name: str, key: str, values: NDArray[Any]) -> None:
-        """A vector (T, …) of an episode."""
+    def numbers(self, name: str, key: str, values: NDArray[Any], begin: int = 0) -> None:
+        """A vector (T, …) of an episode, or the part of it that begins at step `begin`."""
         if values.dtype.kind not in "fiub" or not len(values):
             return
         self.made |= {"finite", "constant"}
@@ -136,7 +137,7 @@ class Survey:
             blank = np.full(flat.shape[1], np.nan)
             held = self._numbers[key] = _Numbers(blank, blank.copy())
         if infinite and not held.infinite:
-            held.first = f"{name}: {key} is not finite at step {int(np.argwhere(~finite)[0, 0])}"
+            held.first = f"{name}: {key} is not finite at step {begin + int(np.argwhere(~finite)[0, 0])}"
         if infinite:
             flat = np.where(finite, flat, np.nan)
         held.low = np.fmin(held.low, np.fmin.reduce(flat, axis=0))
@@ -144,7 +145,8 @@ class Survey:
         held.rows += len(flat)
         held.values += flat.size
         held.infinite += infinite
-        held.episodes += bool(infinite)
+        held.episodes += bool(infinite) and held.last != name
+        held.last = name if infinite else held.last
 
     def pictures(
         self, name: str, key: str, frames: Images, indices: NDArray[np.int64], codec: str | None
@@ -184,7 +186,7 @@ class Survey:
             low, high = held.low[np.isfinite(held.low)], held.high[np.isfinite(held.high)]
             info = replace(
                 info,
-                constant=held.rows > 1 and len(still) == len(held.low) and not held.infinite,
+                constant=bool(still) and len(still) == len(held.low) and not held.infinite,
                 still=tuple(still),
                 low=float(low.min()) if len(low) else None,
                 high=float(high.max()) if len(high) else None,

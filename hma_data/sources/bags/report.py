@@ -31,6 +31,7 @@ MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
 MAX_LENGTHS = 1000
 MAX_FIELDS = 64  # numeric keys of a topic whose values are looked at
+MAX_HELD = 1 << 16  # numbers of a key in memory
 MAX_WIDTH = 4096  # wider than this is a map or a cloud, no action or state
 LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # no streams
 APART_S = 1.0  # header stamps further than this from receive times are worth a word
@@ -42,6 +43,7 @@ class _Values:
 
     place: Field
     width: int = 0
+    taken: int = 0  # rows handed on
     held: array[float] = field(default_factory=lambda: array("d"))
 
     def add(self, message: Any, where: str) -> None:
@@ -52,6 +54,13 @@ class _Values:
         self.width = self.width or len(found)
         if found and len(found) == self.width:
             self.held.extend(found)
+
+    def hand_on(self, survey: Survey, episode: str) -> None:
+        """What is held goes into the survey."""
+        if self.held:
+            read = np.array(self.held).reshape(-1, self.width)
+            survey.numbers(episode, self.place.key, read, self.taken)
+            self.taken, self.held = self.taken + len(read), array("d")
 
 
 @dataclass
@@ -197,6 +206,9 @@ class _Telling:
                 topic.track.add(record.channel, record.log_ns, place, message)
                 if message is not None:
                     topic.look_at(message, where)
+                for value in topic.values:
+                    if len(value.held) > MAX_HELD:
+                        value.hand_on(self._survey, self._name)
             except EpisodeError as fault:
                 topic.fault = fault.fault
                 topic.track.add(record.channel, record.log_ns, place, None)
@@ -215,9 +227,7 @@ class _Telling:
             found = [self._camera(topic, kind)] if kind else _values(topic.track.topic, topic.sample)
         found = found or [KeyInfo(topic.track.topic, "other", (), stated.type or stated.encoding)]
         for value in topic.values:
-            if value.held:
-                read = np.frombuffer(value.held, np.float64).reshape(-1, value.width)
-                self._survey.numbers(self._name, value.place.key, read)
+            value.hand_on(self._survey, self._name)
         about = _about(topic, times, stated.type or stated.encoding)
         return [
             replace(key, hz=clock.hz, count=topic.count, jitter_ms=clock.jitter_ms, topic=about)
@@ -243,11 +253,12 @@ class _Telling:
             stream = camera_stream(self.bag, topic.track, "receive")
             keyframes = topic.track.keyframes() if kind == VIDEO else None
             indices = looks.choose(len(stream.timestamps), _PAIRS, _starts(keyframes))
-            frames = stream.frames(indices)
+            for run in looks.runs(indices):
+                frames = stream.frames(run)
+                self._survey.pictures(self._name, name, frames, run, stored)
         except EpisodeError as fault:
             self._survey.note(Finding("readable", "warn", f"{name}: {fault.fault}", key=name))
             return KeyInfo(name, "other", (), topic.track.channels[0].type)
-        self._survey.pictures(self._name, name, frames, indices, stored)
         channels = 1 if is_grey(topic.sample, kind) else 3
         return KeyInfo(name, "camera", (*frames.shape[1:3], channels), "uint8", codec=stored)
 
