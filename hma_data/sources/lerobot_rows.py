@@ -20,7 +20,8 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.lerobot_meta import Folder, parquet_explained
 from hma_data.video import Images, decode_image
 
-MAX_BYTES = 1 << 30  # of one column of an episode
+MAX_BYTES = 1 << 30  # of one column of a row group, as stored
+MAX_VALUES = 1 << 26  # of the same: a run of equal values may be stored as one
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def rows_of(path: Path, index: int) -> Rows:
                 )
                 within = np.flatnonzero(found == index)
             else:
-                within = np.arange(metadata.row_group(group).num_rows)
+                within = np.arange(min(metadata.row_group(group).num_rows, MAX_VALUES))
             places.append(np.stack([np.full(len(within), group), within], axis=1))
         placed = np.concatenate(places) if places else np.zeros((0, 2), np.int64)
         if not len(placed):
@@ -154,9 +155,7 @@ class StillPictures:
 
     def _column(self, group: int) -> pa.Array:
         if self._held is None or self._held[0] != group:
-            with pq.ParquetFile(self._rows.path) as file:
-                table = file.read_row_group(group, [self._key], use_threads=False)
-            self._held = group, _only(table, self._key)
+            self._held = group, _read(self._rows.path, group, self._key)
         return self._held[1]
 
     def _file(self, relative: str, where: str) -> bytes:
@@ -170,12 +169,21 @@ class StillPictures:
 
 @lru_cache(maxsize=8)  # version 3: the episodes of a file come one after the other
 def _column_of_group(path: Path, changed: int, group: int, key: str) -> pa.Array:
-    with parquet_explained(path, EpisodeError), pq.ParquetFile(path) as file:
+    with parquet_explained(path, EpisodeError):
+        return _read(path, group, key)
+
+
+def _read(path: Path, group: int, key: str) -> pa.Array:
+    """A column of a row group, whole, if it is of a size that recordings have."""
+    with pq.ParquetFile(path) as file:
         held = file.metadata.row_group(group)
-        sizes = [held.column(i) for i in range(held.num_columns)]
-        size = sum(item.total_uncompressed_size for item in sizes if item.path_in_schema.startswith(key))
-        if size > MAX_BYTES:
-            raise EpisodeError(path, f"{key!r} claims {size:,} bytes", "the file may be damaged")
+        columns = [held.column(i) for i in range(held.num_columns)]
+        parts = [item for item in columns if item.path_in_schema.startswith(key)]
+        size = max((item.total_uncompressed_size for item in parts), default=0)
+        values = max((item.num_values for item in parts), default=0)
+        if size > MAX_BYTES or max(values, held.num_rows) > MAX_VALUES:
+            fault = f"{key!r} claims {values:,} values of {held.num_rows:,} rows in {size:,} bytes"
+            raise EpisodeError(path, fault, "the file may be damaged")
         return _only(file.read_row_group(group, [key], use_threads=False), key)
 
 

@@ -249,6 +249,17 @@ def test_rows_that_metadata_does_not_count_are_refused(copy: Callable[[str], Pat
         open_source("lerobot").read(str(folder), "episode_000000", embodiment())
 
 
+def test_a_run_of_more_rows_than_any_recording_is_refused(
+    copy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = copy("v2")
+    monkeypatch.setattr("hma_data.sources.lerobot_rows.MAX_VALUES", 1000)
+    path = folder / "data/chunk-000/episode_000000.parquet"
+    pq.write_table(pa.table({"episode_index": np.zeros(1001, np.int64)}), path)
+    with pytest.raises(EpisodeError, match=r"'episode_index' claims 1,001 values of 1,001 rows"):
+        open_source("lerobot").read(str(folder), "episode_000000", embodiment())
+
+
 def test_a_key_that_is_no_feature_names_the_nearest(originals: dict[str, Path]) -> None:
     arm = embodiment(cameras=[{"name": "cam", "key": "observation.images.camera"}])
     with pytest.raises(SourceError, match=rf"is not a feature.*did you mean {CAMERA}"):
