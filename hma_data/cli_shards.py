@@ -114,6 +114,7 @@ def shards_preview(
     folder: Annotated[Path, typer.Argument(help="A shard set.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder for sheet.png and preview.mp4.")] = None,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="How many to show.")] = 4,
+    camera: Annotated[str | None, typer.Option("--camera", help="Which; default: the first.")] = None,
     weights: Annotated[
         str | None, typer.Option("--weights", help="The tokenizer's weights, if not the usual.")
     ] = None,
@@ -124,7 +125,8 @@ def shards_preview(
     """
     from hma_data.shards.preview import preview
 
-    shown = preview(folder, out or Path(f"{folder.name}-preview"), episodes=episodes, weights=weights)
+    place = out or Path(f"{folder.resolve().name}-preview")
+    shown = preview(folder, place, episodes=episodes, weights=weights, camera=camera)
     print(f"wrote {shown.sheet} and {shown.video} ({len(shown.episodes)} episodes)")
 
 

@@ -17,7 +17,9 @@ from hma_data.errors import UsageError
 
 BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
     "convert": "hma_data.bench.convert",
+    "loader": "hma_data.bench.loader",
     "registry": "hma_data.bench.registry",
+    "shards": "hma_data.bench.shards",
     "sources": "hma_data.bench.sources",
 }
 

@@ -257,3 +257,12 @@ def test_random_tokens_of_18_bits_cost_less_than_600_bytes_a_frame(tmp_path: Pat
     assert tokens_only / frames < 590  # 576 are the information
     # all but the random actions, which are incompressible too
     assert (path.stat().st_size - 4 * actions.size) / frames < 600
+
+
+def test_the_benchmark_of_shards_runs() -> None:
+    from hma_data.bench import shards
+
+    results = shards.run(shards.DEFAULTS | {"frames": 400, "episode": 20})
+    assert [result["step"] for result in results] == ["write", "read", "verify", "verify --quick"]
+    assert all(result["frames_per_second"] > 0 and result["peak_rss_mib"] > 0 for result in results)
+    assert results[0]["bytes_per_frame"] > results[0]["token_bytes_per_frame"] > 500

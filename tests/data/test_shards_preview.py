@@ -1,0 +1,92 @@
+"""Previews show what the tokens say, and where in time."""
+
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from hma_data.convert import convert
+from hma_data.embodiment import Embodiment
+from hma_data.errors import UsageError
+from hma_data.plan import Settings
+from hma_data.shards.curves import CURSOR, UNKNOWN, Curves
+from hma_data.shards.preview import preview
+from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    write_toy(tmp_path / "toy.hdf5", [14, 1, 16, 17, 18])
+    settings = Settings(val_fraction=0.3, cameras=("top", "side"))
+    arm = Embodiment.from_yaml(ARM_YAML)
+    convert(arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "set", settings=settings)
+    return tmp_path / "set"
+
+
+def test_the_video_shows_each_frame_at_the_recorded_rate(made: Path, tmp_path: Path) -> None:
+    shown = preview(made, tmp_path / "seen", episodes=9, tokenizer=BlockTokenizer())
+    with av.open(str(shown.video)) as container:
+        stream = container.streams.video[0]
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        assert float(stream.average_rate) == pytest.approx(10)
+    assert len(frames) == 14 + 1 + 16 + 17 + 18
+    assert len(shown.episodes) == 5
+    blue, brighter = (frame[18 + 128, 128].astype(int) for frame in (frames[0], frames[13]))
+    assert brighter[1] > blue[1] + 100  # the toy's green counts frames
+
+
+def test_the_sheet_shows_decoded_pictures_in_order(made: Path, tmp_path: Path) -> None:
+    shown = preview(made, tmp_path / "seen", episodes=1, columns=3, tokenizer=BlockTokenizer())
+    sheet = cv2.imread(str(shown.sheet))[..., ::-1].astype(int)
+    greens = [sheet[18 + 72, 4 + place * 148 + 72, 1] for place in range(3)]
+    assert greens == [0, 17 * 6, 17 * 13]
+    assert shown.sheet.parent.is_dir()
+    assert {path.name for path in shown.sheet.parent.iterdir()} == {"sheet.png", "preview.mp4"}
+
+
+def test_another_camera_can_be_shown(made: Path, tmp_path: Path) -> None:
+    shown = preview(made, tmp_path / "s", episodes=1, camera="side", tokenizer=BlockTokenizer())
+    sheet = cv2.imread(str(shown.sheet))[..., ::-1]
+    assert shown.sheet.is_file()
+    last = sheet[18 + 72, 4 + 7 * 148 + 72].astype(int)
+    assert last[1] == 17 * 13
+    with pytest.raises(UsageError, match="top, side"):
+        preview(made, tmp_path / "t", camera="nose", tokenizer=BlockTokenizer())
+
+
+def curves(values: np.ndarray, known: np.ndarray | None = None) -> Curves:
+    low, high = values.min(0).astype(np.float64), values.max(0).astype(np.float64)
+    names = [f"v{i}" for i in range(values.shape[1])]
+    return Curves(values.astype(np.float32), known, low, high, names, 3.0, 400, 200)
+
+
+def count(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
+    """Pixels of just that colour; lines are smoothed, so few of theirs are."""
+    return int((picture == colour).all(axis=-1).sum())
+
+
+def lines(picture: np.ndarray) -> int:
+    """Bluish pixels."""
+    return int((picture[..., 2].astype(int) - picture[..., 0] > 40).sum())
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 7), (300, 7), (50, 40)])
+def test_curves_of_any_size_are_drawn(shape: tuple[int, int]) -> None:
+    values = np.random.default_rng(0).normal(size=shape)
+    picture = curves(values).at(0)
+    assert picture.shape == (200, 400, 3)
+    assert count(picture, CURSOR) >= 100
+    assert lines(curves(values).panel) > 20 or shape[0] == 1
+
+
+def test_constant_and_huge_values_are_drawn() -> None:
+    for values in (np.zeros((10, 2)), np.full((10, 2), 3e38), np.array([[-3e38], [3e38]])):
+        assert curves(values).panel.shape == (200, 400, 3)
+
+
+def test_what_is_not_known_is_grey() -> None:
+    values = np.sin(np.arange(40.0))[:, None]
+    assert count(curves(values, np.arange(40) % 20 > 5).panel, UNKNOWN) > 1000
+    assert count(curves(values, np.ones(40, bool)).panel, UNKNOWN) < 100

@@ -1,0 +1,116 @@
+"""Statistics stay true for inputs that are meant to break them."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hma_data.stats import QUANTILES, Stats
+
+RNG = np.random.default_rng(0)
+N = 200_000
+INPUTS: dict[str, Any] = {
+    "ascending": np.arange(N),
+    "descending": -np.arange(N),
+    "two values": RNG.integers(0, 2, N),
+    "constant": np.full(N, 0.1),
+    "heavy-tailed": RNG.standard_cauchy(N),
+    "lognormal": np.exp(RNG.normal(0, 8, N)),
+    "sawtooth": np.arange(N) % 257,
+    "1e38": RNG.choice([-1e38, 1e38], N),
+    "tiny": RNG.normal(0, 1e-38, N),
+    "far from zero": 1e6 + RNG.normal(0, 1e-1, N),
+    "outlier first": np.concatenate([[3e38], RNG.normal(size=N - 1)]),
+}
+
+
+def merged(rows: np.ndarray, size: int) -> Stats:
+    stats = Stats.empty(rows.shape[1])
+    for start in range(0, len(rows), size):
+        stats.merge(Stats.of(rows[start : start + size]))
+    return stats
+
+
+def rank_error(rows: np.ndarray, stats: Stats) -> float:
+    """How far, as a share of the rows, each stated quantile's ranks are from q; ties span ranks."""
+    worst = 0.0
+    for q in QUANTILES:
+        value = stats.quantile(q)[0]
+        below, upto = (rows[:, 0] < value).mean(), (rows[:, 0] <= value).mean()
+        worst = max(worst, below - q, q - upto)
+    return worst
+
+
+@pytest.mark.parametrize("size", [50, 5000])
+@pytest.mark.parametrize("name", INPUTS)
+def test_hostile_inputs(name: str, size: int) -> None:
+    rows = np.asarray(INPUTS[name], np.float32)[:, None]
+    stats, exact = merged(rows, size), rows.astype(np.float64)
+    scale = np.abs(exact).max()
+    assert np.isfinite([stats.mean, stats.std, stats.min, stats.max]).all()
+    assert abs(stats.mean[0] - exact.mean()) <= 1e-12 * scale
+    assert abs(stats.std[0] - exact.std()) <= 1e-9 * scale
+    assert (stats.min[0], stats.max[0]) == (exact.min(), exact.max())
+    assert rank_error(rows, stats) <= np.log2(N / 256) / 512  # stated
+    assert rank_error(rows, stats) <= 0.005  # as docs/format.md says of these
+    values = [value[0] for value in stats.summary()["quantiles"].values()]
+    assert values == sorted(values)
+
+
+def test_any_order_of_merging_agrees_within_rounding() -> None:
+    rows = RNG.normal(size=(3000, 2)) * [1e3, 1e-3] + [5, 1e3]
+    parts = np.split(rows.astype(np.float32), [100, 500, 1700])
+    seen = []
+    for order in itertools.permutations(range(4)):
+        stats = Stats.empty(2)
+        for i in order:
+            stats.merge(Stats.of(parts[i]))
+        seen.append(stats)
+    for stats in seen[1:]:
+        assert stats.count == seen[0].count
+        np.testing.assert_array_equal(stats.min, seen[0].min)
+        np.testing.assert_array_equal(stats.max, seen[0].max)
+        np.testing.assert_allclose(stats.mean, seen[0].mean, rtol=1e-12)
+        np.testing.assert_allclose(stats.std, seen[0].std, rtol=1e-9)
+
+
+def test_the_same_order_gives_the_same_bytes() -> None:
+    rows = RNG.normal(size=(5000, 3)).astype(np.float32)
+    assert merged(rows, 77).to_json() == merged(rows, 77).to_json()
+    again = Stats.from_json(merged(rows, 77).to_json())
+    assert again.to_json() == merged(rows, 77).to_json()
+
+
+@given(
+    st.lists(st.integers(0, 600), min_size=1, max_size=8),
+    st.floats(-(2.0**126), 2.0**126, width=32, allow_subnormal=False),
+)
+@settings(max_examples=50, deadline=None)
+def test_a_constant_stays_exact_however_it_is_merged(sizes: list[int], value: float) -> None:
+    stats = Stats.empty(1)
+    for size in sizes:
+        stats.merge(Stats.of(np.full((size, 1), value, np.float32)))
+    if stats.count:
+        assert stats.mean[0] == np.float32(value)
+        assert stats.std[0] == 0
+        assert set(np.ravel(list(stats.summary()["quantiles"].values()))) == {np.float64(np.float32(value))}
+
+
+def test_the_mean_of_33_million_constant_rows_is_exact() -> None:
+    block = np.full((2**18, 1), 0.1, np.float32)
+    stats = Stats.empty(1)
+    for _ in range(2**7):  # 2^25 rows, where a sum in float32 has long stopped growing
+        stats.merge(Stats.of(block))
+    assert stats.count == 2**25
+    assert stats.mean[0] == np.float64(np.float32(0.1))
+    assert stats.std[0] == 0
+    assert stats.quantile(0.5)[0] == np.float64(np.float32(0.1))
+
+
+def test_of_no_rows_nothing_is_nan() -> None:
+    for value in Stats.empty(3).summary().values():
+        flat = np.ravel(list(value.values()) if isinstance(value, dict) else value)
+        assert np.isfinite(flat).all()
