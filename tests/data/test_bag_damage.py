@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hma_data.errors import EpisodeError, HMAError
+from tests.data import bag_parts
 from tests.data.bag_files import (
     KINDS,
     SOURCE,
@@ -152,3 +153,78 @@ def test_pictures_are_not_kept_in_memory(tmp_path: Path) -> None:
     tracemalloc.stop()
     assert kept < size / 2
     assert stream.frames([399]).shape == (1, 24, 32, 3)
+
+
+PARTED = list(bag_parts.KINDS)
+
+
+@pytest.fixture(scope="module")
+def parted_bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Of each kind a bag of two episodes."""
+    found = {}
+    for kind in PARTED:
+        run = bag_parts.make_run(20, pause_after=(10,))
+        path = bag_parts.KINDS[kind](tmp_path_factory.mktemp("parted"), run)
+        found[kind] = (path / "run.db3" if path.is_dir() else path).read_bytes()
+    return found
+
+
+def touch_every_part(path: Path) -> None:
+    """Whatever a job would do with the episodes of the bag."""
+    embodiment = bag_parts.parted("{gap_s: 1}")
+    for ref in SOURCE.index(str(path), embodiment):
+        stream = SOURCE.read(str(path), ref.id, embodiment).streams["cam"]
+        stream.frames(range(len(stream.timestamps)))
+
+
+@pytest.mark.parametrize("kind", PARTED)
+@PATIENT
+@given(share=st.floats(0, 1, exclude_max=True))
+def test_a_bag_of_episodes_cut_off_anywhere_is_refused(
+    kind: str, share: float, parted_bags: dict[str, bytes], tmp_path: Path
+) -> None:
+    path = tmp_path / "cut.bag"
+    path.write_bytes(parted_bags[kind][: int(len(parted_bags[kind]) * share)])
+    if kind == "ros1-without-index":  # without an index nothing tells that a whole chunk is missing
+        with contextlib.suppress(EpisodeError):
+            touch_every_part(path)
+        return
+    with pytest.raises(EpisodeError) as fault:
+        touch_every_part(path)
+    assert "\n" not in str(fault.value)
+
+
+@pytest.mark.parametrize("kind", PARTED)
+@PATIENT
+@given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7), fill=st.booleans())
+def test_a_flipped_bit_in_a_bag_of_episodes_gives_an_answer_or_our_error(
+    kind: str, share: float, bit: int, fill: bool, parted_bags: dict[str, bytes], tmp_path: Path
+) -> None:
+    data = bytearray(parted_bags[kind])
+    at = int(len(data) * share)
+    if fill:
+        data[at : at + 8] = b"\xff" * 8
+    else:
+        data[at] ^= 1 << bit
+    path = tmp_path / "flipped.bag"
+    path.write_bytes(data)
+    try:
+        touch_every_part(path)
+    except HMAError as fault:
+        assert "\n" not in str(fault)
+
+
+def test_a_wrong_checksum_is_refused_whether_chunks_are_packed_or_not(tmp_path: Path) -> None:
+    for kind in ("mcap-plain", "mcap-zstd"):
+        folder = tmp_path / kind
+        folder.mkdir()
+        path = bag_parts.KINDS[kind](folder, bag_parts.make_run(20))
+        data = bytearray(path.read_bytes())
+        chunk = data.index(b"\x06", 60)
+        while int.from_bytes(data[chunk + 1 : chunk + 9], "little") > 9000:
+            chunk = data.index(b"\x06", chunk + 1)
+        data[chunk + 9 + 24] ^= 1  # its checksum
+        path.write_bytes(data)
+        with pytest.raises(EpisodeError, match="checksum"):
+            stream = SOURCE.read(str(path), "run", bag_parts.parted("{gap_s: 1}")).streams["cam"]
+            stream.frames(range(20))

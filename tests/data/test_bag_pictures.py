@@ -11,10 +11,7 @@ import pytest
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.pictures import picture
-from tests.data.bag_files import (
-    arm,
-    read,
-)
+from tests.data.bag_files import SOURCE, arm, read
 
 
 def image(encoding: str, data: np.ndarray, width: int, height: int, step: int) -> dict[str, Any]:
@@ -177,3 +174,89 @@ def test_unknown_video_is_refused(tmp_path: Path) -> None:
     write_video(tmp_path / "v.mcap", "libx264", "mjpeg2000", LOW_DELAY)
     with pytest.raises(EpisodeError, match=r"'mjpeg2000' cannot be read.*h264"):
         read(tmp_path / "v.mcap", arm(VIDEO_YAML))
+
+
+@pytest.mark.parametrize("padding", [0, 4])
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+def test_semi_planar_yuv_is_converted_plane_by_plane(encoding: str, padding: int) -> None:
+    """Rec. 601, studio range: luma 81 with U 90 and V 240 is red."""
+    luma, colours = np.full((4, 6), 81, np.uint8), np.zeros((2, 6), np.uint8)
+    first, second = (90, 240) if encoding == "nv12" else (240, 90)
+    colours[:, ::2], colours[:, 1::2] = first, second
+    rows = np.pad(np.concatenate([luma, colours]), ((0, 0), (0, padding)))
+    found = picture(image(encoding, rows, 6, 4, 6 + padding), "raw", "")
+    np.testing.assert_allclose(found, np.broadcast_to([254, 0, 0], (4, 6, 3)), atol=2)
+    with pytest.raises(EpisodeError, match="has 20 bytes"):
+        picture(image(encoding, np.zeros(20, np.uint8), 4, 4, 4), "raw", "")
+
+
+def test_opencvs_names_of_encodings_are_blue_first() -> None:
+    rgb = smooth()
+    found = picture(image("8UC3", np.ascontiguousarray(rgb[..., ::-1]), 24, 16, 72), "raw", "")
+    np.testing.assert_array_equal(found, rgb)
+    four = np.concatenate([rgb[..., ::-1], np.full((16, 24, 1), 9, np.uint8)], -1)
+    np.testing.assert_array_equal(picture(image("8UC4", four, 24, 16, 96), "raw", ""), rgb)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    ["jpeg", "rgb8; jpeg compressed bgr8", "bgr8; jpeg compressed ", "png", "bgr8; png compressed bgr8", ""],
+)
+def test_compressed_pictures_are_told_by_their_bytes(stated: str) -> None:
+    encoded = cv2.imencode(".png" if "png" in stated else ".jpg", smooth()[..., ::-1])[1]
+    found = picture({"format": stated, "data": encoded.reshape(-1)}, "still", "")
+    assert np.abs(found.astype(int) - smooth()).mean() < 6
+
+
+VP9 = {"g": "10", "lag-in-frames": "0", "deadline": "realtime", "cpu-used": "8", "auto-alt-ref": "0"}
+AV1 = {"g": "10", "preset": "12", "svtav1-params": "pred-struct=1:lookahead=0"}
+
+
+@pytest.mark.parametrize(
+    ("codec", "name", "options"),
+    [("libx264", "h264", LOW_DELAY), ("libvpx-vp9", "vp9", VP9), ("libsvtav1", "av1", AV1)],
+)
+def test_key_frames_of_every_codec_are_told(
+    tmp_path: Path, codec: str, name: str, options: dict[str, str]
+) -> None:
+    from hma_data.sources.bags.bag import Bag
+    from hma_data.sources.bags.messages import decode
+    from hma_data.sources.bags.pictures import payload
+    from hma_data.sources.bags.video import is_keyframe
+
+    pictures = write_video(tmp_path / "v.mcap", codec, name, options)
+    records = Bag(tmp_path / "v.mcap").records(frozenset({"/video"}))
+    told = [is_keyframe(payload(decode(record.channel, record.data, "")), name) for _, record in records]
+    assert [i for i, begins in enumerate(told) if begins][:2] == [0, 10]
+    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
+    for indices in ([3], [25, 12], [29]):
+        assert np.abs(stream.frames(indices).astype(int) - pictures[indices]).mean() < 12
+
+
+@pytest.mark.parametrize(
+    ("codec", "name", "options"), [("libx264", "h264", LOW_DELAY), ("libvpx-vp9", "vp9", VP9)]
+)
+def test_an_episode_that_begins_between_key_frames_is_decoded_from_the_one_before(
+    tmp_path: Path, codec: str, name: str, options: dict[str, str]
+) -> None:
+    write_video(tmp_path / "v.mcap", codec, name, options)
+    whole = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"].frames(range(30))
+    parted = arm(VIDEO_YAML, **{"format: rosbag": "format: rosbag, segments: {gap_s: 0.5}"})
+    refs = SOURCE.index(str(tmp_path / "v.mcap"), parted)
+    assert [ref.frames for ref in refs] == [1] * 30  # a picture a second
+    for i in (0, 7, 10, 23):
+        found = SOURCE.read(str(tmp_path / "v.mcap"), refs[i].id, parted).streams["cam"]
+        assert found.timestamps.tolist() == [1 + i]
+        np.testing.assert_array_equal(found.frames([0])[0], whole[i])
+
+
+@pytest.mark.parametrize(
+    ("stated", "codec"),
+    [("libx264", "h264"), ("h264_nvenc", "h264"), ("hevc_vaapi", "h265"), ("h264;yuv420p;bgr8;bgr8", "h264"),
+     ("libsvtav1", "av1"), ("mpeg4", "mpeg4")],
+)  # fmt: skip
+def test_the_codec_of_an_ffmpeg_packet_is_that_of_its_encoder(stated: str, codec: str) -> None:
+    from hma_data.sources.bags.pictures import picture_kind, video_codec
+
+    assert picture_kind("ffmpeg_image_transport_msgs/msg/FFMPEGPacket") == "video"
+    assert video_codec({"encoding": stated, "data": b""}) == codec

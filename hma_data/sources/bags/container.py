@@ -66,7 +66,7 @@ class Wanted:
         topics: None for all.
         first_ns, last_ns: received from the one to the other, both included.
         heads: topics of whose messages the first HEAD bytes will do; more may come.
-        checked: whether checksums must be looked at where only heads are read.
+        checked: whether a checksum must be looked at also where no head is met, whose message is read later.
     """
 
     topics: frozenset[str] | None = None
@@ -162,6 +162,8 @@ def unzstd(data: Data, limit: int) -> bytes:
     import zstandard
 
     try:
+        if zstandard.get_frame_parameters(data).content_size == limit:
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
         with zstandard.ZstdDecompressor().stream_reader(bytes(data)) as stream:
             unpacked: bytes = stream.read(limit + 1)
     except zstandard.ZstdError as fault:

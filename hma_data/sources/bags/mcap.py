@@ -7,7 +7,6 @@ not repeat the channels; places for random access come with it.
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -48,6 +47,7 @@ class McapFile:
         self._chunks = chunks or ChunkCache()
         self._surveyed: Survey | None = None
         self._notes: dict[str, str] | None = None
+        self._checked: set[int] = set()
 
     def counts(self) -> Counter[Channel]:
         """See Container."""
@@ -62,11 +62,11 @@ class McapFile:
         with reading(self.path), self.path.open("rb") as file:
             end = self._data_end(file)
             if not wanted.bounded:
-                yield from between(file, len(MAGIC), end, Declared(), wanted)
+                yield from between(file, len(MAGIC), end, Declared(), wanted, self._chunk)
                 return
             survey = self._survey(file, end)
             for piece in overlapping(survey.pieces, wanted):
-                yield from between(file, piece.at, piece.end, survey.declared, wanted)
+                yield from between(file, piece.at, piece.end, survey.declared, wanted, self._chunk)
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """See Container."""
@@ -76,7 +76,9 @@ class McapFile:
                 survey.pieces,
                 topics,
                 log_ns,
-                lambda piece, wanted: between(file, piece.at, piece.end, survey.declared, wanted),
+                lambda piece, wanted: between(
+                    file, piece.at, piece.end, survey.declared, wanted, self._chunk
+                ),
             )
 
     def notes(self) -> dict[str, str]:
@@ -94,10 +96,20 @@ class McapFile:
                     _, length = frame(file, at)
                     yield read_exact(file, length)[MESSAGE_HEAD.size :]
                     continue
-                chunk = self._chunks.get(self.path, chunk_at, partial(load_chunk, file, chunk_at))
+                chunk = self._chunk(file, chunk_at)
                 _, length = FRAME.unpack_from(chunk, at)
                 start = at + FRAME.size
                 yield memoryview(chunk)[start + MESSAGE_HEAD.size : start + length]
+
+    def _chunk(self, file: BinaryIO, at: int) -> bytes:
+        """A chunk, unpacked; its checksum is looked at the first time."""
+
+        def load() -> bytes:
+            chunk = load_chunk(file, at, at not in self._checked)
+            self._checked.add(at)
+            return chunk
+
+        return self._chunks.get(self.path, at, load)
 
     def _survey(self, file: BinaryIO, end: int) -> Survey:
         if self._surveyed is None:

@@ -27,6 +27,7 @@ from hma_data.sources.bags.mcap_records import (
     chunk_head,
     frame,
     frames,
+    load_chunk,
     message_head,
 )
 from hma_data.sources.bags.pieces import Piece
@@ -196,7 +197,7 @@ def _unindexed(
 ) -> Piece:
     """A chunk that has to be looked into; its channels may be declared nowhere else."""
     first_ns, last_ns, topics = FOREVER, -1, set()
-    for record in between(file, part.at, part.end, declared, Wanted()):
+    for record in between(file, part.at, part.end, declared, Wanted(), load_chunk):
         first_ns, last_ns = min(first_ns, record.log_ns), max(last_ns, record.log_ns)
         topics.add(record.channel.topic)
     held = frozenset(topics)

@@ -5,7 +5,7 @@ Chunks that are not packed need not be read whole: their records are walked in t
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import BinaryIO, NamedTuple
 
 from hma_data.sources.bags.container import (
@@ -25,6 +25,7 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05,
 STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
 FRAME = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+Load = Callable[[BinaryIO, int], bytes]
 LOOSE = -1  # in a place: the message is in no chunk
 CODEC_BYTES = 32  # a codec's name is no longer
 
@@ -86,13 +87,15 @@ def frames(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, int, int]]:
         at = following
 
 
-def between(file: BinaryIO, at: int, end: int, declared: Declared, wanted: Wanted) -> Iterator[Record]:
-    """The wanted messages from offset `at` to `end` of the data section."""
+def between(
+    file: BinaryIO, at: int, end: int, declared: Declared, wanted: Wanted, load: Load
+) -> Iterator[Record]:
+    """The wanted messages from offset `at` to `end` of the data section; `load` unpacks a chunk."""
     for opcode, offset, length in frames(file, at, end):
         if opcode in (DATA_END, FOOTER):
             return
         if opcode == CHUNK:
-            yield from _in_chunk(file, offset, length, declared, wanted)
+            yield from _in_chunk(file, offset, length, declared, wanted, load)
         elif opcode in (SCHEMA, CHANNEL):
             declared.learn(opcode, read_exact(file, length))
         elif opcode == MESSAGE:
@@ -123,29 +126,33 @@ def chunk_head(file: BinaryIO, length: int) -> ChunkHead:
     return ChunkHead(first_ns, last_ns, size, checksum, codec, at, packed)
 
 
-def load_chunk(file: BinaryIO, at: int) -> bytes:
-    """The records of the chunk at that offset, unpacked."""
+def load_chunk(file: BinaryIO, at: int, checked: bool = True) -> bytes:
+    """The records of the chunk at that offset, unpacked, and `checked` against its checksum."""
     opcode, length = frame(file, at)
     if opcode != CHUNK:
         raise ValueError(f"there is no chunk at {at:,}")
-    return _unpack(file, chunk_head(file, length))
-
-
-def _unpack(file: BinaryIO, head: ChunkHead) -> bytes:
+    head = chunk_head(file, length)
     file.seek(head.at)
     chunk = decompress(head.codec, read_exact(file, head.packed), head.size)
-    if head.checksum and zlib.crc32(chunk) != head.checksum:
+    if checked and head.checksum and zlib.crc32(chunk) != head.checksum:
         raise ValueError("a chunk's checksum does not fit its content")
     return chunk
 
 
-def _in_chunk(file: BinaryIO, at: int, length: int, declared: Declared, wanted: Wanted) -> Iterator[Record]:
+def _in_chunk(
+    file: BinaryIO, at: int, length: int, declared: Declared, wanted: Wanted, load: Load
+) -> Iterator[Record]:
     head = chunk_head(file, length)
     plain = head.codec in ("", "none") and head.packed == head.size
-    if plain and wanted.heads and not (head.checksum and wanted.checked):
-        yield from _walk(file, at, head, declared, wanted)
+    if plain and wanted.heads:
+        short = False
+        for record in _walk(file, at, head, declared, wanted):
+            short = short or record.channel.topic in wanted.heads
+            yield record
+        if head.checksum and wanted.checked and not short:
+            load(file, at)  # with a picture in it, it will be loaded for that
         return
-    yield from _in_records(_unpack(file, head), at, declared, wanted)
+    yield from _in_records(load(file, at), at, declared, wanted)
 
 
 def _in_records(chunk: bytes, chunk_at: int, declared: Declared, wanted: Wanted) -> Iterator[Record]:

@@ -104,8 +104,8 @@ class StillStream:
         """See episode.Stream."""
         distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
         where = self._messages.where
-        pictures = [picture(message, self._kind, where) for message in self._messages.read(distinct)]
-        stacked = _stack(pictures, where)
+        pictures = (picture(message, self._kind, where) for message in self._messages.read(distinct))
+        stacked = _stack(pictures, len(distinct), where)
         return stacked if np.array_equal(inverse, np.arange(len(stacked))) else stacked[inverse]
 
 
@@ -130,7 +130,7 @@ class VideoStream:
         wanted = [int(i) + self._lead for i in indices]
         found = self._decoder.frames(wanted)
         distinct = list(found)
-        stacked = _stack([found[i] for i in distinct], self._messages.where)
+        stacked = _stack(iter(found.values()), len(found), self._messages.where)
         return stacked[[distinct.index(i) for i in wanted]]
 
     def _from(self, start: int) -> Iterator[bytes]:
@@ -139,8 +139,16 @@ class VideoStream:
                 yield payload(message)
 
 
-def _stack(pictures: list[Images], where: str) -> Images:
-    shapes = sorted({picture.shape for picture in pictures})
-    if len(shapes) > 1:
-        raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
-    return np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)
+def _stack(pictures: Iterator[Images], count: int, where: str) -> Images:
+    """(count, H, W, 3); each is put in its place as it comes, so that one is held twice, not all."""
+    first = next(pictures, None)
+    if first is None:
+        return np.zeros((0, 1, 1, 3), np.uint8)
+    stacked = np.empty((count, *first.shape), np.uint8)
+    stacked[0] = first
+    for i, item in enumerate(pictures, start=1):
+        if item.shape != first.shape:
+            shapes = sorted({first.shape, item.shape})
+            raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
+        stacked[i] = item
+    return stacked

@@ -15,8 +15,8 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Place
 from hma_data.sources.bags.container import Channel, Data
 from hma_data.sources.bags.fields import Column
-from hma_data.sources.bags.messages import child, head_stamp, stamp_ns
-from hma_data.sources.bags.pictures import VIDEO, payload, picture_kind
+from hma_data.sources.bags.messages import head_stamp, stamp_ns
+from hma_data.sources.bags.pictures import VIDEO, payload, picture_kind, video_codec
 from hma_data.sources.bags.video import is_keyframe
 
 INT64 = np.iinfo(np.int64)
@@ -74,7 +74,7 @@ class Track:
 
     def _is_keyframe(self, message: Any) -> bool | None:
         try:
-            self.codec = self.codec or str(child(message, "format")).lower()
+            self.codec = self.codec or video_codec(message)
             return is_keyframe(payload(message), self.codec)
         except (KeyError, TypeError, ValueError) as fault:
             raise EpisodeError(self.topic, f"a message is no frame of a video: {fault!r}") from fault

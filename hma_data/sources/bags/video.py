@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError
 from hma_data.video import MAX_PIXELS, Images
 
-CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "av1"}  # Foxglove's and FFmpeg's names
+CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}  # Foxglove's and FFmpeg's names
 NAL_UNIT = re.compile(b"\x00\x00\x01(.)", re.DOTALL)
 
 
@@ -24,7 +24,36 @@ def is_keyframe(data: bytes, codec: str) -> bool | None:
         return any(kind & 0x1F == 5 for kind in kinds)
     if codec == "h265":
         return any(16 <= (kind >> 1) & 0x3F <= 21 for kind in kinds)
-    return None
+    return {"vp9": _vp9_begins, "av1": _av1_begins}.get(codec, lambda data: None)(data)
+
+
+def _vp9_begins(data: bytes) -> bool:
+    """Whether the first frame is a key frame: VP9 bitstream specification, uncompressed_header."""
+    if not data or data[0] >> 6 != 2:
+        raise ValueError("no VP9 frame")
+    at = 5 if data[0] >> 4 & 3 == 3 else 4  # bits: marker 2, profile 2, of profile 3 one more
+    shows_existing, inter = data[0] >> (7 - at) & 1, data[0] >> (6 - at) & 1
+    return not shows_existing and not inter
+
+
+def _av1_begins(data: bytes) -> bool:
+    """Whether a sequence header is in it, as with every key frame: AV1 specification, section 5.3."""
+    at = 0
+    while at < len(data):
+        kind, extended, sized = data[at] >> 3 & 15, data[at] & 4, data[at] & 2
+        if kind == 1:
+            return True
+        at += 2 if extended else 1
+        size, shift = 0, 0
+        while sized and at < len(data):
+            size |= (data[at] & 0x7F) << shift
+            at, shift = at + 1, shift + 7
+            if not data[at - 1] & 0x80:
+                break
+        if not sized:
+            return False
+        at += size
+    return False
 
 
 class VideoDecoder:
