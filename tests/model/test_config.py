@@ -47,6 +47,8 @@ def test_continuous_tokens_are_patches() -> None:
         ({"objectives": {"dream": 1.0}}, "objectives"),
         ({"label_smoothing": 1.5}, "label_smoothing"),
         ({"action_loss_weight": float("nan")}, "action_loss_weight"),
+        ({"norms": "qk"}, "norms"),
+        ({"add_at": "end"}, "add_at"),
         ({"shared_modulation": True, "modulation_out": "embodiment"}, "modulation_out"),
     ],
 )

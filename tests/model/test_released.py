@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from typer.testing import CliRunner
 
 from hma_data.embodiment import find
-from hma_data.errors import CheckpointError, HMAError
+from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_model import hub
 from hma_model.checkpoint import Checkpoint, require_tokenizer
 from hma_model.cli import app
@@ -22,6 +22,7 @@ from hma_model.model import HMA
 from hma_model.released import config_from_released, config_to_released
 from hma_model.released_state import state_to_released
 from tests.model.network_parts import small_batch, small_config
+from tests.model.test_hub_hf import Repository, repository  # noqa: F401
 from tests.test_cli import fails, hma
 
 RELEASED: dict[str, Any] = {
@@ -204,6 +205,42 @@ def test_the_tokenizer_is_the_papers_where_the_sizes_are(tmp_path: Path) -> None
     )
     with pytest.raises(CheckpointError, match="fsq-8"):
         hub.import_released(source, tmp_path / "no", tokenizer="fsq-8")
+
+
+@pytest.mark.parametrize("actions", [True, False])
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if "continuous" not in name])
+def test_the_cache_changes_nothing_in_a_released_rollout(layout: str, actions: bool) -> None:
+    model = _model(**LAYOUTS[layout])
+    batch = small_batch(model.config, ["arm", "pusher"], frames=9)
+    chunks = batch.actions if actions else None
+    cached, plain = (
+        model.generate(
+            batch.tokens[:, :2],
+            chunks,
+            batch.embodiment,
+            7,
+            generator=torch.Generator().manual_seed(0),
+            cache=c,
+        )
+        for c in (True, False)
+    )
+    assert torch.equal(cached, plain)
+
+
+def test_a_repository_of_the_hub_comes_in(
+    repository: Repository,  # noqa: F811, the fixture
+    tmp_path: Path,
+) -> None:
+    source = _write(_model(), tmp_path / "released")
+    files = {name: (source / name).read_bytes() for name in ("config.json", "model.safetensors")}
+    repository.commits = [{**files, "README.md": b"", "optimizer.bin": b"x"}]
+    made = hub.import_released("liruiw/hma-base-disc", tmp_path / "ours")
+    assert made.embodiments == ("arm", "pusher")
+    assert sorted(repository.downloads) == sorted(files)
+    assert made.card("arm")["data"]["released_checkpoint"] == "liruiw/hma-base-disc"
+    repository.commits = [{"README.md": b""}]
+    with pytest.raises(HubError, match=r"has no config\.json"):
+        hub.import_released("liruiw/hma-base-disc", tmp_path / "again")
 
 
 # -- what is refused

@@ -16,6 +16,8 @@ LAYOUTS = [
     {"conditioning": ("add",), "time_position": "learned"},
     {"conditioning": ("cross_attention",), "qk_norm": True},
     {"conditioning": ("modulation",), "shared_modulation": True, "action_alignment": "current", "mup": True},
+    {"conditioning": ("add", "concat"), "add_at": "layers", "qk_norm": True, "norms": "qk"},
+    {"conditioning": ("concat", "modulation"), "absent_action": "tokens", "action_alignment": "current"},
 ]
 
 
@@ -44,6 +46,13 @@ def test_dims_that_never_vary_become_zero_and_come_back_as_their_mean() -> None:
 def test_float32_rounding_of_a_constant_is_no_variance() -> None:
     space = ActionSpace("x", 1, 1, (1000.1,), (3e-5,), (True,))
     assert Normalizer(space)(torch.tensor([[1000.2]])).item() == 0
+
+
+def test_a_released_stem_divides_dims_that_never_vary_too() -> None:
+    space = ActionSpace("x", 2, 1, (1.0, 2.0), (0.0, 4.0), (True, True), "divide")
+    values = Normalizer(space)(torch.tensor([[1.0, 6.0], [2.0, 6.0]]))
+    assert torch.allclose(values, torch.tensor([[0.0, 1.0], [1e10, 1.0]]))
+    assert torch.allclose(Normalizer(space).undo(values), torch.tensor([[1.0, 6.0], [2.0, 6.0]]))
 
 
 def test_statistics_stay_float32_when_the_model_is_cast() -> None:
@@ -142,6 +151,30 @@ def test_absent_actions_can_skip_conditioning_altogether() -> None:
     with torch.no_grad():
         one = model.video_logits(batch.tokens, None, "arm")
         assert torch.equal(one, model.video_logits(batch.tokens, None, "hand.v1"))
+
+
+def test_without_actions_only_learned_tokens_may_stand_for_them() -> None:
+    model = small_model(conditioning=("modulation",), absent_action="tokens", action_tokens=3)
+    batch = small_batch(model.config, ["arm"])
+    with torch.no_grad():
+        one = model.video_logits(batch.tokens, None, "arm")
+        assert torch.equal(one, model.video_logits(batch.tokens, None, "hand.v1"))
+        chunks = model.predict_actions(batch.tokens, "arm")
+        model.trunk.absent += 1
+        assert not torch.equal(one, model.video_logits(batch.tokens, None, "arm"))
+        assert not torch.equal(chunks, model.predict_actions(batch.tokens, "arm"))
+
+
+def test_a_hidden_chunk_is_hidden_in_the_tokens_alone_where_the_release_does_so() -> None:
+    for conditioning, seen in ((("concat",), False), (("concat", "modulation"), True)):
+        model = small_model(conditioning=conditioning, absent_action="tokens")
+        batch = small_batch(model.config, ["arm"])
+        batch.action_mask[:, 1:3] = False
+        with torch.no_grad():
+            one = model.video_logits(batch.tokens, batch.actions, "arm", batch.action_mask)
+            batch.actions[:, 1:3] += 1
+            two = model.video_logits(batch.tokens, batch.actions, "arm", batch.action_mask)
+        assert torch.equal(one, two) != seen
 
 
 def test_absent_chunks_are_not_read() -> None:
