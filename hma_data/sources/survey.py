@@ -195,7 +195,7 @@ class Survey:
             rates = [clock.hz for clock in times.met.values() if clock.hz]
             jitters = [clock.jitter_ms for clock in times.met.values() if clock.jitter_ms is not None]
             measured = float(np.median(rates)) if rates else None
-            stated = info.hz and measured and abs(measured / info.hz - 1) <= clocks.DRIFT
+            stated = info.hz and any(abs(one / info.hz - 1) <= clocks.DRIFT for one in rates)
             info = replace(
                 info,
                 hz=info.hz if stated or not measured else measured,
@@ -209,7 +209,7 @@ class Survey:
     def findings(self, keys: Sequence[KeyInfo]) -> tuple[Finding, ...]:
         """Everything that was found, check by check."""
         found = [
-            *self._readable(), *self._extra, *self._keys(), *self._rows(), *self._clocks(),
+            *self._readable(), *_merged(self._extra), *self._keys(), *self._rows(), *self._clocks(),
             *self._finite(), *self._constant(keys), *looks.findings(self.looks),
         ]  # fmt: skip
         order = list(CHECKS)
@@ -291,6 +291,16 @@ class Survey:
     @staticmethod
     def _still(held: _Numbers) -> list[int]:
         return [int(i) for i in np.flatnonzero(held.low == held.high)] if held.rows > 1 else []
+
+
+def _merged(found: list[Finding]) -> Iterator[Finding]:
+    """One finding for each check and key: the first, and how many more there are."""
+    together: dict[tuple[str, str, str], list[Finding]] = {}
+    for one in found:
+        together.setdefault((one.check, one.severity, one.key or one.message), []).append(one)
+    for first, *more in together.values():
+        said = f"{first.message} (and {len(more)} more like it)" if more else first.message
+        yield replace(first, message=said)
 
 
 def sampled(count: int, wanted: int) -> list[int]:
