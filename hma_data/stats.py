@@ -87,7 +87,14 @@ class QuantileSketch:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "QuantileSketch":
         """The sketch that `to_json` wrote."""
-        flat = np.frombuffer(zlib.decompress(base64.b64decode(values["values"])), "<f4")
+        size = 4 * sum(values["rows"]) * values["width"]
+        try:
+            packed = zlib.decompressobj().decompress(base64.b64decode(values["values"]), size + 1)
+        except zlib.error as fault:
+            raise ValueError(f"a sketch cannot be unpacked: {fault}") from fault
+        if len(packed) != size:  # more is not unpacked, however much it is
+            raise ValueError(f"a sketch of {values['rows']} rows holds other than {size} bytes")
+        flat = np.frombuffer(packed, "<f4")
         parts = np.split(flat, np.cumsum([n * values["width"] for n in values["rows"]])[:-1])
         return cls(
             [part.reshape(-1, values["width"]).astype(np.float32) for part in parts], list(values["odd"])
@@ -156,10 +163,13 @@ class Stats:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, complete: `from_json` gives the same object back."""
-        numbers = {name: getattr(self, name).tolist() for name in ("mean", "m2", "min", "max")}
+        numbers = {name: getattr(self, name).tolist() for name in ("mean", "m2")}
+        return {"count": self.count, **numbers, **self._range(), "sketch": self.sketch.to_json()}
+
+    def _range(self) -> dict[str, list[float]]:
         if not self.count:
-            numbers["min"] = numbers["max"] = [0.0] * len(self.mean)
-        return {"count": self.count, **numbers, "sketch": self.sketch.to_json()}
+            return {"min": [0.0] * len(self.mean), "max": [0.0] * len(self.mean)}
+        return {"min": self.min.tolist(), "max": self.max.tolist()}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Stats":
@@ -175,7 +185,6 @@ class Stats:
             "count": self.count,
             "mean": self.mean.tolist(),
             "std": self.std.tolist(),
-            "min": self.to_json()["min"],
-            "max": self.to_json()["max"],
+            **self._range(),
             "quantiles": {f"q{round(q * 100):02d}": self.quantile(q).tolist() for q in QUANTILES},
         }

@@ -1,6 +1,8 @@
 """Statistics stay true for inputs that are meant to break them."""
 
+import base64
 import itertools
+import zlib
 from typing import Any
 
 import numpy as np
@@ -114,3 +116,18 @@ def test_of_no_rows_nothing_is_nan() -> None:
     for value in Stats.empty(3).summary().values():
         flat = np.ravel(list(value.values()) if isinstance(value, dict) else value)
         assert np.isfinite(flat).all()
+
+
+@pytest.mark.parametrize("size", [0, 5, 10**8])
+def test_a_sketch_of_another_size_than_it_says_is_refused(size: int) -> None:
+    values = Stats.of(RNG.normal(size=(10, 2))).to_json()
+    values["sketch"]["values"] = base64.b64encode(zlib.compress(bytes(size))).decode()
+    with pytest.raises(ValueError, match="sketch"):
+        Stats.from_json(values)
+
+
+def test_a_sketch_that_is_not_zlib_is_refused() -> None:
+    values = Stats.of(RNG.normal(size=(10, 2))).to_json()
+    values["sketch"]["values"] = base64.b64encode(b"not zlib").decode()
+    with pytest.raises(ValueError, match="sketch"):
+        Stats.from_json(values)
