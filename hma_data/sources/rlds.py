@@ -133,6 +133,7 @@ def _refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float
 def _remote_refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
     """Without a look at each record, from what the file system knows of the shard."""
     found = info(folder.files, shard.path)
+    folder.believe(shard, found["size"])
     fingerprint = hashlib.sha256(mark(found).encode()).hexdigest()[:24]
     records = shard.records or 1
     frames = max(1, round(rate * found["size"] / records))

@@ -31,6 +31,7 @@ NAMED = (  # the suffix after the number, or before it as TFDS writes it
     re.compile(rf"(?P<stem>.+?)[-_]{NUMBER[1:]}\.(?:tfrecord|array_record)"),
     re.compile(rf"(?P<stem>.+)\.(?:tfrecord|array_record)(?:{NUMBER})?"),
 )
+LISTED = 10_000  # records missing from a shard that are still listed, to be quarantined one by one
 LONGEST_JSON = 64 << 20  # bytes of a description; more is a mistake
 PACKAGES = {
     "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",
@@ -108,7 +109,21 @@ class Folder:
                 f"has {len(frames)} records, dataset_info.json says {shard.records}",
                 "write dataset_info.json again, or remove it: the records are then counted",
             )
+        self.believe(shard, LISTED * (len(frames) + 1))
         return frames
+
+    def believe(self, shard: Shard, most: int) -> None:
+        """Refuse what dataset_info.json says of a shard that cannot have so many records.
+
+        Raises:
+            SourceError: it says more than `most`.
+        """
+        if shard.records is not None and shard.records > max(most, LISTED):
+            raise SourceError(
+                shard.path,
+                f"cannot have the {shard.records:,} records that dataset_info.json says",
+                "write dataset_info.json again, or remove it: the records are then counted",
+            )
 
     def records(self, shard: Shard) -> RecordFile:
         """The shard's file.
@@ -290,7 +305,7 @@ def _info(files: Any, root: str) -> dict[str, Any]:
         info = {} if text is None else json.loads(text)
     except (ValueError, RecursionError) as fault:
         raise SourceError(path, f"is not JSON: {fault}", "write it again, or remove it") from fault
-    if not isinstance(info, dict) or not isinstance(info.get("splits", []), list):
+    if not isinstance(info, dict) or not _are_splits(info.get("splits", [])):
         raise SourceError(path, "is not what TFDS writes", "write it again, or remove it")
     form = info.get("fileFormat") or info.get("file_format") or FORMATS[0]
     if form not in FORMATS:
@@ -298,6 +313,16 @@ def _info(files: Any, root: str) -> dict[str, Any]:
             path, f"states the file format {form!r}", "convert it to tfrecord with tensorflow_datasets"
         )
     return info
+
+
+def _are_splits(splits: Any) -> bool:
+    """Whether they have the form TFDS gives them; what they say is not looked at."""
+    return isinstance(splits, list) and all(
+        isinstance(split, dict)
+        and isinstance(split.get("filepathTemplate") or split.get("filepath_template") or "", str)
+        and isinstance(split.get("shardLengths") or split.get("shard_lengths") or [], list)
+        for split in splits
+    )
 
 
 def _stated_shards(
@@ -325,8 +350,11 @@ def _stated_shards(
 
 def _counts(split: dict[str, Any]) -> list[int]:
     try:
-        return [int(count) for count in split.get("shardLengths") or split.get("shard_lengths") or ()]
-    except (TypeError, ValueError) as fault:
+        counts = [int(count) for count in split.get("shardLengths") or split.get("shard_lengths") or ()]
+        if counts and min(counts) < 0:
+            raise ValueError(f"{min(counts)} records")
+        return counts
+    except (TypeError, ValueError, OverflowError, AttributeError) as fault:
         raise SourceError(
             "dataset_info.json",
             f"shardLengths of split {split.get('name')!r} are not numbers",

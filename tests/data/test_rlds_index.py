@@ -370,3 +370,51 @@ def test_a_split_is_told_by_the_name_of_its_file(tmp_path, name, split):
     shard(folder).rename(folder / name)
     (folder / "dataset_info.json").write_text(json.dumps({"name": "toy", "splits": []}))
     assert RLDS.episode_ids(str(folder)) == [f"{split}/000000", f"{split}/000001"]
+
+
+QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-5, 2**70) | st.floats() | st.text(max_size=4),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@QUICK
+@given(data=st.data(), name=st.sampled_from(["features.json", "dataset_info.json"]))
+def test_a_description_with_anything_in_it_is_read_or_refused(tmp_path, data, name):
+    folder = tmp_path / "d"
+    if not folder.exists():
+        dataset(folder, 4, 2)
+        for item in folder.glob("*.json"):
+            item.with_suffix(".true").write_text(item.read_text())
+    for item in folder.glob("*.true"):
+        item.with_suffix(".json").write_text(item.read_text())
+    tree = json.loads((folder / name).read_text())
+    spot, steps = tree, data.draw(st.integers(0, 8))
+    for turn in range(steps):
+        keys = list(spot) if isinstance(spot, dict) else list(range(len(spot)))
+        key = data.draw(st.sampled_from(keys))
+        if turn < steps - 1 and isinstance(spot[key], dict | list) and spot[key]:
+            spot = spot[key]
+            continue
+        spot[key] = data.draw(JSON)
+        break
+    (folder / name).write_text(json.dumps(tree))
+    try:
+        for ref in RLDS.index(str(folder)):
+            number(folder, ref.id)
+    except (SourceError, EpisodeError) as fault:
+        assert str(fault)
+
+
+@pytest.mark.parametrize("count", [10**15, 2**70, -3, 1e400, "many", None])
+def test_a_count_of_records_that_cannot_be_is_refused(tmp_path, memory, count):
+    folder = tmp_path / "d"
+    text = json.dumps({"name": "toy", "splits": [{"name": "train", "shardLengths": [count, "4", "4"]}]})
+    (folder / "dataset_info.json").write_text(text)
+    fsspec.filesystem("memory").pipe(memory.removeprefix("memory:/") + "/dataset_info.json", text.encode())
+    open_folder.__globals__["_remote"].cache_clear()
+    for place in (str(folder), memory):
+        with pytest.raises(SourceError, match="cannot have|are not numbers"):
+            RLDS.index(place)
