@@ -97,7 +97,8 @@ def _cached_table(path: str, size: int, changed: int) -> FrameTable:
                 keyframes.append((stamp, stamp if packet.dts is None else packet.dts))
             if not packet.is_discard:  # an edit list may hide frames, which are decoded but not shown
                 shown.append(stamp)
-        counted = bool(stream.codec_context.has_b_frames) and len(delays) == 1
+        timeless = "avi" in container.format.name or delays <= {0, None}
+        counted = bool(stream.codec_context.has_b_frames) and timeless and len(delays) == 1
         return _table(path, stream, shown, keyframes, counted)
 
 

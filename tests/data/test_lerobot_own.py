@@ -104,7 +104,7 @@ def many_files(writer: Any) -> None:
     """Files so small that episodes are spread over several, and chunks of two files."""
     writer.meta.info.chunks_size = 2
     writer.meta.info.data_files_size_in_mb = 1e-6  # a file that is being written looks empty
-    writer.meta.info.video_files_size_in_mb = 0.2
+    writer.meta.info.video_files_size_in_mb = 1e-6
 
 
 def version() -> str:

@@ -142,6 +142,11 @@ def test_a_lying_container_that_gives_fewer_frames_is_refused(
         VideoFile(path).frames([3])
 
 
+def test_frames_that_were_never_reordered_are_not_counted(tmp_path: Path) -> None:
+    table = frame_table(make(tmp_path / "v.mp4", *X264, gop=2))  # x264 announces B-frames, and makes none
+    assert not table.counted and (np.arange(N) - table.keys).max() == 1
+
+
 def test_a_group_is_decoded_no_further_back_than_its_keyframe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
