@@ -59,6 +59,10 @@ _CONTINUOUS_DEFAULTS: dict[str, Any] = {
     "num_sampling_steps": "100",
     "diffusion_batch_mul": 1,
 }
+_COUNTS = {"num_layers": 1000, "diffloss_d": 1000, "num_factored_vocabs": 64} | dict.fromkeys(
+    ("num_heads", "d_model", "T", "S", "action_token_size", "patch_size", "vae_embed_dim", "diffloss_w",
+     "diffusion_batch_mul"), 1_000_000
+)  # fmt: skip
 
 
 def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | None = None) -> HMAConfig:
@@ -75,6 +79,7 @@ def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | No
     continuous = bool(config.get("Diffusion", config.get("image_vocab_size", 0) is None))
     given = {key: value for key, value in config.items() if value is not None}
     values = _DEFAULTS | (_CONTINUOUS_DEFAULTS if continuous else {}) | given
+    _check_counts(values)
     try:
         shared = _shared(values, continuous)
         shared["grid"] = _grid(values["S"], (case or {}).get("grid"))
@@ -85,9 +90,21 @@ def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | No
     except RecipeError as error:
         fault = f"{error.where.removeprefix('model.')}: {error.fault}"
         raise CheckpointError(_WHERE, fault, "is it a released checkpoint?") from error
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, ArithmeticError) as error:
         fault = f"has a value of the wrong type: {error}"
         raise CheckpointError(_WHERE, fault, "is it a released checkpoint?") from error
+
+
+def _check_counts(values: Mapping[str, Any]) -> None:
+    """Raise unless what counts something is a whole number, and no more than a network can have."""
+    for name, most in _COUNTS.items():
+        value = values.get(name, 1)
+        if type(value) is not int or not 1 <= value <= most:
+            raise CheckpointError(
+                _WHERE,
+                f"{name} is {value!r}, not a whole number from 1 to {most}",
+                "is it a released checkpoint?",
+            )
 
 
 def _shared(values: Mapping[str, Any], continuous: bool) -> dict[str, Any]:
