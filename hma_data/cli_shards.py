@@ -6,7 +6,7 @@ Only what is light is imported here; each verb imports what it needs.
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -45,39 +45,51 @@ def shards_info(folder: Annotated[Path, typer.Argument(help="A shard set.")], js
 
     Example: hma shards info shards/my_arm
     """
-    from hma_data.shards.reader import ShardSet
+    from hma_data.shards.info import describe
 
-    manifest = ShardSet(folder).manifest
-    values = manifest.to_json()
+    facts = describe(folder)
     if json:
-        print_json({k: values[k] for k in ("plan", "source", "tokenizer", "splits", "totals", "stats")})
-        return
-    totals = values["totals"]
-    rows = sum(split["rows"] for split in manifest.splits.values())
-    print(f"{folder}: {manifest.embodiment.id} × {manifest.tokenizer.name}, from {manifest.source}")
+        print_json(facts)
+    else:
+        _print_info(facts)
+
+
+def _print_info(facts: dict[str, Any]) -> None:
+    robot, totals, episodes = facts["embodiment"], facts["totals"], facts["episodes"]
+    print(f"{facts['folder']}: {robot['id']} × {facts['tokenizer']['name']}, from {facts['source']}")
     print(
-        f"{totals['episodes']:,} episodes, {totals['frames']:,} frames, {human_bytes(totals['bytes'])} "
-        f"({totals['bytes'] / max(rows, 1):.0f} bytes a row), {totals['quarantined']:,} in quarantine"
+        f"{totals['episodes']:,} episodes, {totals['frames']:,} frames at {robot['rows_hz']:g} Hz "
+        f"({totals['hours']:.2f} h), {human_bytes(totals['bytes'])} in {facts['shards']:,} shards "
+        f"({facts['bytes_per_frame']:.0f} bytes a frame)"
     )
-    print_table(
-        ["split", *next(iter(manifest.splits.values()))],
-        [[n, *s.values()] for n, s in manifest.splits.items()],
+    print(
+        f"cameras {', '.join(robot['cameras'])}; {robot['action_dim']} action and {robot['state_dim']} state "
+        f"values; stride {robot['stride']}, so the model sees {robot['effective_hz']:g} Hz"
     )
-    stats = manifest.stats["action"]
-    columns = ["mean", "std", "min", "max"]
-    names = manifest.embodiment.action.names()
+    print(
+        f"episodes of {episodes['shortest']:,} to {episodes['longest']:,} frames, median "
+        f"{episodes['median']:,.0f}; {episodes['instructions']:,} instructions; "
+        f"{episodes['success']:,} successes, {episodes['failure']:,} failures, "
+        f"{episodes['not_told']:,} not told; skew up to {episodes['worst_skew_ms']:.1f} ms"
+    )
+    for label in ("flags", "quarantine"):
+        for name, count in episodes[label].items():
+            print(f"{label}: {count:,} × {name}")
     print_table(
-        ["action", *columns, "q01", "q99"],
+        ["split", "episodes", "frames", "rows", "shards", "windows of 12", "episodes too short"],
         [
-            [
-                name,
-                *(stats[c][i] for c in columns),
-                stats["quantiles"]["q01"][i],
-                stats["quantiles"]["q99"][i],
-            ]
-            for i, name in enumerate(names)
+            [name, *(split[key] for key in ("episodes", "frames", "rows", "shards")), *windows.values()]
+            for (name, split), windows in zip(facts["splits"].items(), facts["windows"].values())
         ],
     )
+    for vector, stats in facts["stats"].items():
+        names = facts["names"][vector]
+        ends = (stats["quantiles"][q] for q in ("q01", "q50", "q99"))
+        columns = [*(stats[key] for key in ("mean", "std", "min", "max")), *ends]
+        print_table(
+            [vector, "mean", "std", "min", "max", "q01", "q50", "q99"],
+            [[name, *(column[i] for column in columns)] for i, name in enumerate(names)],
+        )
 
 
 @shards_app.command("verify")

@@ -20,6 +20,7 @@ from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
 from hma_data.files import atomic_path, file_sha256, write_atomic
 from hma_data.shards.schema import SCHEMA_VERSION, EpisodeRow, Footer, Refused, read_footer
+from hma_data.shards.wellformed import check_plan, check_spec, check_splits, check_stats, is_count
 from hma_data.stats import Stats
 from hma_data.tokenizers.base import TokenizerSpec
 
@@ -79,9 +80,7 @@ class ShardFile:
         named = SHARD_NAME.fullmatch(self.path)  # keeps paths inside the folder, whoever wrote the manifest
         if not named or named[1] != self.split:
             raise ValueError(f"{self.path!r} is not the name of a shard of split {self.split!r}")
-        if not all(
-            type(n) is int and n >= 0 for n in (self.rows, self.episodes, self.bytes, *self.row_groups)
-        ):
+        if not all(map(is_count, (self.rows, self.episodes, self.bytes, *self.row_groups))):
             raise ValueError(f"{self.path} has counts that are not whole numbers")
 
 
@@ -108,6 +107,12 @@ class Manifest:
     quarantined: int
     source: str
     files: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_spec(self.tokenizer)
+        check_plan(self.plan)
+        check_splits(self.splits)
+        check_stats(self.stats, self.embodiment)
 
     @property
     def frame_stride(self) -> int:
@@ -180,11 +185,11 @@ class Manifest:
                 ),
                 splits=values["splits"],
                 stats=values["stats"],
-                quarantined=values["totals"]["quarantined"],
+                quarantined=int(values["totals"]["quarantined"]),
                 source=str(values["source"]),
                 files=dict(values.get("files", {})),
             )
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as fault:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as fault:
             said = f"no {fault}" if isinstance(fault, KeyError) else str(fault)
             raise ShardError(
                 path, f"is damaged: {said}", f"hma shards restat {folder} writes it anew from the shards"

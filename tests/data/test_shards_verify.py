@@ -314,3 +314,45 @@ def test_a_damaged_page_is_known_where_the_manifest_is_lost(sound: Path) -> None
     with pytest.raises(ShardError, match="shard-00001"):
         restat(sound)
     assert not (sound / MANIFEST).exists()
+
+
+# -- hostile
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-5, 10**20) | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=4,
+)
+
+
+def places(values: object, path: tuple = ()) -> list[tuple]:
+    """Paths to all keys and items."""
+    found = []
+    items = (
+        values.items() if isinstance(values, dict) else enumerate(values if isinstance(values, list) else [])
+    )
+    for key, value in items:
+        found += [(*path, key), *places(value, (*path, key))]
+    return found
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_value_anywhere_in_a_sealed_manifest_ends_in_clear_lines(made: Path, data: st.DataObject) -> None:
+    path = made / MANIFEST
+    whole = path.read_bytes()
+    values = json.loads(whole)
+    *way, last = data.draw(st.sampled_from(places(values)))
+    holder = values
+    for key in way:
+        holder = holder[key]
+    was, holder[last] = holder[last], data.draw(JSON)
+    try:
+        reseal(made, lambda manifest: (manifest.clear(), manifest.update(values)))
+        problems = verify(made)
+        assert all("\n" not in problem and len(problem) < 1500 for problem in problems)
+        free = way[:1] == ["totals"] or last in ("totals", "bytes", "manifest_sha256", "source")
+        assert problems or holder[last] == was or free, (way, last, was, holder[last])
+    finally:
+        path.write_bytes(whole)

@@ -1,0 +1,70 @@
+"""Whether the values of a manifest have the form that docs/format.md gives them; whoever wrote it.
+
+Each check raises ValueError with what is wrong; `Manifest.load` makes one clear error of it.
+"""
+
+from typing import Any, get_args
+
+from hma_data.embodiment import Embodiment
+from hma_data.plan import Settings
+from hma_data.tokenizers.base import TokenizerSpec
+
+DTYPES = {"discrete": ("uint16", "uint32"), "continuous": ("float16", "uint8")}
+LARGEST = 2**20  # cells, pixels and channels of a tokenizer; beyond is no tokenizer
+
+
+def is_count(value: Any, least: int = 0) -> bool:
+    """A whole number that int64 holds."""
+    return type(value) is int and least <= value < 2**63
+
+
+def check_spec(spec: TokenizerSpec) -> None:
+    """A tokenizer's spec."""
+    sizes = [*spec.grid, spec.image_size, *(() if spec.channels is None else (spec.channels,))]
+    if len(spec.grid) != 2 or not all(is_count(size, 1) and size <= LARGEST for size in sizes):
+        raise ValueError(f"the tokenizer's sizes are {sizes}")
+    if spec.kind not in DTYPES or spec.dtype not in DTYPES[spec.kind]:
+        raise ValueError(f"the tokenizer is of kind {spec.kind!r} and dtype {spec.dtype!r}")
+    if spec.kind == "discrete" and not is_count(spec.vocab_size, 1):
+        raise ValueError(f"the tokenizer's vocab_size is {spec.vocab_size!r}")
+    if type(spec.name) is not str or type(spec.weights_sha256) is not str:
+        raise ValueError("the tokenizer's name and weights_sha256 must be text")
+
+
+def check_plan(plan: dict[str, Any]) -> None:
+    """The facts of a plan that a reader goes by."""
+    if type(plan["hash"]) is not str or not is_count(plan["frame_stride"], 1):
+        raise ValueError("its plan has no hash, or a frame_stride that is no whole number above 0")
+    cameras = plan["cameras"]
+    if not isinstance(cameras, list) or not cameras or not all(type(name) is str for name in cameras):
+        raise ValueError("its plan names no cameras")
+    if plan.get("frames", "all") not in get_args(Settings.__annotations__["frames"]):
+        raise ValueError(f"its plan's frames are {plan['frames']!r}")
+    settings, extends = plan.get("settings", {}), plan.get("extends", [])
+    if not isinstance(settings, dict) or not isinstance(extends, list):
+        raise ValueError("its plan's settings are not a mapping, or extends not a list")
+    if not all(type(item) is str for item in extends):
+        raise ValueError("its plan's extends are not hashes")
+
+
+def check_splits(splits: dict[str, Any]) -> None:
+    """Counts of both splits."""
+    for split in ("train", "val"):
+        counts = [splits[split][name] for name in ("episodes", "frames", "rows", "shards")]
+        if not all(is_count(count) for count in counts):
+            raise ValueError(f"the counts of split {split} are not whole numbers")
+
+
+def check_stats(stats: dict[str, Any], robot: Embodiment) -> None:
+    """The summaries have a number for each value of the embodiment's vectors."""
+    widths = {"action": robot.action_dim} | ({"state": robot.state.dims} if robot.state else {})
+    for name, width in widths.items():
+        said = stats[name]
+        if not is_count(said["count"]):
+            raise ValueError(f"the statistics of {name} count {said['count']!r}")
+        numbers = [said[key] for key in ("mean", "std", "min", "max")] + list(said["quantiles"].values())
+        for values in numbers:
+            if not isinstance(values, list) or len(values) != width:
+                raise ValueError(f"the statistics of {name} are not {width} numbers each")
+            if not all(type(value) is float or is_count(abs(value)) for value in values):
+                raise ValueError(f"the statistics of {name} are not numbers")
