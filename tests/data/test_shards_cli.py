@@ -1,0 +1,95 @@
+"""`hma shards …`: exit codes, one line an error, JSON."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from hma_data.cli_shards import shards_app
+from hma_data.convert import convert
+from hma_data.embodiment import Embodiment
+from hma_data.errors import HMAError
+from hma_data.plan import Settings
+from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    write_toy(folder / "toy.hdf5", [14, 15, 16, 17, 60])
+    settings = Settings(val_fraction=0.3, shard_frames=40)
+    convert(
+        Embodiment.from_yaml(ARM_YAML),
+        str(folder / "toy.hdf5"),
+        BlockTokenizer(),
+        folder / "set",
+        settings=settings,
+    )
+    return folder / "set"
+
+
+def run(*words: object, code: int = 0) -> Result:
+    done = CliRunner().invoke(shards_app, [str(word) for word in words])
+    assert done.exit_code == code, (done.output, done.exception)
+    return done
+
+
+def test_info_in_figures(made: Path) -> None:
+    facts = json.loads(run("info", made, "--json").stdout)
+    assert facts["totals"]["episodes"] == 5
+    assert facts["totals"]["frames"] == 14 + 15 + 16 + 17 + 60
+    assert facts["episodes"]["longest"] == 60
+    assert facts["embodiment"]["stride"] == 2
+    windows = sum(split["windows"] for split in facts["windows"].values())
+    assert windows == 60 - 24 + 1
+    assert {"plan", "source", "tokenizer", "splits", "stats"} < facts.keys()
+    said = run("info", made).stdout
+    for word in ("toy_arm", "122 frames", "q99", "windows"):
+        assert word in said
+
+
+def test_verify_ends_with_1_when_it_finds_something(made: Path, tmp_path: Path) -> None:
+    assert "sound" in run("verify", made, "--workers", 2).stdout
+    assert json.loads(run("verify", made, "--quick", "--json").stdout) == {str(made): []}
+    assert "manifest.json" in run("verify", tmp_path, code=1).stdout
+
+
+def test_every_verb_that_makes_a_set_makes_a_sound_one(made: Path, tmp_path: Path) -> None:
+    facts = json.loads(run("merge", made, made, "--out", tmp_path / "m", "--json").stdout)
+    assert facts["episodes"] == 10
+    said = run("split", tmp_path / "m", "--val-fraction", 0.4, "--seed", 2, "--out", tmp_path / "s").stdout
+    assert "10 episodes" in said
+    said = run("export", tmp_path / "s", "--to", "memmap", "--out", tmp_path / "flat").stdout
+    assert str(tmp_path / "flat" / "train") in said
+    run("import", tmp_path / "flat", "--from", "memmap", "--out", tmp_path / "back")
+    run("restat", tmp_path / "back")
+    run("verify", tmp_path / "m", tmp_path / "s", tmp_path / "back")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["info", "nowhere"],
+        ["merge", "nowhere", "--out", "x"],
+        ["split", "nowhere", "--out", "x"],
+        ["restat", "nowhere"],
+        ["export", "nowhere", "--out", "x"],
+        ["import", "nowhere", "--out", "x"],
+        ["preview", "nowhere", "--out", "x"],
+    ],
+)
+def test_a_folder_that_is_not_there_is_one_error(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(shards_app, words)
+    assert isinstance(done.exception, HMAError)
+    assert "nowhere" in str(done.exception)
+    assert "\n" not in str(done.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_verb_shows_an_example() -> None:
+    for verb in ("info", "verify", "preview", "merge", "split", "restat", "export", "import"):
+        assert "Example: hma shards" in " ".join(run(verb, "--help").stdout.replace("│", " ").split())
