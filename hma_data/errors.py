@@ -42,6 +42,10 @@ class SourceError(HMAError):
     """A recording cannot be read at all."""
 
 
+class StorageAwayError(SourceError):
+    """Storage did not answer, however often it was asked: no fault of what is recorded there."""
+
+
 class EpisodeError(HMAError):
     """One episode of a readable recording is bad: it goes to quarantine, the job goes on."""
 

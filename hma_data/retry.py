@@ -3,6 +3,8 @@
 import errno
 from collections.abc import Iterator
 
+from hma_data.errors import StorageAwayError
+
 WAITS_S = (0.5, 3.0, 15.0)  # before the second, third and fourth try
 _ANSWERS_LATER = {
     errno.EAGAIN,
@@ -35,7 +37,7 @@ def causes(fault: BaseException | None) -> Iterator[BaseException]:
 def storage_is_away(fault: BaseException) -> bool:
     """Whether storage did not answer, which says nothing about the episode that was being read."""
     return any(
-        isinstance(item, ConnectionError | TimeoutError)
+        isinstance(item, ConnectionError | TimeoutError | StorageAwayError)
         or (isinstance(item, OSError) and item.errno in _ANSWERS_LATER)
         for item in causes(fault)
     )

@@ -40,7 +40,7 @@ from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef, Source, open_source
 from hma_data.stats import Stats
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
-from hma_data.video import prepare
+from hma_data.video import prepared
 
 BATCH = 32  # frames decoded and tokenized together
 FATAL = (
@@ -208,8 +208,9 @@ def _episode(job: Job, source: Source, spec: TokenizerSpec, index: int, ref: Epi
         camera = job.embodiment.camera(name)
         kept = np.arange(0, len(clip) // stride * stride, stride)
         for start in range(0, len(kept), BATCH):
-            raw = clip.frames_at(name, kept[start : start + BATCH])
-            yield _Frames(name, prepare(raw, camera, spec.image_size, spec.resize_filter))
+            indices = clip.frame_indices[name][kept[start : start + BATCH]]
+            stream = clip.episode.streams[name]
+            yield _Frames(name, prepared(stream, indices, camera, spec.image_size, spec.resize_filter))
     yield _End()
 
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from hma_data.errors import HMAError, SourceError
+from hma_data.errors import HMAError, SourceError, StorageAwayError
 
 TRIES, FIRST_PAUSE_S = 4, 0.2  # each pause is three times the one before
 BUSY = {408, 425, 429, 500, 502, 503, 504}
@@ -52,7 +52,8 @@ def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
             raise
         except Exception as fault:  # file systems raise what they like
             if turn == tries - 1 or not _may_pass(fault):
-                raise SourceError(path, f"cannot be read: {_said(fault)}", _remedy(fault)) from fault
+                kind = StorageAwayError if _may_pass(fault) else SourceError
+                raise kind(path, f"cannot be read: {_said(fault)}", _remedy(fault)) from fault
             log.info("%s: %s; trying again", path, _said(fault))
             time.sleep(FIRST_PAUSE_S * 3**turn)
     raise AssertionError("a try returns or raises")
