@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
+from hma_data.shards.wellformed import check_fields, check_numbers, check_plan
 from hma_data.stats import Stats
 from hma_data.tokenizers.base import TokenizerSpec
 
@@ -128,7 +129,10 @@ class Footer:
                     where,
                     f"has schema version {values['schema_version']}, this release reads {SCHEMA_VERSION}",
                 )
-            return cls(
+            check_plan(values["plan"])
+            for stats in values["stats"].values():
+                check_numbers(stats)
+            footer = cls(
                 plan=values["plan"],
                 name=values["name"],
                 split=values["split"],
@@ -136,8 +140,13 @@ class Footer:
                 quarantine=tuple(Refused(**item) for item in values["quarantine"]),
                 stats={name: Stats.from_json(stats) for name, stats in values["stats"].items()},
             )
-        except (KeyError, TypeError, ValueError) as fault:
-            raise ShardError(where, f"has a damaged footer: {fault}") from fault
+            for item in (*footer.episodes, *footer.quarantine):
+                check_fields(item)
+            return footer
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as fault:
+            raise ShardError(
+                where, f"has a damaged footer: {fault}", "delete it and convert again"
+            ) from fault
 
 
 def flags_text(trimmed: int, counts: Mapping[str, int]) -> str:

@@ -1,8 +1,11 @@
-"""Whether the values of a manifest have the form that docs/format.md gives them; whoever wrote it.
+"""Whether the values of a manifest or footer have the form that docs/format.md gives them; whoever wrote it.
 
-Each check raises ValueError with what is wrong; `Manifest.load` makes one clear error of it.
+Each check raises ValueError with what is wrong; whoever reads makes one clear error of it.
 """
 
+import math
+from collections.abc import Callable
+from dataclasses import fields
 from typing import Any, get_args
 
 from hma_data.embodiment import Embodiment
@@ -16,6 +19,44 @@ LARGEST = 2**20  # cells, pixels and channels of a tokenizer; beyond is no token
 def is_count(value: Any, least: int = 0) -> bool:
     """A whole number that int64 holds."""
     return type(value) is int and least <= value < 2**63
+
+
+def is_number(value: Any) -> bool:
+    """Finite, and within float64."""
+    return (type(value) is float and math.isfinite(value)) or (type(value) is int and abs(value) < 2**63)
+
+
+_KINDS: dict[Any, Callable[[Any], bool]] = {
+    int: is_count,
+    float: is_number,
+    str: lambda value: type(value) is str,
+    bool | None: lambda value: value is None or type(value) is bool,
+}
+
+
+def check_fields(item: Any) -> None:
+    """A dataclass whose values are of the types it declares; whole numbers are not negative."""
+    for field in fields(item):
+        value = getattr(item, field.name)
+        if not _KINDS[field.type](value):
+            raise ValueError(f"{field.name} is {str(value)[:40]!r}")
+
+
+def check_numbers(stats: dict[str, Any]) -> None:
+    """The statistics of one vector in a footer."""
+    width = len(stats["mean"])
+    for name in ("mean", "m2", "min", "max"):
+        if len(stats[name]) != width or not all(map(is_number, stats[name])):
+            raise ValueError(f"{name} is not {width} numbers")
+    sketch = stats["sketch"]
+    levels = [*sketch["rows"], *sketch["odd"]]
+    if not is_count(stats["count"]) or not all(map(is_count, levels)) or len(sketch["rows"]) > 64:
+        raise ValueError("counts are not whole numbers")
+    if len(sketch["odd"]) != len(sketch["rows"]) or sketch["width"] not in (width, 0):
+        raise ValueError("a sketch does not fit its vector")
+    weight = sum(rows << level for level, rows in enumerate(sketch["rows"]))
+    if weight != stats["count"] or (weight and sketch["width"] != width):
+        raise ValueError(f"a sketch of {weight} rows stands beside a count of {stats['count']}")
 
 
 def check_spec(spec: TokenizerSpec) -> None:

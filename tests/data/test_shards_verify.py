@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hma_data.convert import convert
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
+from hma_data.files import file_sha256
 from hma_data.plan import Settings
 from hma_data.shards.manifest import MANIFEST, Manifest, finish, plan_hash, seal_problem
 from hma_data.shards.restat import restat
@@ -356,3 +357,29 @@ def test_any_value_anywhere_in_a_sealed_manifest_ends_in_clear_lines(made: Path,
         assert problems or holder[last] == was or free, (way, last, was, holder[last])
     finally:
         path.write_bytes(whole)
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_value_anywhere_in_a_hashed_footer_ends_in_clear_lines(made: Path, data: st.DataObject) -> None:
+    path, manifest = made / "val" / "shard-00000.parquet", made / MANIFEST
+    whole, stated = path.read_bytes(), manifest.read_bytes()
+    metadata = footer(path)
+    values = json.loads(metadata[b"hma"])
+    *way, last = data.draw(st.sampled_from(places(values)))
+    holder = values
+    for key in way:
+        holder = holder[key]
+    holder[last] = data.draw(JSON)
+    try:
+        write(path, pq.read_table(path), metadata | {b"hma": json.dumps(values).encode()})
+
+        def describe(facts: dict) -> None:
+            shard = next(item for item in facts["shards"] if item["split"] == "val")
+            shard |= {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+
+        reseal(made, describe)
+        assert all("\n" not in problem and len(problem) < 1500 for problem in verify(made))
+    finally:
+        path.write_bytes(whole)
+        manifest.write_bytes(stated)
