@@ -47,7 +47,10 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
     """
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
-    width, height = claimed_size(buffer[:65536].tobytes())
+    head = buffer[:65536].tobytes()
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:26] in (b"\x10\0", b"\x10\4"):
+        raise EpisodeError(where, "a picture is grey of 16 bits, so depth, not colour", "name another camera")
+    width, height = claimed_size(head)
     if width * height > MAX_PIXELS:
         raise EpisodeError(where, f"a picture claims {width}×{height} pixels, more than {MAX_PIXELS:,}")
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION

@@ -331,3 +331,9 @@ def test_a_damaged_picture_is_a_picture_or_our_error(data: st.DataObject) -> Non
         assert decode_image(bytes(content), "e").shape[2] == 3
     except EpisodeError as fault:
         assert str(fault)
+
+
+def test_depth_is_no_picture() -> None:
+    depth = cv2.imencode(".png", np.full((8, 8), 3000, np.uint16))[1].tobytes()
+    with pytest.raises(EpisodeError, match="grey of 16 bits, so depth, not colour"):
+        decode_image(depth, "camera 0")
