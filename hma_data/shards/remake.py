@@ -263,6 +263,8 @@ def split(
     if by not in ("episode", "instruction", "source"):
         raise UsageError("--by", f"{by!r} is not known", "allowed: episode, instruction, source")
     settings = replace(_settings(shards), val_fraction=val_fraction, seed=seed)
+    if settings.limit is not None and settings.limit < len(rows):
+        settings = replace(settings, limit=None)  # of a set that was extended beyond it
     together = [row.group for row in rows] if by == "episode" else _together(rows, by)
     episodes = [Ready(row, (0, old), key) for row, old, key in zip(rows, _rows(shards), together)]
     made_by = {} if by == "episode" else {"split_by": by}

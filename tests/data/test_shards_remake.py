@@ -200,3 +200,16 @@ def test_several_cameras_and_strided_rows_survive(tmp_path: Path) -> None:
     assert verify(tmp_path / "all") == []
     assert verify(tmp_path / "again") == []
     assert episodes(tmp_path / "again") == episodes(tmp_path / "all")
+
+
+def test_a_set_extended_beyond_its_limit_is_split_whole(tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [14, 15, 16, 17])
+    arm, recording = Embodiment.from_yaml(ARM_YAML), str(tmp_path / "toy.hdf5")
+    for limit, extend in ((2, False), (4, True)):
+        settings = Settings(val_fraction=0.3, limit=limit)
+        convert(arm, recording, BlockTokenizer(), tmp_path / "set", settings=settings, extend=extend)
+    split(tmp_path / "set", tmp_path / "again", seed=2)
+    assert verify(tmp_path / "set") == []
+    assert verify(tmp_path / "again") == []
+    assert episodes(tmp_path / "again") == episodes(tmp_path / "set")
+    assert len(episodes(tmp_path / "set")) == 4
