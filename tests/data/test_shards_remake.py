@@ -2,20 +2,27 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 
 from hma_data.convert import convert
 from hma_data.embodiment import Embodiment
 from hma_data.errors import OutputError, ShardError, UsageError
 from hma_data.plan import Settings
+from hma_data.shards.manifest import Manifest, finish
+from hma_data.shards.memmap import export
+from hma_data.shards.memmap_import import import_memmap
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.remake import merge, split
+from hma_data.shards.schema import read_footer, to_arrow, to_numpy
 from hma_data.shards.verify import verify
+from hma_data.stats import Stats
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)
@@ -213,3 +220,51 @@ def test_a_set_extended_beyond_its_limit_is_split_whole(tmp_path: Path) -> None:
     assert verify(tmp_path / "again") == []
     assert episodes(tmp_path / "again") == episodes(tmp_path / "set")
     assert len(episodes(tmp_path / "set")) == 4
+
+
+def test_masks_go_along(tmp_path: Path) -> None:
+    """Masked rows are put into a set by hand; merged, split, flat and back they are the same."""
+    yaml = ARM_YAML + "sync: {beyond: mask, max_skew_ms: 50}\n"
+    folder = make(tmp_path / "set", [14, 15, 16], yaml=yaml)
+    mask_some(folder)
+    assert verify(folder) == []
+    merge([folder], tmp_path / "one")
+    split(tmp_path / "one", tmp_path / "two", val_fraction=0.5)
+    export(tmp_path / "two", tmp_path / "flat")
+    import_memmap(tmp_path / "flat", tmp_path / "back")
+    for other in ("one", "two", "back"):
+        assert verify(tmp_path / other) == []
+        mine, theirs = (
+            {row["id"]: s.episode_rows(row["episode_index"], s.columns()) for row in s.episodes.to_pylist()}
+            for s in (ShardSet(folder), ShardSet(tmp_path / other))
+        )
+        for name, columns in mine.items():
+            assert not columns["action_known"][3]
+            for column in ("action", "action_known", "tokens"):
+                np.testing.assert_array_equal(theirs[name][column], columns[column])
+
+
+def mask_some(folder: Path) -> None:
+    """Row 3 of every episode is unknown; footers and manifest follow."""
+    manifest = Manifest.load(folder)
+    names = [shard.path for shard in manifest.shards]
+    for name in names:
+        path = folder / name
+        said, _ = read_footer(path, name)
+        table = pq.read_table(path)
+        unknown = table["frame_index"].to_numpy() == 3
+        actions = to_numpy(table["action"]).copy()
+        actions[unknown] = 0
+        for column, values in (("action", actions), ("action_known", ~unknown)):
+            place = table.schema.get_field_index(column)
+            table = table.set_column(
+                place, table.schema.field(place), to_arrow(table.schema.field(place), values)
+            )
+        stats = Stats.empty(3)
+        for row in said.episodes:
+            own = slice(row.row_start, row.row_start + row.rows)
+            stats.merge(Stats.of(actions[own][~unknown[own]]))
+        with pq.ParquetWriter(path, table.schema) as writer:
+            writer.write_table(table, row_group_size=2048)
+            writer.add_key_value_metadata(replace(said, stats={"action": stats}).to_metadata())
+    finish(folder, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source)
