@@ -1,125 +1,34 @@
 """Windows from shards into training batches.
 
-`MixtureDataset` streams: it decodes a few row groups of each embodiment, shuffles the windows in
+`MixtureDataset` streams: it decodes a pool of row groups of each embodiment, shuffles the windows in
 them, and goes on to the next; which embodiment a sample comes from is the mixture's draw.
 `WindowDataset` gives any window by number, for evaluation and small data.
 
 What comes out depends on (seed, step, rank) alone, never on the number of DataLoader workers:
 batch t of a rank is made from lane t mod `lanes`, each lane owns its share of the row groups,
-and any process can work out where a lane stands. So a run is resumed exactly from two numbers
+and any process can work out where a lane stands. So a run is resumed exactly from one number
 a lane and embodiment.
 
 B batch, T frames, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
 
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
-from hma_data.errors import ShardError, UsageError
-from hma_data.mixture import Mixture
-from hma_data.shards.reader import RowGroupCache, ShardSet
-from hma_data.shards.schema import mask_columns, token_column
-from hma_data.windows import Ints, WindowIndex
+from hma_data.batch import Batch, as_batch, assemble
+from hma_data.errors import HMAError, ShardError, UsageError
+from hma_data.mixture import Draw, Mixture
+from hma_data.pools import Deal, Stream, pool_size
+from hma_data.row_groups import MIB, Decoder
+from hma_data.shards.reader import ShardSet
+from hma_data.windows import Ints, Short
 
-
-@dataclass
-class Batch:
-    """Windows, as the model takes them.
-
-    Attributes:
-        embodiment: B ids; may mix.
-        actions: (B, T, Kmax) float32 raw; rows of narrower embodiments are zero at the end.
-        action_mask: (B, T) bool, True where the chunk is known: all of its steps are.
-        tokens: (B, T, h, w) int64, or None.
-        latents: (B, T, c, H, W) float32 as stored, or None.
-        episode, frame: (B,) int64, where the window comes from.
-    """
-
-    embodiment: list[str]
-    actions: Tensor
-    action_mask: Tensor
-    tokens: Tensor | None = None
-    latents: Tensor | None = None
-    episode: Tensor | None = None
-    frame: Tensor | None = None
-
-    def __len__(self) -> int:
-        return len(self.embodiment)
-
-    def to(self, device: torch.device | str) -> "Batch":
-        """The same batch elsewhere."""
-        return self._map(lambda value: value.to(device, non_blocking=True))
-
-    def pin_memory(self) -> "Batch":
-        """Called by a DataLoader with pin_memory=True."""
-        return self._map(Tensor.pin_memory)
-
-    def _map(self, change: Any) -> "Batch":
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Batch(**{k: change(v) if isinstance(v, Tensor) else v for k, v in values.items()})
-
-
-@dataclass
-class _Rows:
-    """Decoded rows, contiguous; windows are cut from them."""
-
-    tokens: NDArray[Any]
-    actions: NDArray[np.float32]
-    episode: NDArray[np.int32]
-    frame: NDArray[np.int32]
-    known: NDArray[np.bool_]  # whether the row's action is
-
-    def cut(self, first: Ints, index: WindowIndex) -> dict[str, NDArray[Any]]:
-        """Windows that start at these rows: tokens (n, T, S), actions (n, T, K), known (n, T), …"""
-        steps = first[:, None] + np.arange(0, index.span, index.row_stride)
-        every = first[:, None] + np.arange(index.span)
-        chunks = self.actions[every].reshape(len(first), index.frames, -1)
-        known = np.all(self.known[every].reshape(len(first), index.frames, -1), axis=2)
-        return {
-            "tokens": self.tokens[steps],
-            "actions": chunks,
-            "known": known,
-            "episode": self.episode[first],
-            "frame": self.frame[first],
-        }
-
-
-class _SplitReader:
-    """Row groups of one shard set and split, decoded, with the windows in them."""
-
-    def __init__(self, shards: ShardSet, split: str, frames: int, stride: int | None, cache: int) -> None:
-        self.shards, self.split = shards, split
-        self.index = WindowIndex.of(shards, split, frames, stride)
-        self._token_name = token_column(shards.spec)[0]
-        self._columns = [self._token_name, "action", "episode_index", "frame_index"]
-        self._masks = [name for name in mask_columns(shards.embodiment) if name == "action_known"]
-        self._cache = RowGroupCache(shards, split, self._columns + self._masks, cache)
-
-    def rows(self, group: int) -> _Rows:
-        """All rows that the windows starting in row group `group` need."""
-        parts = [
-            self._cache.get(*map(int, self.index.groups[g]))
-            for g in range(group, self.index.reach(group) + 1)
-        ]
-        extra = self.index.span - 1  # rows past the group that its windows may need
-        kept = int(self.index.edges[group + 1] - self.index.edges[group]) + extra
-        names = self._columns + self._masks
-        if len(parts) == 1:
-            found = [parts[0][name] for name in names]
-        else:
-            found = [np.concatenate([part[name] for part in parts])[:kept] for name in names]
-        if not self._masks:
-            found.append(np.ones(len(found[0]), np.bool_))
-        return _Rows(*found)
+__all__ = ["Batch", "MixtureDataset", "WindowDataset", "as_batch", "open_sets"]
 
 
 def open_sets(data: Sequence[str | Path | ShardSet]) -> dict[str, ShardSet]:
@@ -153,45 +62,21 @@ def open_sets(data: Sequence[str | Path | ShardSet]) -> dict[str, ShardSet]:
     return sets
 
 
-def _assemble(
-    sets: Mapping[str, ShardSet], names: list[str], pieces: Mapping[str, tuple[Ints, dict[str, NDArray[Any]]]]
-) -> Batch:
-    """One batch from the pieces of each embodiment; `pieces[name]` = (places in the batch, windows)."""
-    size = len(names)
-    width = max(windows["actions"].shape[2] for _, windows in pieces.values())
-    frames = next(iter(pieces.values()))[1]["actions"].shape[1]
-    actions = np.zeros((size, frames, width), np.float32)
-    known = np.ones((size, frames), np.bool_)
-    episode, frame = np.zeros(size, np.int64), np.zeros(size, np.int64)
-    spec = next(iter(sets.values())).spec
-    discrete = spec.kind == "discrete"
-    shape = spec.grid if discrete else (spec.channels or 1, *spec.grid)
-    tokens = np.empty((size, frames, *shape), np.int64 if discrete else np.float32)
-    for places, windows in pieces.values():
-        actions[places, :, : windows["actions"].shape[2]] = windows["actions"]
-        known[places] = windows["known"]
-        episode[places], frame[places] = windows["episode"], windows["frame"]
-        tokens[places] = windows["tokens"].reshape(len(places), frames, *shape)
-    return Batch(
-        embodiment=names,
-        actions=torch.from_numpy(actions),
-        action_mask=torch.from_numpy(known),
-        tokens=torch.from_numpy(tokens) if discrete else None,
-        latents=None if discrete else torch.from_numpy(tokens),
-        episode=torch.from_numpy(episode),
-        frame=torch.from_numpy(frame),
-    )
-
-
 class WindowDataset(Dataset[Batch]):
     """Windows of one shard set by number.
+
+    A torch DataLoader takes it with `collate_fn=as_batch`.
 
     Args:
         data: the shard set.
         split: train or val.
         frames: T.
         stride: rows between frames; None takes the embodiment's.
-        cache: decoded row groups kept.
+        short: episodes shorter than a window are dropped, or padded.
+        cache_mib: decoded row groups kept.
+
+    Raises:
+        ShardError: the set is damaged or contradicts itself.
     """
 
     def __init__(
@@ -200,11 +85,14 @@ class WindowDataset(Dataset[Batch]):
         split: str,
         frames: int = 12,
         stride: int | None = None,
-        cache: int = 16,
+        short: Short = "drop",
+        cache_mib: int = 256,
     ) -> None:
         self.shards = data if isinstance(data, ShardSet) else ShardSet(data)
-        self._reader = _SplitReader(self.shards, split, frames, stride, cache)
-        self.index = self._reader.index
+        _check_frames(frames)
+        self._decoder = Decoder(self.shards, split, frames, stride, short, cache_mib * MIB)
+        self._short: Short = short
+        self.index = self._decoder.index
 
     def __len__(self) -> int:
         return self.index.count
@@ -212,113 +100,65 @@ class WindowDataset(Dataset[Batch]):
     def __getitem__(self, window: int) -> Batch:
         return self.batch([window])
 
+    def __getitems__(self, windows: list[int]) -> Batch:
+        return self.batch(windows)  # what a DataLoader asks of a dataset that makes whole batches
+
     def batch(self, windows: Sequence[int] | Ints) -> Batch:
         """Those windows, in that order.
 
         Raises:
-            IndexError: a number outside 0..len-1.
+            IndexError: no numbers, or one outside 0..len-1.
+            ShardError: a shard is missing or damaged.
         """
         wanted = np.asarray(windows, np.int64)
-        if len(wanted) and (wanted.min() < 0 or wanted.max() >= len(self)):
-            raise IndexError(f"window {wanted.max()} of {len(self)}")
-        first = self.index.first_rows(wanted)
-        groups = np.searchsorted(self.index.edges, first, side="right") - 1
+        outside = wanted[(wanted < 0) | (wanted >= len(self))]
+        if not len(wanted) or len(outside):
+            which = f"window {outside[0]}" if len(outside) else "no window"
+            raise IndexError(f"{which} of the {len(self)} of {self.shards.folder}")
+        index = self.index
+        first, last = index.first_rows(wanted), index.last_rows(wanted)
+        group = np.searchsorted(index.edges, first, side="right") - 1
+        over = np.minimum(first + index.span - 1, last) >= index.edges[group + 1]  # goes on in the next
+        places, cuts = [], []
+        for key in np.unique(2 * group + over):
+            chosen = np.flatnonzero(2 * group + over == key)
+            rows = self._decoder.rows(int(key // 2), whole=bool(key % 2))
+            edge = index.edges[key // 2]
+            cuts.append(rows.cut(first[chosen] - edge, last[chosen] - edge, index))
+            places.append(chosen)
+        joined = {name: np.concatenate([cut[name] for cut in cuts]) for name in cuts[0]}
+        order = np.concatenate(places)
+        joined["camera"] = index.cameras(wanted)[order]
         name = self.shards.embodiment.id
-        parts = []
-        for group in np.unique(groups):
-            places = np.flatnonzero(groups == group)
-            rows = self._reader.rows(int(group))
-            parts.append((places, rows.cut(first[places] - self.index.edges[group], self.index)))
-        order = np.concatenate([places for places, _ in parts])
-        joined = {key: np.concatenate([cut[key] for _, cut in parts]) for key in parts[0][1]}
-        return _assemble({name: self.shards}, [name] * len(wanted), {name: (order, joined)})
-
-
-class _LaneStream:
-    """An endless, shuffled sequence of one embodiment's windows for one of `streams` readers.
-
-    Window j is a pure function of j: epoch after epoch, the stream's row groups in a new order, a
-    pool of them at a time, the windows of a pool shuffled.
-    """
-
-    def __init__(self, reader: _SplitReader, seed: int, stream: int, streams: int, pool: int) -> None:
-        self._reader, self._pool = reader, pool
-        self._entropy = [seed, zlib.crc32(reader.shards.embodiment.id.encode()), stream]
-        index = reader.index
-        groups = index.units()
-        parts = -(-streams // len(groups))  # few row groups: several streams share one, window by window
-        if index.count < streams:
-            stream, streams, parts = 0, 1, 1  # fewer windows than readers: all of them see all
-        every = np.stack([np.tile(groups, parts), np.repeat(np.arange(parts), len(groups))], axis=1)
-        self._units = every[stream::streams]
-        self._parts = parts
-        sizes = np.diff(index.unit_first)[self._units[:, 0]]
-        self._sizes = (sizes - self._units[:, 1] + parts - 1) // parts
-        if self._sizes.sum() == 0:  # its share is empty: a part beyond a small group's windows
-            self._units, self._parts, self._sizes = every[: len(groups)], 1, np.diff(index.unit_first)[groups]
-        self.length = int(self._sizes.sum())
-        self._at: tuple[int, int] | None = None
-
-    def take(self, start: int, count: int) -> dict[str, NDArray[Any]]:
-        """Windows start to start + count of the sequence."""
-        parts = []
-        while count:
-            epoch, offset = divmod(start, self.length)
-            order, ends = self._rounds(epoch)
-            number = int(np.searchsorted(ends, offset, side="right"))
-            self._load(epoch, number, order)
-            inside = offset - (int(ends[number - 1]) if number else 0)
-            some = min(count, int(ends[number]) - offset)
-            parts.append(self._rows.cut(self._first[inside : inside + some], self._reader.index))
-            start, count = start + some, count - some
-        return (
-            parts[0]
-            if len(parts) == 1
-            else {key: np.concatenate([p[key] for p in parts]) for key in parts[0]}
-        )
-
-    def _rounds(self, epoch: int) -> tuple[Ints, Ints]:
-        order = np.random.default_rng([*self._entropy, epoch]).permutation(len(self._units))
-        return order, np.cumsum(np.add.reduceat(self._sizes[order], np.arange(0, len(order), self._pool)))
-
-    def _load(self, epoch: int, number: int, order: Ints) -> None:
-        if self._at == (epoch, number):
-            return
-        index = self._reader.index
-        loaded, firsts, offset = [], [], 0
-        for unit in order[number * self._pool : (number + 1) * self._pool]:
-            group, part = (int(v) for v in self._units[unit])
-            rows = self._reader.rows(group)
-            windows = np.arange(index.unit_first[group] + part, index.unit_first[group + 1], self._parts)
-            firsts.append(index.first_rows(windows) - index.edges[group] + offset)
-            loaded.append(rows)
-            offset += len(rows.frame)
-        first = np.concatenate(firsts)
-        self._first = first[np.random.default_rng([*self._entropy, epoch, number]).permutation(len(first))]
-        join = (lambda arrays: arrays[0]) if len(loaded) == 1 else np.concatenate
-        self._rows = _Rows(*(join([getattr(rows, f.name) for rows in loaded]) for f in fields(_Rows)))
-        self._at = (epoch, number)
+        return assemble({name: self.shards}, [name] * len(wanted), {name: (order, joined)}, self._short)
 
 
 class MixtureDataset(IterableDataset[Batch]):
     """An endless stream of batches over a mixture of shard sets.
 
     Iterate it directly, or `batches(workers)` for decoding in other processes; both can be
-    resumed with `state_dict` and `load_state_dict`. A torch DataLoader with batch_size=None
-    gives the same batches in the same order.
+    resumed with `state_dict` and `load_state_dict`. A torch DataLoader, or torchdata's
+    StatefulDataLoader, with batch_size=None gives the same batches in the same order.
+
+    An embodiment with fewer windows than there are lanes in all ranks is seen whole by every lane;
+    all others are divided, so that lanes and ranks never share a window.
 
     Args:
         data: shard sets, each of another embodiment.
         batch_size: B on this rank.
         frames: T.
-        temperature, weights, draw: of the mixture.
+        temperature, weights, groups, caps, max_epochs, samples, draw: of the mixture, see `Mixture.of`.
         seed: of draws and shuffles.
         rank, world: this process among those that train together; their windows are disjoint.
-        pool: row groups decoded together for an embodiment and lane.
+        split: train or val.
+        short: episodes shorter than a window are dropped, or padded.
+        pool: row groups decoded together for an embodiment and lane; None: as `memory_mib` allows, at most 8.
         lanes: independent streams a rank; at least the number of workers for full speed.
+        memory_mib: of decoded rows, about, in all lanes together.
 
     Raises:
-        ShardError: sets that do not go together, or one without a single window.
+        ShardError: sets that do not go together, one without a single window, or one that is damaged.
+        UsageError: values that cannot be.
     """
 
     def __init__(
@@ -329,63 +169,102 @@ class MixtureDataset(IterableDataset[Batch]):
         *,
         temperature: float = 3.0,
         weights: Mapping[str, float] | None = None,
-        draw: Literal["per_sample", "per_batch"] = "per_sample",
+        groups: Mapping[str, str] | None = None,
+        caps: Mapping[str, float] | None = None,
+        max_epochs: float | None = None,
+        samples: int | None = None,
+        draw: Draw = "per_sample",
         seed: int = 0,
         rank: int = 0,
         world: int = 1,
         split: str = "train",
-        pool: int = 4,
+        short: Short = "drop",
+        pool: int | None = None,
         lanes: int = 4,
+        memory_mib: int = 1024,
     ) -> None:
         if batch_size < 1 or not 0 <= rank < world:
             raise UsageError("batches", f"batch_size {batch_size}, rank {rank} of {world} is not possible")
+        if lanes < 1 or (pool is not None and pool < 1):
+            raise UsageError("batches", f"lanes {lanes}, pool {pool} must be at least 1")
+        _check_frames(frames)
         self.sets = open_sets(data)
-        self.batch_size, self.rank, self.world, self.pool, self.lanes = batch_size, rank, world, pool, lanes
-        self.seed = seed
-        cache = 2 * pool + 2
-        self._readers = {name: _SplitReader(s, split, frames, None, cache) for name, s in self.sets.items()}
-        for reader in self._readers.values():
-            if not reader.index.count:
-                raise ShardError(
-                    reader.shards.folder,
-                    f"has no window of {frames} frames, {reader.index.row_stride} steps apart, in {split} "
-                    f"({reader.index.short_episodes} episodes are shorter)",
-                    "use fewer frames, or leave this embodiment out",
-                )
-        counts = {name: reader.index.count for name, reader in self._readers.items()}
-        self.mixture = Mixture.of(counts, temperature, weights=weights, draw=draw, seed=seed)
-        self._streams: dict[tuple[int, int], _LaneStream] = {}
+        self.batch_size, self.rank, self.world, self.lanes = batch_size, rank, world, lanes
+        self.seed, self._short = seed, short
+        share = memory_mib * MIB / len(self.sets)
+        self._decoders = {
+            name: Decoder(shards, split, frames, None, short, int(share / 5))
+            for name, shards in self.sets.items()
+        }
+        for shards in self.sets.values():
+            vars(shards).pop("episodes", None)  # the index is made of it; it is read again when asked for
+        _check_windows(self._decoders, frames, split)
+        counts = {name: decoder.index.count for name, decoder in self._decoders.items()}
+        self.mixture = Mixture.of(
+            counts,
+            temperature,
+            weights=weights,
+            groups=groups,
+            caps=caps,
+            max_epochs=max_epochs,
+            samples=samples,
+            draw=draw,
+            seed=seed,
+        )
+        self._pools = [pool or pool_size(d, share * 4 / 5 / lanes) for d in self._decoders.values()]
+        self._deals: dict[int, Deal] = {}
+        self._streams: dict[tuple[int, int], Stream] = {}
         self._step = 0
+        self._origin: int | None = None  # in a DataLoader worker: the step that worker 0 began with
         self._taken: Ints = np.zeros((lanes, len(counts)), np.int64)
 
     def __iter__(self) -> Iterator[Batch]:
         """Batches from where `load_state_dict` left off; in a DataLoader worker, that worker's share."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        step, taken = self._step, self._taken.copy()
-        turn = 0
+        if info and self._origin is None:
+            self._origin = self._step  # the DataLoader asks worker 0 for this one
         while True:
+            step, taken = self._step, self._taken
             lane, draws = step % self.lanes, self._draws(step)
-            if turn % workers == worker:
-                batch = self._make(lane, draws, taken[lane])
-                if info is None:
-                    self._step, self._taken = step + 1, _counted(taken, lane, draws)
+            self._step, self._taken = step + 1, _counted(taken, lane, draws)
+            if (step - (self._origin or 0)) % workers == worker:
+                try:
+                    batch = self._make(lane, draws, taken[lane])
+                except HMAError:
+                    self._step, self._taken = step, taken
+                    raise
                 yield batch
-            taken = _counted(taken, lane, draws)
-            step, turn = step + 1, turn + 1
 
-    def batches(self, workers: int = 0) -> Iterator[Batch]:
-        """The same batches, decoded by `workers` processes; `state_dict` follows what was taken from here."""
+    def batches(self, workers: int = 0, context: str = "spawn") -> Iterator[Batch]:
+        """The same batches, decoded by `workers` processes; `state_dict` follows what was taken from here.
+
+        Args:
+            context: how the processes are started: spawn, fork, forkserver.
+
+        Raises:
+            ShardError: a shard is missing or damaged.
+        """
         if not workers:
             yield from self
             return
         loader = DataLoader(
-            self, batch_size=None, num_workers=workers, multiprocessing_context="spawn", prefetch_factor=4
+            _Carrier(self),
+            batch_size=None,
+            num_workers=workers,
+            multiprocessing_context=context,
+            prefetch_factor=4,
         )
         for batch in loader:
+            if isinstance(batch, HMAError):
+                raise batch
             lane, draws = self._step % self.lanes, self._draws(self._step)
             self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
             yield batch
+
+    def realised(self) -> list[dict[str, float | str | int]]:
+        """What this rank has taken of each embodiment, beside what was intended: `Mixture.table`."""
+        return self.mixture.table(self._taken.sum(axis=0))
 
     def _draws(self, step: int) -> Ints:
         """(B,) embodiments of this rank's batch `step`."""
@@ -401,40 +280,100 @@ class MixtureDataset(IterableDataset[Batch]):
             places = np.flatnonzero(draws == which)
             stream = self._stream(lane, int(which))
             pieces[names[which]] = (places, stream.take(int(taken[which]), len(places)))
-        return _assemble(self.sets, [names[i] for i in draws], pieces)
+        return assemble(self.sets, [names[i] for i in draws], pieces, self._short)
 
-    def _stream(self, lane: int, which: int) -> _LaneStream:
+    def _stream(self, lane: int, which: int) -> Stream:
         if (lane, which) not in self._streams:
-            reader = self._readers[self.mixture.names[which]]
-            number, streams = self.rank * self.lanes + lane, self.world * self.lanes
-            self._streams[lane, which] = _LaneStream(reader, self.seed, number, streams, self.pool)
+            decoder = self._decoders[self.mixture.names[which]]
+            if which not in self._deals:
+                self._deals[which] = Deal.of(decoder.index, self.world * self.lanes)
+            reader = self.rank * self.lanes + lane
+            self._streams[lane, which] = Stream(
+                decoder, self._deals[which], self.seed, reader, self._pools[which]
+            )
         return self._streams[lane, which]
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_streams": {}, "_deals": {}}  # what a worker makes anew, pools of rows too
+
     def state_dict(self) -> dict[str, Any]:
-        """Where the stream stands, after the last batch that was taken."""
+        """Where the stream stands, after the last batch that was taken: plain values, a few kB."""
         return {
             "step": self._step,
+            "origin": self._origin,
             "taken": self._taken.tolist(),
+            **self._identity(),
+        }
+
+    def _identity(self) -> dict[str, Any]:
+        """All that decides which windows come, but the place."""
+        index = next(iter(self._decoders.values())).index
+        return {
             "names": list(self.mixture.names),
+            "counts": list(self.mixture.counts),
+            "p": [float(f"{p:.9g}") for p in self.mixture.p],  # the same on every processor
+            "draw": self.mixture.draw,
             "batch_size": self.batch_size,
+            "frames": index.frames,
+            "short": self._short,
             "world": self.world,
+            "rank": self.rank,
+            "lanes": self.lanes,
+            "pools": self._pools,
             "seed": self.seed,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict`.
+        """Go on from `state_dict`, with any number of workers.
 
         Raises:
             UsageError: it is of another mixture.
         """
-        mine = self.state_dict()
-        for key in ("names", "batch_size", "world", "seed"):
-            if state[key] != mine[key]:
-                raise UsageError("sampler state", f"has {key} {state[key]}, this run has {mine[key]}")
-        taken = np.asarray(state["taken"], np.int64)
+        for key, mine in self._identity().items():
+            if state.get(key) != mine:
+                raise UsageError(
+                    "sampler state",
+                    f"has {key} {state.get(key)}, this run has {mine}",
+                    "go on with the settings and data it was saved with, or begin anew",
+                )
+        taken = np.asarray(state.get("taken"), np.int64)
         if taken.shape != self._taken.shape:
-            raise UsageError("sampler state", f"is of {len(taken)} lanes, this run has {self.lanes}")
+            raise UsageError("sampler state", f"counts {taken.shape} streams, this run {self._taken.shape}")
         self._step, self._taken = int(state["step"]), taken
+        self._origin = state.get("origin") if get_worker_info() else None
+
+
+class _Carrier(IterableDataset[Any]):
+    """A dataset whose errors come through the queue whole; torch would pass on their text alone."""
+
+    def __init__(self, dataset: MixtureDataset) -> None:
+        self._dataset = dataset
+
+    def __iter__(self) -> Iterator[Batch | HMAError]:
+        try:
+            yield from self._dataset
+        except HMAError as fault:
+            yield fault
+
+
+def _check_frames(frames: int) -> None:
+    if frames < 1:
+        raise UsageError("frames", f"of a window must be at least 1, are {frames}")
+
+
+def _check_windows(decoders: Mapping[str, Decoder], frames: int, split: str) -> None:
+    """Every set gives windows, and a first row group of it is what it should be."""
+    for decoder in decoders.values():
+        index = decoder.index
+        if not index.count:
+            raise ShardError(
+                decoder.shards.folder,
+                f"has no window of {frames} frames, {index.row_stride} rows apart, in {split} "
+                f"({index.short_episodes} episodes, all shorter)",
+                "use fewer frames, or leave this embodiment out",
+            )
+    with ThreadPoolExecutor(min(8, len(decoders))) as threads:
+        list(threads.map(Decoder.check, decoders.values()))
 
 
 def _counted(taken: Ints, lane: int, draws: Ints) -> Ints:

@@ -7,8 +7,8 @@ uniform. Draws are a pure function of (seed, step), so every rank and worker kno
 E embodiments, B samples a batch.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hma_data.errors import UsageError
 
 Floats = NDArray[np.float64]
+Draw = Literal["per_sample", "per_batch"]
 
 
 def probabilities(
@@ -26,15 +27,17 @@ def probabilities(
     weights: Sequence[float] | None = None,
     groups: Sequence[str] | None = None,
     caps: Sequence[float] | None = None,
+    group_weights: Mapping[str, float] | None = None,
 ) -> Floats:
     """The probability (E,) of each embodiment; they sum to one.
 
     Args:
         counts: training windows of each.
         temperature: τ above; math.inf is uniform.
-        weights: multiply the probabilities before they are normalized.
+        weights: multiply the probabilities before they are normalized; within a group, where there are.
         groups: names; each group gets an equal share, shared inside it by the rule above.
         caps: no probability exceeds its cap; what is cut goes to the others in proportion.
+        group_weights: multiply the shares of groups.
 
     Raises:
         UsageError: a value out of range, no windows at all, or caps that leave less than one.
@@ -48,25 +51,48 @@ def probabilities(
     present = n > 0
     share[present] = np.exp((np.log(n[present]) - np.log(n.max())) / temperature)  # no overflow at any count
     if weights is not None:
-        factor = np.asarray(weights, np.float64)
-        if len(factor) != len(n) or not np.isfinite(factor).all() or (factor < 0).any():
-            raise UsageError(
-                "mixture weights", f"must be {len(n)} numbers of at least 0, are {list(weights)}"
-            )
-        share *= factor
-    if share.sum() <= 0:
-        raise UsageError("mixture weights", "leave nothing to draw")
+        share *= _factors("weights", weights, len(n))
     if groups is not None:
+        factors = _factors("weights", list((group_weights or {}).values()), len(group_weights or {}))
+        factor = dict(zip(group_weights or {}, factors))
         for name in dict.fromkeys(groups):
             members = np.array([group == name for group in groups])
             if share[members].sum() > 0:
-                share[members] /= share[members].sum()
+                share[members] *= factor.get(name, 1.0) / share[members].sum()
+    if share.sum() <= 0:
+        raise UsageError("mixture weights", "leave nothing to draw")
     share /= share.sum()
-    return _capped(share, caps) if caps is not None else share
+    return share if caps is None else _capped(share, _factors("caps", caps, len(n)))
 
 
-def _capped(share: Floats, caps: Sequence[float]) -> Floats:
-    limit = np.asarray(caps, np.float64)
+def epoch_caps(counts: Sequence[int], max_epochs: float, samples: int) -> Floats:
+    """The largest probabilities (E,) at which `samples` draws pass over no set more than `max_epochs` times.
+
+    Raises:
+        UsageError: so many samples cannot be drawn.
+    """
+    if not max_epochs > 0 or samples < 1:
+        raise UsageError(
+            "mixture max_epochs", f"must be above 0 and of at least 1 sample, is {max_epochs} of {samples}"
+        )
+    most = max_epochs * sum(counts)
+    if samples > most:
+        raise UsageError(
+            "mixture max_epochs",
+            f"{max_epochs:g} passes over {sum(counts):,} windows are fewer than {samples:,} planned samples",
+            f"allow {samples / max(1, sum(counts)):.3g} passes, or plan {int(most):,} samples",
+        )
+    return np.minimum(1.0, max_epochs * np.asarray(counts, np.float64) / samples)
+
+
+def _factors(name: str, values: Sequence[float], count: int) -> Floats:
+    factors = np.asarray(values, np.float64)
+    if len(factors) != count or not np.isfinite(factors).all() or (factors < 0).any():
+        raise UsageError(f"mixture {name}", f"must be {count} numbers of at least 0, are {list(values)}")
+    return factors
+
+
+def _capped(share: Floats, limit: Floats) -> Floats:
     if limit[share > 0].sum() < 1 - 1e-12:
         raise UsageError("mixture caps", f"sum to {limit[share > 0].sum():g}, so not everything can be drawn")
     fixed = np.zeros(len(share), bool)
@@ -96,7 +122,7 @@ class Mixture:
     names: tuple[str, ...]
     counts: tuple[int, ...]
     p: Floats
-    draw: Literal["per_sample", "per_batch"] = "per_sample"
+    draw: Draw = "per_sample"
     seed: int = 0
 
     @classmethod
@@ -106,18 +132,47 @@ class Mixture:
         temperature: float = 3.0,
         *,
         weights: Mapping[str, float] | None = None,
-        draw: Literal["per_sample", "per_batch"] = "per_sample",
+        groups: Mapping[str, str] | None = None,
+        caps: Mapping[str, float] | None = None,
+        max_epochs: float | None = None,
+        samples: int | None = None,
+        draw: Draw = "per_sample",
         seed: int = 0,
     ) -> "Mixture":
-        """The mixture over named counts; see `probabilities`."""
-        unknown = set(weights or {}) - set(counts)
-        if unknown:
-            raise UsageError(
-                "mixture weights", f"name {', '.join(sorted(unknown))}, which is not in the mixture"
-            )
-        factors = [(weights or {}).get(name, 1.0) for name in counts]
-        p = probabilities(list(counts.values()), temperature, weights=factors)
-        return cls(tuple(counts), tuple(counts.values()), p, draw, seed)
+        """The mixture over named counts; see `probabilities`.
+
+        Args:
+            counts: embodiment -> training windows.
+            weights: embodiment or group -> factor on its probability; 1 where not named.
+            groups: embodiment -> group; one that is not named is a group of its own.
+            caps: embodiment -> its largest probability.
+            max_epochs: passes over any one embodiment at most, while `samples` are drawn in all.
+
+        Raises:
+            UsageError: a name that is not there, or values that cannot be met.
+        """
+        group = {name: (groups or {}).get(name, name) for name in counts}
+        _known("groups", groups, counts)
+        _known("weights", weights, [*counts, *(group.values() if groups else [])])
+        _known("caps", caps, counts)
+        if seed < 0:
+            raise UsageError("mixture seed", f"must be at least 0, is {seed}")
+        shared = {name for name in group.values() if name not in counts}
+        size = list(counts.values())
+        limits: Floats | None = None
+        if caps or max_epochs is not None:
+            limits = np.array([(caps or {}).get(name, 1.0) for name in counts])
+        if limits is not None and max_epochs is not None:
+            limits = np.minimum(limits, epoch_caps(size, max_epochs, samples or 0))
+        p = probabilities(
+            size,
+            temperature,
+            weights=[(weights or {}).get(name, 1.0) for name in counts],
+            groups=list(group.values()) if groups else None,
+            caps=None if limits is None else limits.tolist(),
+            group_weights={name: w for name, w in (weights or {}).items() if name in shared},
+        )
+        return cls(tuple(counts), tuple(size), p, draw, seed)
 
     def batch(self, step: int, size: int) -> NDArray[np.int64]:
         """(B,) which embodiment each sample of batch `step` comes from; the same wherever it is asked."""
@@ -127,30 +182,30 @@ class Mixture:
         draws = np.searchsorted(edges, rng.random(1 if self.draw == "per_batch" else size), side="right")
         return np.broadcast_to(draws, (size,)).astype(np.int64)
 
+    def table(self, drawn: Sequence[int] | NDArray[np.int64]) -> list[dict[str, float | str | int]]:
+        """What was drawn beside what was intended.
 
-@dataclass
-class Realised:
-    """Counts what was drawn, to hold it against what was intended."""
+        Args:
+            drawn: (E,) samples of each embodiment.
 
-    mixture: Mixture
-    drawn: dict[str, int] = field(default_factory=dict)
-
-    def add(self, names: Sequence[str]) -> None:
-        """Samples of one batch."""
-        for name in names:
-            self.drawn[name] = self.drawn.get(name, 0) + 1
-
-    def table(self) -> list[dict[str, float | str | int]]:
-        """One row an embodiment: intended and realised share, samples, passes over its windows."""
-        total = max(1, sum(self.drawn.values()))
+        Returns:
+            One row an embodiment: intended and realised share, samples, passes over its windows.
+        """
+        total = max(1, int(np.sum(drawn)))
         return [
             {
                 "embodiment": name,
                 "windows": count,
                 "intended": float(p),
-                "realised": self.drawn.get(name, 0) / total,
-                "samples": self.drawn.get(name, 0),
-                "passes": self.drawn.get(name, 0) / max(1, count),
+                "realised": int(samples) / total,
+                "samples": int(samples),
+                "passes": int(samples) / max(1, count),
             }
-            for name, count, p in zip(self.mixture.names, self.mixture.counts, self.mixture.p)
+            for name, count, p, samples in zip(self.names, self.counts, self.p, drawn, strict=True)
         ]
+
+
+def _known(what: str, named: Mapping[str, object] | None, known: Iterable[str]) -> None:
+    unknown = set(named or {}) - set(known)
+    if unknown:
+        raise UsageError(f"mixture {what}", f"name {', '.join(sorted(unknown))}, which is not in the mixture")

@@ -3,16 +3,24 @@
 A window is T frames `stride` apart with their T action chunks, so it spans T·stride recorded
 rows of one episode and never leaves it. Rows of a split are numbered through all its shards;
 windows are numbered in row order. Memory is per episode and row group, not per window.
+
+A shorter episode is dropped, or padded: it gives one window from its first row, whose missing frames
+repeat its last row and are masked. Attention is causal in time, so what follows the last frame changes
+no prediction before it.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.shards.reader import ShardSet
+from hma_data.errors import ShardError
+from hma_data.shards.manifest import EPISODES
+from hma_data.shards.reader import EpisodeIndex, ShardSet
 
 Ints = NDArray[np.int64]
+Short = Literal["drop", "pad"]
 
 
 @dataclass(frozen=True)
@@ -25,11 +33,11 @@ class WindowIndex:
         span: rows a window covers, T · row_stride.
         count: windows.
         short_episodes: episodes too short for a window; they are left out, and counted here.
+        padded_episodes: short episodes that give one window all the same.
         unit_first: (G+1,) number of windows before each row group; row group g starts windows
             unit_first[g] to unit_first[g+1].
         edges: (G+1,) first row of each row group.
         groups: (G, 2) shard index and row group in it.
-        last_group: (G,) last row group that shares its shard, so how far reading may go on.
     """
 
     frames: int
@@ -37,47 +45,60 @@ class WindowIndex:
     span: int
     count: int
     short_episodes: int
+    padded_episodes: int
     unit_first: Ints
     edges: Ints
     groups: Ints
-    last_group: Ints
     _starts: Ints  # (N,) first row of each episode that has windows
+    _lengths: Ints  # (N,) its rows
+    _cameras: NDArray[np.int16]  # (N,) which camera saw it
     _before: Ints  # (N+1,) windows before each
 
     @classmethod
-    def of(cls, shards: ShardSet, split: str, frames: int, row_stride: int | None = None) -> "WindowIndex":
-        """The windows of a split; `row_stride` None takes the embodiment's."""
+    def of(
+        cls,
+        shards: ShardSet,
+        split: str,
+        frames: int,
+        row_stride: int | None = None,
+        short: Short = "drop",
+    ) -> "WindowIndex":
+        """The windows of a split.
+
+        Args:
+            frames: T.
+            row_stride: rows between frames; None takes the embodiment's.
+            short: what becomes of episodes shorter than a window; one of a single frame is always dropped.
+
+        Raises:
+            ShardError: episodes.parquet names rows that the shards do not have.
+        """
         stride = row_stride or shards.row_stride
         span = frames * stride
-        per_shard = shards.row_groups(split)
-        sizes = np.array([rows for groups in per_shard for rows in groups], np.int64)
-        edges = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        counts = np.array([len(groups) for groups in per_shard], np.int64)
-        shard_of = np.repeat(np.arange(len(per_shard)), counts)
-        shard_first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        within = np.arange(len(sizes)) - shard_first[shard_of]
-        rows_before = edges[shard_first[:-1]] if len(counts) else np.zeros(0, np.int64)
-
+        edges, groups = _row_groups(shards.row_groups(split))
         episodes = shards.index(split)
+        starts = _first_rows(shards, split, episodes)
+        cameras = len(shards.manifest.cameras)
         windows = np.maximum(0, episodes.length - span + 1)
-        starts = (
-            rows_before[episodes.shard] + episodes.start if len(episodes.shard) else np.zeros(0, np.int64)
-        )
+        padded = (windows == 0) & (episodes.length > stride) & (short == "pad")
+        windows[padded] = 1
         order = np.argsort(starts, kind="stable")
         keep = order[windows[order] > 0]
         before = np.concatenate([[0], np.cumsum(windows[keep])]).astype(np.int64)
         index = cls(
-            frames,
-            stride,
-            span,
-            int(before[-1]),
-            int((windows == 0).sum()),
-            np.zeros(0, np.int64),
-            edges,
-            np.stack([shard_of, within], axis=1).astype(np.int64),
-            (shard_first[1:] - 1)[shard_of],
-            starts[keep],
-            before,
+            frames=frames,
+            row_stride=stride,
+            span=span,
+            count=int(before[-1]),
+            short_episodes=int((windows == 0).sum()),
+            padded_episodes=int(padded.sum()),
+            unit_first=np.zeros(0, np.int64),
+            edges=edges,
+            groups=groups,
+            _starts=starts[keep],
+            _lengths=episodes.length[keep],
+            _cameras=(np.arange(len(starts)) % cameras)[keep].astype(np.int16),
+            _before=before,
         )
         object.__setattr__(index, "unit_first", index._windows_before(edges))
         return index
@@ -90,17 +111,66 @@ class WindowIndex:
         inside = np.minimum(rows - self._starts[at], np.diff(self._before)[at])
         return np.where(at < 0, 0, self._before[at] + inside)
 
+    def _episodes(self, windows: Ints) -> Ints:
+        return np.searchsorted(self._before, windows, side="right") - 1
+
     def first_rows(self, windows: Ints) -> Ints:
         """First row of each window."""
-        at = np.searchsorted(self._before, windows, side="right") - 1
+        at = self._episodes(windows)
         return self._starts[at] + (windows - self._before[at])
+
+    def last_rows(self, windows: Ints) -> Ints:
+        """Last row of each window's episode; beyond it the window is padded."""
+        at = self._episodes(windows)
+        return self._starts[at] + self._lengths[at] - 1
+
+    def cameras(self, windows: Ints) -> Ints:
+        """Which of the set's cameras saw each window."""
+        return self._cameras[self._episodes(windows)].astype(np.int64)
 
     def units(self) -> Ints:
         """Row groups in which at least one window starts."""
         return np.flatnonzero(np.diff(self.unit_first) > 0)
 
     def reach(self, group: int) -> int:
-        """Last row group needed for the windows that start in `group`."""
-        needed = self.edges[group + 1] + self.span - 2
-        last = int(np.searchsorted(self.edges, needed, side="right")) - 1
-        return int(min(last, self.last_group[group]))
+        """Last row group needed for the windows that start in `group`: its own unless an episode goes on."""
+        after = self.unit_first[group + 1]
+        if after == self.unit_first[group]:
+            return group
+        last = np.array([after - 1])
+        row = min(int(self.first_rows(last)[0]) + self.span - 1, int(self.last_rows(last)[0]))
+        return int(np.searchsorted(self.edges, row, side="right")) - 1
+
+    def episode_starts(self, group: int) -> Ints:
+        """Rows of a row group, counted from its first, at which an episode with windows begins."""
+        first, after = np.searchsorted(self._starts, self.edges[group : group + 2])
+        return self._starts[first:after] - self.edges[group]
+
+
+def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
+    """First rows (G+1,) and places (G, 2) of all row groups of a split."""
+    sizes = np.array([rows for groups in per_shard for rows in groups], np.int64)
+    edges = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    counts = np.array([len(groups) for groups in per_shard], np.int64)
+    shard = np.repeat(np.arange(len(per_shard)), counts)
+    first = np.repeat(np.cumsum(counts) - counts, counts)
+    return edges, np.stack([shard, np.arange(len(sizes)) - first], axis=1).astype(np.int64)
+
+
+def _first_rows(shards: ShardSet, split: str, episodes: EpisodeIndex) -> Ints:
+    """First row of each episode, counted through all shards of the split."""
+    sizes = np.array([sum(groups) for groups in shards.row_groups(split)], np.int64)
+    if not len(episodes.shard):
+        return np.zeros(0, np.int64)
+    known = (episodes.shard >= 0) & (episodes.shard < len(sizes))
+    rows = np.append(sizes, 0)[np.where(known, episodes.shard, -1)]
+    wrong = ~known | (episodes.start < 0) | (episodes.length < 1) | (episodes.start + episodes.length > rows)
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise ShardError(
+            shards.folder,
+            f"{EPISODES} puts episode {episodes.episode_index[i]} at rows {episodes.start[i]:,} to "
+            f"{episodes.start[i] + episodes.length[i]:,} of a shard that has {rows[i]:,}",
+            f"hma shards restat {shards.folder} writes it anew from the shards",
+        )
+    return (np.cumsum(sizes) - sizes)[episodes.shard] + episodes.start

@@ -2,6 +2,7 @@
 
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -160,6 +161,7 @@ def test_one_embodiment_twice_is_refused(sets: list[Path]) -> None:
 def test_window_arithmetic_equals_counting(lengths: list[int], frames: int, stride: int) -> None:
     class Fake:
         row_stride = stride
+        manifest = SimpleNamespace(cameras=["top"])
 
         def row_groups(self, split):
             groups, rows = [], sum(lengths)

@@ -1,12 +1,15 @@
 """The mixture's probabilities and draws, against worked numbers."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.errors import UsageError
-from hma_data.mixture import Mixture, Realised, probabilities
+from hma_data.mixture import Mixture, epoch_caps, probabilities
+from hma_data.plots import plot_mixture
 
 COUNTS = [10**6, 10**5, 10**4, 10**3]
 
@@ -83,9 +86,75 @@ def test_per_batch_draws_one_embodiment_a_batch() -> None:
     assert len({int(batch[0]) for batch in batches}) == 2
 
 
-def test_realised_shares_are_counted() -> None:
-    realised = Realised(Mixture.of({"a": 30, "b": 10}))
-    realised.add(["a", "a", "b", "a"])
-    rows = {row["embodiment"]: row for row in realised.table()}
+def test_realised_shares_stand_beside_the_intended() -> None:
+    rows = {row["embodiment"]: row for row in Mixture.of({"a": 30, "b": 10}).table([3, 1])}
     assert rows["a"]["realised"] == 0.75
+    assert rows["a"]["intended"] == pytest.approx(3 ** (1 / 3) / (1 + 3 ** (1 / 3)))
     assert rows["b"]["passes"] == 0.1
+    assert Mixture.of({"a": 30}).table([0])[0]["realised"] == 0
+
+
+def test_sets_of_a_group_share_one_weight() -> None:
+    counts = {"arm": 900, "left": 10, "right": 90}
+    groups = {"left": "hands", "right": "hands"}
+    equal = Mixture.of(counts, 1, groups=groups)
+    np.testing.assert_allclose(equal.p, [0.5, 0.05, 0.45])
+    heavier = Mixture.of(counts, 1, groups=groups, weights={"hands": 3})
+    np.testing.assert_allclose(heavier.p, [0.25, 0.075, 0.675])
+    within = Mixture.of(counts, 1, groups=groups, weights={"left": 9})
+    np.testing.assert_allclose(within.p, [0.5, 0.25, 0.25])
+
+
+def test_no_set_is_passed_over_more_often_than_allowed() -> None:
+    counts = {"large": 1_000_000, "small": 1_000}
+    free, capped = Mixture.of(counts), Mixture.of(counts, max_epochs=5, samples=500_000)
+    assert free.p[1] * 500_000 / 1_000 > 40
+    assert capped.p[1] * 500_000 / 1_000 == pytest.approx(5)
+    assert capped.p.sum() == pytest.approx(1)
+
+
+def test_more_samples_than_the_passes_give_are_refused_with_how_many_there_are() -> None:
+    with pytest.raises(UsageError, match="plan 2,000 samples"):
+        epoch_caps([600, 400], 2, 2_001)
+
+
+@given(
+    st.lists(st.integers(1, 10**6), min_size=2, max_size=12),
+    st.floats(1.0, 5.0),
+    st.floats(0.05, 1.0),
+)
+def test_capped_probabilities_hold_every_cap_and_sum_to_one(
+    counts: list[int], max_epochs: float, used: float
+) -> None:
+    samples = max(1, int(used * max_epochs * sum(counts)))
+    caps = epoch_caps(counts, max_epochs, samples)
+    p = probabilities(counts, 3, caps=caps.tolist())
+    assert p.sum() == pytest.approx(1)
+    assert (p <= caps + 1e-9).all()
+
+
+@pytest.mark.parametrize("what", ["weights", "groups", "caps"])
+def test_a_name_that_is_not_in_the_mixture_is_refused(what: str) -> None:
+    with pytest.raises(UsageError, match=f"mixture {what}: name leg"):
+        Mixture.of({"a": 10, "b": 10}, **{what: {"leg": "a" if what == "groups" else 0.5}})
+
+
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("what", ["weights", "caps"])
+def test_factors_that_are_no_sizes_are_refused(what: str, value: float) -> None:
+    with pytest.raises(UsageError, match=f"mixture {what}"):
+        Mixture.of({"a": 10, "b": 10}, **{what: {"a": value}})
+
+
+def test_a_negative_seed_is_refused() -> None:
+    with pytest.raises(UsageError, match="seed"):
+        Mixture.of({"a": 10}, seed=-1)
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_the_plot_names_every_robot(count: int, tmp_path: Path) -> None:
+    names = [f"robot_{i}" for i in range(count - 1)] + ["a_dataset_with_a_name_too_long_for_the_axis_rlds"]
+    plot_mixture(Mixture.of({name: 10 ** (i % 6) for i, name in enumerate(names)}), 3.0, tmp_path / "m.svg")
+    drawn = (tmp_path / "m.svg").read_text()
+    assert all(f"<!-- {name} -->" in drawn for name in names[:-1])
+    assert "<!-- a_dataset_with_a_…" in drawn

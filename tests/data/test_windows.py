@@ -1,0 +1,112 @@
+"""The arithmetic of windows against counting them, and against sets that contradict themselves."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hma_data.errors import ShardError
+from hma_data.shards.reader import EpisodeIndex
+from hma_data.windows import WindowIndex
+
+
+def fake(lengths: list[int], stride: int = 1, cameras: int = 1, group: int = 7, shards: int = 1) -> Any:
+    """A set of these episodes, in row groups of `group` rows; episodes are dealt out among the shards."""
+    shard = np.sort(np.arange(len(lengths)) % shards)
+    size = np.array(lengths, np.int64) * cameras
+    sums = [int(size[shard == i].sum()) for i in range(shards)]
+    starts = np.concatenate([np.cumsum(size[shard == i]) - size[shard == i] for i in range(shards)])
+    offsets = np.arange(cameras) * np.array(lengths)[:, None]
+    index = EpisodeIndex(
+        np.repeat(np.arange(len(lengths)), cameras),
+        np.repeat(shard, cameras).astype(np.int64),
+        (starts[:, None] + offsets).ravel().astype(np.int64),
+        np.repeat(np.array(lengths, np.int64), cameras),
+    )
+    groups = [tuple(min(group, rows - at) for at in range(0, rows, group)) for rows in sums]
+    return SimpleNamespace(
+        folder="a set",
+        row_stride=stride,
+        manifest=SimpleNamespace(cameras=["top", "side", "wrist"][:cameras]),
+        row_groups=lambda split: groups,
+        index=lambda split: index,
+    )
+
+
+LENGTHS = st.lists(st.integers(1, 30), min_size=1, max_size=20)
+
+
+@given(LENGTHS, st.integers(1, 6), st.integers(1, 3), st.integers(1, 2), st.integers(1, 3))
+@settings(max_examples=80, deadline=None)
+def test_window_arithmetic_equals_counting(
+    lengths: list[int], frames: int, stride: int, cameras: int, shards: int
+) -> None:
+    index = WindowIndex.of(fake(lengths, stride, cameras, shards=shards), "train", frames)
+    starts, seen, row = [], [], 0
+    for length in lengths:
+        for camera in range(cameras):
+            found = range(row, row + max(0, length - frames * stride + 1))
+            starts += list(found)
+            seen += [camera] * len(found)
+            row += length
+    every = np.arange(len(starts))
+    assert index.count == len(starts)
+    np.testing.assert_array_equal(index.first_rows(every), starts)
+    np.testing.assert_array_equal(index.cameras(every), seen)
+    np.testing.assert_array_equal(index.unit_first, [sum(s < edge for s in starts) for edge in index.edges])
+
+
+@given(LENGTHS, st.integers(1, 6), st.integers(1, 3))
+@settings(max_examples=60, deadline=None)
+def test_a_row_group_reaches_as_far_as_its_windows_and_no_further(
+    lengths: list[int], frames: int, stride: int
+) -> None:
+    index = WindowIndex.of(fake(lengths, stride), "train", frames)
+    for group in index.units():
+        last = index.first_rows(np.array([index.unit_first[group + 1] - 1]))[0] + index.span - 1
+        reach = index.reach(int(group))
+        assert index.edges[reach] <= last < index.edges[reach + 1]
+
+
+@given(LENGTHS, st.integers(2, 6), st.integers(1, 3))
+@settings(max_examples=60, deadline=None)
+def test_a_padded_episode_gives_one_window_from_its_first_row(
+    lengths: list[int], frames: int, stride: int
+) -> None:
+    index = WindowIndex.of(fake(lengths, stride), "train", frames, short="pad")
+    ends = np.cumsum(lengths)
+    expected = []
+    for end, length in zip(ends, lengths, strict=True):
+        first = int(end - length)
+        whole = max(0, length - frames * stride + 1)
+        expected += [(first + i, end - 1) for i in range(whole or (length > stride))]
+    every = np.arange(index.count)
+    rows = zip(index.first_rows(every).tolist(), index.last_rows(every).tolist(), strict=True)
+    assert list(rows) == expected
+    assert index.short_episodes == sum(n < frames * stride and n <= stride for n in lengths)
+    assert index.padded_episodes == sum(stride < n < frames * stride for n in lengths)
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [("start", 30), ("length", 99), ("length", 0), ("start", -1), ("shard", 3), ("shard", -1)],
+)
+def test_an_episode_outside_its_shard_is_refused(entry: str, value: int) -> None:
+    broken = fake([20, 15, 9])
+    getattr(broken.index("train"), entry)[1] = value
+    with pytest.raises(ShardError, match="puts episode 1 at rows"):
+        WindowIndex.of(broken, "train", 4)
+
+
+def test_a_split_without_shards_has_no_windows() -> None:
+    empty = np.zeros(0, np.int64)
+    nothing = fake([5])
+    nothing.row_groups, nothing.index = (
+        lambda split: [],
+        lambda split: EpisodeIndex(empty, empty, empty, empty),
+    )
+    index = WindowIndex.of(nothing, "val", 4)
+    assert index.count == 0 and len(index.units()) == 0
