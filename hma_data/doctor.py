@@ -21,6 +21,7 @@ from hma_data.sources.base import SAMPLE, Inspection, detect, open_source
 from hma_data.sources.findings import SEVERITIES, Finding, Severity
 from hma_data.sources.survey import sampled
 from hma_data.spec import Camera
+from hma_data.store import place
 
 WINDOW = 12  # frames of the model's window, by default
 LOOKS = ("blank", "still", "colour", "size")  # checks of pictures, which matter for cameras that are used
@@ -37,11 +38,18 @@ def examine(target: str, embodiment: str | None = None, sample: int = SAMPLE) ->
     Raises:
         RegistryError: no such embodiment.
     """
-    if (Path(target) / "manifest.json").is_file():
-        found = list(_shard_set(Path(target)))
+    if _is_shard_set(target):
+        found = list(_shard_set(place(target)))
     else:
         found = list(_recording(target, find(embodiment) if embodiment else None, sample))
     return sorted(found, key=lambda finding: -SEVERITIES.index(finding.severity))
+
+
+def _is_shard_set(target: str) -> bool:
+    try:
+        return (place(target) / "manifest.json").is_file()
+    except HMAError:
+        return False  # a source's own schemes
 
 
 # -- recordings
@@ -92,7 +100,11 @@ def _as_stated(camera: Camera, shape: tuple[int, ...], swapped: str | None) -> I
 
 def _episodes(uri: str, robot: Embodiment, sample: int, inspection: Inspection) -> Iterator[Finding]:
     source = open_source(robot.source.format)
-    names = source.episode_ids(uri)
+    try:
+        names = [ref.id for ref in source.index(uri, robot)]
+    except HMAError as fault:
+        yield Finding("usable", "error", f"none of its episodes: {fault.fault}")
+        return
     chosen = [names[i] for i in sampled(len(names), sample)]
     refused: Counter[str] = Counter()
     clips: list[Clip] = []

@@ -46,6 +46,10 @@ class StorageAwayError(SourceError):
     """Storage did not answer, however often it was asked: no fault of what is recorded there."""
 
 
+class StorageError(HMAError):
+    """A store refuses what is asked of it: no access, no such bucket, no room."""
+
+
 class EpisodeError(HMAError):
     """One episode of a readable recording is bad: it goes to quarantine, the job goes on."""
 

@@ -13,6 +13,7 @@ from hma_data.errors import OutputError
 from hma_data.plan import Plan, ShardUnit, differences, digest, pack, shard_size
 from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest
 from hma_data.sources.base import EpisodeRef
+from hma_data.store import parquet_input
 
 _OF_THE_CUT = ("recording", "shards", "hash", "extends")
 
@@ -44,7 +45,7 @@ def extended(out: Path, base: Manifest, plan: Plan, shard_frames: int | None) ->
             f"cannot be extended; different: {differences(plan.facts, base.plan)}",
             "convert with the same settings, or choose another --out",
         )
-    known = pq.read_table(out / EPISODES, columns=["id", "fingerprint", "split"]).to_pydict()
+    known = pq.read_table(parquet_input(out / EPISODES), columns=["id", "fingerprint", "split"]).to_pydict()
     fingerprints = dict(zip(known["id"], known["fingerprint"], strict=True))
     refused = {json.loads(line)["id"] for line in (out / QUARANTINE).read_text("utf-8").splitlines()}
     placed = ((index, ref, unit.split) for unit in plan.units for index, ref in unit.episodes)

@@ -24,6 +24,7 @@ from hma_data.shards.schema import (
     token_column,
 )
 from hma_data.stats import Stats
+from hma_data.store import parquet_file, parquet_input
 
 REMAKE = "delete it and run the same hma convert again"
 KNOWN = {"action": "action_known", "state": "state_known"}  # bool columns, where values can be missing
@@ -128,7 +129,7 @@ def _column_problems(path: Path, manifest: Manifest) -> list[str]:
         len(manifest.cameras),
         mask_columns(embodiment),
     )
-    actual = pq.read_schema(path)
+    actual = pq.read_schema(parquet_input(path))
     if actual.equals(expected, check_metadata=False):
         return []
     wrong = [f"{column.name} {column.type}" for column in actual if column not in list(expected)]
@@ -173,7 +174,7 @@ def _read_rows(path: Path, manifest: Manifest, found: list[str]) -> dict[str, ND
     name = token_column(manifest.tokenizer)[0]
     size = manifest.tokenizer.vocab_size
     parts: dict[str, list[NDArray[Any]]] = {}
-    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+    with parquet_file(path, page_checksum_verification=True) as file:
         columns = file.schema_arrow.names
         for group in range(file.metadata.num_row_groups):
             table = file.read_row_group(group, use_threads=False)

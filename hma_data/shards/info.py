@@ -26,7 +26,7 @@ def describe(folder: Path) -> dict[str, Any]:
     rows = sum(split["rows"] for split in manifest.splits.values())
     row_hz = robot.rate_hz / manifest.frame_stride
     return {
-        "folder": str(folder),
+        "folder": str(shards.folder),
         "embodiment": {
             "id": robot.id,
             "robot": robot.robot,

@@ -22,7 +22,9 @@ from hma_data.files import atomic_path, file_sha256, write_atomic
 from hma_data.shards.schema import SCHEMA_VERSION, EpisodeRow, Footer, Refused, read_footer
 from hma_data.shards.wellformed import check_plan, check_spec, check_splits, check_stats, is_count
 from hma_data.stats import Stats
+from hma_data.store import is_remote, place
 from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.yaml_io import decode_yaml, parse_yaml
 
 MANIFEST, EPISODES, QUARANTINE, EMBODIMENT = (
     "manifest.json",
@@ -160,6 +162,7 @@ class Manifest:
         Raises:
             ShardError: there is none, or it is damaged.
         """
+        folder = place(folder)
         path = folder / MANIFEST
         if not path.is_file():
             raise ShardError(
@@ -194,6 +197,19 @@ class Manifest:
             raise ShardError(
                 path, f"is damaged: {said}", f"hma shards restat {folder} writes it anew from the shards"
             ) from fault
+
+
+def stored_embodiment(folder: Path) -> Embodiment:
+    """The embodiment.yaml of a shard set.
+
+    Raises:
+        RegistryError: it is damaged.
+    """
+    path = folder / EMBODIMENT
+    if not is_remote(path):
+        return Embodiment.load(path)
+    text = decode_yaml(path.read_bytes(), path)
+    return Embodiment.from_values(parse_yaml(text, str(path)), str(path))
 
 
 def seal_problem(text: bytes) -> str:

@@ -7,7 +7,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from hma_data.errors import ShardError
-from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest
+from hma_data.shard_cache import kept_shard, limit_bytes
+from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
 from hma_data.shards.schema import mask_columns, to_numpy, token_column
+from hma_data.store import RangeFile, RemotePath, parquet_input, place
 
 Ints = NDArray[np.int64]
 
@@ -42,15 +44,24 @@ class EpisodeIndex:
 
 
 class ShardSet:
-    """A folder that `hma convert` wrote.
+    """A folder that `hma convert` wrote, here or in a store (`s3://bucket/set`).
 
     Opening it reads the manifest only; episodes and rows are read when asked for.
+
+    Args:
+        folder: path or URI.
+        cache: of a set in a store, keep whole shards on this machine while they fit; else read by ranges.
+
+    Raises:
+        ShardError: there is none, or its manifest is damaged.
+        StorageError: the store refuses to read it.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
-        if not self.folder.is_dir():
+    def __init__(self, folder: str | Path, cache: bool = True) -> None:
+        self.folder = place(folder)
+        if not (self.folder / MANIFEST).is_file() and not self.folder.is_dir():
             raise ShardError(self.folder, "is not a folder", "give the --out of an hma convert")
+        self._cache = cache
         self.manifest = Manifest.load(self.folder)
         self.embodiment = self.manifest.embodiment
         self.spec = self.manifest.tokenizer
@@ -69,7 +80,7 @@ class ShardSet:
         """
         path = self.folder / EPISODES
         try:
-            return pq.read_table(path)
+            return pq.read_table(parquet_input(path))
         except (OSError, pa.ArrowException) as fault:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
 
@@ -121,13 +132,33 @@ class ShardSet:
         """
         path = self.folder / shard
         try:
-            with pq.ParquetFile(path, pre_buffer=False) as file:
+            with self._opened(shard) as file:
                 table = file.read_row_groups(list(row_groups), columns=list(columns), use_threads=False)
         except (OSError, pa.ArrowException) as fault:
             raise ShardError(
                 path, f"cannot be read: {fault}", "hma shards verify tells what is damaged"
             ) from fault
         return {name: to_numpy(table[name]) for name in columns}
+
+    def _opened(self, shard: str) -> pq.ParquetFile:
+        path = self.folder / shard
+        if not isinstance(path, RemotePath):
+            return pq.ParquetFile(path, pre_buffer=False)
+        listed = self._listed.get(shard)
+        if listed is None:
+            raise ShardError(path, "is not in the manifest", "hma shards verify tells what is damaged")
+        whole = sum(item.bytes for item in self._listed.values())
+        if self._cache and whole <= limit_bytes() and (kept := kept_shard(path, listed.sha256, listed.bytes)):
+            return pq.ParquetFile(kept, pre_buffer=False)
+        return pq.ParquetFile(
+            RangeFile(path, listed.bytes),
+            pre_buffer=True,
+            metadata=_footer(path, listed.bytes, listed.sha256),
+        )
+
+    @cached_property
+    def _listed(self) -> dict[str, ShardFile]:
+        return {shard.path: shard for shard in self.manifest.shards}
 
     def episode_rows(
         self, episode_index: int, columns: Sequence[str] | None = None
@@ -152,6 +183,12 @@ class ShardSet:
             if self.spec.kind == "discrete"
             else rows.reshape(-1, self.spec.channels or 1, h, w)
         )
+
+
+@lru_cache(maxsize=64)
+def _footer(path: RemotePath, size: int, sha256: str) -> pq.FileMetaData:
+    """Of a shard in a store: asked for once, while its sha256 stays."""
+    return pq.read_metadata(RangeFile(path, size))
 
 
 class EpisodeReader:

@@ -26,9 +26,11 @@ from hma_data.shards.manifest import (
     Manifest,
     derive,
     seal_problem,
+    stored_embodiment,
 )
 from hma_data.shards.schema import Footer, read_footer
 from hma_data.shards.verify import check_rows
+from hma_data.store import parquet_input, place
 from hma_data.tokenizers.base import TokenizerSpec
 
 AGAIN = "run the same hma convert again"
@@ -48,6 +50,7 @@ def restat(
     Raises:
         ShardError: a shard is missing or damaged, or nothing tells whether all are there; nothing is written.
     """
+    folder = place(folder)
     if not folder.is_dir():
         raise ShardError(folder, "is not a folder", "give the --out of an hma convert")
     with locked(folder):
@@ -106,7 +109,7 @@ def _as_found(folder: Path) -> Found:
     gapless = all(found == list(range(len(found))) for found in numbers)
     if not gapless or not (_planned(names, footers, plan) or _listed(folder, footers, source)):
         raise ShardError(folder, "nothing tells whether all its shards are there", AGAIN)
-    embodiment = Embodiment.load(folder / EMBODIMENT)
+    embodiment = stored_embodiment(folder)
     if embodiment.digest != plan.get("embodiment_hash"):
         raise ShardError(folder / EMBODIMENT, "is not the embodiment the shards were made with", AGAIN)
     return names, plan, source, embodiment
@@ -124,7 +127,7 @@ def _listed(folder: Path, footers: list[Footer], source: str) -> bool:
     for footer in footers:
         gathered.add(footer)
     try:
-        return bool(pq.read_table(folder / EPISODES).equals(gathered.episodes()))
+        return bool(pq.read_table(parquet_input(folder / EPISODES)).equals(gathered.episodes()))
     except (OSError, pa.ArrowException):
         return False
 
@@ -133,7 +136,9 @@ def _source(folder: Path, footers: list[Footer]) -> str:
     """The URI the recordings came from: of files beside the shards, which do not state it."""
     own = {row.episode_index for footer in footers for row in footer.episodes if not row.source}
     try:
-        for row in pq.read_table(folder / EPISODES, columns=["episode_index", "source"]).to_pylist():
+        for row in pq.read_table(
+            parquet_input(folder / EPISODES), columns=["episode_index", "source"]
+        ).to_pylist():
             if row["episode_index"] in own:
                 return str(row["source"])
     except (OSError, pa.ArrowException):

@@ -17,6 +17,7 @@ from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
 from hma_data.shards.wellformed import check_fields, check_numbers, check_plan
 from hma_data.stats import Stats
+from hma_data.store import parquet_input
 from hma_data.tokenizers.base import TokenizerSpec
 
 SCHEMA_VERSION = 1
@@ -244,7 +245,7 @@ def read_footer(path: Any, where: str) -> tuple[Footer, list[int]]:
         ShardError: not a whole parquet file, or not a shard.
     """
     try:
-        metadata = pq.read_metadata(path)
+        metadata = pq.read_metadata(parquet_input(path))
     except (pa.ArrowInvalid, OSError) as fault:
         raise ShardError(
             where, f"is not a whole parquet file: {fault}", "delete it and convert again"

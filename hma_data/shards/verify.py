@@ -13,7 +13,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from hma_data.embodiment import Embodiment
 from hma_data.engines.local import usable_cores
 from hma_data.errors import HMAError
 from hma_data.files import PART, file_sha256
@@ -29,8 +28,10 @@ from hma_data.shards.manifest import (
     Manifest,
     seal_problem,
     split_totals,
+    stored_embodiment,
 )
 from hma_data.stats import Stats
+from hma_data.store import parquet_input, place
 
 BESIDE = {"README.md", ".gitattributes"}  # what a hub adds
 OnProgress = Callable[[int, int], None]
@@ -50,6 +51,7 @@ def verify(
         quick: sizes and footers only: seconds for any set, but a flipped bit in a shard stays unseen.
         on_progress: called with (bytes checked, bytes in all) after each shard.
     """
+    folder = place(folder)
     restat = f"hma shards restat {folder} writes it anew from the shards"
     try:
         manifest = Manifest.load(folder)
@@ -133,7 +135,7 @@ def _other_files(folder: Path, manifest: Manifest) -> Iterator[str]:
                 yield f"{folder / MANIFEST}: states no sha256 of {name} — {remedy}"
             elif file_sha256(path) != manifest.files[name]:
                 yield f"{path}: its bytes changed since the manifest was written (sha256 differs) — {remedy}"
-            elif name == EMBODIMENT and Embodiment.load(path) != manifest.embodiment:
+            elif name == EMBODIMENT and stored_embodiment(folder) != manifest.embodiment:
                 yield f"{path}: is another embodiment than the manifest's — {remedy}"
         except FileNotFoundError:
             yield f"{path}: is missing — {remedy}"
@@ -150,7 +152,7 @@ def _set_problems(
     expected = gathered.episodes()
     yield from _episode_problems(folder, expected)
     with suppress(OSError, pa.ArrowException):  # unreadable is unlike its sha256, which was said already
-        if not pq.read_table(folder / EPISODES).equals(expected):
+        if not pq.read_table(parquet_input(folder / EPISODES)).equals(expected):
             yield f"{folder / EPISODES}: differs from the shards' footers — {restat}"
     with suppress(OSError):
         if (folder / QUARANTINE).read_bytes() != gathered.quarantine().encode():

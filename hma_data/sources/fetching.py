@@ -51,10 +51,10 @@ def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
         except HMAError:
             raise
         except Exception as fault:  # file systems raise what they like
-            if turn == tries - 1 or not _may_pass(fault):
-                kind = StorageAwayError if _may_pass(fault) else SourceError
-                raise kind(path, f"cannot be read: {_said(fault)}", _remedy(fault)) from fault
-            log.info("%s: %s; trying again", path, _said(fault))
+            if turn == tries - 1 or not may_pass(fault):
+                kind = StorageAwayError if may_pass(fault) else SourceError
+                raise kind(path, f"cannot be read: {said(fault)}", _remedy(fault)) from fault
+            log.info("%s: %s; trying again", path, said(fault))
             time.sleep(FIRST_PAUSE_S * 3**turn)
     raise AssertionError("a try returns or raises")
 
@@ -127,7 +127,8 @@ def _status(fault: BaseException) -> int:
     return 0
 
 
-def _may_pass(fault: BaseException) -> bool:
+def may_pass(fault: BaseException) -> bool:
+    """Whether what a remote file system raised may be gone on the next try."""
     if isinstance(fault, (*ABSENT, PermissionError, ImportError)):
         return False
     if status := _status(fault):
@@ -136,16 +137,28 @@ def _may_pass(fault: BaseException) -> bool:
         return True
     names = {kind.__name__ for kind in type(fault).__mro__}
     return bool(
-        names & {"ClientConnectionError", "ClientPayloadError", "EndpointConnectionError", "ReadTimeoutError"}
+        names
+        & {
+            "ClientConnectionError",  # aiohttp
+            "ClientPayloadError",
+            "ConnectTimeoutError",  # botocore
+            "EndpointConnectionError",
+            "HTTPClientError",
+            "ReadTimeoutError",
+            "ResponseParserError",
+            "IncompleteRead",
+            "TransportError",  # google-auth, httpx
+        }
     )
 
 
-def _said(fault: BaseException) -> str:
+def said(fault: BaseException) -> str:
+    """An exception in one line."""
     text = " ".join(str(fault).split())
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
 def _remedy(fault: BaseException) -> str:
-    if _may_pass(fault):
+    if may_pass(fault):
         return "the network failed again and again; run it again later, it continues where it was"
     return "check the path and your access to it"
