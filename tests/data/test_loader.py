@@ -2,13 +2,10 @@
 
 from itertools import islice
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from hma_data.convert import convert
 from hma_data.embodiment import Embodiment
@@ -17,7 +14,6 @@ from hma_data.loader import Batch, MixtureDataset, WindowDataset
 from hma_data.plan import Settings
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
-from hma_data.windows import WindowIndex
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 FRAMES = 4
@@ -156,33 +152,85 @@ def test_one_embodiment_twice_is_refused(sets: list[Path]) -> None:
         MixtureDataset([sets[0], sets[0]], 4, FRAMES)
 
 
-@given(st.lists(st.integers(1, 30), min_size=1, max_size=20), st.integers(1, 6), st.integers(1, 3))
-@settings(max_examples=60, deadline=None)
-def test_window_arithmetic_equals_counting(lengths: list[int], frames: int, stride: int) -> None:
-    class Fake:
-        row_stride = stride
-        manifest = SimpleNamespace(cameras=["top"])
+def test_strided_rows_give_the_windows_of_all_rows(tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", range(20, 31))
+    arm = Embodiment.from_yaml(ARM_YAML)
+    made = {}
+    for frames in ("all", "strided"):
+        settings = Settings(frames=frames, val_fraction=0)  # type: ignore[arg-type]
+        convert(arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / frames, settings=settings)
+        windows = WindowDataset(tmp_path / frames, "train", FRAMES)
+        made[frames] = windows.batch(range(len(windows)))
+    of_all = {(int(e), int(f)): i for i, (e, f) in enumerate(zip(made["all"].episode, made["all"].frame))}
+    grid = made["strided"]
+    places = [of_all[int(e), 2 * int(f)] for e, f in zip(grid.episode, grid.frame, strict=True)]
+    assert len(places) == sum((n // 2) - FRAMES + 1 for n in range(20, 31))
+    assert torch.equal(grid.tokens, made["all"].tokens[places])
+    assert torch.equal(grid.actions, made["all"].actions[places])
+    mixed = next(iter(MixtureDataset([tmp_path / "strided"], 5, FRAMES)))
+    assert mixed.actions.shape == (5, FRAMES, 6)
 
-        def row_groups(self, split):
-            groups, rows = [], sum(lengths)
-            while rows:
-                groups.append(min(7, rows))
-                rows -= groups[-1]
-            return [tuple(groups)]
 
-        def index(self, split):
-            from hma_data.shards.reader import EpisodeIndex
+def test_every_camera_gives_its_own_windows(tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [12, 9])
+    settings = Settings(cameras=("side", "top"), val_fraction=0)
+    convert(
+        Embodiment.from_yaml(ARM_YAML), str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "out",
+        settings=settings,
+    )  # fmt: skip
+    windows = WindowDataset(tmp_path / "out", "train", FRAMES)
+    batch = windows.batch(range(len(windows)))
+    assert len(windows) == 2 * (5 + 2)
+    by_camera = [batch.tokens[batch.camera == camera] for camera in (0, 1)]
+    order = {0: "side", 1: "top"}
+    colour = {"top": batch.frame[batch.camera == 1] % 16, "side": batch.frame[batch.camera == 0] % 16}
+    for camera, tokens in enumerate(by_camera):
+        digits = [tokens // 256, tokens // 16 % 16, tokens % 16]  # blue, green, red
+        assert torch.equal(digits[1][:, 0, 0, 0], colour[order[camera]])  # green counts frames in both
+        other = digits[0] if order[camera] == "top" else digits[2]
+        assert (other == 0).all()  # top has no blue, side (its mirror) no red
+    mixed = next(iter(MixtureDataset([tmp_path / "out"], 14, FRAMES, lanes=1)))
+    assert set(mixed.camera.tolist()) == {0, 1}
 
-            size = np.array(lengths, np.int64)
-            starts = np.concatenate([[0], np.cumsum(size)[:-1]])
-            return EpisodeIndex(np.arange(len(size)), np.zeros(len(size), np.int64), starts, size)
 
-    index = WindowIndex.of(Fake(), "train", frames, stride)
-    starts, row = [], 0
-    for length in lengths:
-        starts += list(range(row, row + max(0, length - frames * stride + 1)))
-        row += length
-    assert index.count == len(starts)
-    np.testing.assert_array_equal(index.first_rows(np.arange(len(starts))), starts)
-    expected = [sum(s < edge for s in starts) for edge in index.edges]
-    np.testing.assert_array_equal(index.unit_first, expected)
+def test_short_episodes_are_padded_with_their_last_frame_and_masked(tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [2, 3, 5, 20])
+    settings = Settings(val_fraction=0)
+    out = tmp_path / "out"
+    convert(
+        Embodiment.from_yaml(ARM_YAML), str(tmp_path / "toy.hdf5"), BlockTokenizer(), out, settings=settings
+    )
+    windows = WindowDataset(out, "train", FRAMES, short="pad")
+    assert (windows.index.short_episodes, windows.index.padded_episodes) == (1, 2)
+    batch = windows.batch([0, 1, 2])
+    assert batch.episode.tolist() == [1, 2, 3]
+    assert batch.frame_mask.tolist() == [[True, True, False, False], [True, True, True, False], [True] * 4]
+    assert batch.action_mask.tolist() == [[True, False, False, False], [True, True, False, False], [True] * 4]
+    rows = ShardSet(out).episode_rows(1, ["tokens", "action"])
+    np.testing.assert_array_equal(batch.tokens[0].reshape(4, -1), rows["tokens"][[0, 2, 2, 2]])
+    np.testing.assert_array_equal(batch.actions[0].reshape(8, 3)[:3], rows["action"])
+    assert not batch.actions[0].reshape(8, 3)[3:].any()
+    seen = list(islice(MixtureDataset([out], 5, FRAMES, short="pad", lanes=1), 6))
+    assert {int(e) for b in seen for e in b.episode} == {1, 2, 3}
+    assert WindowDataset(out, "train", FRAMES)[0].frame_mask is None
+
+
+def test_windows_of_an_episode_longer_than_a_row_group_are_whole(tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [90])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(writer, "ROW_GROUP", 16)
+        settings = Settings(val_fraction=0)
+        arm = Embodiment.from_yaml(ARM_YAML)
+        convert(arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "out", settings=settings)
+    shards = ShardSet(tmp_path / "out")
+    rows = shards.episode_rows(0, ["tokens", "action"])
+    windows = WindowDataset(shards, "train", 10)  # 20 rows: each window lies in two or three row groups
+    batch = windows.batch(range(len(windows)))
+    stream = next(iter(MixtureDataset([shards], 71, 10, lanes=1)))
+    for found in (batch, stream):
+        assert sorted(found.frame.tolist()) == list(range(71))
+        for i, first in enumerate(found.frame.tolist()):
+            np.testing.assert_array_equal(
+                found.tokens[i].reshape(10, -1), rows["tokens"][first : first + 20 : 2]
+            )
+            np.testing.assert_array_equal(found.actions[i].reshape(20, 3), rows["action"][first : first + 20])
