@@ -4,9 +4,9 @@ An Episode is lazy: it knows its times and values, and decodes a picture when as
 T frames, A values a sample; times are float64 seconds, pictures uint8 RGB.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,15 @@ class Stream(Protocol):
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """Pictures (n, H, W, 3) RGB of those indices, decoding only them."""
+        ...
+
+
+@runtime_checkable
+class OneByOne(Protocol):
+    """A Stream that can give its pictures one by one, so that large ones are never held together."""
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+        """(H, W, 3) RGB of each of those indices, in that order; it is there until the next is asked for."""
         ...
 
 
@@ -160,6 +169,10 @@ class Pictures:
                 raise EpisodeError("", f"pictures change size within the episode: {sizes}")
             pictures[place] = picture
         return pictures
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+        """See OneByOne."""
+        return (self._decode(int(index)) for index in indices)
 
 
 class Decode(Protocol):

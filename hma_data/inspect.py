@@ -56,7 +56,12 @@ def _fit(
     """What the embodiment makes of the first episode it can read; why it cannot goes into `found`."""
     facts = {"embodiment": f"{robot.id}, {robot.action_dim} action dims"}
     faults: list[HMAError] = []
-    for name in source.episode_ids(uri)[:TRIED]:
+    names: list[str] = []
+    try:
+        names = [ref.id for ref in source.index(uri, robot)]
+    except HMAError as fault:
+        faults.append(fault)
+    for name in names[:TRIED]:
         try:
             clip = to_clip(source.read(uri, name, robot), robot)
             pictures = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))

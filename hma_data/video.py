@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episode import Pictures, Stream
+from hma_data.episode import OneByOne, Stream
 from hma_data.errors import EpisodeError, MissingDependencyError
 from hma_data.spec import Camera
 
@@ -78,8 +78,14 @@ def claimed_size(head: bytes) -> tuple[int, int]:
     return 0, 0
 
 
-def prepare(frames: Images, camera: Camera, size: int, resize_filter: Filter = "area") -> Images:
-    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, flip, rotation, crop, resize by its YAML."""
+def prepare(
+    frames: Images, camera: Camera, size: int, resize_filter: Filter = "area", out: Images | None = None
+) -> Images:
+    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, flip, rotation, crop, resize by its YAML.
+
+    Args:
+        out: (N, size, size, 3) where they are put; new memory by default.
+    """
     if camera.color == "bgr":
         frames = frames[..., ::-1]
     if camera.flip:
@@ -94,7 +100,7 @@ def prepare(frames: Images, camera: Camera, size: int, resize_filter: Filter = "
                 f"crop {list(camera.crop)} leaves the picture of {frames.shape[2]}×{frames.shape[1]}",
             )
         frames = frames[:, y : y + height, x : x + width]
-    return resize(frames, size, camera.resize, resize_filter)
+    return resize(frames, size, camera.resize, resize_filter, out)
 
 
 def prepared(
@@ -102,18 +108,23 @@ def prepared(
 ) -> Images:
     """Pictures of a stream -> (n, size, size, 3) RGB, as `prepare` makes them of `stream.frames`.
 
-    Pictures that are kept one by one are made square one by one: large ones are never held together.
+    Pictures that can be had one by one are made square one by one: large ones are never held together.
     """
-    if not isinstance(stream, Pictures) or not len(indices):
+    if not isinstance(stream, OneByOne) or not len(indices):
         return prepare(stream.frames(indices), camera, size, resize_filter)
-    out = _empty(len(indices), size)
-    for place, index in enumerate(indices):
-        out[place] = prepare(stream.frames([index]), camera, size, resize_filter)[0]
-    return out
+    distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
+    squares = _empty(len(distinct), size)
+    for place, picture in enumerate(stream.each(distinct)):
+        prepare(picture[None], camera, size, resize_filter, squares[place : place + 1])
+    return squares if np.array_equal(inverse, np.arange(len(squares))) else squares[inverse]
 
 
 def resize(
-    frames: Images, size: int, rule: str = "short_side_crop", resize_filter: Filter = "area"
+    frames: Images,
+    size: int,
+    rule: str = "short_side_crop",
+    resize_filter: Filter = "area",
+    out: Images | None = None,
 ) -> Images:
     """(N, H, W, 3) -> (N, size, size, 3).
 
@@ -121,6 +132,7 @@ def resize(
         rule: short_side_crop (short side to `size`, centre crop), letterbox (long
             side to `size`, black borders) or stretch.
         resize_filter: area averages when shrinking and is linear when enlarging; linear is always linear.
+        out: (N, size, size, 3) where they are put; new memory by default.
     """
     cv2 = opencv()
     height, width = frames.shape[1:3]
@@ -130,7 +142,11 @@ def resize(
         frames = frames[:, top : top + side, left : left + side]
         height = width = side
     if (height, width) == (size, size):
-        return np.ascontiguousarray(frames)
+        if out is None:
+            return np.ascontiguousarray(frames)
+        out[:] = frames
+        return out
+    out = _empty(len(frames), size) if out is None else out
     if rule == "letterbox":
         scale = size / max(height, width)
         inner_h, inner_w = max(1, round(height * scale)), max(1, round(width * scale))
@@ -138,8 +154,8 @@ def resize(
         inner_h = inner_w = size
     shrinks = inner_h < height or inner_w < width
     interpolation = cv2.INTER_AREA if resize_filter == "area" and shrinks else cv2.INTER_LINEAR
-    bordered = (inner_h, inner_w) != (size, size)
-    out = np.zeros((len(frames), size, size, 3), np.uint8) if bordered else _empty(len(frames), size)
+    if (inner_h, inner_w) != (size, size):
+        out[:] = 0
     top, left = (size - inner_h) // 2, (size - inner_w) // 2
     for frame, square in zip(frames, out):
         inner = square[top : top + inner_h, left : left + inner_w]

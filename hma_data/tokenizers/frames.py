@@ -104,7 +104,7 @@ def recording_frames(
     from hma_data.sources.base import open_source
 
     source = open_source(embodiment.source.format)
-    ids = source.episode_ids(uri)
+    ids = [ref.id for ref in source.index(uri, embodiment)]
     spread = np.unique(np.linspace(0, len(ids) - 1, min(EPISODES, len(ids))).astype(int)).tolist()
     others = [index for index in range(len(ids)) if index not in set(spread)]
     read, fault = 0, "it holds no episode"

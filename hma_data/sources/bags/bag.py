@@ -10,10 +10,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from hma_data.errors import EpisodeError
+from hma_data.sources.bags.chunks import ChunkCache
 from hma_data.sources.bags.container import (
     MAX_CHUNK,
     Channel,
-    ChunkCache,
     Container,
     Data,
     Record,
@@ -125,7 +125,7 @@ class Bag:
         return record._replace(data=self._unpack(record.data)) if self._message_packed else record
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
-        """The data of the messages at those places, in that order."""
+        """The data of the messages at those places, in that order; each until the next is asked for."""
         files = self.files()
         for number, group in groupby(places, key=lambda place: place.file):
             for data in files[number].payloads([(place.first, place.second) for place in group]):

@@ -9,8 +9,8 @@ between calls.
 import bz2
 import sqlite3
 import struct
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +19,6 @@ from typing import BinaryIO, NamedTuple, Protocol
 from hma_data.errors import EpisodeError
 
 MAX_CHUNK = 512 << 20  # bytes; a chunk that unpacks to more is a bomb or an error
-CACHED_BYTES = 64 << 20
 FOREVER = 2**64
 HEAD = 64  # bytes: the stamp of a message is within them
 FAULTS = (
@@ -107,7 +106,7 @@ class Container(Protocol):
         ...
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
-        """The data of the messages at those places."""
+        """The data of the messages at those places; each is there until the next is asked for."""
         ...
 
 
@@ -128,29 +127,76 @@ def damaged(path: Path, fault: str) -> EpisodeError:
     )
 
 
-def decompress(codec: str, data: Data, size: int) -> bytes:
-    """The `size` bytes that were packed.
+def decompress(codec: str, data: Data, into: memoryview) -> None:
+    """Fills `into` with what was packed.
 
     Raises:
-        ValueError: another codec, another size, or more than MAX_CHUNK.
+        ValueError: another codec, or another size.
+    """
+    if codec in ("", "none"):
+        unpacked: Data = data
+    elif codec == "zstd":
+        _unzstd_into(data, into)
+        return
+    else:
+        unpacked = _unpacked(codec, data, len(into) + 1)
+    if len(unpacked) != len(into):
+        raise ValueError(f"a chunk unpacks to {len(unpacked):,} bytes where {len(into):,} are announced")
+    into[:] = unpacked
+
+
+def decompress_begin(codec: str, data: Data, into: memoryview) -> None:
+    """Fills `into` with the first bytes of what was packed; the rest is not looked at.
+
+    Raises:
+        ValueError: another codec, or fewer bytes.
+    """
+    if codec == "zstd":
+        _unzstd_into(data, into, whole=False)
+        return
+    unpacked = data[: len(into)] if codec in ("", "none") else _unpacked(codec, data, len(into))
+    if len(unpacked) != len(into):
+        raise ValueError(f"a chunk unpacks to {len(unpacked):,} bytes, fewer than its index says")
+    into[:] = unpacked
+
+
+def _unpacked(codec: str, data: Data, limit: int) -> bytes:
+    """Up to `limit` bytes of what was packed by bz2 or lz4."""
+    if codec == "bz2":
+        return bz2.BZ2Decompressor().decompress(data, limit)
+    if codec == "lz4":
+        from lz4.frame import LZ4FrameDecompressor
+
+        unpacked: bytes = LZ4FrameDecompressor().decompress(data, limit)
+        return unpacked
+    raise ValueError(f"chunks packed with {codec!r} cannot be read; none, bz2, lz4 and zstd can")
+
+
+def _unzstd_into(data: Data, into: memoryview, whole: bool = True) -> None:
+    """Fills `into`; `whole`: there must be no more than that, and its checksum is looked at."""
+    import zstandard
+
+    filled = more = 0
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+            while filled < len(into) and (got := stream.readinto(into[filled:])):
+                filled += got
+            more = len(stream.read(1)) if whole else 0
+    except zstandard.ZstdError as fault:
+        raise ValueError(str(fault)) from fault
+    if filled != len(into) or more:
+        raise ValueError(f"a chunk unpacks to {filled + more:,} bytes where {len(into):,} are announced")
+
+
+def checked_size(size: int) -> int:
+    """That size of a chunk.
+
+    Raises:
+        ValueError: it is more than MAX_CHUNK.
     """
     if size > MAX_CHUNK:
         raise ValueError(f"a chunk claims {size:,} bytes, more than {MAX_CHUNK:,}")
-    if codec in ("", "none"):
-        unpacked = data if isinstance(data, bytes) else bytes(data)
-    elif codec == "bz2":
-        unpacked = bz2.BZ2Decompressor().decompress(data, size + 1)
-    elif codec == "lz4":
-        from lz4.frame import LZ4FrameDecompressor
-
-        unpacked = LZ4FrameDecompressor().decompress(data, size + 1)
-    elif codec == "zstd":
-        unpacked = unzstd(data, size)
-    else:
-        raise ValueError(f"chunks packed with {codec!r} cannot be read; none, bz2, lz4 and zstd can")
-    if len(unpacked) != size:
-        raise ValueError(f"a chunk unpacks to {len(unpacked):,} bytes where {size:,} are announced")
-    return unpacked
+    return size
 
 
 def unzstd(data: Data, limit: int) -> bytes:
@@ -213,23 +259,3 @@ def read_exact(file: BinaryIO, size: int) -> bytes:
     if len(data) != size:
         raise EOFError(f"the file ends {size - len(data):,} bytes before a record does")
     return data
-
-
-class ChunkCache:
-    """The chunks of a bag unpacked last, at most CACHED_BYTES of them (and always one)."""
-
-    def __init__(self) -> None:
-        self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()
-        self._bytes = 0
-
-    def get(self, path: Path, offset: int, load: Callable[[], bytes]) -> bytes:
-        """The chunk at that offset of that file, from `load` where it is not kept."""
-        key = (path, offset)
-        chunk = self._chunks.pop(key, b"")
-        self._bytes -= len(chunk)
-        chunk = chunk or load()
-        self._chunks[key] = chunk
-        self._bytes += len(chunk)
-        while len(self._chunks) > 1 and self._bytes > CACHED_BYTES:
-            self._bytes -= len(self._chunks.popitem(last=False)[1])
-        return chunk

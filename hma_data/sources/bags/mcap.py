@@ -10,27 +10,37 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
+from hma_data.sources.bags.chunks import WORTH, ChunkCache, Take, reach
 from hma_data.sources.bags.container import (
     Channel,
-    ChunkCache,
     Data,
     Place,
     Record,
     Wanted,
     damaged,
-    read_exact,
     reading,
 )
-from hma_data.sources.bags.mcap_index import FOOTER_SIZE, Survey, notes, stated_counts, survey
+from hma_data.sources.bags.mcap_index import (
+    FOOTER_SIZE,
+    Survey,
+    entries,
+    learn_summary,
+    notes,
+    stated_counts,
+    survey,
+)
+from hma_data.sources.bags.mcap_plain import PlainChunks
 from hma_data.sources.bags.mcap_records import (
     FRAME,
     LOOSE,
     MAGIC,
     MESSAGE_HEAD,
+    Ask,
     Declared,
     between,
-    frame,
+    load_begin,
     load_chunk,
+    message,
 )
 from hma_data.sources.bags.pieces import last_before, overlapping
 
@@ -48,11 +58,13 @@ class McapFile:
         self._surveyed: Survey | None = None
         self._notes: dict[str, str] | None = None
         self._checked: set[int] = set()
+        self._told = False  # whether the summary tells every channel
 
     def counts(self) -> Counter[Channel]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
             found = stated_counts(file, self._data_end(file))
+            self._told = found is not None
         if found is None:
             found = Counter(record.channel for record in self.records(Wanted()))
         return found
@@ -62,7 +74,10 @@ class McapFile:
         with reading(self.path), self.path.open("rb") as file:
             end = self._data_end(file)
             if not wanted.bounded:
-                yield from between(file, len(MAGIC), end, Declared(), wanted, self._chunk)
+                declared = Declared()
+                if self._told:
+                    learn_summary(file, end, declared)
+                yield from between(file, len(MAGIC), end, declared, wanted, self._chunk)
                 return
             survey = self._survey(file, end)
             for piece in overlapping(survey.pieces, wanted):
@@ -91,25 +106,33 @@ class McapFile:
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
-            for chunk_at, at in places:
-                if chunk_at == LOOSE:
-                    _, length = frame(file, at)
-                    yield read_exact(file, length)[MESSAGE_HEAD.size :]
-                    continue
-                chunk = self._chunk(file, chunk_at)
-                _, length = FRAME.unpack_from(chunk, at)
-                start = at + FRAME.size
-                yield memoryview(chunk)[start + MESSAGE_HEAD.size : start + length]
+            plain = PlainChunks(file, self._checked)
+            for chunk_offset, at in places:
+                if chunk_offset == LOOSE or plain.has(chunk_offset):
+                    yield plain.message(chunk_offset, at)
+                else:
+                    yield message(self._chunk(file, chunk_offset), at)
 
-    def _chunk(self, file: BinaryIO, at: int) -> bytes:
-        """A chunk, unpacked; its checksum is looked at the first time."""
+    def _chunk(self, file: BinaryIO, at: int, ask: Ask | None = None) -> memoryview:
+        """A chunk, unpacked; its checksum is looked at the first time.
 
-        def load() -> bytes:
-            chunk = load_chunk(file, at, at not in self._checked)
+        Where pictures' heads will do and there is no room to keep it, what is asked for may be all of it.
+        """
+        if ask and ask.wanted.heads and self._told and not self._may_keep(at, ask.head.size):
+            found = entries(file, ask, self._data_end(file))
+            size = reach(found, ask.wanted, ask.head.size, FRAME.size + MESSAGE_HEAD.size) if found else None
+            if size is not None and size < WORTH * ask.head.size:
+                return load_begin(file, at, size, self._chunks.scratch)
+
+        def load(take: Take) -> memoryview:
+            chunk = load_chunk(file, at, take, at not in self._checked)
             self._checked.add(at)
             return chunk
 
         return self._chunks.get(self.path, at, load)
+
+    def _may_keep(self, at: int, size: int) -> bool:
+        return self._chunks.has(self.path, at) or self._chunks.room(size)
 
     def _survey(self, file: BinaryIO, end: int) -> Survey:
         if self._surveyed is None:

@@ -8,6 +8,9 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hma_data.sources.bags.container import FOREVER, Channel, Fields, Wanted, read_exact
 from hma_data.sources.bags.mcap_records import (
     CHANNEL,
@@ -22,6 +25,7 @@ from hma_data.sources.bags.mcap_records import (
     METADATA,
     SCHEMA,
     STATISTICS,
+    Ask,
     Declared,
     between,
     chunk_head,
@@ -155,9 +159,27 @@ def survey(file: BinaryIO, end: int) -> Survey:
         elif opcode == MESSAGE:
             number, log_ns = message_head(read_exact(file, min(length, MESSAGE_HEAD.size)))
             _add_loose(parts, at, at + FRAME.size + length, number, log_ns)
-    _learn_summary(file, end, declared)
+    learn_summary(file, end, declared)
     kinds: dict[frozenset[str], frozenset[str]] = {}
     return Survey([_piece(file, part, declared, kinds) for part in parts], declared, noted)
+
+
+def entries(file: BinaryIO, ask: Ask, end: int) -> dict[str, NDArray[np.uint64]] | None:
+    """Topic -> (n, 2) times and offsets of its messages in a chunk, by the message indexes behind it.
+
+    None where there are none, or of a channel that is not declared.
+    """
+    found: dict[str, list[NDArray[np.uint64]]] = {}
+    for opcode, _, length in frames(file, ask.after, end):
+        if opcode != MESSAGE_INDEX:
+            break
+        fields = Fields(read_exact(file, length))
+        number = fields.number(2)
+        if number not in ask.declared.channels:
+            return None
+        times = np.frombuffer(fields.block(), "<u8").reshape(-1, 2).astype(np.uint64)
+        found.setdefault(ask.declared.channels[number].topic, []).append(times)
+    return {topic: np.concatenate(parts) for topic, parts in found.items()} or None
 
 
 def _add_loose(parts: list[_Part], at: int, end: int, number: int, log_ns: int) -> None:
@@ -170,7 +192,8 @@ def _add_loose(parts: list[_Part], at: int, end: int, number: int, log_ns: int) 
     last.channels.add(number)
 
 
-def _learn_summary(file: BinaryIO, end: int, declared: Declared) -> None:
+def learn_summary(file: BinaryIO, end: int, declared: Declared) -> None:
+    """Takes the schemas and channels that the summary repeats."""
     start = _summary_start(file, end)
     if not start:
         return
@@ -197,8 +220,12 @@ def _unindexed(
 ) -> Piece:
     """A chunk that has to be looked into; its channels may be declared nowhere else."""
     first_ns, last_ns, topics = FOREVER, -1, set()
-    for record in between(file, part.at, part.end, declared, Wanted(), load_chunk):
+    for record in between(file, part.at, part.end, declared, Wanted(), _whole):
         first_ns, last_ns = min(first_ns, record.log_ns), max(last_ns, record.log_ns)
         topics.add(record.channel.topic)
     held = frozenset(topics)
     return Piece(part.at, part.end, first_ns, last_ns, kinds.setdefault(held, held))
+
+
+def _whole(file: BinaryIO, at: int, ask: Ask | None) -> memoryview:
+    return load_chunk(file, at)

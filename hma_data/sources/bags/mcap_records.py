@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from typing import BinaryIO, NamedTuple
 
+from hma_data.sources.bags.chunks import Take
 from hma_data.sources.bags.container import (
     HEAD,
     Channel,
@@ -16,7 +17,9 @@ from hma_data.sources.bags.container import (
     Place,
     Record,
     Wanted,
+    checked_size,
     decompress,
+    decompress_begin,
     read_exact,
 )
 
@@ -25,7 +28,6 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05,
 STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
 FRAME = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-Load = Callable[[BinaryIO, int], bytes]
 LOOSE = -1  # in a place: the message is in no chunk
 CODEC_BYTES = 32  # a codec's name is no longer
 
@@ -68,6 +70,23 @@ class ChunkHead(NamedTuple):
     at: int
     packed: int
 
+    @property
+    def plain(self) -> bool:
+        """Whether its records lie in the file as they are."""
+        return self.codec in ("", "none") and self.packed == self.size
+
+
+class Ask(NamedTuple):
+    """Which messages of a chunk are asked for; `after` is the offset of what follows it in the file."""
+
+    head: ChunkHead
+    after: int
+    declared: Declared
+    wanted: Wanted
+
+
+Load = Callable[[BinaryIO, int, Ask | None], memoryview]
+
 
 def frame(file: BinaryIO, at: int) -> tuple[int, int]:
     """Opcode and length of the record at `at`; the file stands at its content."""
@@ -90,7 +109,8 @@ def frames(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, int, int]]:
 def between(
     file: BinaryIO, at: int, end: int, declared: Declared, wanted: Wanted, load: Load
 ) -> Iterator[Record]:
-    """The wanted messages from offset `at` to `end` of the data section; `load` unpacks a chunk."""
+    """The wanted messages from offset `at` to `end` of the data section; `load` unpacks a chunk, or what is
+    asked of it."""
     for opcode, offset, length in frames(file, at, end):
         if opcode in (DATA_END, FOOTER):
             return
@@ -126,49 +146,88 @@ def chunk_head(file: BinaryIO, length: int) -> ChunkHead:
     return ChunkHead(first_ns, last_ns, size, checksum, codec, at, packed)
 
 
-def load_chunk(file: BinaryIO, at: int, checked: bool = True) -> bytes:
+def _fresh(size: int) -> memoryview:
+    return memoryview(bytearray(size))
+
+
+def load_chunk(file: BinaryIO, at: int, take: Take = _fresh, checked: bool = True) -> memoryview:
     """The records of the chunk at that offset, unpacked, and `checked` against its checksum."""
+    head = chunk_at(file, at)
+    file.seek(head.at)
+    chunk = take(checked_size(head.size))
+    decompress(head.codec, read_exact(file, head.packed), chunk)
+    if checked:
+        check(chunk, head)
+    return chunk
+
+
+def load_begin(file: BinaryIO, at: int, size: int, take: Take) -> memoryview:
+    """The first `size` bytes of a chunk's records; the checksum is not looked at."""
+    head = chunk_at(file, at)
+    file.seek(head.at)
+    chunk = take(size)
+    decompress_begin(head.codec, read_exact(file, head.packed), chunk)
+    return chunk
+
+
+def message(chunk: memoryview, at: int) -> memoryview:
+    """The data of the message at that place of a chunk."""
+    _, length = FRAME.unpack_from(chunk, at)
+    end = at + FRAME.size + length
+    if end > len(chunk):
+        raise ValueError("a record reaches beyond its chunk")
+    return chunk[at + FRAME.size + MESSAGE_HEAD.size : end]
+
+
+def chunk_at(file: BinaryIO, at: int) -> ChunkHead:
+    """The head of the chunk at that offset."""
     opcode, length = frame(file, at)
     if opcode != CHUNK:
         raise ValueError(f"there is no chunk at {at:,}")
-    head = chunk_head(file, length)
-    file.seek(head.at)
-    chunk = decompress(head.codec, read_exact(file, head.packed), head.size)
-    if checked and head.checksum and zlib.crc32(chunk) != head.checksum:
+    return chunk_head(file, length)
+
+
+def check(chunk: Data, head: ChunkHead) -> None:
+    """Looks at the checksum of a chunk's records, where there is one."""
+    if head.checksum and zlib.crc32(chunk) != head.checksum:
         raise ValueError("a chunk's checksum does not fit its content")
-    return chunk
 
 
 def _in_chunk(
     file: BinaryIO, at: int, length: int, declared: Declared, wanted: Wanted, load: Load
 ) -> Iterator[Record]:
     head = chunk_head(file, length)
-    plain = head.codec in ("", "none") and head.packed == head.size
-    if plain and wanted.heads:
+    if head.plain and wanted.heads:
         short = False
         for record in _walk(file, at, head, declared, wanted):
             short = short or record.channel.topic in wanted.heads
             yield record
         if head.checksum and wanted.checked and not short:
-            load(file, at)  # with a picture in it, it will be loaded for that
+            load(file, at, None)  # with a picture in it, it will be loaded for that
         return
-    yield from _in_records(load(file, at), at, declared, wanted)
+    chunk = load(file, at, None if head.plain else Ask(head, at + FRAME.size + length, declared, wanted))
+    yield from _in_records(chunk, head.size, at, declared, wanted)
 
 
-def _in_records(chunk: bytes, chunk_at: int, declared: Declared, wanted: Wanted) -> Iterator[Record]:
-    view, at, size = memoryview(chunk), 0, len(chunk)
-    while at < size:
-        opcode, length = FRAME.unpack_from(view, at)
+def _in_records(
+    chunk: memoryview, size: int, chunk_at: int, declared: Declared, wanted: Wanted
+) -> Iterator[Record]:
+    """The wanted messages of a chunk of that size; of one unpacked in part, those that begin there."""
+    at, known = 0, len(chunk)
+    while at < known and (known == size or at + FRAME.size + MESSAGE_HEAD.size <= known):
+        opcode, length = FRAME.unpack_from(chunk, at)
         start, following = at + FRAME.size, at + FRAME.size + length
         if following > size:
             raise ValueError("a record reaches beyond its chunk")
         if opcode == MESSAGE:
-            number, log_ns = message_head(view[start:following])
+            number, log_ns = message_head(chunk[start:following])
             channel = declared.channel(number)
             if wanted.topic(channel.topic) and wanted.time(log_ns):
-                yield Record(channel, log_ns, view[start + MESSAGE_HEAD.size : following], (chunk_at, at))
-        elif opcode in (SCHEMA, CHANNEL):
-            declared.learn(opcode, view[start:following])
+                if following > known and channel.topic not in wanted.heads:
+                    raise ValueError("an index tells another place of a message")
+                yield Record(channel, log_ns, chunk[start + MESSAGE_HEAD.size : following], (chunk_at, at))
+        elif opcode in (SCHEMA, CHANNEL) and following <= known:
+            declared.learn(opcode, chunk[start:following])
         at = following
 
 

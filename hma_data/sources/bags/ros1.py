@@ -5,24 +5,29 @@ Indexed or not (a recorder that was killed leaves no index), chunks plain, bz2 o
 
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.sources.bags.chunks import WORTH, Buffer, ChunkCache, Take, reach
 from hma_data.sources.bags.container import (
     FOREVER,
     HEAD,
     Channel,
-    ChunkCache,
     Data,
     Fields,
     Place,
     Record,
     Wanted,
+    checked_size,
     damaged,
     decompress,
+    decompress_begin,
     read_exact,
     reading,
 )
@@ -31,6 +36,7 @@ from hma_data.sources.bags.pieces import Piece, last_before, overlapping
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 HEADER_BYTES = 1 << 16  # a record's header is no longer
+MESSAGE_BYTES = 128  # before the data of a message: its header has three short fields
 SAMPLE_BYTES = 12  # an entry of an index record: time, offset
 TIME = struct.Struct("<II")
 Header = dict[str, memoryview]
@@ -63,7 +69,7 @@ class Ros1File:
             channels = index.channels if index else {}
             found = (piece.at for piece in overlapping(index.pieces(), wanted)) if index else None
             for at in found or _scan(file, channels):
-                yield from _in_chunk(file, at, channels, wanted)
+                yield from _in_chunk(file, at, channels, wanted, self._asked)
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """See Container."""
@@ -73,15 +79,35 @@ class Ros1File:
                 index.pieces(),
                 topics,
                 log_ns,
-                lambda piece, wanted: _in_chunk(file, piece.at, index.channels, wanted),
+                lambda piece, wanted: _in_chunk(file, piece.at, index.channels, wanted, self._asked),
             )
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
-            for chunk_at, at in places:
-                chunk = self._chunks.get(self.path, chunk_at, partial(_load_chunk, file, chunk_at))
-                yield _split(memoryview(chunk), at)[1]
+            buffer, heads = Buffer(), dict[int, _ChunkHead]()
+            for offset, at in places:
+                if offset not in heads:
+                    heads = {offset: _chunk_head(file, offset)}
+                if heads[offset].plain:
+                    yield _content(file, heads[offset], at, buffer)
+                else:
+                    yield _split(self._chunk(file, heads[offset]), at)[1]
+
+    def _chunk(self, file: BinaryIO, head: "_ChunkHead") -> memoryview:
+        return self._chunks.get(self.path, head.offset, partial(_load_chunk, file, head))
+
+    def _asked(
+        self, file: BinaryIO, head: "_ChunkHead", channels: dict[int, Channel], wanted: Wanted
+    ) -> memoryview:
+        """A chunk unpacked, or where there is no room to keep it what is wanted of it."""
+        kept = self._chunks.has(self.path, head.offset) or self._chunks.room(head.size)
+        if wanted.heads and not kept:
+            found = _entries(file, head, channels)
+            size = reach(found, wanted, head.size, MESSAGE_BYTES) if found else head.size
+            if size < WORTH * head.size:
+                return _load_begin(file, head, size, self._chunks.scratch)
+        return self._chunk(file, head)
 
     def _survey(self, file: BinaryIO) -> "_Index":
         """The index, made from the chunks where the recorder left none."""
@@ -106,6 +132,24 @@ class Ros1File:
             if at
             else None
         )
+
+
+class _ChunkHead(NamedTuple):
+    """A chunk at `offset`: its content lies at `at`, `packed` bytes that unpack to `size`."""
+
+    offset: int
+    codec: str
+    at: int
+    packed: int
+    size: int
+
+    @property
+    def plain(self) -> bool:
+        """Whether its records lie in the file as they are."""
+        return self.codec == "none"
+
+
+Load = Callable[[BinaryIO, _ChunkHead, dict[int, Channel], Wanted], memoryview]
 
 
 @dataclass
@@ -248,7 +292,7 @@ def _count(info: _ChunkInfo, header: Header, entries: Data) -> None:
 
 def _counted(file: BinaryIO, at: int, channels: dict[int, Channel]) -> _ChunkInfo:
     info = _ChunkInfo(FOREVER, -1, {})
-    for record in _in_chunk(file, at, channels, Wanted()):
+    for record in _in_chunk(file, at, channels, Wanted(), _whole):
         info.first_ns, info.last_ns = min(info.first_ns, record.log_ns), max(info.last_ns, record.log_ns)
         number = next(number for number, channel in channels.items() if channel == record.channel)
         info.counts[number] = info.counts.get(number, 0) + 1
@@ -278,13 +322,17 @@ def _scan(file: BinaryIO, channels: dict[int, Channel]) -> Iterator[int]:
             raise ValueError("a message outside a chunk")
 
 
-def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
-    """Header and content of the record at `at` of a chunk, and where the next one begins."""
+def _split(view: memoryview, at: int, end: int | None = None) -> tuple[memoryview, memoryview, int]:
+    """Header and content of the record at `at` of a chunk, and where the next one begins.
+
+    The chunk ends at `end`; where less of it is there, a content may be cut.
+    """
+    end = len(view) if end is None else end
     parts = []
     for _ in range(2):
         size = int.from_bytes(view[at : at + 4], "little")
         at += 4
-        if at + size > len(view):
+        if at + size > end:
             raise ValueError("a record reaches beyond its chunk")
         parts.append(view[at : at + size])
         at += size
@@ -292,18 +340,24 @@ def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
 
 
 def _in_chunk(
-    file: BinaryIO, chunk_at: int, channels: dict[int, Channel], wanted: Wanted
+    file: BinaryIO, offset: int, channels: dict[int, Channel], wanted: Wanted, load: Load
 ) -> Iterator[Record]:
-    header, size, at = _chunk_head(file, chunk_at)
-    if wanted.heads and bytes(header["compression"]) == b"none":
-        yield from _walk(file, chunk_at, at, at + size, channels, wanted)
+    head = _chunk_head(file, offset)
+    if wanted.heads and head.plain:
+        yield from _walk(file, offset, head.at, head.at + head.packed, channels, wanted)
         return
-    view, at = memoryview(_load_chunk(file, chunk_at)), 0
+    view, at = load(file, head, channels, wanted), 0
     while at < len(view):
-        place = (chunk_at, at)
-        head, content, at = _split(view, at)
-        channel, log_ns = _take(_header(head), content, channels, wanted)
+        place = (offset, at)
+        if len(view) < head.size and len(view) < at + 8 + int.from_bytes(view[at : at + 4], "little"):
+            break  # the rest was not asked for
+        header, content, at = _split(view, at, head.size)
+        if at > len(view) and _number(_header(header), "op") == CONNECTION:
+            break
+        channel, log_ns = _take(_header(header), content, channels, wanted)
         if channel:
+            if at > len(view) and channel.topic not in wanted.heads:
+                raise ValueError("an index tells another place of a message")
             yield Record(channel, log_ns, content, place)
 
 
@@ -339,14 +393,58 @@ def _take(
     return None, 0
 
 
-def _chunk_head(file: BinaryIO, at: int) -> tuple[Header, int, int]:
-    """Header of the chunk at that offset, size and place of its content; the file stands there."""
-    header, size, content_at = _record(file, at)
+def _chunk_head(file: BinaryIO, offset: int) -> _ChunkHead:
+    """Of the chunk at that offset; the file stands at its content."""
+    header, packed, at = _record(file, offset)
     if _number(header, "op") != CHUNK:
-        raise ValueError(f"there is no chunk at {at:,}, where the index says one is")
-    return header, size, content_at
+        raise ValueError(f"there is no chunk at {offset:,}, where the index says one is")
+    codec = str(header["compression"], "ascii")
+    return _ChunkHead(offset, codec, at, packed, packed if codec == "none" else _number(header, "size"))
 
 
-def _load_chunk(file: BinaryIO, at: int) -> bytes:
-    header, size, _ = _chunk_head(file, at)
-    return decompress(str(header["compression"], "ascii"), read_exact(file, size), _number(header, "size"))
+def _content(file: BinaryIO, head: _ChunkHead, at: int, buffer: Buffer) -> memoryview:
+    """The data of the message at that place of a chunk that is not packed, until the buffer's next."""
+    _, size, begin = _record(file, head.at + at)
+    if begin + size > head.at + head.packed:
+        raise ValueError("a record reaches beyond its chunk")
+    return buffer.read(file, size)
+
+
+def _load_chunk(file: BinaryIO, head: _ChunkHead, take: Take) -> memoryview:
+    file.seek(head.at)
+    chunk = take(checked_size(head.size))
+    decompress(head.codec, read_exact(file, head.packed), chunk)
+    return chunk
+
+
+def _load_begin(file: BinaryIO, head: _ChunkHead, size: int, take: Take) -> memoryview:
+    file.seek(head.at)
+    chunk = take(size)
+    decompress_begin(head.codec, read_exact(file, head.packed), chunk)
+    return chunk
+
+
+def _whole(file: BinaryIO, head: _ChunkHead, channels: dict[int, Channel], wanted: Wanted) -> memoryview:
+    return _load_chunk(file, head, lambda size: memoryview(bytearray(size)))
+
+
+def _entries(
+    file: BinaryIO, head: _ChunkHead, channels: dict[int, Channel]
+) -> dict[str, NDArray[np.uint64]] | None:
+    """Topic -> (n, 2) times and offsets of its messages in a chunk, by the index records behind it.
+
+    None where there are none, or of a connection that is not declared.
+    """
+    at, end = head.at + head.packed, file.seek(0, 2)
+    found: dict[str, list[NDArray[np.uint64]]] = {}
+    while at < end:
+        header, size, content_at = _record(file, at)
+        if _number(header, "op") != INDEX:
+            break
+        if _number(header, "conn") not in channels or size % SAMPLE_BYTES:
+            return None
+        stored = np.frombuffer(read_exact(file, size), "<u4").reshape(-1, 3).astype(np.uint64)
+        times = np.stack([stored[:, 0] * np.uint64(10**9) + stored[:, 1], stored[:, 2]], -1)
+        found.setdefault(channels[_number(header, "conn")].topic, []).append(times)
+        at = content_at + size
+    return {topic: np.concatenate(parts) for topic, parts in found.items()} or None

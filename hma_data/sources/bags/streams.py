@@ -103,10 +103,13 @@ class StillStream:
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """See episode.Stream."""
         distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
-        where = self._messages.where
-        pictures = (picture(message, self._kind, where) for message in self._messages.read(distinct))
-        stacked = _stack(pictures, len(distinct), where)
+        stacked = _stack(self.each(distinct), len(distinct))
         return stacked if np.array_equal(inverse, np.arange(len(stacked))) else stacked[inverse]
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[Images]:
+        """See episode.OneByOne."""
+        where = self._messages.where
+        return _of_one_size((picture(m, self._kind, where) for m in self._messages.read(indices)), where)
 
 
 class VideoStream:
@@ -130,7 +133,7 @@ class VideoStream:
         wanted = [int(i) + self._lead for i in indices]
         found = self._decoder.frames(wanted)
         distinct = list(found)
-        stacked = _stack(iter(found.values()), len(found), self._messages.where)
+        stacked = _stack(_of_one_size(iter(found.values()), self._messages.where), len(found))
         return stacked[[distinct.index(i) for i in wanted]]
 
     def _from(self, start: int) -> Iterator[bytes]:
@@ -139,7 +142,18 @@ class VideoStream:
                 yield payload(message)
 
 
-def _stack(pictures: Iterator[Images], count: int, where: str) -> Images:
+def _of_one_size(pictures: Iterator[Images], where: str) -> Iterator[Images]:
+    """Those pictures; EpisodeError once one has another size than the first."""
+    first: tuple[int, ...] = ()
+    for item in pictures:
+        first = first or item.shape
+        if item.shape != first:
+            shapes = sorted({first, item.shape})
+            raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
+        yield item
+
+
+def _stack(pictures: Iterator[Images], count: int) -> Images:
     """(count, H, W, 3); each is put in its place as it comes, so that one is held twice, not all."""
     first = next(pictures, None)
     if first is None:
@@ -147,8 +161,5 @@ def _stack(pictures: Iterator[Images], count: int, where: str) -> Images:
     stacked = np.empty((count, *first.shape), np.uint8)
     stacked[0] = first
     for i, item in enumerate(pictures, start=1):
-        if item.shape != first.shape:
-            shapes = sorted({first.shape, item.shape})
-            raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
         stacked[i] = item
     return stacked
