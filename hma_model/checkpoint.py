@@ -169,6 +169,8 @@ def save(
     cards: Mapping[str, dict[str, Any]],
     tokenizer: Mapping[str, Any],
     training: Callable[[Path], None] | None = None,
+    base: Checkpoint | None = None,
+    samples: Mapping[str, bytes] | None = None,
 ) -> Checkpoint:
     """Write a model and all its embodiments; an existing checkpoint of that name is replaced in one step.
 
@@ -180,6 +182,9 @@ def save(
         cards: id -> what is known of its data and metrics; ids without one get an empty one.
         tokenizer: the spec, plain values.
         training: fills the folder `training/` it is given, for what only a resumed run needs.
+        base: a checkpoint whose trunk this is: its trunk, its configuration and the files of its other
+            embodiments are taken over as they are.
+        samples: id -> a PNG shown in the model card.
 
     Raises:
         CheckpointError: parts do not agree, the folder holds something else, or cannot be written.
@@ -191,14 +196,19 @@ def save(
     config = model.config.replace(tokenizer=dict(tokenizer))
     try:
         with new_folder(folder) as new:
-            write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"})
-            trunk = file_sha256(new / TRUNK)
-            (new / CONFIG).write_bytes(to_json(config_json(config, trunk)))
+            if base:
+                trunk = _take_over(base, new, set(embodiment_yaml))
+            else:
+                write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"})
+                trunk = file_sha256(new / TRUNK)
+                (new / CONFIG).write_bytes(to_json(config_json(config, trunk)))
             for name in sorted(embodiment_yaml):
                 home = new / "embodiments" / name
                 home.mkdir(parents=True)
                 (home / YAML).write_text(embodiment_yaml[name], encoding="utf-8")
                 (home / STATS).write_bytes(to_json(stats[name]))
+                if samples and name in samples:
+                    (home / SAMPLE).write_bytes(samples[name])
                 _write_embodiment(model, home, trunk, digest(tokenizer), cards.get(name, {}))
             if training:
                 (new / TRAINING).mkdir()
@@ -415,6 +425,22 @@ def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
         return ActionStats([float(v) for v in action["mean"]], [float(v) for v in action["std"]], rule)
     except (AttributeError, KeyError, TypeError, ValueError) as fault:
         raise CheckpointError(where, "lacks action.mean or action.std as lists of numbers") from fault
+
+
+def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
+    """Put a checkpoint's trunk and embodiments, but for some, in a new folder; returns the trunk's hash."""
+    kept = [name for name in base.embodiments if name not in besides]
+    names = [CONFIG, TRUNK]
+    for name in kept:
+        home = base.folder / "embodiments" / name
+        names += [f"embodiments/{name}/{part}" for part in (*PARTS, SAMPLE) if (home / part).is_file()]
+    for name in names:
+        (new / name).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            (new / name).hardlink_to(inside(base.folder, name))
+        except OSError:  # another file system, or one without links
+            shutil.copyfile(inside(base.folder, name), new / name)
+    return base.trunk_sha256
 
 
 def _write_embodiment(model: "HMA", home: Path, trunk: str, tokenizer: str, given: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError
+from hma_model.parallel import is_sharded, like, whole
 
 if TYPE_CHECKING:
     from hma_model.model import HMA
@@ -58,16 +59,16 @@ def parameter_groups(model: "HMA", lr: float, weight_decay: float) -> list[dict[
     multiplier = model.config.width / model.config.base_width if model.config.mup else 1.0
     matrices = _growing_matrices(model) if multiplier != 1.0 else set()
     plain = _undecayed(model)
-    groups: dict[tuple[bool, bool], dict[str, Any]] = {}
+    groups: dict[tuple[bool, bool, bool], dict[str, Any]] = {}
     for name, parameter in model.named_parameters():
         if not parameter.requires_grad:
             continue
-        decays, scaled = name not in plain, name in matrices
+        decays, scaled, sharded = name not in plain, name in matrices, is_sharded(parameter)
         base_lr = lr / multiplier if scaled else lr
         decay = weight_decay * (multiplier if scaled else 1.0) if decays else 0.0
         empty: dict[str, Any] = {"params": [], "names": []}
         group = groups.setdefault(
-            (decays, scaled), {**empty, "lr": base_lr, "base_lr": base_lr, "weight_decay": decay}
+            (decays, scaled, sharded), {**empty, "lr": base_lr, "base_lr": base_lr, "weight_decay": decay}
         )
         group["params"].append(parameter)
         group["names"].append(name)
@@ -100,9 +101,12 @@ def _growing_matrices(model: "HMA") -> set[str]:
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Moments by parameter name: `<name>/exp_avg` and so on; parameters never updated have none."""
+    """Whole moments by parameter name: `<name>/exp_avg` and so on; parameters never updated have none.
+
+    Every rank must ask.
+    """
     return {
-        f"{name}/{moment}": torch.as_tensor(optimizer.state[parameter][moment])
+        f"{name}/{moment}": whole(torch.as_tensor(optimizer.state[parameter][moment]))
         for group in optimizer.param_groups
         for name, parameter in zip(group["names"], group["params"])
         if optimizer.state.get(parameter)
@@ -126,9 +130,7 @@ def load_optimizer_state(
             raise CheckpointError(where, f"optimizer state {key!r} fits no parameter", "train from the start")
     for name, parameter in known.items():
         if f"{name}/step" in state:
-            kept = {moment: state[f"{name}/{moment}"].clone() for moment in _MOMENTS}
+            moments = {key: like(state[f"{name}/{key}"].clone(), parameter) for key in _MOMENTS[:2]}
             step_device = parameter.device if optimizer.defaults.get("fused") else "cpu"
-            optimizer.state[parameter] = {
-                moment: value.to(step_device if moment == "step" else parameter.device)
-                for moment, value in kept.items()
-            }
+            step = state[f"{name}/step"].clone().to(step_device)
+            optimizer.state[parameter] = {**moments, "step": step}

@@ -40,6 +40,47 @@ def loss_curve(
     return _svg(figure)
 
 
+def losses_by_robot(
+    training: Mapping[str, Sequence[tuple[int, float]]],
+    validation: Mapping[str, Sequence[tuple[int, float]]],
+    label: str,
+) -> bytes:
+    """Losses of each robot: training as a running mean, evaluations as markers.
+
+    Args:
+        training, validation: robot -> (step, loss).
+        label: of the losses' axis.
+    """
+    figure, axes = _axes("training step", label)
+    for i, name in enumerate(sorted(training)):
+        colour, style = COLOURS[i % len(COLOURS)], STYLES[i // len(COLOURS) % len(STYLES)]
+        steps, losses = np.array(training[name], float).T
+        width = max(1, len(losses) // 40)
+        smooth = np.convolve(losses, np.ones(width) / width, "valid")
+        axes.plot(steps[width - 1 :], smooth, color=colour, ls=style, lw=1.6, label=name)
+        if validation.get(name):
+            steps, losses = np.array(validation[name], float).T
+            axes.plot(steps, losses, MARKERS[i % len(MARKERS)], color=colour, ms=5)
+    axes.legend(frameon=False, fontsize=9, ncols=1 + len(training) // 8)
+    return _svg(figure)
+
+
+def course(points: Sequence[tuple[int, float]], label: str, log: bool = False) -> bytes:
+    """One figure over the steps of a run.
+
+    Args:
+        points: (step, value).
+        label: of the value's axis, with its unit.
+        log: draw the values on a logarithmic axis.
+    """
+    figure, axes = _axes("training step", label)
+    steps, values = np.array(points or [(0, np.nan)], float).T
+    axes.plot(steps, values, color=COLOURS[0], lw=1.2)
+    if log and (values > 0).any():
+        axes.set_yscale("log")
+    return _svg(figure)
+
+
 def psnr_over_horizon(curves: Mapping[str, Sequence[float]], seconds_per_frame: float) -> bytes:
     """PSNR of each predicted frame.
 

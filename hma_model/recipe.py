@@ -28,7 +28,11 @@ if TYPE_CHECKING:
 MAX_EXTENDS = 8
 _DERIVED = {"kind", "grid", "factored", "channels", "latent_scale", "frames", "objectives", "tokenizer"}
 # what may differ when a run goes on: where and how often, but nothing that changes the weights
-_FREE = {"data", "out", "device", "workers", "eval_every", "eval_windows", "checkpoint_every", "keep_last"}
+_FREE = {
+    *("data", "out", "start", "device", "workers", "parallel", "compile", "checkpointing"),
+    *("eval_every", "eval_windows", "pictures", "checkpoint_every", "keep_last"),
+    *("report", "track", "project"),
+}
 
 
 def _no_bool(value: Any) -> Any:
@@ -70,6 +74,8 @@ class Recipe(_Settings):
     model: dict[str, Any] = Field({}, description="fields of HMAConfig")
     objectives: dict[str, Number] = Field({"forward": 1.0}, description="how often each is drawn")
 
+    start: str | None = Field(None, description="a checkpoint to begin from: folder, run, URI or hub repo")
+    freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
     readout_bias: Literal["frequencies", "zero"] = Field(
         "frequencies", description="what the token readout begins with: the training tokens' log frequencies"
     )
@@ -84,16 +90,38 @@ class Recipe(_Settings):
     eps: Number = Field(1e-8, gt=0)
     weight_decay: Number = Field(0.05, ge=0)
     clip: Number = Field(1.0, gt=0, description="of the gradient's norm")
-    nonfinite: Literal["stop", "skip"] = Field("stop", description="at a loss that is not a number")
+    nonfinite: Literal["stop", "skip"] = Field(
+        "stop", description="at a loss that is not a number, or at a spike"
+    )
+    spike: Number = Field(
+        0.0, ge=0, description="a gradient's norm above this many times its running mean; 0 never"
+    )
+    ema: Number = Field(
+        0.0, ge=0, lt=1, description="decay of averaged weights, then evaluated and saved; 0 without"
+    )
+    self_forward: Number = Field(
+        0.0, ge=0, le=1, description="share of the windows whose past is the model's own prediction"
+    )
+    self_forward_from: Count = Field(0, ge=0, description="step from which that share rises,")
+    self_forward_over: Count = Field(0, ge=0, description="and in how many steps it is reached")
 
     seed: Count = Field(42, ge=0, lt=2**63)
     precision: Literal["fp32", "bf16"] = "fp32"
     device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")
-    workers: Count = Field(0, ge=0, description="processes that decode batches")
+    parallel: Literal["ddp", "fsdp"] = Field("ddp", description="with torchrun: how ranks hold the network")
+    compile: bool = Field(False, description="torch.compile of the trunk's blocks")
+    checkpointing: bool = Field(False, description="recompute activations: less memory, a third more time")
+    workers: Count = Field(0, ge=0, description="processes that decode batches, a rank")
     eval_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
     eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
+    pictures: Count = Field(1, ge=0, description="windows rolled out for a picture at evaluations, a robot")
     checkpoint_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
     keep_last: Count = Field(3, ge=1)
+    report: bool = Field(True, description="write report.html")
+    track: Annotated[tuple[Literal["tensorboard", "trackio", "wandb"], ...], BeforeValidator(_listed)] = (
+        "tensorboard",
+    )
+    project: str = Field("hma", description="the name trackio and wandb file the run under")
     out: str | None = Field(None, description="the run's folder")
 
     @property

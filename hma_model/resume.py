@@ -2,6 +2,7 @@
 
     state.json                step, recipe, the shards' digests, where the sampler stands
     optimizer.safetensors     moments by parameter name
+    weights.safetensors       of training, where the checkpoint's own are averages of them
 
 There is no state of random numbers: every draw of a step comes from (seed, what, step) by `seed_for`.
 """
@@ -13,18 +14,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, RecipeError
-from hma_model.checkpoint import TRAINING, Checkpoint, inside
+from hma_model.checkpoint import HEAD, STEM, TRAINING, Checkpoint, inside
 from hma_model.files import read_json, read_tensors, to_json, write_tensors
-from hma_model.optim import load_optimizer_state, optimizer_state
-from hma_model.recipe import differences
+from hma_model.recipe import Recipe, differences
+from hma_model.state import check_fit
 
 if TYPE_CHECKING:
-    import torch
+    from torch import Tensor
 
     from hma_data.shards.reader import ShardSet
     from hma_model.model import HMA
 
-STATE, OPTIMIZER = "state.json", "optimizer.safetensors"
+STATE, OPTIMIZER, WEIGHTS = "state.json", "optimizer.safetensors", "weights.safetensors"
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,11 @@ class State:
         step: steps done.
         recipe: `Recipe.identity` of the run.
         data: embodiment id -> digest of its shards.
-        sampler: `MixtureDataset.state_dict`.
+        sampler: `Feed.state`.
         skipped: steps left out for losses that were not numbers.
         seconds: spent in steps so far.
         evaluation: the last one's figures.
+        norms: running mean of the gradients' norms, and over how many.
     """
 
     step: int
@@ -48,10 +50,12 @@ class State:
     skipped: int = 0
     seconds: float = 0.0
     evaluation: dict[str, Any] = field(default_factory=dict)
+    norms: list[float] = field(default_factory=list)
 
     def require_same(self, recipe: dict[str, Any], data: dict[str, str], where: object) -> None:
         """Raise RecipeError with the differences unless recipe and shards are those of the run."""
-        changed = differences(self.recipe, recipe) + differences(self.data, data, "data")
+        before = {**Recipe().identity(), **self.recipe}  # keys that came later had their defaults
+        changed = differences(before, recipe) + differences(self.data, data, "data")
         if changed:
             raise RecipeError(
                 where,
@@ -74,37 +78,74 @@ def data_digests(sets: Mapping[str, "ShardSet"]) -> dict[str, str]:
     }
 
 
-def write_state(folder: Path, state: State, optimizer: "torch.optim.Optimizer") -> None:
-    """Fill a checkpoint's `training/`."""
-    write_tensors(folder / OPTIMIZER, optimizer_state(optimizer), {"format": "pt"})
+def write_state(
+    folder: Path, state: State, moments: Mapping[str, "Tensor"], weights: Mapping[str, "Tensor"]
+) -> None:
+    """Fill a checkpoint's `training/`; without `weights` those of the checkpoint are the run's."""
+    write_tensors(folder / OPTIMIZER, moments, {"format": "pt"})
+    if weights:
+        write_tensors(folder / WEIGHTS, weights, {"format": "pt"})
     (folder / STATE).write_bytes(to_json(asdict(state)))
 
 
-def read_state(checkpoint: Checkpoint) -> State:
-    """The state in a checkpoint.
+@dataclass(frozen=True)
+class Kept:
+    """What a checkpoint keeps of a run, read whole so that nothing can fail half way.
+
+    Attributes:
+        state: where the run stood.
+        shown: of the trunk ("") and each embodiment's stem and head, as published.
+        weights: of training, where these differ.
+        moments: of the optimizer.
+    """
+
+    state: State
+    shown: dict[str, tuple[dict[str, "Tensor"], ...]]
+    weights: dict[str, "Tensor"]
+    moments: dict[str, "Tensor"]
+    _averages: dict[str, "Tensor"] = field(default_factory=dict)
+
+    @property
+    def averages(self) -> dict[str, "Tensor"]:
+        """Averaged parameters by name, once `fill` has seen them."""
+        return self._averages
+
+    def fill(self, model: "HMA") -> None:
+        """Bring the weights of training into a whole model.
+
+        Raises:
+            CheckpointError: parts that do not fit the model.
+        """
+        model.load_trunk(self.shown[""][0])
+        for name in model.embodiments:
+            model.load_embodiment(name, *self.shown[name])
+        if not self.weights:
+            return
+        self._averages.update({n: p.detach().cpu().clone() for n, p in model.named_parameters()})
+        check_fit(f"{TRAINING}/{WEIGHTS}", self.weights, model.state_dict())
+        model.load_state_dict(self.weights)
+
+
+def read_kept(checkpoint: Checkpoint, model: "HMA") -> Kept:
+    """What a checkpoint keeps of a run with this model's embodiments.
 
     Raises:
-        CheckpointError: it has none, or it is damaged.
+        CheckpointError: parts are missing, damaged, or do not belong together.
     """
+    state = _read_state(checkpoint)
+    shown: dict[str, tuple[dict[str, Tensor], ...]] = {"": (read_tensors(checkpoint.trunk()),)}
+    for name in model.embodiments:
+        checkpoint.check(name)
+        shown[name] = tuple(read_tensors(checkpoint.path(name, part)) for part in (STEM, HEAD))
+    averaged = (checkpoint.folder / TRAINING / WEIGHTS).is_file()
+    weights = read_tensors(inside(checkpoint.folder, f"{TRAINING}/{WEIGHTS}")) if averaged else {}
+    moments = read_tensors(inside(checkpoint.folder, f"{TRAINING}/{OPTIMIZER}"))
+    return Kept(state, shown, weights, moments)
+
+
+def _read_state(checkpoint: Checkpoint) -> State:
     path = inside(checkpoint.folder, f"{TRAINING}/{STATE}")
     try:
         return State(**read_json(path))
     except TypeError as fault:
         raise CheckpointError(path, f"is damaged: {fault}", "delete this checkpoint") from fault
-
-
-def restore(checkpoint: Checkpoint, model: "HMA", optimizer: "torch.optim.Optimizer") -> None:
-    """Bring weights and moments back, onto the devices they are on.
-
-    Raises:
-        CheckpointError: parts that do not fit the model.
-    """
-    from hma_model.checkpoint import HEAD, STEM
-
-    model.load_trunk(read_tensors(checkpoint.trunk()))
-    for name in model.embodiments:
-        checkpoint.check(name)
-        stem, head = (read_tensors(checkpoint.path(name, part)) for part in (STEM, HEAD))
-        model.load_embodiment(name, stem, head)
-    path = inside(checkpoint.folder, f"{TRAINING}/{OPTIMIZER}")
-    load_optimizer_state(optimizer, read_tensors(path), path)

@@ -8,6 +8,7 @@ import json
 import sys
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
@@ -17,6 +18,8 @@ from hma_data.errors import OutputError
 from hma_data.files import write_atomic
 from hma_model.files import finite
 from hma_model.metrics import perplexity
+from hma_model.pictures import FOLDER as PICTURES
+from hma_model.trackers import Tracker
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -50,13 +53,20 @@ class RunLog:
         steps: how many the whole run has.
         begin: steps done before; later lines of an earlier, killed run are dropped.
         show: anything at all on standard error.
+        write: keep metrics.jsonl; the ranks but the first do not.
+        trackers: get the same figures.
     """
 
-    def __init__(self, out: Path, steps: int, begin: int, show: bool = True) -> None:
-        self._steps, self._begin, self._show = steps, begin, show
+    def __init__(
+        self, out: Path, steps: int, begin: int, show: bool = True, write: bool = True,
+        trackers: Sequence[Tracker] = (),
+    ) -> None:  # fmt: skip
+        self._steps, self._begin, self._show, self._write_it = steps, begin, show, write
+        self._trackers = trackers
         self._path = out / METRICS
         kept = [line for line in read_metrics(out) if line["step"] <= begin]
-        write_atomic(self._path, "".join(_line(values) for values in kept))
+        if write:
+            write_atomic(self._path, "".join(_line(values) for values in kept))
         self._recent: dict[str, deque[float]] = {}
         self._last: dict[str, Any] = {}
         evaluations = [line for line in kept if line["kind"] == "eval"]
@@ -65,7 +75,7 @@ class RunLog:
         self._live: Live | None = None
 
     def __enter__(self) -> "RunLog":
-        self._file: TextIO = self._path.open("a", encoding="utf-8")
+        self._file: TextIO | None = self._path.open("a", encoding="utf-8") if self._write_it else None
         if self._show and sys.stderr.isatty():
             from rich.console import Console
             from rich.live import Live
@@ -80,7 +90,10 @@ class RunLog:
         self._present(force=True)
         if self._live:
             self._live.__exit__(kind, fault, trace)
-        self._file.close()
+        if self._file:
+            self._file.close()
+        for tracker in self._trackers:
+            tracker.close()
 
     def note(self, text: str) -> None:
         """A sentence for the person who watches."""
@@ -92,6 +105,7 @@ class RunLog:
     def step(self, facts: dict[str, Any]) -> None:
         """One line of kind train; `facts` has step, loss_by_embodiment, lr, step_seconds and more."""
         self._write({"kind": "train", **facts})
+        self._track("train", facts, ("loss", "lr", "grad_norm", "step_seconds", "memory_mib", "skipped"))
         self._last = facts
         self._spent += facts["step_seconds"]
         for name, loss in facts["loss_by_embodiment"].items():
@@ -101,11 +115,31 @@ class RunLog:
     def evaluation(self, facts: dict[str, Any]) -> None:
         """One line of kind eval."""
         self._write({"kind": "eval", **facts})
+        self._track("eval", facts, ("loss", "perplexity", "accuracy", "baseline"))
         self._evaluation = facts
         if not self._live:
             self._present(force=True)
 
+    def pictures(self, out: Path, step: int) -> None:
+        """Hand the pictures of an evaluation on to the trackers."""
+        for path in sorted((out / PICTURES).glob(f"step-{step:08d}-*.png")) if self._trackers else ():
+            for tracker in self._trackers:
+                tracker.picture(step, f"rollout/{path.stem[14:]}", path)
+
+    def _track(self, kind: str, facts: dict[str, Any], keys: Sequence[str]) -> None:
+        if not self._trackers:
+            return
+        values = {f"{kind}/{key}": facts.get(key) for key in keys}
+        for key in ("loss", "accuracy"):
+            own = facts.get(f"{key}_by_embodiment", {})
+            values.update({f"{kind}_{key}/{name}": value for name, value in own.items()})
+        known = {tag: float(value) for tag, value in values.items() if value is not None}
+        for tracker in self._trackers:
+            tracker.scalars(facts["step"], known)
+
     def _write(self, values: dict[str, Any]) -> None:
+        if self._file is None:
+            return
         try:
             self._file.write(_line(values))
             self._file.flush()

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from hma_data.errors import OutputError, RecipeError
+from hma_model.parallel import local_rank
 
 RECIPE, ENVIRONMENT = "recipe.json", "environment.json"
 
@@ -27,8 +28,8 @@ def choose_device(name: str) -> torch.device:
     """
     cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
     if name == "auto":
-        return torch.device("cuda" if cuda else "mps" if mps else "cpu")
-    device = torch.device(name)
+        name = "cuda" if cuda else "mps" if mps else "cpu"
+    device = torch.device(f"cuda:{local_rank()}" if name == "cuda" else name)
     there = {"cuda": cuda and (device.index or 0) < torch.cuda.device_count(), "mps": mps, "cpu": True}
     if not there[device.type]:
         raise RecipeError("recipe: device", f"{name} is not there", "use device=auto or device=cpu")

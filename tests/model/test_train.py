@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from hma_data.errors import (
     CheckpointError,
@@ -29,13 +28,8 @@ from hma_model.resume import seed_for
 from hma_model.runlog import read_metrics
 from hma_model.runtime import own_folder
 from hma_model.train import train
+from tests.model.runs import TINY, same
 from tests.model.shards import make_shards
-
-TINY = {
-    "frames": 4, "batch_size": 4, "model": {"layers": 1, "width": 16, "heads": 2}, "device": "cpu",
-    "steps": 6, "lr": 3e-3, "warmup": 2, "schedule": "cosine", "eval_every": 3, "eval_windows": 6,
-    "checkpoint_every": 2,
-}  # fmt: skip
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -62,19 +56,6 @@ def recipe(data):
         return make_recipe({**TINY, "data": data, **changes})
 
     return recipe
-
-
-def weights(folder: Path) -> dict[str, torch.Tensor]:
-    return {
-        f"{path.relative_to(folder)}:{name}": value
-        for path in sorted(folder.rglob("*.safetensors"))
-        for name, value in load_file(path).items()
-    }
-
-
-def same(one: Path, other: Path) -> bool:
-    a, b = weights(one), weights(other)
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 def finite(folder: Path) -> bool:
@@ -251,7 +232,8 @@ def test_a_loss_that_is_no_number_stops_and_names_the_window(recipe, tmp_path, p
     with pytest.raises(TrainingError) as caught:
         train(recipe(checkpoint_every=1), out=tmp_path / "run", show=False)
     batch = poisoned[2]
-    place = f"{batch.embodiment[1]} episode {batch.episode[1]} frame {batch.frame[1]}"
+    number = int(batch.episode[1])
+    place = f"{batch.embodiment[1]} episode {number} (e{number}) frame {batch.frame[1]}"
     assert f"windows: {place}" in caught.value.fault and caught.value.where == "step 3"
     last = checkpoint.resolve(tmp_path / "run")
     assert last.name == "step-00000002"

@@ -1,0 +1,59 @@
+"""Bring a robot to a trained trunk: a new stem and head on it, with the trunk as it is or tuned along.
+
+    result = finetune("runs/base", ["shards/my_arm"], out="runs/my_arm", freeze_trunk=True)
+
+With the trunk frozen the result can be pushed to the hub that the trunk came from, beside its other robots.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from hma_data.errors import UsageError
+from hma_model.recipe import load_recipe
+
+if TYPE_CHECKING:
+    from hma_model.train import TrainResult
+
+RECIPE = "finetune"
+
+
+def finetune(
+    source: str | Path,
+    data: Sequence[str | Path],
+    *,
+    out: str | Path | None = None,
+    freeze_trunk: bool = False,
+    overrides: Sequence[str] = (),
+    recipe: str | Path = RECIPE,
+    **options: Any,
+) -> "TrainResult":
+    """Train on a checkpoint's trunk; run it again to resume.
+
+    Args:
+        source: a checkpoint, a run's folder, a URI, or a hub repository.
+        data: folders of shards, made with the checkpoint's tokenizer.
+        out: the run's folder; by default that of the overrides.
+        freeze_trunk: train stems and heads alone.
+        overrides: `key=value` over the recipe.
+        recipe: name or path.
+        options: `show`, `force`, `on_progress` of `hma_model.train.train`.
+
+    Raises:
+        UsageError: no shards, or no folder for the run.
+        CheckpointError: the shards are of another tokenizer, or know the robot with other actions.
+        HubError: there is no such checkpoint.
+    """
+    from hma_model.train import train
+
+    if not data:
+        raise UsageError("--data", "names no shards", "give the folder of hma convert")
+    given = {
+        "start": str(source),
+        "data": [str(folder) for folder in data],
+        "freeze": "trunk" if freeze_trunk else "nothing",
+    }
+    ours = [f"{key}={yaml.safe_dump(value, default_flow_style=True)}" for key, value in given.items()]
+    return train(load_recipe(recipe, [*ours, *overrides]), out=out, **options)

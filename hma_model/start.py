@@ -1,0 +1,147 @@
+"""Where a run begins that does not begin from nothing: another run's checkpoint, or one from a hub.
+
+The run keeps its own copy in `.start/`, so that it goes on whatever becomes of the source. Robots of the data
+that the checkpoint knows go on from their stem and head, with the statistics these were trained with; others
+get fresh ones. With the trunk frozen the run's checkpoints carry the very files of the trunk and of all other
+robots; a tuned trunk leaves them behind, because they belong to the trunk as it was.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hma_data.errors import CheckpointError, RecipeError
+from hma_data.shards.reader import ShardSet
+from hma_model import checkpoint as checkpoints
+from hma_model.checkpoint import Checkpoint, require_tokenizer
+from hma_model.config import HMAConfig
+from hma_model.files import read_tensors
+
+if TYPE_CHECKING:
+    from hma_model.model import HMA
+    from hma_model.recipe import Recipe
+
+FOLDER = ".start"
+# what may differ from the checkpoint's network, because no weight's meaning depends on it
+_TRAINED_BY = {
+    *("dropout", "action_loss_weight", "label_smoothing", "corrupt_max", "history_probability"),
+    *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
+}
+
+
+@dataclass(frozen=True)
+class Start:
+    """A checkpoint to begin from.
+
+    Attributes:
+        checkpoint: the run's own copy.
+        frozen: the trunk stays as it is.
+        source: where it came from, for notes.
+    """
+
+    checkpoint: Checkpoint
+    frozen: bool
+    source: str
+
+    @classmethod
+    def bring(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> None:
+        """Bring the recipe's checkpoint into the run's folder, unless it is there.
+
+        Raises:
+            HubError, CheckpointError: it is not there, or damaged.
+            CheckpointError: the data is of another tokenizer.
+        """
+        from hma_model import hub
+
+        assert recipe.start is not None
+        frozen, place, source = recipe.freeze == "trunk", out / FOLDER, recipe.start
+        if (place / checkpoints.README).is_file():  # written last
+            return
+        if not hub.is_repository(source) and "://" not in source:
+            found = checkpoints.resolve(Path(source).expanduser())
+            require_tokenizer(Checkpoint.open(found).config, _spec(sets), found)
+            source = str(found)
+        known = [str(row["embodiment"]) for row in hub.list_embodiments(source)]
+        hub.pull(source, [name for name in known if frozen or name in sets], place)
+
+    @classmethod
+    def open(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> "Start":
+        """What `bring` has brought.
+
+        Raises:
+            CheckpointError: it is damaged, or the data is of another tokenizer.
+        """
+        start = cls(Checkpoint.open(out / FOLDER), recipe.freeze == "trunk", str(recipe.start))
+        require_tokenizer(start.checkpoint.config, _spec(sets), start.source)
+        return start
+
+    def network(self, recipe: "Recipe") -> HMAConfig:
+        """The checkpoint's network, trained as the recipe says.
+
+        Raises:
+            RecipeError: the recipe asks for another network.
+        """
+        config = self.checkpoint.config
+        changes: dict[str, Any] = {"objectives": recipe.objectives}
+        for key, value in recipe.model.items():
+            if key in _TRAINED_BY:
+                changes[key] = value
+            elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
+                raise RecipeError(
+                    f"recipe: model.{key}",
+                    f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}",
+                    "leave it out: the network is the checkpoint's",
+                )
+        if config.time_position == "learned" and recipe.frames > config.frames:
+            raise RecipeError(
+                "recipe: frames",
+                f"{recipe.frames} are more than the checkpoint's {config.frames}",
+                "use fewer",
+            )
+        return config.replace(**changes)
+
+    def stats(self, shards: ShardSet) -> dict[str, Any]:
+        """A robot's statistics: the checkpoint's where it knows the robot, else those of the shards.
+
+        Raises:
+            CheckpointError: it knows the robot with other actions.
+        """
+        name = shards.embodiment.id
+        if name not in self.checkpoint.embodiments:
+            return shards.manifest.stats
+        theirs, ours = self.checkpoint.embodiment(name), shards.embodiment
+        for key in ("action_dim", "stride", "normalize_mask"):
+            a, b = getattr(theirs, key), getattr(ours, key)
+            if list(a) != list(b) if key == "normalize_mask" else a != b:
+                raise CheckpointError(
+                    self.source,
+                    f"knows {name} with {key} {a}, the shards have {b}",
+                    "give the robot of the shards another id",
+                )
+        return self.checkpoint.stats(name)
+
+    def fill(self, model: "HMA") -> None:
+        """Put the checkpoint's weights in a model that has its embodiments, and freeze what stays."""
+        model.load_trunk(read_tensors(self.checkpoint.trunk()))
+        for name in model.embodiments:
+            if name in self.checkpoint.embodiments:
+                checkpoints.add_embodiment(model, self.checkpoint, name)
+        if self.frozen:
+            for part in (model.trunk, model.readout):
+                part.requires_grad_(False)
+
+    def remarks(self, names: Mapping[str, Any]) -> list[str]:
+        """What becomes of the checkpoint's robots and of those of the data."""
+        known = [name for name in names if name in self.checkpoint.embodiments]
+        fresh = [name for name in names if name not in known]
+        notes = [f"from {self.source}: trunk {'frozen' if self.frozen else 'tuned'}"]
+        if fresh:
+            notes.append(f"fresh stem and head: {', '.join(fresh)}")
+        if known:
+            notes.append(f"going on from its stem and head, with its statistics: {', '.join(known)}")
+        return notes
+
+
+def _spec(sets: Mapping[str, ShardSet]) -> Any:
+    return next(iter(sets.values())).spec

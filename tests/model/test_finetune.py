@@ -1,0 +1,163 @@
+"""Finetuning: what is new, what goes on, and what stays byte for byte."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from hma_data.errors import CheckpointError, HubError, RecipeError, UsageError
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model import checkpoint, hub
+from hma_model.checkpoint import Checkpoint
+from hma_model.finetune import finetune
+from hma_model.recipe import make_recipe
+from hma_model.train import TrainResult, train
+from tests.model.robots import SPEC
+from tests.model.runs import TINY, same, weights
+from tests.model.shards import make_shards
+
+SHORT = [
+    "steps=4", "batch_size=4", "device=cpu", "warmup=1", "eval_every=0", "eval_windows=4",
+    "checkpoint_every=2", "report=false", "pictures=0", "track=[]", "lr=3e-3",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory) -> TrainResult:
+    """A run on two robots."""
+    folder = tmp_path_factory.mktemp("base")
+    arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
+    data = [str(arm), str(hand)]
+    torch.set_num_threads(1)
+    recipe = make_recipe({**TINY, "data": data, "model": {**TINY["model"], "mup": True, "base_width": 8}})
+    return train(recipe, out=folder / "run", show=False)
+
+
+@pytest.fixture
+def leg(tmp_path) -> Path:
+    return make_shards(tmp_path / "leg", "leg", dims=4, seed=2)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def tune(base, leg, out, *changes, freeze=True, **options) -> TrainResult:
+    overrides = [*SHORT, *changes]
+    return finetune(base, [leg], out=out, freeze_trunk=freeze, overrides=overrides, show=False, **options)
+
+
+def test_a_frozen_trunk_and_the_other_robots_stay_byte_for_byte(base, leg, tmp_path):
+    result = tune(base.out, leg, tmp_path / "run")
+    before, after = files(base.checkpoint), files(result.checkpoint)
+    kept = [name for name in before if name.startswith(("embodiments/", "trunk", "config"))]
+    assert len(kept) == 12 and all(before[name] == after[name] for name in kept)
+    assert Checkpoint.open(result.checkpoint).embodiments == ("arm", "hand", "leg")
+    checkpoint.load(result.checkpoint)
+
+
+def test_the_new_stem_learns_while_the_trunk_is_frozen(base, leg, tmp_path):
+    one, four = (tune(base.out, leg, tmp_path / str(n), f"steps={n}") for n in (1, 4))
+    a, b = weights(one.checkpoint), weights(four.checkpoint)
+    changed = {name.split(":")[0] for name in a if not torch.equal(a[name], b[name])}
+    assert changed == {"embodiments/leg/stem.safetensors", "training/optimizer.safetensors"}
+    assert not any(name.startswith("training") and "trunk" in name for name in a)
+
+
+def test_a_tuned_trunk_leaves_the_other_robots_behind(base, leg, tmp_path):
+    result = tune(base.out, leg, tmp_path / "run", freeze=False)
+    opened = Checkpoint.open(result.checkpoint)
+    assert opened.embodiments == ("leg",)
+    assert opened.trunk_sha256 != Checkpoint.open(base.checkpoint).trunk_sha256
+    assert opened.card("leg")["training"]["trunk"] == "tuned"
+
+
+def test_the_source_is_not_touched(base, leg, tmp_path):
+    before = files(base.out)
+    tune(base.out, leg, tmp_path / "run", freeze=False)
+    assert files(base.out) == before
+
+
+def test_the_new_robots_yaml_statistics_and_card_are_there(base, leg, tmp_path):
+    opened = Checkpoint.open(tune(base.out, leg, tmp_path / "run").checkpoint)
+    assert opened.embodiment("leg").action_dim == 4
+    assert len(opened.stats("leg")["action"]["mean"]) == 4
+    card = opened.card("leg")
+    assert card["training"]["from_trunk_sha256"] == opened.trunk_sha256 and card["metrics"]["val_loss"] > 0
+
+
+def test_the_network_and_the_window_are_the_checkpoints(base, leg, tmp_path):
+    config = Checkpoint.open(tune(base.out, leg, tmp_path / "run", freeze=False).checkpoint).config
+    assert (config.width, config.mup, config.frames) == (16, True, TINY["frames"])
+
+
+def test_from_a_hub_and_back_into_it(base, leg, tmp_path):
+    hub.push(base.checkpoint, tmp_path / "hub" / "team" / "model")
+    result = tune(tmp_path / "hub" / "team" / "model", leg, tmp_path / "run")
+    hub.push(result.checkpoint, tmp_path / "hub" / "team" / "model", ["leg"])
+    pulled = hub.from_pretrained(tmp_path / "hub" / "team" / "model", ["leg", "arm"])
+    assert set(pulled.embodiments) == {"leg", "arm"}
+
+
+def test_a_known_robot_goes_on_with_its_stem_and_statistics(base, tmp_path):
+    shards = make_shards(tmp_path / "arm", "arm", seed=9)
+    result = tune(base.out, shards, tmp_path / "run", "steps=1", "lr=1e-12")
+    a, b = (weights(r.checkpoint) for r in (base, result))
+    for name in (n for n in a if n.startswith("embodiments/arm")):
+        assert torch.allclose(a[name].float(), b[name].float(), atol=1e-9), name
+
+
+def test_a_known_robot_with_other_actions_is_refused(base, tmp_path):
+    shards = make_shards(tmp_path / "arm", "arm", dims=5)
+    with pytest.raises(CheckpointError, match="knows arm with action_dim 2, the shards have 5"):
+        tune(base.out, shards, tmp_path / "run")
+
+
+def test_another_tokenizer_is_refused_with_both_names(base, tmp_path):
+    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "coded", "weights_sha256": "ab" * 32})
+    shards = make_shards(tmp_path / "leg", "leg", dims=4, spec=spec)
+    with pytest.raises(CheckpointError, match="tokenizer 'raw', this is 'coded'"):
+        tune(base.out, shards, tmp_path / "run")
+
+
+def test_another_network_is_refused(base, leg, tmp_path):
+    with pytest.raises(RecipeError, match=r"model\.width.*is 32, .* has 16"):
+        tune(base.out, leg, tmp_path / "run", "model.width=32")
+
+
+def test_how_it_is_trained_may_differ(base, leg, tmp_path):
+    assert tune(base.out, leg, tmp_path / "run", "model.dropout=0.1", "model.width=16").step == 4
+
+
+def test_a_killed_finetuning_goes_on_bit_for_bit_though_its_source_is_gone(base, leg, tmp_path):
+    whole = tune(base.out, leg, tmp_path / "whole", freeze=False)
+    source = tmp_path / "hub"
+    hub.push(base.checkpoint, source)
+
+    def kill(facts):
+        if facts["step"] == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tune(source, leg, tmp_path / "cut", freeze=False, on_progress=kill)
+    kept = source.rename(tmp_path / "elsewhere")
+    again = tune(source, leg, tmp_path / "cut", freeze=False)
+    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
+    assert kept.is_dir()
+
+
+def test_what_is_missing_is_said(base, leg, tmp_path):
+    with pytest.raises((CheckpointError, HubError), match="nowhere"):
+        tune(tmp_path / "nowhere", leg, tmp_path / "run")
+    with pytest.raises(UsageError, match="--data"):
+        finetune(base.out, [], out=tmp_path / "run")
+    with pytest.raises(RecipeError, match="nothing has trained"):
+        train(make_recipe({**TINY, "data": [str(leg)], "freeze": "trunk"}), out=tmp_path / "r", show=False)
+
+
+def test_heads_learn_on_a_frozen_trunk_when_actions_are_the_objective(base, leg, tmp_path):
+    objective = "objectives={policy: 1}"
+    one, four = (tune(base.out, leg, tmp_path / str(n), objective, f"steps={n}") for n in (1, 4))
+    a, b = weights(one.checkpoint), weights(four.checkpoint)
+    name = "embodiments/leg/head.safetensors:policy.weight"
+    assert not torch.equal(a[name], b[name])
