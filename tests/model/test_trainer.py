@@ -1,0 +1,263 @@
+"""Options of a step: precision, accumulation, averages, recomputation, compilation, spikes."""
+
+import numpy as np
+import pytest
+import torch
+
+from hma_data.errors import RecipeError, TrainingError
+from hma_model import checkpoint
+from hma_model.ema import Average
+from hma_model.feed import Feed, share
+from hma_model.health import SETTLED, Pulse, listed
+from hma_model.model import HMA
+from hma_model.parallel import World
+from hma_model.recipe import make_recipe
+from hma_model.runlog import read_metrics
+from hma_model.train import train
+from hma_model.trainer import Run
+from tests.model.runs import TINY, same, weights
+from tests.model.shards import make_shards
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> list[str]:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("shards")
+    arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
+    return [str(arm), str(hand)]
+
+
+@pytest.fixture
+def recipe(data):
+    def recipe(**changes):
+        return make_recipe({**TINY, "data": data, **changes})
+
+    return recipe
+
+
+def losses(recipe, out, **changes) -> list[float]:
+    return [loss for _, loss in train(recipe(**changes), out=out, show=False).losses]
+
+
+# -- gradients
+
+
+def gradients(recipe, out, batches) -> dict[str, torch.Tensor]:
+    """Of one step whose passes see the given batches."""
+    out.mkdir()
+    run = Run(recipe, out, torch.device("cpu"))
+    run.prepare(None)
+    assert run.feed.passes == len(batches)
+    run.feed.step = lambda: iter(enumerate(batches))
+    run.spread.clip = lambda limit: 1.0
+    run.optimizer.step = lambda: None
+    run.advance()
+    return {n: p.grad.clone() for n, p in run.model.named_parameters() if p.grad is not None}
+
+
+def part(batch, rows: slice):
+    """Some windows of a batch."""
+    cut = {k: v[rows] if v is not None else None for k, v in vars(batch).items()}
+    return type(batch)(**cut)
+
+
+def test_accumulated_passes_have_the_gradient_of_the_whole_batch(recipe, tmp_path):
+    model = {**TINY["model"], "mask_ratio_min": 1.0, "corrupt_max": 0.0, "history_probability": 0.0}
+    whole = recipe(batch_size=8, model=model)
+    _, batch = next(Feed(whole, Run(whole, tmp_path, torch.device("cpu")).sets, World()).step())
+    one = gradients(whole, tmp_path / "one", [batch])
+    halves = [part(batch, slice(0, 4)), part(batch, slice(4, 8))]
+    two = gradients(recipe(batch_size=4, accumulate=2, model=model), tmp_path / "two", halves)
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        assert torch.allclose(value, two[name], atol=1e-6), name
+
+
+def test_recomputing_activations_changes_no_loss(recipe, tmp_path):
+    network = {**TINY["model"], "dropout": 0.1}
+    plain = losses(recipe, tmp_path / "a", model=network)
+    assert losses(recipe, tmp_path / "b", model=network, checkpointing=True) == plain
+
+
+def test_compiled_blocks_give_the_same_losses(recipe, tmp_path, monkeypatch):
+    compiled, plain = [], torch.nn.Module.compile
+
+    def traced(self, **options):
+        compiled.append(self)
+        plain(self, backend="eager")
+
+    monkeypatch.setattr(torch.nn.Module, "compile", traced)
+    given = losses(recipe, tmp_path / "a", steps=3, compile=True)
+    assert len(compiled) == 1 and given == pytest.approx(losses(recipe, tmp_path / "b", steps=3), rel=1e-5)
+
+
+def test_bf16_stays_near_full_precision_with_weights_in_float32(recipe, tmp_path):
+    full = losses(recipe, tmp_path / "full")
+    result = train(recipe(precision="bf16"), out=tmp_path / "half", show=False)
+    assert [loss for _, loss in result.losses] == pytest.approx(full, rel=0.02)
+    assert all(t.dtype != torch.bfloat16 for t in weights(result.checkpoint).values())
+
+
+# -- averages
+
+
+def test_the_average_moves_by_its_decay():
+    model = torch.nn.Linear(1, 1, bias=False)
+    model.weight.data.fill_(0.0)
+    average = Average(model, 0.5)
+    model.weight.data.fill_(1.0)
+    values = []
+    for step in (1, 2, 1000, 1001):
+        average.update(step)
+        values.append(float(average.state()["weight"]))
+    early = [1 - 2 / 11, 1 - 2 / 11 * 3 / 12]
+    assert values == pytest.approx([*early, 1 - (1 - early[1]) * 0.5, 1 - (1 - early[1]) * 0.25])
+
+
+def test_averaged_weights_are_what_is_saved_and_training_goes_on_from_its_own(recipe, tmp_path):
+    plain = train(recipe(), out=tmp_path / "plain", show=False)
+    result = train(recipe(ema=0.9), out=tmp_path / "run", show=False)
+    assert result.losses == plain.losses
+    averaged, trained = weights(result.checkpoint), weights(plain.checkpoint)
+    name = "trunk.blocks.0.mlp.fc1.weight"
+    assert torch.equal(averaged[f"training/weights.safetensors:{name}"], trained[f"trunk.safetensors:{name}"])
+    assert not torch.equal(averaged[f"trunk.safetensors:{name}"], trained[f"trunk.safetensors:{name}"])
+    assert result.masked_val_loss != plain.masked_val_loss
+
+
+def test_the_evaluation_is_that_of_the_averaged_weights(recipe, tmp_path):
+    run = Run(recipe(ema=0.9), tmp_path, torch.device("cpu"))
+    run.prepare(None)
+    for _ in range(4):
+        run.advance()
+    found = run.evaluate()["loss"]
+    run.model.load_state_dict(run.average.state())
+    run.average = None
+    assert run.evaluate()["loss"] == pytest.approx(found, abs=1e-6)
+
+
+def test_a_killed_run_with_averages_goes_on_bit_for_bit(recipe, tmp_path):
+    whole = train(recipe(ema=0.9), out=tmp_path / "whole", show=False)
+
+    def kill(facts):
+        if facts["step"] == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe(ema=0.9), out=tmp_path / "cut", show=False, on_progress=kill)
+    again = train(recipe(ema=0.9), out=tmp_path / "cut", show=False)
+    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
+
+
+# -- what a step says
+
+
+def test_time_memory_and_waiting_are_in_the_log(recipe, tmp_path):
+    train(recipe(steps=2), out=tmp_path / "run", show=False)
+    line = read_metrics(tmp_path / "run")[0]
+    assert 0 < line["data_seconds"] < line["step_seconds"] and line["memory_mib"] > 50
+
+
+@pytest.mark.parametrize("objective", ["passive", "policy", "inverse", "full"])
+def test_what_is_trained_is_what_is_evaluated(recipe, tmp_path, objective):
+    result = train(recipe(objectives={objective: 1}, steps=2), out=tmp_path / "run", show=False)
+    (evaluation,) = result.evaluations
+    assert evaluation["objective"] == objective and np.isfinite(evaluation["loss"])
+    assert ("baseline" in evaluation) == (objective == "full")
+
+
+# -- spikes
+
+
+def test_a_norm_far_above_its_running_mean_is_a_spike():
+    pulse = Pulse(limit=3.0)
+    assert pulse.fault(1.0, 1e9) == ""
+    for _ in range(SETTLED):
+        pulse.take(2.0)
+    assert pulse.fault(1.0, 5.9) == ""
+    assert "3.5 times its running mean 2" in pulse.fault(1.0, 7.0)
+    assert Pulse().fault(1.0, 1e30) == ""
+
+
+@pytest.mark.parametrize(("loss", "norm"), [(float("nan"), 1.0), (1.0, float("inf"))])
+def test_what_is_no_number_is_always_a_fault(loss, norm):
+    assert "the loss is" in Pulse().fault(loss, norm)
+
+
+@pytest.fixture
+def spiking(monkeypatch):
+    """The loss of a late batch is a million times what it was."""
+    plain, calls = HMA.forward, []
+
+    def forward(self, batch, objective=None, generator=None):
+        output = plain(self, batch, objective, generator)
+        if self.training:
+            calls.append(batch)
+            if len(calls) == SETTLED + 2:
+                output.loss = output.loss * 1e6
+        return output
+
+    monkeypatch.setattr(HMA, "forward", forward)
+
+
+def test_a_spike_stops_and_names_the_windows_with_the_largest_loss(recipe, tmp_path, spiking):
+    long = recipe(steps=SETTLED + 4, spike=10, eval_every=0, checkpoint_every=0)
+    with pytest.raises(TrainingError, match=r"times its running mean.*episode \d+ \(e\d+\) frame \d+"):
+        train(long, out=tmp_path / "run", show=False)
+
+
+def test_a_spike_can_be_skipped_and_is_counted(recipe, tmp_path, spiking):
+    long = recipe(steps=SETTLED + 4, spike=10, nonfinite="skip", eval_every=0, checkpoint_every=0)
+    result = train(long, out=tmp_path / "run", show=False)
+    assert result.skipped == 1
+    assert all(torch.isfinite(v).all() for v in checkpoint.load(result.checkpoint).state_dict().values())
+
+
+def test_long_lists_of_windows_are_cut():
+    assert listed(["a", "b"]) == "a; b" and listed(list("abcdefg")) == "a; b; c; d and 3 more"
+
+
+# -- how a step is shared
+
+
+@pytest.mark.parametrize(
+    ("batch", "accumulate", "ranks", "shared"),
+    [(8, 1, 1, (1, 8)), (8, 4, 1, (4, 8)), (8, 4, 2, (4, 8)), (8, 1, 2, (2, 4)), (64, 1, 8, (8, 8))],
+)
+def test_a_step_is_the_same_windows_on_any_number_of_ranks(recipe, batch, accumulate, ranks, shared):
+    given = recipe(batch_size=batch, accumulate=accumulate)
+    passes, size = share(given, ranks)
+    assert (passes, size) == shared and passes * size == batch * accumulate and passes % ranks == 0
+
+
+def test_windows_that_cannot_be_shared_are_refused(recipe):
+    with pytest.raises(RecipeError, match="9 windows a step cannot be shared evenly by 2 ranks.*such as 10"):
+        share(recipe(batch_size=9), 2)
+
+
+def test_ranks_see_what_one_would_see_and_each_window_once(recipe, data, tmp_path):
+    given = recipe(batch_size=4, accumulate=2)
+    sets = Run(given, tmp_path, torch.device("cpu")).sets
+    alone = Feed(given, sets, World())
+    pair = [Feed(given, sets, World(rank, 2)) for rank in range(2)]
+    for _ in range(5):
+        single = dict(alone.step())
+        shared = {number: batch for feed in pair for number, batch in feed.step()}
+        assert shared.keys() == single.keys() == {0, 1}
+        for number, batch in single.items():
+            assert torch.equal(batch.tokens, shared[number].tokens)
+            assert torch.equal(batch.frame, shared[number].frame)
+
+
+def test_ranks_draw_disjoint_windows_within_an_epoch(recipe, data, tmp_path):
+    given = recipe(data=data[:1], batch_size=2, accumulate=2)
+    sets = Run(given, tmp_path, torch.device("cpu")).sets
+    seen = []
+    for rank in range(2):
+        feed = Feed(given, sets, World(rank, 2))
+        places = set()
+        for _ in range(6):
+            for _, batch in feed.step():
+                places |= set(zip(batch.episode.tolist(), batch.frame.tolist()))
+        seen.append(places)
+    assert seen[0] and not seen[0] & seen[1]
