@@ -11,9 +11,11 @@ from typing import Annotated, Any
 import typer
 
 from hma_data.bench import BENCHES
-from hma_data.cli import Json, mount
-from hma_data.console import human_seconds, print_json, print_table
+from hma_data.cli import mount
+from hma_data.console import print_json, print_table
 from hma_data.errors import HMAError
+from hma_model import cli_train
+from hma_model.cli_hub import Json, hub_app
 
 app = typer.Typer(
     name="hma",
@@ -26,7 +28,6 @@ app = typer.Typer(
 _Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[
     2
 ]  # ClickException, wherever typer keeps its click
-hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, one robot at a time.")
 
 
 def main() -> None:
@@ -67,9 +68,6 @@ def _fail(text: str, code: int) -> int:
 
 Checkpoint = Annotated[str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo.")]
 Data = Annotated[Path, typer.Argument(help="A shard set.")]
-Embodiments = Annotated[
-    list[str] | None, typer.Option("--embodiment", "-e", help="Only this robot; repeat for more.")
-]
 
 
 @app.command()
@@ -91,45 +89,6 @@ def demo(
 
     report = run(out, episodes=episodes, steps=steps, seed=seed)
     print(f"open {report}")
-
-
-@app.command()
-def train(
-    recipe: Annotated[str, typer.Argument(help="A recipe: name or YAML file.")],
-    overrides: Annotated[
-        list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Dotted overrides.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="The run's folder.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Go on although recipe or shards changed.")] = False,
-    json: Json = False,
-) -> None:
-    """Train; run it again to resume.
-
-    Example: hma train discrete_tiny data=[shards/my_arm] --out runs/first
-    """
-    from hma_model.recipe import load_recipe
-    from hma_model.train import train as run
-
-    result = run(load_recipe(recipe, overrides or []), out=out, force=force)
-    facts = {
-        "out": str(result.out),
-        "checkpoint": str(result.checkpoint),
-        "step": result.step,
-        "held_out_loss": result.masked_val_loss,
-        "baseline": result.baseline,
-        "seconds": result.seconds,
-        "skipped_steps": result.skipped,
-        "interrupted": result.interrupted,
-    }
-    if json:
-        print_json(facts)
-    else:
-        done = f"step {result.step:,}, {human_seconds(result.seconds)}"
-        print(f"{result.out}: {done}, checkpoint {result.checkpoint}")
-        found, base = result.masked_val_loss, result.baseline
-        if found is not None and base is not None:
-            print(f"held-out loss {found:.4f} nats a token; looking at nothing {base:.4f}")
-    raise typer.Exit(130 if result.interrupted else 0)
 
 
 @app.command()
@@ -226,95 +185,8 @@ def _model(checkpoint: str, embodiment: str) -> Any:
     return HMA.from_pretrained(checkpoint, embodiments=[embodiment]).eval()
 
 
-@hub_app.command("push")
-def hub_push(
-    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint, or a run's folder.")],
-    target: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
-    embodiment: Embodiments = None,
-) -> None:
-    """Publish a checkpoint, whole or robot by robot.
-
-    Example: hma hub push runs/first ./my-hub/team/model -e my_arm
-    """
-    from hma_model import hub
-
-    print(f"published to {hub.push(checkpoint, target, embodiment)}")
-
-
-@hub_app.command("pull")
-def hub_pull(
-    source: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
-    embodiment: Embodiments = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder; default the local cache.")] = None,
-    revision: Annotated[str | None, typer.Option("--revision", help="Branch, tag or commit.")] = None,
-) -> None:
-    """Fetch the trunk and the robots asked for, nothing else.
-
-    Example: hma hub pull team/model -e my_arm --out model
-    """
-    from hma_model import hub
-
-    print(f"pulled to {hub.pull(source, embodiment, out, revision)}")
-
-
-@hub_app.command("list")
-def hub_list(
-    source: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")], json: Json = False
-) -> None:
-    """The robots of a repo.
-
-    Example: hma hub list ./my-hub/team/model
-    """
-    from hma_model import hub
-
-    rows = hub.list_embodiments(source)
-    if json:
-        print_json(rows)
-    else:
-        print_table(list(rows[0]) if rows else ["embodiment"], [list(row.values()) for row in rows])
-
-
-@hub_app.command("import")
-def hub_import(
-    source: Annotated[str, typer.Argument(help="A released checkpoint: a folder, or org/name on the hub.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the new checkpoint.")],
-    embodiment: Embodiments = None,
-    grid: Annotated[tuple[int, int] | None, typer.Option("--grid", help="h w, if not square.")] = None,
-    tokenizer: Annotated[str | None, typer.Option("--tokenizer", help="Default the paper's.")] = None,
-    revision: Annotated[str | None, typer.Option("--revision", help="Branch, tag or commit.")] = None,
-    json: Json = False,
-) -> None:
-    """Bring a checkpoint of the paper's release into our layout.
-
-    Example: hma hub import liruiw/hma-base-disc --out hma-base-disc
-    """
-    from hma_model import hub
-
-    made = hub.import_released(
-        source, out, embodiments=embodiment, grid=grid, tokenizer=tokenizer, revision=revision
-    )
-    if json:
-        print_json({"out": str(made.folder), "embodiments": list(made.embodiments)})
-    else:
-        print(f"imported to {made.folder}: {len(made.embodiments)} embodiments")
-
-
-@hub_app.command("export")
-def hub_export(
-    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint, or a run's folder.")],
-    out: Annotated[Path, typer.Option("--out", help="A new folder: config.json, model.safetensors.")],
-    embodiment: Embodiments = None,
-) -> None:
-    """Write a checkpoint in the layout of the paper's release, for its code to read.
-
-    Example: hma hub export runs/first --out released
-    """
-    from hma_model import hub
-
-    print(f"exported to {hub.export_released(checkpoint, out, embodiments=embodiment)}")
-
-
 mount(app)
+cli_train.mount(app)
 BENCHES.setdefault("mup", "hma_model.bench_mup")
 app.add_typer(hub_app, name="hub")
 

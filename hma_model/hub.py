@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from hma_model.model import HMA
 
 Content = Path | bytes
-_FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
-_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
+REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
 
 
 class Store(Protocol):
@@ -48,8 +47,9 @@ class Store(Protocol):
         """A small file."""
         ...
 
-    def publish(self, changes: Callable[[], Mapping[str, Content]], message: str) -> str:
-        """Put files in place and return the address; `changes` is asked again if somebody else was faster."""
+    def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str:
+        """Put files in place, delete where None, return the address; `changes` is asked again if somebody
+        else was faster."""
         ...
 
     def pull(self, names: list[str], out: Path | None) -> Path:
@@ -57,8 +57,10 @@ class Store(Protocol):
         ...
 
 
-def open_store(address: str | Path, revision: str | None = None, write: bool = False) -> Store:
-    """The hub behind an address.
+def open_store(
+    address: str | Path, revision: str | None = None, write: bool = False, private: bool | None = None
+) -> Store:
+    """The hub behind an address; `private` is of a repository that is made now.
 
     Raises:
         HubError: it is not there, or cannot be reached.
@@ -66,7 +68,7 @@ def open_store(address: str | Path, revision: str | None = None, write: bool = F
     if is_repository(address):
         from hma_model.hub_hf import HuggingFaceStore
 
-        return HuggingFaceStore(str(address).removeprefix("hf://"), revision, write)
+        return HuggingFaceStore(str(address).removeprefix("hf://"), revision, write, private=private)
     from hma_model.hub_folder import FolderStore
 
     if revision is not None:
@@ -79,19 +81,25 @@ def is_repository(address: str | Path) -> bool:
     if isinstance(address, Path):
         return False
     if address.startswith("hf://"):
-        if not _REPOSITORY.fullmatch(address.removeprefix("hf://")):
+        if not REPOSITORY.fullmatch(address.removeprefix("hf://")):
             raise HubError(address, "is not hf://ORGANISATION/NAME", "name a model repository")
         return True
-    return _REPOSITORY.fullmatch(address) is not None and not Path(address).is_dir()
+    return REPOSITORY.fullmatch(address) is not None and not Path(address).is_dir()
 
 
-def push(checkpoint: str | Path, target: str | Path, embodiments: Iterable[str] | None = None) -> str:
+def push(
+    checkpoint: str | Path,
+    target: str | Path,
+    embodiments: Iterable[str] | None = None,
+    private: bool | None = None,
+) -> str:
     """Publish embodiments of a checkpoint, with the trunk where there is none yet.
 
     Args:
         checkpoint: its folder, or that of a training run.
         target: a folder, a URI, or a repository; made where it is not there.
         embodiments: ids; None for all.
+        private: make a new repository a private one.
 
     Returns:
         Where it is now: a path, URI or web address.
@@ -105,7 +113,7 @@ def push(checkpoint: str | Path, target: str | Path, embodiments: Iterable[str] 
     source.trunk()
     for name in ids:
         source.check(name)
-    store = open_store(target, write=True)
+    store = open_store(target, write=True, private=private)
 
     def changes() -> dict[str, Content]:
         return _changes(source, ids, store)
@@ -145,7 +153,7 @@ def _pull(
     store = open_store(source, revision)
     files = store.files()
     values = _config(store, files)
-    there = _ids(files)
+    there = embodiment_ids(files)
     wanted = list(dict.fromkeys(there if embodiments is None else embodiments))
     for name in wanted:
         check_id(name, store.name)
@@ -169,23 +177,9 @@ def _pull(
 
 def list_embodiments(source: str | Path, revision: str | None = None) -> list[dict[str, Any]]:
     """What is published there, a row an embodiment: ids, action, rate, figures, licence, bytes."""
-    rows = []
-    for name, facts in describe(source, revision)["embodiments"].items():
-        card = facts["card"]
-        metrics = card.get("metrics") or {}
-        rows.append(
-            {
-                "embodiment": name,
-                "robot": card.get("robot"),
-                "action_dim": card.get("action_dim"),
-                "hz": card.get("effective_hz"),
-                "stride": card.get("stride"),
-                **{key: metrics.get(key) for key in _FIGURES},
-                "licence": card.get("license"),
-                "bytes": facts["bytes"],
-            }
-        )
-    return rows
+    from hma_model.hub_list import listed
+
+    return listed(describe(source, revision))
 
 
 def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
@@ -202,7 +196,7 @@ def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
                 "card": _card(store, name),
                 "bytes": sum(files.get(f"embodiments/{name}/{part}", 0) for part in PARTS),
             }
-            for name in _ids(files)
+            for name in embodiment_ids(files)
         },
     }
 
@@ -298,7 +292,7 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
         sample = source.folder / "embodiments" / name / SAMPLE
         parts = (SAMPLE, *PARTS) if sample.is_file() else PARTS
         present.update({f"embodiments/{name}/{part}": source.path(name, part) for part in parts})
-    cards = {name: _readable_card(store, name) for name in _ids(files)}
+    cards = {name: _readable_card(store, name) for name in embodiment_ids(files)}
     cards.update({name: source.card(name) for name in ids})
     suffix = f"/{SAMPLE}"
     samples = {path.split("/")[1] for path in (*files, *present) if path.endswith(suffix)}
@@ -331,8 +325,8 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
     return values
 
 
-def _ids(files: Iterable[str]) -> list[str]:
-    """Ids with a card, which is written last."""
+def embodiment_ids(files: Iterable[str]) -> list[str]:
+    """Ids with a card, which is written last, in a listing of a checkpoint's files."""
     found = set()
     for path in files:
         parts = path.split("/")

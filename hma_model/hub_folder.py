@@ -75,7 +75,7 @@ class FolderStore:
             raise HubError(f"{self.name}/{name}", f"is larger than {MAX_JSON_BYTES:,} bytes")
         return content
 
-    def publish(self, changes: Callable[[], Mapping[str, Path | bytes]], message: str) -> str:
+    def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """Stage everything, then rename; README.md is renewed until it shows what is there."""
         for attempt in range(ATTEMPTS):
             if self._put(dict(changes())):
@@ -84,12 +84,20 @@ class FolderStore:
         else:
             raise HubError(self.name, "somebody else keeps writing here", "push again later")
         for _ in range(ATTEMPTS):
-            page = changes()[README]
-            assert isinstance(page, bytes)
-            if self.read(README) == page:
+            page = changes().get(README)
+            if not isinstance(page, bytes) or self.read(README) == page:
                 break
             self._put({README: page})
         return self.name
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of the parquet files, where reading them again is cheap."""
+        names = [name for name in self.files() if name.endswith(".parquet")] if self._local else []
+        return {name: file_sha256(inside(Path(self._root), name)) for name in names}
+
+    def download(self, names: list[str], out: Path) -> None:
+        """As `pull`."""
+        self.pull(names, out)
 
     def pull(self, names: list[str], out: Path | None) -> Path:
         """Copy files that are not there with the same content; a folder of this machine may stay in place."""
@@ -121,16 +129,19 @@ class FolderStore:
                 beside.unlink(missing_ok=True)
         return out
 
-    def _put(self, files: Mapping[str, Path | bytes]) -> bool:
+    def _put(self, files: Mapping[str, Path | bytes | None]) -> bool:
         """False where somebody else has put a config there first."""
         staged: dict[str, str] = {}
         try:
             for name, content in files.items():
-                staged[name] = self._stage(name, content)
-            for name in files:
-                if name == CONFIG and not self._claim(staged[name], self._path(name)):
+                if content is not None:
+                    staged[name] = self._stage(name, content)
+            for name, content in files.items():
+                if content is None:
+                    self._fs.rm_file(self._path(name))
+                elif name == CONFIG and not self._claim(staged[name], self._path(name)):
                     return False
-                if name != CONFIG:
+                elif name != CONFIG:
                     self._rename(staged.pop(name), self._path(name))
         except OSError as fault:
             raise HubError(

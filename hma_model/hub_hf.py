@@ -1,20 +1,22 @@
-"""A hub that is a model repository of the Hugging Face Hub.
+"""A hub that is a repository of the Hugging Face Hub.
 
 A push is one commit on top of the commit it was prepared for; when somebody else has committed in between, it
-is prepared again. What is downloaded goes through the client's own cache, which resumes and works offline.
+is prepared again. What is downloaded goes through the client's own cache, which works offline.
 """
 
 import random
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HubError
 from hma_model.files import MAX_JSON_BYTES
+from hma_model.hub_errors import LOG_IN, cuts, explain, explained, waiting
+from hma_model.hub_fetch import LARGE, fetch, fetch_to
 
 ATTEMPTS = 8
+TIMEOUT = 30.0  # seconds for a listing
 _CONFLICTS = (409, 412)
 
 
@@ -25,36 +27,60 @@ class HuggingFaceStore:
         repo: organisation/name.
         revision: branch, tag or commit; None for main.
         write: make the repository where it is not there.
+        kind: model or dataset.
+        private: make it a private one.
 
     Raises:
         HubError: not there, no access, or not reachable.
     """
 
-    def __init__(self, repo: str, revision: str | None = None, write: bool = False) -> None:
+    def __init__(
+        self,
+        repo: str,
+        revision: str | None = None,
+        write: bool = False,
+        kind: str = "model",
+        private: bool | None = None,
+    ) -> None:
         from huggingface_hub import HfApi, get_token
 
-        self.name, self.repo, self._revision = f"hf://{repo}", repo, revision
+        prefix = "datasets/" if kind == "dataset" else ""
+        self.name, self.repo, self._revision, self._kind = f"hf://{prefix}{repo}", repo, revision, kind
         self._api = HfApi(library_name="hma-toolkit")
+        self.address = f"{self._api.endpoint}/{prefix}{repo}"
         self._commit: str | None = None
         self._sizes: dict[str, int] | None = None
+        self._digests: dict[str, str] = {}
         if write:
             if get_token() is None:
-                raise HubError(
-                    self.name,
-                    "needs a token to be written",
-                    f"log in with hf auth login, or set HF_TOKEN; for a folder write ./{repo}",
-                )
-            with _explained(self.name):
-                self._api.create_repo(repo, repo_type="model", exist_ok=True)
+                remedy = f"{LOG_IN}; for a folder write ./{repo}"
+                raise HubError(self.name, "needs a token to be written", remedy)
+            self._patiently(
+                lambda: self._api.create_repo(repo, repo_type=kind, exist_ok=True, private=private or None)
+            )
 
     def files(self) -> dict[str, int]:
         """Sizes by name at the revision's newest commit; out of the hub's reach, of what the cache has."""
-        with _explained(self.name):
+
+        def ask() -> Any:
             try:
-                info = self._api.model_info(self.repo, revision=self._revision, files_metadata=True)
+                return self._api.repo_info(
+                    self.repo,
+                    repo_type=self._kind,
+                    revision=self._revision,
+                    files_metadata=True,
+                    timeout=TIMEOUT,
+                )
             except _unreachable():
+                return None
+
+        info = self._patiently(ask)
+        if info is None:
+            with explained(self.name):
                 return self._cached_files()
         self._commit = info.sha
+        lfs = {item.rfilename: item.lfs for item in info.siblings or [] if item.lfs}
+        self._digests = {name: str(facts["sha256"]) for name, facts in lfs.items()}
         self._sizes = {item.rfilename: int(item.size or 0) for item in info.siblings or []}
         return dict(self._sizes)
 
@@ -63,53 +89,86 @@ class HuggingFaceStore:
         from huggingface_hub import hf_hub_download
 
         sizes = self.files() if self._sizes is None else self._sizes
-        if sizes.get(name, 0) > MAX_JSON_BYTES:
-            raise HubError(f"{self.name}/{name}", f"is larger than {MAX_JSON_BYTES:,} bytes")
-        with _explained(f"{self.name}/{name}"):
-            path = hf_hub_download(self.repo, name, revision=self._commit or self._revision)
-            return Path(path).read_bytes()
+        where, revision = f"{self.name}/{name}", self._commit or self._revision
+        if sizes.get(name, 0) <= MAX_JSON_BYTES:
+            with explained(where):
+                path = Path(hf_hub_download(self.repo, name, repo_type=self._kind, revision=revision))
+            if path.stat().st_size <= MAX_JSON_BYTES:
+                return path.read_bytes()
+        raise HubError(where, f"is larger than {MAX_JSON_BYTES:,} bytes", "this is not a file of ours")
 
-    def publish(self, changes: Callable[[], Mapping[str, Path | bytes]], message: str) -> str:
+    def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """One commit, prepared again while others commit first."""
-        from huggingface_hub import CommitOperationAdd
+        from huggingface_hub import CommitOperationAdd, CommitOperationDelete
         from huggingface_hub.errors import HfHubHTTPError
 
+        transient: tuple[type[BaseException], ...] = (HfHubHTTPError, *cuts())
         for attempt in range(ATTEMPTS):
-            operations = [
+            operations: list[CommitOperationAdd | CommitOperationDelete] = [
                 CommitOperationAdd(name, str(content) if isinstance(content, Path) else content)
+                if content is not None
+                else CommitOperationDelete(name)
                 for name, content in changes().items()
             ]
-            with _explained(self.name):
-                try:
-                    self._api.create_commit(
-                        self.repo, operations, commit_message=message, parent_commit=self._commit
-                    )
-                    return f"{self._api.endpoint}/{self.repo}"
-                except HfHubHTTPError as fault:
-                    if fault.response is None or fault.response.status_code not in _CONFLICTS:
-                        raise
-            time.sleep(min(0.2 * 2**attempt, 10.0) * (0.5 + random.random()))
+            try:
+                self._api.create_commit(
+                    self.repo,
+                    operations,
+                    repo_type=self._kind,
+                    commit_message=message,
+                    parent_commit=self._commit,
+                )
+                return self.address
+            except transient as fault:
+                response = getattr(fault, "response", None)
+                conflict = response is not None and response.status_code in _CONFLICTS
+                seconds = min(0.2 * 2**attempt, 10.0) if conflict else waiting(fault, attempt)
+                if seconds is None or (not conflict and attempt >= ATTEMPTS // 2):
+                    raise explain(self.name, fault) from fault
+            except (OSError, ValueError, RuntimeError, KeyError) as fault:
+                raise explain(self.name, fault) from fault
+            time.sleep(seconds * (0.5 + random.random()) if conflict else seconds)
         raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 by name of the large files, at the commit that `files` saw."""
+        self.files()
+        return dict(self._digests)
+
+    def download(self, names: list[str], out: Path) -> None:
+        """Files to a folder, past the client's cache; a killed download goes on where it stopped."""
+        sizes = self.files() if self._sizes is None else self._sizes
+        if self._commit is None:
+            raise HubError(self.name, "is out of reach", "go online and pull again")
+        commit = self._commit
+        for name in names:
+            if name in sizes:
+                self._patiently(lambda: fetch_to(self.repo, self._kind, name, commit, out / name))  # noqa: B023
 
     def pull(self, names: list[str], out: Path | None) -> Path:
         """The client's cache, or a folder with copies of its own."""
-        from huggingface_hub import snapshot_download
-
-        offline = self._commit is None
-        with _explained(self.name):
-            folder = Path(
-                snapshot_download(
-                    self.repo,
-                    revision=self._revision if offline else self._commit,
-                    allow_patterns=names,
-                    local_files_only=offline,
-                )
-            )
+        folder = self._patiently(lambda: self._fetched(names))
         if out is None:
             return folder
         from hma_model.hub_folder import FolderStore
 
         return FolderStore(folder).pull(names, out)
+
+    def _fetched(self, names: list[str]) -> Path:
+        from huggingface_hub import snapshot_download
+
+        for name in names:
+            if self._commit and (self._sizes or {}).get(name, 0) >= LARGE:
+                fetch(self.repo, self._kind, name, self._commit)
+        folder = snapshot_download(
+            self.repo,
+            repo_type=self._kind,
+            revision=self._revision,  # by its name, so that it is found under it offline
+            allow_patterns=names,
+            local_files_only=self._commit is None,
+            max_workers=4,
+        )
+        return Path(folder)
 
     def _cached_files(self) -> dict[str, int]:
         from huggingface_hub import snapshot_download
@@ -117,7 +176,11 @@ class HuggingFaceStore:
 
         self._commit = None
         try:
-            folder = Path(snapshot_download(self.repo, revision=self._revision, local_files_only=True))
+            folder = Path(
+                snapshot_download(
+                    self.repo, repo_type=self._kind, revision=self._revision, local_files_only=True
+                )
+            )
         except IncompleteSnapshotError as fault:  # only some embodiments were pulled
             folder = Path(fault.snapshot_path)
         paths = (path for path in folder.rglob("*") if path.is_file())
@@ -125,54 +188,26 @@ class HuggingFaceStore:
         self._revision = folder.name
         return dict(self._sizes)
 
+    def _patiently(self, call: Callable[[], Any]) -> Any:
+        """What a call returns; it is made again where the hub is busy or the connection was cut."""
+        from huggingface_hub.errors import HfHubHTTPError
+
+        for attempt in range(ATTEMPTS // 2):
+            try:
+                with explained(self.name):
+                    return call()
+            except HubError as fault:
+                cause = fault.__cause__
+                again = isinstance(cause, (HfHubHTTPError, *cuts()))
+                seconds = waiting(cause, attempt) if again and cause is not None else None
+                if seconds is None or attempt == ATTEMPTS // 2 - 1:
+                    raise
+                time.sleep(seconds)
+        raise AssertionError("the last attempt returns or raises")
+
 
 def _unreachable() -> tuple[type[BaseException], ...]:
     import httpx
     from huggingface_hub.errors import OfflineModeIsEnabled
 
     return (OfflineModeIsEnabled, httpx.ConnectError, httpx.TimeoutException)
-
-
-@contextmanager
-def _explained(where: str) -> Iterator[None]:
-    """The client's errors as HubErrors; none of them shows a token."""
-    import httpx
-    from huggingface_hub import errors
-
-    try:
-        yield
-    except errors.GatedRepoError as fault:
-        raise HubError(
-            where, "is gated", "ask for access on its page, then log in with hf auth login"
-        ) from fault
-    except errors.RevisionNotFoundError as fault:
-        raise HubError(where, "has no such revision", "name a branch, tag or commit of it") from fault
-    except errors.RepositoryNotFoundError as fault:
-        raise HubError(
-            where, "no such repository, or no access to it", "check the name; log in with hf auth login"
-        ) from fault
-    except errors.LocalEntryNotFoundError as fault:
-        raise HubError(where, "is out of reach, and not in the cache", "go online and pull again") from fault
-    except errors.HFValidationError as fault:
-        raise HubError(where, "is not a repository's name", "write ORGANISATION/NAME") from fault
-    except errors.HfHubHTTPError as fault:
-        raise _answered(where, fault) from fault
-    except (errors.OfflineModeIsEnabled, httpx.HTTPError) as fault:
-        raise HubError(
-            where, f"is out of reach: {type(fault).__name__}", "check the network, try again"
-        ) from fault
-    except OSError as fault:
-        raise HubError(
-            where, f"could not be stored: {fault.strerror or fault}", "free space, try again"
-        ) from fault
-
-
-def _answered(where: str, fault: Any) -> HubError:
-    status = fault.response.status_code if fault.response is not None else None
-    remedies = {
-        401: "the token is not valid: log in with hf auth login",
-        403: "the token may not write here: use one with write access",
-        429: "too many requests: wait and try again",
-    }
-    remedy = remedies.get(status or 0, "try again later; what was there is as it was")
-    return HubError(where, f"the hub answered {status}", remedy)

@@ -1,14 +1,14 @@
 """README.md of a checkpoint, made from its config.json and card.json files alone.
 
 The same facts give the same text, so that whoever pushes last writes what everybody would.
-Cards may come from strangers: every value is brought to one plain line before it enters the page.
+Cards may come from strangers: see `hma_model.card_text`.
 """
 
-import re
 from collections.abc import Collection, Mapping
 from typing import Any
 
 from hma_data.yaml_io import write_yaml
+from hma_model.card_text import licence, line, number
 
 _TAGS = ("robotics", "world-model", "video-prediction", "hma")
 _HEADINGS = ("embodiment", "robot", "action dims", "Hz", "stride", "data", "metrics", "licence")
@@ -32,7 +32,7 @@ def render(
     name = repo or "PATH"
     parts = [
         _front_matter(cards),
-        f"# {_line((repo or 'HMA world model').rsplit('/', 1)[-1])}",
+        f"# {line((repo or 'HMA world model').rsplit('/', 1)[-1])}",
         _about(config),
         "## Embodiments\n\n" + _table(cards),
         *(_pictures(cards, samples)),
@@ -43,11 +43,8 @@ def render(
 
 
 def _front_matter(cards: Mapping[str, Mapping[str, Any]]) -> str:
-    licences = sorted({_line(card.get("license")) for card in cards.values()} - {""})
     values: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
-    if len(licences) == 1:
-        known = re.fullmatch(r"[a-z0-9.+-]{1,40}", licences[0].lower())
-        values["license"] = licences[0].lower() if known else "other"
+    values |= licence(card.get("license") for card in cards.values())
     values["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
     return f"---\n{write_yaml(values)}---"
 
@@ -58,12 +55,12 @@ def _about(config: Mapping[str, Any]) -> str:
     return (
         "An action-conditioned video model of robots (Heterogeneous Masked Autoregression): one trunk, "
         "and a stem and head for each embodiment, which are published and pulled one at a time.\n\n"
-        f"- network: {_line(model.get('kind'))}, {_line(model.get('layers'))} layers, "
-        f"width {_line(model.get('width'))}, {_line(model.get('heads'))} heads, "
-        f"window of {_line(model.get('frames'))} frames\n"
-        f"- tokenizer: {_line(tokenizer.get('name'))}, {grid} tokens of a "
-        f"{_line(tokenizer.get('image_size'))}-pixel picture\n"
-        f"- trunk SHA-256: `{_line(config.get('trunk_sha256'))}`"
+        f"- network: {line(model.get('kind'))}, {line(model.get('layers'))} layers, "
+        f"width {line(model.get('width'))}, {line(model.get('heads'))} heads, "
+        f"window of {line(model.get('frames'))} frames\n"
+        f"- tokenizer: {line(tokenizer.get('name'))}, {grid} tokens of a "
+        f"{line(tokenizer.get('image_size'))}-pixel picture\n"
+        f"- trunk SHA-256: `{line(config.get('trunk_sha256'))}`"
     )
 
 
@@ -77,13 +74,13 @@ def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
             " | ".join(
                 (
                     f"`{name}`",
-                    _line(card.get("robot") or card.get("description")),
-                    f"{_line(card.get('action_dim'))} ({_line(card.get('action_space'))})",
-                    _number(card.get("effective_hz")),
-                    _line(card.get("stride")),
+                    line(card.get("robot") or card.get("description")),
+                    f"{line(card.get('action_dim'))} ({line(card.get('action_space'))})",
+                    number(card.get("effective_hz")),
+                    line(card.get("stride")),
                     _pairs(card.get("data")),
                     _pairs(card.get("metrics")),
-                    _line(card.get("license")) or "not stated",
+                    line(card.get("license")) or "not stated",
                 )
             )
         )
@@ -117,7 +114,7 @@ def _usage(name: str, cards: Mapping[str, Any]) -> str:
 
 def _links(config: Mapping[str, Any]) -> str:
     return (
-        f"Format version {_line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
+        f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
         "parts that do not belong together are refused on loading."
     )
 
@@ -126,17 +123,7 @@ def _pairs(values: Any) -> str:
     if not isinstance(values, Mapping) or not values:
         return "not stated"
     return ", ".join(
-        f"{_line(key).replace('_', ' ')} {_number(value)}"
+        f"{line(key).replace('_', ' ')} {number(value)}"
         for key, value in values.items()
         if value is not None and not isinstance(value, dict | list)
     )
-
-
-def _number(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else _line(value)
-
-
-def _line(value: Any) -> str:
-    """A value as one line that cannot leave its cell or become markup."""
-    text = " ".join(str("" if value is None else value).split())[:200]
-    return re.sub(r"([|`<>\[\]\\*_])", r"\\\1", text) if not re.fullmatch(r"[\w.-]*", text) else text

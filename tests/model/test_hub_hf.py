@@ -1,208 +1,437 @@
-"""Repositories of the hub: commits, conflicts, errors and the cache, on a repository kept in memory."""
+"""Repositories of the hub: its real client and a server on loopback. Commits, faults, cache, tokens."""
 
-import hashlib
+import errno
+import json
+import os
+import resource
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
-import httpx
 import pytest
-from huggingface_hub import HfApi, errors
+import torch
+import yaml as plain_yaml
+from huggingface_hub import constants
 
 from hma_data.errors import HubError
-from hma_model import checkpoint, hub
-from hma_model.hub_hf import HuggingFaceStore
+from hma_model import checkpoint, hub, hub_fetch, hub_hf
+from hma_model.checkpoint import PARTS
 from hma_model.model import HMA
+from tests.hub_server import Hub, connect, serve
 from tests.model.robots import save
 
 ROBOTS = {"arm": 2, "hand": 3}
 REPO = "team/model"
-TOKEN = "hf_secret_of_this_test"
+TOKEN = "hf_TheSecretOfThisTest"
+ROOT = Path(__file__).resolve().parents[2]
 
 
-class Repository:
-    """The calls of the client that a store makes, on snapshots in a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.commits: list[dict[str, bytes]] = []
-        self.before_commit: list = []
-        self.failing: type[Exception] | Exception | None = None
-        self.downloads: list[str] = []
-
-    @property
-    def head(self) -> str:
-        return hashlib.sha1(str(len(self.commits)).encode()).hexdigest()
-
-    def create_repo(self, repo, repo_type=None, exist_ok=False):
-        self.commits = self.commits or [{".gitattributes": b""}]
-
-    def model_info(self, repo, revision=None, files_metadata=False):
-        self._fail()
-        if not self.commits:
-            raise answer(errors.RepositoryNotFoundError, 404)
-        if revision not in (None, self.head, "main"):
-            raise answer(errors.RevisionNotFoundError, 404)
-        siblings = [SimpleNamespace(rfilename=n, size=len(c)) for n, c in self.commits[-1].items()]
-        return SimpleNamespace(sha=self.head, siblings=siblings)
-
-    def create_commit(self, repo, operations, commit_message, parent_commit=None):
-        for act in self.before_commit[:1]:
-            self.before_commit.pop(0)
-            act()
-        self._fail()
-        if parent_commit != self.head:
-            raise answer(errors.HfHubHTTPError, 412)
-        added = {}
-        for operation in operations:
-            with operation.as_file() as file:
-                added[operation.path_in_repo] = file.read()
-        self.commits.append({**self.commits[-1], **added})
-
-    def download(self, repo, name, revision=None):
-        self.downloads.append(name)
-        path = self.folder / self.head / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(self.commits[-1][name])
-        return str(path)
-
-    def snapshot(self, repo, revision=None, allow_patterns=None, local_files_only=False):
-        if local_files_only:
-            if not (self.folder / self.head).is_dir():
-                raise errors.LocalEntryNotFoundError("not cached")
-            if allow_patterns is None:
-                raise errors.IncompleteSnapshotError("some", str(self.folder / self.head))
-        else:
-            for name in allow_patterns:
-                self.download(repo, name)
-        return str(self.folder / self.head)
-
-    def _fail(self):
-        if self.failing is not None:
-            raise self.failing
-
-
-def answer(kind: type[errors.HfHubHTTPError], status: int) -> errors.HfHubHTTPError:
-    request = httpx.Request("POST", "https://hub.invalid/api", headers={"authorization": f"Bearer {TOKEN}"})
-    return kind(f"{status} error", response=httpx.Response(status, request=request))
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("source") / "model"
+    save(folder, ROBOTS)
+    return folder
 
 
 @pytest.fixture
-def repository(tmp_path, monkeypatch) -> Repository:
-    made = Repository(tmp_path / "cache/snapshots")
-    for name in ("create_repo", "model_info", "create_commit"):
-        monkeypatch.setattr(HfApi, name, lambda self, *a, _name=name, **k: getattr(made, _name)(*a, **k))
-    monkeypatch.setattr("huggingface_hub.get_token", lambda: TOKEN)
-    monkeypatch.setattr("huggingface_hub.hf_hub_download", made.download)
-    monkeypatch.setattr("huggingface_hub.snapshot_download", made.snapshot)
-    monkeypatch.setattr("time.sleep", lambda seconds: None)
-    return made
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    from huggingface_hub.utils import close_session
+
+    with serve() as made:
+        made.tokens = {TOKEN: "write"}
+        connect(monkeypatch, made, tmp_path / "cache", TOKEN)
+        yield made
+        close_session()
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
-    save(tmp_path / "model", ROBOTS)
-    return tmp_path / "model"
+def published(server: Hub, source: Path) -> Hub:
+    hub.push(source, REPO)
+    server.log.clear()
+    return server
 
 
-def test_one_embodiment_is_one_commit_that_touches_nothing_else(repository, source):
+def files_of(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+# -- pushing
+
+
+def test_one_embodiment_is_one_commit_that_touches_its_folder_and_the_card_only(server, source):
     hub.push(source, REPO, ["arm"])
+    first = server.model(REPO).files
     hub.push(source, REPO, ["hand"])
-    first, second = repository.commits[1:]
-    changed = {name for name in second if second[name] != first.get(name)}
-    assert {name for name in changed if not name.startswith("embodiments/hand/")} == {"README.md"}
-    assert len(repository.commits) == 3 and b"| `arm` |" in second["README.md"]
-    assert b'HMA.from_pretrained("team/model"' in second["README.md"]
+    commits = server.model(REPO).commits
+    assert [commit.message for commit in commits] == ["initial commit", "Add arm", "Add hand"]
+    changed = {name for name, content in commits[-1].files.items() if first.get(name) != content}
+    assert changed == {"README.md", *(f"embodiments/hand/{part}" for part in PARTS)}
+    assert set(first) <= set(commits[-1].files)
 
 
-def test_a_push_between_is_taken_in(repository, source):
+def test_the_address_of_the_page_is_returned(server, source):
+    assert hub.push(source, f"hf://{REPO}") == f"{server.url}/{REPO}"
+
+
+def test_the_card_can_be_found_by_the_hubs_filters(published):
+    front = published.model(REPO).files["README.md"].decode().split("---\n")[1]
+    values = plain_yaml.safe_load(front)
+    assert values["library_name"] == "hma-toolkit" and values["pipeline_tag"] == "robotics"
+    assert {"robotics", "world-model", "embodiment:arm", "embodiment:hand"} <= set(values["tags"])
+
+
+def test_two_pushes_at_once_both_land(server, source):
     hub.push(source, REPO, [])
-    repository.before_commit = [lambda: hub.push(source, REPO, ["hand"])]
+    server.before_commit = [lambda: hub.push(source, REPO, ["hand"])]
     hub.push(source, REPO, ["arm"])
-    page = repository.commits[-1]["README.md"]
-    assert b"| `arm` |" in page and b"| `hand` |" in page
+    assert server.count("POST .*/commit/") == 4  # trunk, hand, arm refused, arm again
+    page = server.model(REPO).files["README.md"].decode()
+    assert "| `arm` |" in page and "| `hand` |" in page
     assert [row["embodiment"] for row in hub.list_embodiments(REPO)] == ["arm", "hand"]
 
 
-def test_two_first_pushes_of_different_trunks_leave_one(repository, source, tmp_path):
+def test_pushes_from_threads_all_land(server, source):
+    hub.push(source, REPO, [])
+    threads = [threading.Thread(target=hub.push, args=(source, REPO, [name])) for name in ROBOTS]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert set(HMA.from_pretrained(REPO).embodiments) == set(ROBOTS)
+    assert len(server.model(REPO).commits) == 4
+
+
+def test_two_first_pushes_of_different_trunks_leave_one(server, source, tmp_path):
     save(tmp_path / "other", ROBOTS, seed=1)
-    repository.before_commit = [lambda: hub.push(tmp_path / "other", REPO)]
-    with pytest.raises(HubError, match="has another trunk"):
+    server.before_commit = [lambda: hub.push(tmp_path / "other", REPO)]
+    with pytest.raises(HubError, match=r"has another trunk.*push to a hub of its own, or finetune"):
         hub.push(source, REPO)
-    assert repository.commits[-1]["trunk.safetensors"] == (tmp_path / "other/trunk.safetensors").read_bytes()
+    there = server.model(REPO).files["trunk.safetensors"]
+    assert there == (tmp_path / "other/trunk.safetensors").read_bytes()
 
 
-def test_endless_conflicts_end(repository, source):
-    def between():
-        repository.commits.append(repository.commits[-1])
-        repository.before_commit.append(between)
-
-    repository.before_commit = [between]
+def test_endless_conflicts_end(server, source):
+    server.create(REPO)
+    server.fail("POST .*/commit/", 412, times=99)
     with pytest.raises(HubError, match="others committed first 8 times"):
         hub.push(source, REPO)
 
 
-def test_one_embodiment_is_pulled_without_the_other(repository, source):
-    hub.push(source, f"hf://{REPO}")
-    repository.downloads.clear()
-    model = HMA.from_pretrained(REPO, embodiments=["arm"])
-    assert list(model.embodiments) == ["arm"]
-    assert not [
-        name for name in repository.downloads if "hand" in name or name.endswith((".md", ".gitattributes"))
-    ]
-
-
-def test_pulling_into_a_folder_gives_files_of_its_own(repository, source, tmp_path):
+def test_pushing_the_same_again_makes_no_commit(published, source):
+    before = len(published.model(REPO).commits)
     hub.push(source, REPO)
-    out = hub.pull(REPO, out=tmp_path / "out", revision="main")
-    assert set(checkpoint.load(out).embodiments) == set(ROBOTS)
-
-
-def test_what_was_pulled_is_there_offline(repository, source):
-    hub.push(source, REPO)
-    hub.pull(REPO, ["arm"])
-    repository.failing = errors.OfflineModeIsEnabled("offline")
-    assert list(HMA.from_pretrained(REPO, embodiments=["arm"]).embodiments) == ["arm"]
-
-
-def test_what_was_never_pulled_is_not_there_offline(repository, source):
-    repository.failing = httpx.ConnectError("no route")
-    with pytest.raises(HubError, match="out of reach, and not in the cache"):
-        hub.pull(REPO)
-
-
-def test_a_repository_and_a_revision_that_are_not_there_say_so(repository, source):
-    with pytest.raises(HubError, match="no such repository, or no access"):
-        hub.pull(REPO)
-    hub.push(source, REPO)
-    with pytest.raises(HubError, match="no such revision"):
-        hub.pull(REPO, revision="v9")
-
-
-def test_a_repository_of_another_library_says_so(repository, source):
-    repository.create_repo(REPO)
-    with pytest.raises(HubError, match=r"has no config\.json"):
-        hub.pull(REPO)
-    repository.commits[-1]["config.json"] = b'{"model_type": "bert"}'
-    with pytest.raises(HubError, match="is not of hma-toolkit"):
-        hub.push(source, REPO)
+    assert len(published.model(REPO).commits) == before
+    assert published.count("PUT ") == 0
 
 
 @pytest.mark.parametrize(
-    ("status", "remedy"), [(401, "not valid"), (403, "may not write"), (429, "too many"), (500, "try again")]
+    "request_", ["PUT /lfs/upload/", "POST .*/objects/batch", "POST /api/models/.*/commit/"]
 )
-def test_a_refusal_names_the_remedy_and_never_the_token(repository, source, status, remedy):
-    repository.create_repo(REPO)
-    repository.failing = answer(errors.HfHubHTTPError, status)
-    with pytest.raises(HubError, match=f"answered {status}.*{remedy}") as caught:
+def test_a_push_cut_for_good_leaves_the_repository_as_it_was(server, source, request_):
+    hub.push(source, REPO, ["arm"])
+    before = server.model(REPO).files
+    server.fail(request_, times=99, after=100)
+    with pytest.raises(HubError, match=r"connection was cut|out of reach"):
+        hub.push(source, REPO, ["hand"])
+    assert server.model(REPO).files == before
+    server.faults.clear()
+    hub.push(source, REPO, ["hand"])
+    assert set(HMA.from_pretrained(REPO).embodiments) == set(ROBOTS)
+
+
+@pytest.mark.parametrize(
+    "fault", [{"status": 503}, {"status": 429, "headers": {"Retry-After": "7"}}, {"after": 10}],
+    ids=["503", "429", "cut"],
+)  # fmt: skip
+@pytest.mark.parametrize(
+    "request_", ["PUT /lfs/upload/", "POST .*/commit/", "GET /api/models", "POST .*preupload"]
+)
+def test_a_passing_fault_does_not_stop_a_push(server, source, fault, request_):
+    server.create(REPO)
+    server.fail(request_, **fault)
+    hub.push(source, REPO, ["arm"])
+    assert len(server.model(REPO).commits) == 2
+    if fault.get("status") == 429:
+        assert max(server.waits) >= 7
+
+
+def test_a_commit_whose_answer_was_lost_is_not_made_twice(server, source, monkeypatch):
+    hub.push(source, REPO, ["arm"])
+    from tests.hub_server import _Handler
+
+    plain, lost = _Handler._answer, []
+
+    def answer(self, status, value, headers=None):
+        if isinstance(value, dict) and "commitOid" in value and not lost:
+            lost.append(1)
+            return self._cut()
+        return plain(self, status, value, headers)
+
+    monkeypatch.setattr(_Handler, "_answer", answer)
+    hub.push(source, REPO, ["hand"])
+    assert lost and [commit.message for commit in server.model(REPO).commits][1:] == ["Add arm", "Add hand"]
+
+
+def test_a_new_repository_can_be_private(server, source):
+    hub.push(source, REPO, private=True)
+    assert server.model(REPO).private
+
+
+# -- pulling
+
+
+def test_one_embodiment_brings_config_trunk_and_its_own_files_byte_for_byte(published, source):
+    model = HMA.from_pretrained(REPO, embodiments=["arm"])
+    assert list(model.embodiments) == ["arm"]
+    wanted = ["config.json", "trunk.safetensors", *(f"embodiments/arm/{part}" for part in PARTS)]
+    assert published.sent() == {name: (source / name).stat().st_size for name in wanted}
+
+
+def test_what_is_in_the_cache_is_not_sent_again(published):
+    hub.pull(REPO, ["arm"])
+    published.log.clear()
+    hub.pull(REPO, ["arm"])
+    assert published.sent() == {}
+    hub.pull(REPO, ["hand"])
+    assert set(published.sent()) == {f"embodiments/hand/{part}" for part in PARTS}
+
+
+def test_a_revision_is_the_one_named(published, source, tmp_path):
+    repository = published.model(REPO)
+    repository.refs["v1"] = repository.commits[-1].id
+    save(tmp_path / "other", {"leg": 4}, seed=3)
+    repository.commit(
+        {name: (tmp_path / "other" / name).read_bytes() for name in files_of(tmp_path / "other")}
+    )
+    for revision in ("v1", repository.refs["v1"]):
+        model = HMA.from_pretrained(REPO, embodiments=["arm"], revision=revision)
+        theirs = checkpoint.load(source, ["arm"]).state_dict()
+        assert all(torch.equal(value, theirs[name]) for name, value in model.state_dict().items())
+
+
+def test_a_listing_in_pages_is_read_whole(published):
+    published.page = 3
+    assert set(HMA.from_pretrained(REPO).embodiments) == set(ROBOTS)
+    assert published.count("GET .*/tree/") > 1
+
+
+def test_pulling_into_a_folder_gives_files_of_its_own(published, tmp_path):
+    out = hub.pull(REPO, out=tmp_path / "out", revision="main")
+    assert set(checkpoint.load(out).embodiments) == set(ROBOTS)
+    assert not [path for path in out.rglob("*") if path.is_symlink()]
+
+
+def test_the_token_is_not_shown_to_the_host_of_the_files(published):
+    hub.pull(REPO, ["arm"])
+    asked = [asked for asked in published.log if asked.path.startswith("/cdn/")]
+    assert asked and not any(asked.authorized for asked in asked)
+    assert all(asked.host.startswith("localhost") for asked in asked)
+
+
+def test_a_cut_download_goes_on_where_it_was_cut(published, source, monkeypatch):
+    monkeypatch.setattr(hub_hf, "LARGE", 0)
+    published.fail("GET /cdn/.*trunk", after=1000)
+    hub.pull(REPO, ["arm"])
+    asked = [a for a in published.log if a.method == "GET" and a.path.endswith("trunk.safetensors")]
+    size = (source / "trunk.safetensors").stat().st_size
+    assert [a.sent for a in asked if a.sent] == [1000, size - 1000]
+
+
+def test_a_cut_download_of_a_small_file_is_made_again(published):
+    published.fail("GET /cdn/.*trunk", after=1000)
+    assert list(HMA.from_pretrained(REPO, embodiments=["arm"]).embodiments) == ["arm"]
+
+
+def test_a_killed_pull_goes_on_where_it_stopped(published, source, monkeypatch):
+    monkeypatch.setattr(hub_hf, "LARGE", 0)
+    published.fail("GET /cdn/.*trunk", after=1000)
+    published.fail("GET /cdn/.*trunk", after=0, times=99)
+    with pytest.raises(HubError, match=r"connection was cut.*goes on where it stopped"):
+        hub.pull(REPO, ["arm"])
+    published.faults.clear()
+    published.log.clear()
+    hub.pull(REPO, ["arm"])
+    size = (source / "trunk.safetensors").stat().st_size
+    assert published.sent("trunk") == {"trunk.safetensors": size - 1000}
+
+
+def test_a_download_with_other_content_than_stated_is_thrown_away(published, monkeypatch, tmp_path):
+    monkeypatch.setattr(hub_hf, "LARGE", 0)
+    trunk = published.model(REPO).files["trunk.safetensors"]
+    name = next(name for name, content in published.objects.items() if content == trunk)
+    published.objects[name] = bytes(len(trunk))
+    with pytest.raises(HubError, match="other content than the hub stated"):
+        hub.pull(REPO, ["arm"])
+    assert not list((tmp_path / "cache").rglob(f"{name}*incomplete"))
+
+
+@pytest.mark.parametrize("fault", [{"status": 503}, {"status": 429, "headers": {"Retry-After": "3"}}])
+def test_a_passing_fault_does_not_stop_a_pull(published, fault):
+    for request in ("GET /api/models", "GET /cdn/", "HEAD .*/resolve/", "GET .*/tree/"):
+        published.fail(request, **fault)
+    assert list(HMA.from_pretrained(REPO, embodiments=["arm"]).embodiments) == ["arm"]
+
+
+def test_what_was_pulled_is_there_offline(published, monkeypatch):
+    hub.pull(REPO, ["arm"])
+    published.log.clear()
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    assert list(HMA.from_pretrained(REPO, embodiments=["arm"]).embodiments) == ["arm"]
+    assert [row["embodiment"] for row in hub.list_embodiments(REPO)] == ["arm"]
+    assert published.log == []
+
+
+def test_what_was_pulled_is_there_when_the_hub_is_gone(published, monkeypatch):
+    hub.pull(REPO, ["arm"])
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    assert list(HMA.from_pretrained(REPO, embodiments=["arm"]).embodiments) == ["arm"]
+
+
+def test_what_was_never_pulled_is_not_there_offline(published, monkeypatch):
+    hub.pull(REPO, ["arm"])
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(HubError, match="no embodiment 'hand'"):
+        hub.pull(REPO, ["hand"])
+    with pytest.raises(HubError, match=r"out of reach, and not in the cache.*go online"):
+        hub.pull("team/other")
+
+
+def test_a_full_disk_says_so_and_the_pull_goes_on_later(published, tmp_path, monkeypatch):
+    monkeypatch.setattr(hub_hf, "LARGE", 0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+    try:
+        with pytest.raises(HubError, match=rf"{os.strerror(errno.EFBIG)}.*free space"):
+            hub.pull(REPO, ["arm"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert checkpoint.load(hub.pull(REPO, ["arm"]), ["arm"])
+
+
+# -- what is not there, not allowed, or something else
+
+
+def test_without_a_token_nothing_is_pushed(server, source, monkeypatch):
+    monkeypatch.delenv("HF_TOKEN")
+    with pytest.raises(HubError, match=r"needs a token.*hf auth login"):
         hub.push(source, REPO)
-    assert TOKEN not in str(caught.value)
+    assert server.log == []
 
 
-def test_a_huge_card_is_not_read(repository, source, monkeypatch):
-    hub.push(source, REPO)
-    store = HuggingFaceStore(REPO)
-    name = "embodiments/arm/card.json"
-    store.files()
-    store._sizes[name] = 10**12
-    with pytest.raises(HubError, match="is larger than"):
-        store.read(name)
+def test_a_wrong_token_is_called_so(published, source, monkeypatch):
+    monkeypatch.setenv("HF_TOKEN", "hf_wrong")
+    for act in (lambda: hub.push(source, REPO), lambda: hub.pull(REPO)):
+        with pytest.raises(HubError, match=r"token is not valid.*hf auth login"):
+            act()
+
+
+def test_a_token_without_write_access_is_called_so(published, source):
+    published.tokens[TOKEN] = "read"
+    for repository in (REPO, "team/another"):
+        with pytest.raises(HubError, match="may not write here"):
+            hub.push(source, repository, ["arm"])
+
+
+def test_a_repository_or_revision_that_is_not_there_is_called_so(published):
+    with pytest.raises(HubError, match=r"hf://team/none: no such repository.*check the name"):
+        hub.pull("team/none")
+    with pytest.raises(HubError, match=r"no such revision.*branch, tag or commit"):
+        hub.pull(REPO, revision="v9")
+
+
+def test_a_private_repository_without_a_token_may_be_there(published, monkeypatch):
+    published.model(REPO).private = True
+    monkeypatch.delenv("HF_TOKEN")
+    with pytest.raises(HubError, match=r"no such repository.*log in"):
+        hub.pull(REPO)
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({}, r"has no config\.json"),
+        ({"config.json": b'{"model_type": "bert"}'}, "is not of hma-toolkit"),
+        ({"config.json": b"[1]"}, "must hold a JSON object"),
+        ({"config.json": b"<html>"}, "is not valid JSON"),
+    ],
+)
+def test_a_repository_of_another_library_is_called_so(server, source, files, message):
+    server.create(REPO).commit(files)
+    before = server.model(REPO).files
+    for act in (lambda: hub.pull(REPO), lambda: hub.list_embodiments(REPO)):
+        with pytest.raises(HubError, match=message):
+            act()
+    if files:
+        with pytest.raises(HubError, match=message):
+            hub.push(source, REPO)
+        assert server.model(REPO).files == before
+
+
+def test_an_endpoint_that_is_no_hub_is_called_so(server, monkeypatch):
+    server.create(REPO)
+    monkeypatch.setattr(Hub, "repositories", {}, raising=False)
+    server.fail("GET /api", 200, times=99)
+    with pytest.raises(
+        HubError, match=r"did not answer as a hub does|was not answered by a hub|has no config"
+    ):
+        hub.pull(REPO)
+
+
+def test_a_huge_config_is_not_read(published):
+    published.model(REPO).commit({"config.json": b" " * 16_000_001})
+    with pytest.raises(HubError, match=r"config\.json: is larger than 16,000,000 bytes"):
+        hub.pull(REPO)
+    assert published.sent() == {}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "embodiments/../../escaped/card.json",
+        "embodiments/arm/../../../x",
+        "/etc/hma",
+        "embodiments/..evil/card.json",
+    ],
+)
+def test_names_that_lead_elsewhere_are_left_there(published, tmp_path, name):
+    published.model(REPO).commit({name: b"{}", "embodiments/arm/weights.pkl": b"cos\nsystem\n(S'true'\ntR."})
+    hub.pull(REPO, out=tmp_path / "out")
+    assert [row["embodiment"] for row in hub.list_embodiments(REPO)] == ["arm", "hand"]
+    assert all(path.name != "x" and "escaped" not in str(path) for path in tmp_path.rglob("*"))
+    assert not list(tmp_path.rglob("*.pkl"))
+
+
+# -- the token, and the command
+
+
+def test_the_command_never_shows_or_stores_the_token(server, source, tmp_path):
+    environment = {
+        "HF_ENDPOINT": server.url, "HF_TOKEN": TOKEN, "HF_HOME": str(tmp_path / "home"),
+        "HF_HUB_DISABLE_XET": "1",
+    }  # fmt: skip
+    out = ["--out", str(tmp_path / "pulled")]
+    calls = [
+        ["push", str(source), REPO], ["list", REPO, "--json"], ["pull", REPO, "-e", "arm", *out],
+        ["pull", "team/none"], ["--debug", "push", str(source), "other/model"],
+    ]  # fmt: skip
+    shown = []
+    for call in calls:
+        if "--debug" in call:
+            server.tokens.clear()
+        done = subprocess.run(
+            [sys.executable, "-m", "hma_model.cli", "hub", *call], env={**os.environ, **environment},
+            capture_output=True, text=True, cwd=ROOT, check=False,
+        )  # fmt: skip
+        shown.append(done.stdout + done.stderr)
+        assert TOKEN not in shown[-1]
+        assert done.returncode == (0 if len(shown) <= 3 else 1), shown[-1]
+    assert [row["embodiment"] for row in json.loads(shown[1])["embodiments"]] == ["arm", "hand"]
+    assert "no such repository" in shown[3] and "Traceback" in shown[4]
+    stored = [path for path in tmp_path.rglob("*") if path.is_file() and TOKEN.encode() in path.read_bytes()]
+    assert stored == [] and all(TOKEN.encode() not in c for c in server.model(REPO).files.values())
+
+
+def test_the_large_files_limit_is_what_the_client_is_left_with():
+    assert hub_fetch.LARGE == hub_hf.LARGE < 10**7

@@ -21,8 +21,8 @@ from hma_model.files import to_json
 from hma_model.model import HMA
 from hma_model.released import config_from_released, config_to_released
 from hma_model.released_state import state_to_released
+from tests.hub_server import connect, serve
 from tests.model.network_parts import small_batch, small_config
-from tests.model.test_hub_hf import Repository, repository  # noqa: F401
 from tests.test_cli import fails, hma
 
 RELEASED: dict[str, Any] = {
@@ -227,20 +227,20 @@ def test_the_cache_changes_nothing_in_a_released_rollout(layout: str, actions: b
     assert torch.equal(cached, plain)
 
 
-def test_a_repository_of_the_hub_comes_in(
-    repository: Repository,  # noqa: F811, the fixture
-    tmp_path: Path,
-) -> None:
+def test_a_repository_of_the_hub_comes_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = _write(_model(), tmp_path / "released")
     files = {name: (source / name).read_bytes() for name in ("config.json", "model.safetensors")}
-    repository.commits = [{**files, "README.md": b"", "optimizer.bin": b"x"}]
-    made = hub.import_released("liruiw/hma-base-disc", tmp_path / "ours")
-    assert made.embodiments == ("arm", "pusher")
-    assert sorted(repository.downloads) == sorted(files)
-    assert made.card("arm")["data"]["released_checkpoint"] == "liruiw/hma-base-disc"
-    repository.commits = [{"README.md": b""}]
-    with pytest.raises(HubError, match=r"has no config\.json"):
-        hub.import_released("liruiw/hma-base-disc", tmp_path / "again")
+    with serve() as server:
+        connect(monkeypatch, server, tmp_path / "cache", None)
+        repository = server.create("liruiw/hma-base-disc")
+        repository.commit({**files, "README.md": b"", "optimizer.bin": b"x"})
+        made = hub.import_released("liruiw/hma-base-disc", tmp_path / "ours")
+        assert made.embodiments == ("arm", "pusher")
+        assert sorted(server.sent()) == sorted(files)
+        assert made.card("arm")["data"]["released_checkpoint"] == "liruiw/hma-base-disc"
+        repository.commit({"config.json": None})
+        with pytest.raises(HubError, match=r"has no config\.json"):
+            hub.import_released("liruiw/hma-base-disc", tmp_path / "again")
 
 
 # -- what is refused

@@ -1,0 +1,177 @@
+"""Publish and pull shard sets: a dataset repository of the hub, a folder, or any fsspec URI.
+
+Shards go up first and the manifest last, in one commit where they are at most `BATCH`. What is there already
+with the same SHA-256 is left out, so that running it again goes on where it stopped. The files lie as
+`docs/format.md` has them, and the card tells the hub's viewer which of them are tables.
+"""
+
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Protocol
+
+from hma_data.errors import HubError, ShardError
+from hma_data.files import file_sha256, write_atomic
+from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SHARD_NAME, Manifest
+from hma_model.checkpoint import README
+from hma_model.data_card import render
+from hma_model.hub import REPOSITORY, Content, is_repository
+
+BATCH = 1000  # shards of a commit
+SMALL = (EMBODIMENT, EPISODES, QUARANTINE)
+_OURS = {*SMALL, MANIFEST, README, ".gitattributes"}
+_DATASETS = "hf://datasets/"
+
+
+class DataStore(Protocol):
+    """Where a shard set is published; see `hma_model.hub.Store`."""
+
+    name: str
+
+    @property
+    def repo(self) -> str | None: ...
+
+    def files(self) -> dict[str, int]: ...
+
+    def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str: ...
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 by name, where it is known."""
+        ...
+
+    def download(self, names: list[str], out: Path) -> None:
+        """Bring files to a folder."""
+        ...
+
+
+def push_data(folder: str | Path, target: str | Path, *, private: bool = False) -> str:
+    """Publish a shard set.
+
+    Args:
+        folder: what `hma convert` wrote.
+        target: organisation/name of a dataset, `hf://datasets/organisation/name`, a folder or a URI.
+        private: make a new repository a private one.
+
+    Returns:
+        Where it is now.
+
+    Raises:
+        ShardError: the set is not finished, or a shard is not the one its manifest names.
+        HubError: another shard set is there, or it cannot be reached or written.
+    """
+    folder = Path(folder)
+    manifest = Manifest.load(folder)
+    for shard in manifest.shards:
+        path = folder / shard.path
+        if not path.is_file() or path.stat().st_size != shard.bytes or file_sha256(path) != shard.sha256:
+            raise ShardError(path, "is not the shard its manifest names", f"run hma shards verify {folder}")
+    store = _open(target, write=True, private=private)
+    _refuse_others(store, manifest)
+    known = store.digests()
+    missing = [shard.path for shard in manifest.shards if known.get(shard.path) != shard.sha256]
+    name = manifest.embodiment.id
+    batches = [missing[start : start + BATCH] for start in range(0, len(missing), BATCH)] or [[]]
+    for number, batch in enumerate(batches[:-1], 1):
+        shards: dict[str, Content | None] = {path: folder / path for path in batch}
+        unfinished = {MANIFEST: None} if MANIFEST in store.files() else {}  # it would name other shards
+        changes: dict[str, Content | None] = {**shards, **unfinished}
+        store.publish(lambda: changes, f"Add shards of {name}, {number} of {len(batches)}")  # noqa: B023
+    last: dict[str, Content | None] = {path: folder / path for path in batches[-1]}
+    last |= {path: folder / path for path in SMALL if (folder / path).is_file()}
+    last |= dict.fromkeys(_left_over(store, manifest))
+    last |= {README: render(manifest, store.repo), MANIFEST: folder / MANIFEST}
+    return store.publish(lambda: last, f"Add {name}")
+
+
+def pull_data(source: str | Path, out: str | Path, *, revision: str | None = None) -> Path:
+    """Fetch a published shard set; what is in `out` already is not transferred again.
+
+    Args:
+        source: as `push_data`'s target.
+        out: a new folder, or one that an interrupted pull has left.
+        revision: branch, tag or commit of a repository.
+
+    Returns:
+        `out`.
+
+    Raises:
+        HubError: no such dataset, no shard set, or out of reach.
+        ShardError: what came is not what the manifest names.
+    """
+    out, store = Path(out), _open(source, revision)
+    files = store.files()
+    manifest, content = _published(store)
+    if (out / MANIFEST).is_file() and (out / MANIFEST).read_bytes() != content:
+        raise HubError(out, "holds another shard set", "pull to another folder")
+    shards = {shard.path: shard.sha256 for shard in manifest.shards}
+    lacking = [path for path in shards if path not in files]
+    if lacking:
+        raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "push it again")
+    wanted = [path for path in shards if not _is(out / path, shards[path])]
+    store.download([*wanted, *(name for name in SMALL if name in files)], out)
+    for path in wanted:
+        if not _is(out / path, shards[path]):
+            raise ShardError(out / path, f"is not the shard that {MANIFEST} names", "pull again")
+    write_atomic(out / MANIFEST, content)
+    return out
+
+
+# -- pieces
+
+
+def _open(address: str | Path, revision: str | None = None, **settings: bool) -> DataStore:
+    text = str(address)
+    given = text.startswith(_DATASETS)
+    name = text.removeprefix(_DATASETS)
+    if given or is_repository(address):
+        from hma_model.hub_hf import HuggingFaceStore
+
+        name = name.removeprefix("hf://")
+        if not REPOSITORY.fullmatch(name):
+            raise HubError(address, f"is not {_DATASETS}ORGANISATION/NAME", "name a dataset repository")
+        return HuggingFaceStore(name, revision, kind="dataset", **settings)
+    from hma_model.hub_folder import FolderStore
+
+    if revision is not None:
+        raise HubError(address, f"is a folder, and has no revision {revision!r}", "leave the revision out")
+    return FolderStore(address, settings.get("write", False))
+
+
+def _published(store: DataStore) -> tuple[Manifest, bytes]:
+    """The manifest that is there, and its bytes.
+
+    Raises:
+        HubError: there is none.
+        ShardError: it is damaged.
+    """
+    if MANIFEST not in store.files():
+        raise HubError(store.name, f"has no {MANIFEST}", "is it a shard set, and has its push finished?")
+    with tempfile.TemporaryDirectory() as folder:
+        store.download([MANIFEST], Path(folder))
+        return Manifest.load(Path(folder)), (Path(folder) / MANIFEST).read_bytes()
+
+
+def _refuse_others(store: DataStore, manifest: Manifest) -> None:
+    """Raise HubError unless the place is empty or holds this robot's set under this tokenizer."""
+    files = store.files()
+    strange = [name for name in files if not (name in _OURS or SHARD_NAME.fullmatch(name))]
+    if strange:
+        raise HubError(store.name, f"holds something else: {strange[0]}", "push to a place of its own")
+    if MANIFEST not in files:
+        return
+    there = _published(store)[0]
+    ours = (manifest.embodiment.id, manifest.tokenizer.name, manifest.tokenizer.weights_sha256)
+    theirs = (there.embodiment.id, there.tokenizer.name, there.tokenizer.weights_sha256)
+    if ours != theirs:
+        fault = f"holds the shard set of {theirs[0]} under {theirs[1]}, not of {ours[0]} under {ours[1]}"
+        raise HubError(store.name, fault, "push to a place of its own")
+
+
+def _left_over(store: DataStore, manifest: Manifest) -> list[str]:
+    """Shards there that the set no longer has."""
+    named = {shard.path for shard in manifest.shards}
+    return [name for name in store.files() if SHARD_NAME.fullmatch(name) and name not in named]
+
+
+def _is(path: Path, sha256: str) -> bool:
+    return path.is_file() and file_sha256(path) == sha256

@@ -1,0 +1,466 @@
+"""A hub on loopback that speaks the public HTTP interface of the Hugging Face Hub, for its real client.
+
+Repositories are kept in memory as lists of commits. Answers follow the hub's: error codes in X-Error-Code,
+LFS uploads by signed address, downloads of LFS files by redirect to another host (here `localhost` beside
+`127.0.0.1`), listings in pages. `fail` makes requests go wrong; `log` says what was asked and sent.
+"""
+
+import base64
+import hashlib
+import json
+import re
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, unquote, urlsplit
+
+LFS_BYTES = 10_000_000  # larger files, and those of binary kinds, go by LFS
+LFS_KINDS = (".safetensors", ".png", ".parquet", ".bin")
+
+
+@dataclass
+class Commit:
+    """A state of a repository: path -> content."""
+
+    id: str
+    files: dict[str, bytes]
+    message: str
+
+
+@dataclass
+class Repository:
+    """Commits, oldest first, and tags and branches besides main."""
+
+    name: str
+    private: bool = False
+    commits: list[Commit] = field(default_factory=list)
+    refs: dict[str, str] = field(default_factory=dict)
+
+    def commit(self, files: dict[str, bytes | None], message: str = "by hand") -> Commit:
+        """Add a commit; None deletes a file."""
+        before = self.commits[-1].files if self.commits else {}
+        after = {path: content for path, content in {**before, **files}.items() if content is not None}
+        name = hashlib.sha1(f"{self.name} {len(self.commits)} {message}".encode()).hexdigest()
+        self.commits.append(Commit(name, after, message))
+        return self.commits[-1]
+
+    def at(self, revision: str) -> Commit | None:
+        """The commit of a branch, tag or id."""
+        wanted = self.commits[-1].id if revision == "main" else self.refs.get(revision, revision)
+        return next((commit for commit in self.commits if commit.id == wanted), None)
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """What is there now."""
+        return self.commits[-1].files
+
+
+@dataclass
+class Fault:
+    """What goes wrong: an answer, or a connection cut after some bytes.
+
+    Attributes:
+        request: regular expression over "METHOD path".
+        status: answered instead; None cuts the connection.
+        after: bytes of the body, coming or going, before the cut.
+        times: how often; then all is well.
+    """
+
+    request: str
+    status: int | None = None
+    headers: dict[str, str] = field(default_factory=dict)
+    after: int = 0
+    times: int = 1
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request and how many bytes of a file were sent for it."""
+
+    method: str
+    path: str
+    range: str | None
+    authorized: bool
+    host: str
+    sent: int
+
+
+class Hub(ThreadingHTTPServer):
+    """The server.
+
+    Attributes:
+        tokens: token -> "read" or "write".
+        repositories: "models/org/name" or "datasets/org/name" -> Repository.
+        before_commit: functions called, one each, before a commit is looked at.
+        waits: seconds that clients slept; see `connect`.
+    """
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.tokens: dict[str, str] = {}
+        self.repositories: dict[str, Repository] = {}
+        self.objects: dict[str, bytes] = {}
+        self.faults: list[Fault] = []
+        self.log: list[Asked] = []
+        self.before_commit: list[Any] = []
+        self.page = 1000
+        self.waits: list[float] = []
+        self.lock = threading.RLock()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}"
+
+    def create(self, name: str, kind: str = "models", private: bool = False) -> Repository:
+        """A new repository with what the hub puts into each."""
+        made = Repository(name, private)
+        made.commit({".gitattributes": b"*.safetensors filter=lfs\n"}, "initial commit")
+        self.repositories[f"{kind}/{name}"] = made
+        return made
+
+    def model(self, name: str) -> Repository:
+        return self.repositories[f"models/{name}"]
+
+    def fail(self, request: str, status: int | None = None, **facts: Any) -> None:
+        """Let the next requests of a kind go wrong; see `Fault`."""
+        self.faults.append(Fault(request, status, **facts))
+
+    def sent(self, pattern: str = "") -> dict[str, int]:
+        """Bytes of files sent, by path in the repository."""
+        totals: dict[str, int] = {}
+        for asked in self.log:
+            if asked.method == "GET" and asked.sent and re.search(pattern, asked.path):
+                path = re.sub(r"^.*?/resolve/[^/]+/|^/cdn/[0-9a-f]+/", "", asked.path)
+                totals[path] = totals.get(path, 0) + asked.sent
+        return totals
+
+    def count(self, request: str) -> int:
+        """How many requests matched."""
+        return sum(re.search(request, f"{asked.method} {asked.path}") is not None for asked in self.log)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        pass  # connections are cut on purpose
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: Hub
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+
+    def log_message(self, *arguments: object) -> None:
+        pass
+
+    def do_HEAD(self) -> None:
+        self._handle()
+
+    do_GET = do_POST = do_PUT = do_HEAD
+
+    def _handle(self) -> None:
+        split = urlsplit(self.path)
+        self.route, self.query = unquote(split.path), parse_qs(split.query)
+        self.bytes_sent = 0
+        with self.server.lock:
+            self.fault = self._fault()
+        try:
+            if self.fault and self.fault.status:
+                self._body()
+                self._answer(self.fault.status, {"error": "made up"}, self.fault.headers)
+            elif self.fault and self.command in ("POST", "PUT"):
+                self.rfile.read(min(self.fault.after, int(self.headers.get("Content-Length", 0))))
+                self._cut()
+            else:
+                self.content = self._body()
+                self._route()
+        finally:
+            self.server.log.append(
+                Asked(
+                    self.command,
+                    self.route,
+                    self.headers.get("Range"),
+                    "authorization" in self.headers,
+                    self.headers.get("Host", ""),
+                    self.bytes_sent,
+                )
+            )
+
+    def _fault(self) -> Fault | None:
+        for fault in self.server.faults:
+            if fault.times > 0 and re.search(fault.request, f"{self.command} {self.route}"):
+                fault.times -= 1
+                return fault
+        return None
+
+    def _body(self) -> bytes:
+        return self.rfile.read(int(self.headers.get("Content-Length", 0)))
+
+    def _cut(self) -> None:
+        self.close_connection = True
+        self.connection.shutdown(2)
+
+    # -- which answer
+
+    def _route(self) -> None:
+        if self.route.startswith("/lfs/"):  # signed addresses, which need no token
+            return self._lfs_object()
+        if self.route.startswith("/cdn/"):
+            return self._send_file(self.server.objects[self.route.split("/")[2]], {})
+        token = (self.headers.get("Authorization") or "").removeprefix("Bearer ")
+        self.right = self.server.tokens.get(token)
+        if token and not self.right:
+            message = "Invalid credentials in Authorization header"
+            return self._answer(401, {"error": message}, {"X-Error-Message": message})
+        if self.route == "/api/whoami-v2":
+            return self._whoami()
+        if self.route == "/api/repos/create":
+            return self._create()
+        if self.route == "/api/validate-yaml":
+            return self._validate()
+        return self._repository()
+
+    def _whoami(self) -> None:
+        if not self.right:
+            return self._answer(401, {"error": "Invalid username or password."})
+        return self._answer(200, {"type": "user", "name": "someone", "orgs": []})
+
+    def _create(self) -> None:
+        wanted = json.loads(self.content)
+        name = f"{wanted.get('organization') or 'someone'}/{wanted['name']}"
+        kind = f"{wanted.get('type', 'model')}s"
+        if not self.right:
+            return self._answer(401, {"error": "Invalid username or password."})
+        if f"{kind}/{name}" in self.server.repositories:
+            return self._answer(
+                409, {"error": "You already created this", "url": f"{self.server.url}/{name}"}
+            )
+        if self.right != "write":
+            return self._answer(403, {"error": "You don't have the rights to create this"})
+        self.server.create(name, kind, wanted.get("visibility") == "private")
+        prefix = "" if kind == "models" else f"{kind}/"
+        return self._answer(200, {"url": f"{self.server.url}/{prefix}{name}", "name": name})
+
+    def _validate(self) -> None:
+        import yaml
+
+        page = json.loads(self.content)["content"]
+        try:
+            front = yaml.safe_load(page.split("---\n")[1]) if page.startswith("---\n") else {}
+        except yaml.YAMLError as fault:
+            return self._answer(400, {"errors": [{"message": str(fault)}], "warnings": []})
+        licence = front.get("license")
+        known = licence is None or licence in ("apache-2.0", "mit", "cc-by-4.0", "other")
+        if not known:
+            message = '"license" must be one of [apache-2.0, mit, ...]'
+            return self._answer(400, {"errors": [{"message": message}], "warnings": []})
+        return self._answer(200, {"errors": [], "warnings": []})
+
+    def _repository(self) -> None:
+        found = re.fullmatch(r"(?:/api)?(?:/(models|datasets))?/([^/]+/[^/]+?)(?:\.git)?(/.*)?", self.route)
+        if not found:
+            return self._answer(404, {"error": "no such page"})
+        kind, name, rest = found[1] or "models", found[2], (found[3] or "").lstrip("/")
+        repository = self.server.repositories.get(f"{kind}/{name}")
+        if repository is None or (repository.private and not self.right):
+            status = 404 if self.right else 401
+            return self._answer(status, {"error": "Repository not found"}, {"X-Error-Code": "RepoNotFound"})
+        verb, _, place = rest.partition("/")
+        if verb in ("preupload", "commit") or rest.endswith("objects/batch"):
+            if self.right != "write":
+                return self._answer(403 if self.right else 401, {"error": "Forbidden: write rights needed"})
+            actions = {"preupload": self._preupload, "commit": self._commit}
+            return actions.get(verb, self._batch)(repository)
+        revision, _, path = place.partition("/")
+        commit = repository.at(revision or "main")
+        if commit is None:
+            return self._answer(404, {"error": "Invalid rev id"}, {"X-Error-Code": "RevisionNotFound"})
+        if verb == "resolve":
+            return self._resolve(commit, path)
+        if verb == "tree":
+            return self._tree(commit)
+        siblings = []
+        for path, content in commit.files.items():
+            siblings.append({"rfilename": path, "size": len(content), "blobId": _oid(content)})
+            if _by_lfs(path, len(content)):
+                lfs = {"sha256": _sha256(content), "size": len(content), "pointerSize": 134}
+                siblings[-1]["lfs"] = lfs
+        facts = {"id": name, "sha": commit.id, "private": repository.private, "siblings": siblings}
+        return self._answer(200, {**facts, "tags": [], "downloads": 0, "likes": 0})
+
+    # -- reading
+
+    def _tree(self, commit: Commit) -> None:
+        entries = []
+        for path, content in sorted(commit.files.items()):
+            entry = {"type": "file", "path": path, "size": len(content), "oid": _oid(content)}
+            if _by_lfs(path, len(content)):
+                entry["lfs"] = {"oid": _sha256(content), "size": len(content), "pointerSize": 134}
+            entries.append(entry)
+        start = int(self.query.get("cursor", ["0"])[0])
+        headers = {}
+        if start + self.server.page < len(entries):
+            following = f"{self.server.url}{self.route}?recursive=true&cursor={start + self.server.page}"
+            headers["Link"] = f'<{following}>; rel="next"'
+        self._answer(200, entries[start : start + self.server.page], headers)
+
+    def _resolve(self, commit: Commit, path: str) -> None:
+        headers = {"X-Repo-Commit": commit.id}
+        content = commit.files.get(path)
+        if content is None:
+            return self._answer(404, {"error": "no such entry"}, {**headers, "X-Error-Code": "EntryNotFound"})
+        if not _by_lfs(path, len(content)):
+            return self._send_file(content, {**headers, "ETag": f'"{_oid(content)}"'})
+        name = _sha256(content)
+        self.server.objects.setdefault(name, content)
+        place = f"http://localhost:{self.server.server_address[1]}/cdn/{name}/{path}?signature=x"
+        headers |= {"X-Linked-ETag": f'"{name}"', "X-Linked-Size": str(len(content)), "Location": place}
+        return self._answer(302, None, headers)
+
+    def _send_file(self, content: bytes, headers: dict[str, str]) -> None:
+        status, part = 200, content
+        asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range") or "")
+        if asked:
+            first, last = int(asked[1]), int(asked[2] or len(content) - 1)
+            if first >= len(content):
+                return self._answer(416, None, {"Content-Range": f"bytes */{len(content)}"})
+            status, part = 206, content[first : last + 1]
+            headers = {**headers, "Content-Range": f"bytes {first}-{last}/{len(content)}"}
+        self.send_response(status)
+        for name, value in {**headers, "Accept-Ranges": "bytes", "Content-Length": str(len(part))}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command == "GET":
+            cut = self.fault is not None
+            part = part[: self.fault.after] if self.fault else part
+            self.bytes_sent = len(part)
+            self.wfile.write(part)
+            self.wfile.flush()
+            if cut:
+                self._cut()
+        return None
+
+    # -- writing
+
+    def _preupload(self, repository: Repository) -> None:
+        answers = []
+        for file in json.loads(self.content)["files"]:
+            path, there = file["path"], repository.files.get(file["path"])
+            lfs = _by_lfs(path, file["size"])
+            answer = {"path": path, "uploadMode": "lfs" if lfs else "regular", "shouldIgnore": False}
+            if there is not None:
+                answer["oid"] = _sha256(there) if lfs else _oid(there)
+            answers.append(answer)
+        self._answer(200, {"files": answers})
+
+    def _batch(self, repository: Repository) -> None:
+        objects = []
+        for item in json.loads(self.content)["objects"]:
+            if item["oid"] not in self.server.objects:
+                item["actions"] = {
+                    "upload": {"href": f"{self.server.url}/lfs/upload/{item['oid']}"},
+                    "verify": {"href": f"{self.server.url}/lfs/verify/{item['oid']}"},
+                }
+            objects.append(item)
+        self._answer(200, {"transfer": "basic", "objects": objects})
+
+    def _lfs_object(self) -> None:
+        _, _, verb, name = self.route.split("/")
+        if verb == "upload":
+            if _sha256(self.content) != name:
+                return self._answer(400, {"error": "sha256 mismatch"})
+            self.server.objects[name] = self.content
+            return self._answer(200, None)
+        there = self.server.objects.get(name)
+        whole = there is not None and len(there) == json.loads(self.content)["size"]
+        return self._answer(200 if whole else 404, {})
+
+    def _commit(self, repository: Repository) -> None:
+        for act in self.server.before_commit[:1]:
+            self.server.before_commit.pop(0)
+            act()
+        with self.server.lock:
+            self._commit_now(repository)
+
+    def _commit_now(self, repository: Repository) -> None:
+        lines = [json.loads(line) for line in self.content.splitlines()]
+        header = lines[0]["value"]
+        if header.get("parentCommit") not in (None, repository.commits[-1].id):
+            return self._answer(412, {"error": "A commit has happened since. Please refresh and try again."})
+        files: dict[str, bytes | None] = {}
+        for line in lines[1:]:
+            value = line["value"]
+            if line["key"] == "file":
+                files[value["path"]] = base64.b64decode(value["content"])
+            elif line["key"] == "lfsFile":
+                if value["oid"] not in self.server.objects:
+                    return self._answer(400, {"error": "LFS pointer to an object that does not exist"})
+                files[value["path"]] = self.server.objects[value["oid"]]
+            else:
+                files[value["path"]] = None
+        made = repository.commit(files, header["summary"])
+        address = f"{self.server.url}/{repository.name}/commit/{made.id}"
+        return self._answer(200, {"success": True, "commitOid": made.id, "commitUrl": address})
+
+    def _answer(self, status: int, value: Any, headers: dict[str, str] | None = None) -> None:
+        body = b"" if value is None or self.command == "HEAD" else json.dumps(value).encode()
+        self.send_response(status)
+        for name, text in {"Content-Type": "application/json", **(headers or {})}.items():
+            self.send_header(name, text)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        if self.fault and not self.fault.status:
+            self.wfile.write(body[: self.fault.after])
+            self.wfile.flush()
+            return self._cut()
+        self.wfile.write(body)
+        return None
+
+
+def _by_lfs(path: str, size: int) -> bool:
+    return size > LFS_BYTES or path.endswith(LFS_KINDS)
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _oid(content: bytes) -> str:
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+
+
+@contextmanager
+def serve() -> Iterator[Hub]:
+    """A hub that runs until the block ends."""
+    hub = Hub()
+    thread = threading.Thread(target=hub.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    try:
+        yield hub
+    finally:
+        hub.shutdown()
+        hub.server_close()
+        thread.join()
+
+
+def connect(monkeypatch: Any, hub: Hub, cache: Any, token: str | None) -> None:
+    """Let the client in this process speak to a hub, with an empty cache; waits become short."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "ENDPOINT", hub.url)
+    template = hub.url + "/{repo_id}/resolve/{revision}/{filename}"
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(cache))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
+    monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(cache) + "-no-token")
+    monkeypatch.setenv("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+    if token:
+        monkeypatch.setenv("HF_TOKEN", token)
+    else:
+        monkeypatch.delenv("HF_TOKEN", raising=False)
+    sleep = time.sleep
+    monkeypatch.setattr(time, "sleep", lambda seconds: (hub.waits.append(seconds), sleep(0.001)))

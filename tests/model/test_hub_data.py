@@ -1,0 +1,178 @@
+"""Shard sets on the hub: one commit, resumed, read back the same, and what the viewer is told."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hma_data.errors import HubError, ShardError
+from hma_model import hub_data
+from hma_model.hub_data import pull_data, push_data
+from tests.hub_server import Hub, connect, serve
+from tests.model.shards import make_shards
+
+REPO = "team/arm"
+TOKEN = "hf_TheSecretOfThisTest"
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    from huggingface_hub.utils import close_session
+
+    with serve() as made:
+        made.tokens = {TOKEN: "write"}
+        connect(monkeypatch, made, tmp_path / "cache", TOKEN)
+        yield made
+        close_session()
+
+
+@pytest.fixture
+def shards(tmp_path: Path) -> Path:
+    return make_shards(tmp_path / "shards", "arm")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def dataset(server: Hub):
+    return server.repositories[f"datasets/{REPO}"]
+
+
+@pytest.mark.parametrize("target", [REPO, f"hf://datasets/{REPO}", "folder", "memory://data/arm"])
+def test_what_is_pushed_and_pulled_is_the_same(server, shards, tmp_path, target):
+    target = str(tmp_path / target) if target == "folder" else target
+    push_data(shards, target)
+    out = pull_data(target, tmp_path / "out")
+    assert contents(out) == contents(shards)
+
+
+def test_a_small_set_is_one_commit(server, shards):
+    assert push_data(shards, REPO) == f"{server.url}/datasets/{REPO}"
+    assert [commit.message for commit in dataset(server).commits] == ["initial commit", "Add arm"]
+
+
+def test_a_large_set_is_few_commits_with_the_manifest_in_the_last(server, shards, monkeypatch):
+    monkeypatch.setattr(hub_data, "BATCH", 1)
+    push_data(shards, REPO)
+    commits = dataset(server).commits
+    assert [commit.message for commit in commits[1:]] == ["Add shards of arm, 1 of 2", "Add arm"]
+    assert ["manifest.json" in commit.files for commit in commits] == [False, False, True]
+
+
+def test_a_push_that_was_cut_goes_on_with_what_is_missing(server, shards, monkeypatch):
+    monkeypatch.setattr(hub_data, "BATCH", 1)
+    server.fail("PUT /lfs/", times=1, status=403)
+    with pytest.raises(HubError):
+        push_data(shards, REPO)
+    push_data(shards, REPO)
+    server.log.clear()
+    push_data(shards, REPO)
+    assert server.count("PUT ") == 0
+    assert "manifest.json" in dataset(server).files
+
+
+def test_an_unfinished_push_is_no_shard_set(server, shards, tmp_path, monkeypatch):
+    monkeypatch.setattr(hub_data, "BATCH", 1)
+    server.create(REPO, "datasets")
+    server.before_commit = [lambda: server.fail("POST .*preupload", 403, times=9)]
+    with pytest.raises(HubError, match="may not write here"):
+        push_data(shards, REPO)
+    assert "train/shard-00000.parquet" in dataset(server).files
+    with pytest.raises(HubError, match=r"has no manifest\.json.*has its push finished"):
+        pull_data(REPO, tmp_path / "out")
+
+
+def test_an_interrupted_pull_goes_on_byte_by_byte(server, shards, tmp_path):
+    push_data(shards, REPO)
+    server.log.clear()
+    server.fail("GET /cdn/.*train", after=500)
+    server.fail("GET /cdn/.*train", after=0, times=99)
+    with pytest.raises(HubError, match="connection was cut"):
+        pull_data(REPO, tmp_path / "out")
+    assert not (tmp_path / "out/manifest.json").exists()
+    server.faults.clear()
+    server.log.clear()
+    pull_data(REPO, tmp_path / "out")
+    size = (shards / "train/shard-00000.parquet").stat().st_size
+    assert server.sent("train") == {"train/shard-00000.parquet": size - 500}
+    assert contents(tmp_path / "out") == contents(shards)
+
+
+def test_the_viewer_is_told_which_files_are_which_split(server, shards):
+    push_data(shards, REPO)
+    page = dataset(server).files["README.md"].decode()
+    front = yaml.safe_load(page.split("---\n")[1])
+    frames, episodes = front["configs"]
+    assert frames["data_files"] == [
+        {"split": "train", "path": "train/*.parquet"},
+        {"split": "validation", "path": "val/*.parquet"},
+    ]
+    assert episodes["data_files"] == [{"split": "all", "path": "episodes.parquet"}]
+    assert front["size_categories"] == ["n<1K"] and front["license"] == "apache-2.0"
+    assert {"robotics", "embodiment:arm", "tokenizer:raw"} <= set(front["tags"])
+    assert f'load_dataset("{REPO}", "frames")' in page
+
+
+def test_a_set_made_anew_replaces_the_old_one_whole(server, shards, tmp_path):
+    push_data(shards, REPO)
+    shutil.rmtree(shards)
+    make_shards(shards, "arm", episodes=4, held_out=0, seed=5)
+    push_data(shards, REPO)
+    assert "val/shard-00000.parquet" not in dataset(server).files
+    assert contents(pull_data(REPO, tmp_path / "out")) == contents(shards)
+
+
+def test_another_robots_set_is_not_overwritten(server, shards, tmp_path):
+    push_data(shards, REPO)
+    before = dataset(server).files
+    with pytest.raises(
+        HubError, match=r"holds the shard set of arm under raw, not of hand.*a place of its own"
+    ):
+        push_data(make_shards(tmp_path / "hand", "hand"), REPO)
+    assert dataset(server).files == before
+
+
+def test_a_dataset_of_something_else_is_left_alone(server, shards):
+    server.create(REPO, "datasets").commit({"data/x.csv": b"1"})
+    with pytest.raises(HubError, match=r"holds something else: data/x\.csv"):
+        push_data(shards, REPO)
+
+
+def test_a_damaged_shard_is_not_published(server, shards):
+    path = shards / "train/shard-00000.parquet"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    with pytest.raises(ShardError, match="is not the shard its manifest names"):
+        push_data(shards, REPO)
+    assert server.log == []
+
+
+def test_a_shard_that_is_not_the_manifests_is_refused_on_pulling(server, shards, tmp_path):
+    push_data(shards, REPO)
+    dataset(server).commit({"train/shard-00000.parquet": b"other"})
+    with pytest.raises(ShardError, match="is not the shard that manifest.json names"):
+        pull_data(REPO, tmp_path / "out")
+    assert not (tmp_path / "out/manifest.json").exists()
+
+
+def test_a_manifest_that_names_files_elsewhere_is_refused(server, shards, tmp_path):
+    push_data(shards, REPO)
+    text = dataset(server).files["manifest.json"].decode()
+    dataset(server).commit({"manifest.json": text.replace("train/shard-00000", "../../escaped").encode()})
+    with pytest.raises(ShardError, match="is not the name of a shard"):
+        pull_data(REPO, tmp_path / "out")
+    assert not list(tmp_path.rglob("*escaped*"))
+
+
+def test_another_set_in_the_folder_is_not_overwritten(server, shards, tmp_path):
+    push_data(shards, REPO)
+    with pytest.raises(HubError, match="holds another shard set"):
+        pull_data(REPO, make_shards(tmp_path / "hand", "hand"))
+
+
+@pytest.mark.parametrize("name", ["hf://datasets/x", "hf://datasets/a/b/c"])
+def test_a_wrong_name_is_refused(server, shards, name):
+    with pytest.raises(HubError, match="is not hf://datasets/ORGANISATION/NAME"):
+        push_data(shards, name)
