@@ -196,8 +196,6 @@ class MixtureDataset(IterableDataset[Batch]):
             name: Decoder(shards, split, frames, None, short, int(share / 5))
             for name, shards in self.sets.items()
         }
-        for shards in self.sets.values():
-            vars(shards).pop("episodes", None)  # the index is made of it; it is read again when asked for
         _check_windows(self._decoders, frames, split)
         counts = {name: decoder.index.count for name, decoder in self._decoders.items()}
         self.mixture = Mixture.of(

@@ -21,7 +21,7 @@ from hma_data.errors import ShardError
 from hma_data.shard_cache import kept_shard, limit_bytes
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
 from hma_data.shards.schema import mask_columns, to_numpy, token_column
-from hma_data.store import RangeFile, RemotePath, parquet_input, place
+from hma_data.store import RangeFile, RemotePath, parquet_file, place
 
 Ints = NDArray[np.int64]
 
@@ -78,10 +78,17 @@ class ShardSet:
         Raises:
             ShardError: it is not there or damaged.
         """
+        return self._episodes()
+
+    def _episodes(self, columns: list[str] | None = None) -> pa.Table:
         path = self.folder / EPISODES
         try:
-            return pq.read_table(parquet_input(path))
-        except (OSError, pa.ArrowException) as fault:
+            if columns is None:
+                with parquet_file(path) as file:
+                    return file.read()
+            with parquet_file(path, read_dictionary=["split", "shard"]) as file:
+                return file.read(columns=columns).select(columns)
+        except (OSError, KeyError, pa.ArrowException) as fault:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
 
     def refused(self) -> list[dict[str, Any]]:
@@ -114,11 +121,14 @@ class ShardSet:
     def index(self, split: str, cameras: int | None = None) -> EpisodeIndex:
         """The split's episodes, in row order; an episode seen by several cameras counts once for each."""
         cameras = cameras or len(self.manifest.cameras)
-        table = self.episodes.filter(pc.equal(self.episodes["split"], split))
-        names = pa.array(self.shards(split), pa.string())
-        shard = to_numpy(pc.index_in(table["shard"], value_set=names)).astype(np.int64)
-        start, length = (to_numpy(table[name]).astype(np.int64) for name in ("row_start", "length"))
-        index = to_numpy(table["episode_index"]).astype(np.int64)
+        table = self._episodes(["episode_index", "split", "shard", "row_start", "length"])
+        splits, names = _words(table["split"]), _words(table["shard"])
+        mine = np.array([word == split for word in splits[1]], np.bool_)[splits[0]]
+        order = {name: i for i, name in enumerate(self.shards(split))}
+        shard = np.array([order.get(word, -1) for word in names[1]], np.int64)[names[0][mine]]
+        start, length, index = (
+            to_numpy(table[name]).astype(np.int64)[mine] for name in ("row_start", "length", "episode_index")
+        )
         offsets = np.arange(cameras)
         starts = (start[:, None] + offsets * length[:, None]).ravel()
         repeat = lambda values: np.repeat(values, cameras)  # noqa: E731
@@ -255,3 +265,14 @@ class RowGroupCache:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
+
+
+def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:
+    """A dictionary-encoded column -> which word each row holds (N,), and the words.
+
+    pyarrow's own functions for it would import pandas where it is installed, which takes a second.
+    """
+    codes = column.unify_dictionaries().combine_chunks()
+    if isinstance(codes, pa.ChunkedArray):
+        codes = codes.chunk(0) if codes.num_chunks else pa.DictionaryArray.from_arrays([], [])
+    return to_numpy(codes.indices).astype(np.int64), codes.dictionary.to_pylist()
