@@ -29,11 +29,12 @@ class Cache:
     def __init__(self, config: HMAConfig, batch: int, tokens: int, like: Tensor) -> None:
         self.config = config
         self.slots = config.frames + (config.time_position == "rotary")
-        rest = (config.heads, self.slots, config.head_dim)
+        heads = (config.heads, config.head_dim)
         crossed = "cross_attention" in config.conditioning
         self.layers = [
             LayerCache(
-                like.new_zeros(2, batch * tokens, *rest), like.new_zeros(2, batch, *rest) if crossed else None
+                like.new_zeros(2, self.slots, batch, tokens, *heads),
+                like.new_zeros(2, batch, heads[0], self.slots, heads[1]) if crossed else None,
             )
             for _ in range(config.layers)
         ]

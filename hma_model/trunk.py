@@ -67,7 +67,7 @@ class LayerCache:
     """Keys and values of one layer.
 
     Attributes:
-        time: (2, B*N, heads, R, head_dim).
+        time: (2, R, B, N, heads, head_dim); a frame's lie side by side, as they are computed.
         action: (2, B, heads, R, head_dim), with cross-attention.
     """
 
@@ -103,20 +103,27 @@ def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
     return torch.stack([even * cos - odd * sin, odd * cos + even * sin], dim=-1).flatten(-2)
 
 
-def rotate_qkv(qkv: Tensor, rotary: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotate the queries and keys of (M, T, 3, heads, head_dim), the values staying; give the three.
+def rotate_qkv(
+    qkv: Tensor, rotary: tuple[Tensor, Tensor], within: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotate queries and keys, the values staying; give the three.
 
     Without a compiler to fuse it, one complex product over contiguous memory is several times as fast.
+
+    Args:
+        qkv: (..., T, 3, heads, head_dim), or `within` frames (..., T, N, 3, heads, head_dim).
+        rotary: cos and sin (T, head_dim / 2).
+        within: whether there are places between the times and the three.
     """
+    cos, sin = (angle.unsqueeze(1) if within else angle for angle in rotary)
     if qkv.dtype != torch.float32 or torch.compiler.is_compiling():
-        q, k, v = qkv.unbind(2)
-        return rotate(q, rotary), rotate(k, rotary), v
-    turn = torch.complex(*rotary)
-    turns = (
-        torch.stack([turn, turn, torch.ones_like(turn)], dim=1).unsqueeze(2).expand(-1, -1, qkv.shape[3], -1)
-    )
-    flat = torch.view_as_complex(qkv.view(*qkv.shape[:2], -1, 2)) * turns.flatten(1)
-    q, k, v = torch.view_as_real(flat).view_as(qkv).unbind(2)
+        q, k, v = qkv.unbind(-3)
+        return rotate(q, (cos, sin)), rotate(k, (cos, sin)), v
+    turn = torch.complex(cos, sin)
+    turns = torch.stack([turn, turn, torch.ones_like(turn)], dim=-2).unsqueeze(-2)
+    turns = turns.expand(*turns.shape[:-2], qkv.shape[-2], -1).flatten(-3)
+    flat = torch.view_as_complex(qkv.view(*qkv.shape[:-3], -1, 2)) * turns
+    q, k, v = torch.view_as_real(flat).view_as(qkv).unbind(-3)
     return q, k, v
 
 
@@ -133,22 +140,24 @@ class Attention(nn.Module):
         self.q_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
         self.k_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
 
-    def project(self, x: Tensor, rotary: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor, Tensor]:
-        """(M, length, D) -> queries, keys, values (M, heads, length, head_dim)."""
+    def project(
+        self, x: Tensor, rotary: tuple[Tensor, Tensor] | None, within: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(..., length, D), or `within` frames (..., T, N, D) -> three times (..., heads, head_dim)."""
         qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1))
         if rotary is not None and not self.normed:
-            q, k, v = rotate_qkv(qkv, rotary)
-        else:
-            q, k, v = qkv.unbind(2)
-            q, k = self.q_norm(q), self.k_norm(k)
-            if rotary is not None:
-                q, k = rotate(q, rotary), rotate(k, rotary)
-        return q.transpose(1, 2), k.transpose(1, 2), v.transpose(1, 2)
+            return rotate_qkv(qkv, rotary, within)
+        q, k, v = qkv.unbind(-3)
+        q, k = self.q_norm(q), self.k_norm(k)
+        if rotary is not None:
+            q, k, _ = rotate_qkv(torch.stack([q, k, v], dim=-3), rotary, within)
+        return q, k, v
 
     def merge(
         self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None, causal: bool = False
     ) -> Tensor:
-        """Attend and project back: (M, length, D)."""
+        """Attend over (M, length, heads, head_dim) and project back: (M, length, D)."""
+        q, k, v = (x.transpose(1, 2) for x in (q, k, v))
         mixed = F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=self.scale)
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
@@ -162,14 +171,34 @@ class TemporalAttention(Attention):
 
     def forward(self, x: Tensor, clock: Clock, cache: LayerCache | None) -> Tensor:
         """(B, T, N, D) -> the same shape."""
-        b, t, n, width = x.shape
-        rows = x.transpose(1, 2).reshape(b * n, t, width)
-        q, k, v = self.project(rows, clock.rotary if self.rotary else None)
+        rotary = clock.rotary if self.rotary else None
         if cache is not None:
+            q, k, v = self.project(x, rotary, within=True)
             assert clock.slots is not None
-            k, v = cache.time[0].index_copy_(2, clock.slots, k), cache.time[1].index_copy_(2, clock.slots, v)
+            for values, kept in zip((k, v), cache.time):
+                kept.index_copy_(0, clock.slots, values.transpose(0, 1))
+            return self.proj(self._recall(q, clock, cache.time))
+        b, t, n, width = x.shape
+        q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), rotary)
         mask = None if clock.causal else clock.allowed
         return self.merge(q, k, v, mask, clock.causal).view(b, n, t, width).transpose(1, 2)
+
+    def _recall(self, q: Tensor, clock: Clock, cache: Tensor) -> Tensor:
+        """Attend to the whole cache: queries (B, T, N, heads, head_dim) -> (B, T, N, D)."""
+        b, t, n, heads, size = q.shape
+        if q.device.type != "cpu" or q.dtype != torch.float32:
+            queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
+            k, v = cache.flatten(2, 3).permute(0, 2, 3, 1, 4)
+            mixed = F.scaled_dot_product_attention(queries, k, v, clock.allowed, scale=self.scale)
+            return mixed.view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
+        # On a CPU so few frames a place take half as long in batched products as in the fused kernel, and the
+        # softmax a tenth where places, not frames, fill the vectors.
+        rows = q.permute(0, 2, 3, 1, 4).reshape(-1, t, size)
+        k, v = cache.flatten(2, 4).transpose(1, 2)  # (B*N*heads, R, head_dim)
+        hidden = torch.zeros_like(clock.allowed, dtype=q.dtype).masked_fill(~clock.allowed, -torch.inf)
+        scores = torch.baddbmm(hidden, rows, k.transpose(1, 2), alpha=self.scale)
+        weights = scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
+        return torch.bmm(weights, v).view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
 
 
 class ActionAttention(nn.Module):
