@@ -246,6 +246,17 @@ def local_path(uri: str) -> Path:
     return path
 
 
+def leaves(path: Path, folder: Path) -> bool:
+    """Whether a path leads out of its folder by a link or `..`.
+
+    The Hugging Face Hub's cache keeps the files of a snapshot as links to its blobs, which may be followed.
+    """
+    inside, target = folder.resolve(), path.resolve()
+    hub = next((above.parent for above in inside.parents if above.name == "snapshots"), None)
+    homes = (inside, hub / "blobs") if hub else (inside,)
+    return not any(target.is_relative_to(home) for home in homes)
+
+
 def first_bytes(path: Path, count: int) -> bytes:
     """The first bytes of a file; empty when it cannot be read."""
     try:

@@ -30,7 +30,7 @@ from pathlib import Path, PurePosixPath
 
 from hma_data.embodiment import Embodiment
 from hma_data.errors import EpisodeError, RegistryError, SourceError
-from hma_data.sources.base import VIDEO_SUFFIXES, local_path
+from hma_data.sources.base import VIDEO_SUFFIXES, leaves, local_path
 
 LABELS = ("detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose")
 _CHOICES = {
@@ -139,14 +139,13 @@ def videos_of(uri: str) -> dict[str, Video]:
         if root.suffix.lower() not in VIDEO_SUFFIXES:
             raise SourceError(root, "is not a video file", f"looked for {', '.join(VIDEO_SUFFIXES)}")
         return {root.name: Video(root, root.name, (root.name, root.stem))}
-    inside = root.resolve()
     paths: dict[str, Path] = {}
     for folder, _, files in os.walk(root):
         for file in files:
             path = Path(folder, file)
             if path.suffix.lower() not in VIDEO_SUFFIXES or file.startswith(".") or not path.is_file():
                 continue
-            if not path.resolve().is_relative_to(inside):
+            if leaves(path, root):
                 raise SourceError(
                     path, "is a link that leaves the folder", "copy the file in, or convert its folder"
                 )

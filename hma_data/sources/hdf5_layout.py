@@ -14,7 +14,7 @@ import h5py
 
 from hma_data.embodiment import Embodiment
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.base import local_path
+from hma_data.sources.base import leaves, local_path
 from hma_data.sources.hdf5_file import OpenFiles, child, explained, member
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
@@ -209,12 +209,11 @@ def _stems(uri: str) -> dict[str, Path]:
     path = local_path(uri)
     if path.is_file():
         return {_safe(path.stem): path}
-    inside = path.resolve()
     found: dict[str, Path] = {}
     for file in sorted(path.rglob("*"), key=lambda item: natural(str(item.relative_to(path)))):
         if file.suffix.lower() not in SUFFIXES or not file.is_file():
             continue
-        if not file.resolve().is_relative_to(inside):
+        if leaves(file, path):
             raise SourceError(
                 file, "is a link that leaves the folder", "copy the file in, or convert its folder"
             )

@@ -16,6 +16,7 @@ from string import Formatter
 from typing import Any
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.sources.base import leaves
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _DATA_PATHS = {
@@ -71,11 +72,9 @@ class Folder:
             SourceError: the path leads out of the folder.
         """
         path = self.root / relative
-        # The Hub's cache keeps the files of a snapshot as links to its blobs, two folders up.
-        home = self.root.resolve().parent.parent if self.repo else self.root.resolve()
         if self.repo and not path.is_file():
             path = self._fetch(self.repo, relative)
-        if not path.resolve().is_relative_to(home):
+        if leaves(path, self.root):
             raise SourceError(path, "leads out of the dataset's folder", "copy the file in")
         return path
 

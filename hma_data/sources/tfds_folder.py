@@ -18,6 +18,7 @@ from typing import Any
 import fsspec
 
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
+from hma_data.sources.base import leaves
 from hma_data.sources.fetching import attempt, fetch_whole, is_listless, is_local
 from hma_data.sources.record_file import RecordFile, open_records
 from hma_data.sources.record_index import EMPTY, Framing
@@ -135,7 +136,7 @@ class Folder:
 
     def leaves(self, shard: Shard) -> bool:
         """Whether the shard is a link to something outside the dataset's folder."""
-        return not self.remote and _leaves(shard.path, self.root)
+        return not self.remote and leaves(Path(shard.path), Path(self.root))
 
     def example(self, episode_id: str) -> tuple[Example, str]:
         """The record of an episode, parsed; and the path of its shard.
@@ -280,21 +281,13 @@ def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], p
 def _text(files: Any, root: str, name: str) -> str | None:
     """A description in the folder, None where it has none."""
     path = f"{root}/{name}"
-    if is_local(files) and _leaves(path, root):
+    if is_local(files) and leaves(Path(path), Path(root)):
         raise SourceError(path, "is a link to a file outside its folder", "copy the file in")
     data = fetch_whole(files, path, LONGEST_JSON)
     try:
         return None if data is None else data.decode()
     except UnicodeDecodeError as fault:
         raise SourceError(path, f"is not text: {fault}", "copy it again") from fault
-
-
-def _leaves(path: str, root: str) -> bool:
-    """Whether a local path leads out of its folder; into the files of the Hugging Face Hub's cache it may."""
-    inside, target = Path(root).resolve(), Path(path).resolve()
-    hub = next((above.parent for above in inside.parents if above.name == "snapshots"), None)
-    homes = (inside, hub / "blobs") if hub else (inside,)
-    return not any(target.is_relative_to(home) for home in homes)
 
 
 def _info(files: Any, root: str) -> dict[str, Any]:

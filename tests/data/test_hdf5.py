@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.base import detect, open_source
 from hma_data.sources.hdf5_file import rows
 from tests.data.hdf5_files import H, T, W, embodiment, fill
+from tests.data.hub_cache import as_snapshot
 
 
 @pytest.fixture
@@ -361,6 +363,15 @@ def test_a_link_out_of_the_folder_is_refused(demos: Path, tmp_path: Path) -> Non
     (inside / "link.hdf5").symlink_to(demos)
     with pytest.raises(SourceError, match=r"link\.hdf5: is a link that leaves the folder"):
         open_source("hdf5").index(str(inside))
+
+
+def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(demos: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "plain"
+    folder.mkdir()
+    shutil.copy(demos, folder)
+    snapshot = as_snapshot(folder, tmp_path / "cache")
+    source = open_source("hdf5")
+    assert source.episode_ids(str(snapshot)) == source.episode_ids(str(folder))
 
 
 def test_two_files_of_one_name_are_told_apart(tmp_path: Path) -> None:

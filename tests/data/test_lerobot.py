@@ -18,6 +18,7 @@ from hma_data.embodiment import Embodiment, find
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.base import detect, open_source
 from hma_data.sources.lerobot_meta import fill
+from tests.data.hub_cache import as_snapshot
 from tests.data.videos import (
     CAMERA,
     HEIGHT,
@@ -375,6 +376,15 @@ def test_a_link_out_of_the_folder_is_refused(copy: Callable[[str], Path], tmp_pa
     video.symlink_to(tmp_path / "elsewhere.mp4")
     with pytest.raises(SourceError, match="leads out of the dataset's folder"):
         open_source("lerobot").read(str(folder), "episode_000000", embodiment())
+
+
+def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(
+    originals: dict[str, Path], tmp_path: Path
+) -> None:
+    folders = (originals["v3"], as_snapshot(originals["v3"], tmp_path))
+    plain, cached = (open_source("lerobot").read(str(f), "episode_000001", embodiment()) for f in folders)
+    assert np.array_equal(cached.actions[0].values, plain.actions[0].values)
+    assert np.array_equal(cached.streams["cam"].frames([3]), plain.streams["cam"].frames([3]))
 
 
 def test_a_folder_that_is_none_says_so(tmp_path: Path) -> None:
