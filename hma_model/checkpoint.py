@@ -23,14 +23,15 @@ from typing import TYPE_CHECKING, Any
 from hma_data.embodiment import ID_PATTERN, Embodiment
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.files import file_sha256, write_atomic
+from hma_model import migrate, weights
 from hma_model.config import ActionSpace, HMAConfig
-from hma_model.files import new_folder, read_json, read_metadata, read_tensors, to_json, write_tensors
+from hma_model.files import new_folder, read_json, read_metadata, to_json, write_tensors
+from hma_model.migrate import FORMAT_VERSION
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import TokenizerSpec
     from hma_model.model import HMA
 
-FORMAT_VERSION = 1
 LIBRARY = "hma-toolkit"
 CONFIG, TRUNK, README, TRAINING = "config.json", "trunk.safetensors", "README.md", "training"
 STEM, HEAD, YAML, STATS, CARD = (
@@ -61,12 +62,16 @@ class Checkpoint:
         config: of the network; the tokenizer's spec is in it.
         embodiments: ids present, sorted.
         trunk_sha256: of the trunk, as config.json states it.
+        tokenizer: digest of its spec.
+        format_version: of config.json and trunk.
     """
 
     folder: Path
     config: HMAConfig
     embodiments: tuple[str, ...]
     trunk_sha256: str
+    tokenizer: str
+    format_version: int
     _cards: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
@@ -82,7 +87,8 @@ class Checkpoint:
         home = folder / "embodiments"
         found = sorted(path.name for path in home.iterdir()) if home.is_dir() else []
         present = tuple(name for name in found if (home / name / CARD).is_file())
-        return cls(folder, config, present, str(values.get("trunk_sha256")))
+        trunk, version = str(values.get("trunk_sha256")), int(values["format_version"])
+        return cls(folder, config, present, trunk, digest(values.get("tokenizer") or {}), version)
 
     def trunk(self) -> Path:
         """trunk.safetensors.
@@ -119,7 +125,8 @@ class Checkpoint:
     def card(self, embodiment: str) -> dict[str, Any]:
         """card.json of an embodiment."""
         if embodiment not in self._cards:
-            self._cards[embodiment] = read_json(self.path(embodiment, CARD))
+            path = self.path(embodiment, CARD)
+            self._cards[embodiment] = migrate.card(read_json(path), path)
         return self._cards[embodiment]
 
     def embodiment(self, embodiment: str) -> Embodiment:
@@ -144,9 +151,7 @@ class Checkpoint:
         _same(path, stem, "embodiment", embodiment, "was saved for another embodiment")
         for where, facts in ((path, stem), (self.path(embodiment, CARD), self.card(embodiment))):
             _same(where, facts, "trunk_sha256", self.trunk_sha256, "belongs to another trunk")
-            _same(
-                where, facts, "tokenizer", digest(self.config.tokenizer), "was trained on another tokenizer"
-            )
+            _same(where, facts, "tokenizer", self.tokenizer, "was trained on another tokenizer")
             stats = file_sha256(self.path(embodiment, STATS))
             _same(where, facts, "stats_sha256", stats, f"was trained with other statistics than {STATS}")
         files = self.card(embodiment).get("files")
@@ -245,8 +250,9 @@ def load(
     checkpoint = Checkpoint.open(folder)
     if tokenizer is not None:
         require_tokenizer(checkpoint.config, tokenizer, checkpoint.folder)
+    trunk = weights.trunk(checkpoint)
     model = HMA(checkpoint.config)
-    model.load_trunk(read_tensors(checkpoint.trunk()))
+    model.load_trunk(trunk)
     for name in checkpoint.embodiments if embodiments is None else dict.fromkeys(embodiments):
         add_embodiment(model, checkpoint, name)
     vars(model)["origin"] = checkpoint.folder  # where hub.push_model finds YAML and statistics again
@@ -265,9 +271,9 @@ def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> Non
         raise CheckpointError(
             path, f"does not fit {YAML}: {fault.fault}", "pull the embodiment again"
         ) from fault
+    stem, head = weights.embodiment(checkpoint, embodiment, space)
     model.add_embodiment(space)
-    stem = read_tensors(checkpoint.path(embodiment, STEM))
-    model.load_embodiment(embodiment, stem, read_tensors(checkpoint.path(embodiment, HEAD)))
+    model.load_embodiment(embodiment, stem, head)
 
 
 def update_card(folder: str | Path, embodiment: str, **facts: Any) -> dict[str, Any]:
@@ -328,14 +334,7 @@ def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
             f"is not of {LIBRARY}: library is {values.get('library')!r}",
             "give a checkpoint of hma train",
         )
-    version = values.get("format_version")
-    if version != FORMAT_VERSION:
-        newer = isinstance(version, int) and version > FORMAT_VERSION
-        raise CheckpointError(
-            where,
-            f"has format_version {version!r}, this release reads {FORMAT_VERSION}",
-            f"update {LIBRARY}" if newer else "save the checkpoint again",
-        )
+    values = migrate.config(values, where)
     model, tokenizer = values.get("model"), values.get("tokenizer")
     if not isinstance(model, dict) or not isinstance(tokenizer, dict):
         raise CheckpointError(where, "lacks its 'model' or 'tokenizer'", "pull or save the checkpoint again")

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from hma_data.embodiment import ID_PATTERN
 from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_model import checkpoint as checkpoints
+from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
 from hma_model.files import parse_json
 from hma_model.model_card import render
@@ -189,7 +190,7 @@ def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
     values = _config(store, files)
     return {
         "source": store.name,
-        **{key: values[key] for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
+        **{key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
         "trunk_bytes": files.get(TRUNK, 0),
         "embodiments": {
             name: {
@@ -320,9 +321,9 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
     values = parse_json(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
     try:
         checkpoints.parse_config(values, f"{store.name}: {CONFIG}")
+        return migrate.config(values, store.name) | {"format_version": values["format_version"]}
     except CheckpointError as fault:
         raise HubError(fault.where, fault.fault, fault.remedy) from fault
-    return values
 
 
 def embodiment_ids(files: Iterable[str]) -> list[str]:

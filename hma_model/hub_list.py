@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HMAError, HubError
+from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
 from hma_model.files import parse_json
 from hma_model.hub import Store, embodiment_ids, open_store
@@ -70,11 +71,12 @@ def _ours(
     store: Store, files: Mapping[str, int], root: str, where: str, values: dict[str, Any]
 ) -> dict[str, Any]:
     facts = _facts(where, LIBRARY, files.get(TRUNK, 0), _tokenizer_problems(values.get("tokenizer")))
-    facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
     try:
         parse_config(values, f"{where}/{CONFIG}")
+        values = migrate.config(values, where) | {"format_version": values["format_version"]}
     except HMAError as fault:
         facts["problems"].append(f"{fault.fault}: {fault.remedy}")
+    facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
     if TRUNK not in files:
         facts["problems"].append(f"has no {TRUNK}")
     for name in embodiment_ids(files):

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 from hma_data.errors import CheckpointError, RecipeError
 from hma_data.shards.reader import ShardSet
 from hma_model import checkpoint as checkpoints
+from hma_model import weights
 from hma_model.checkpoint import Checkpoint, require_tokenizer
 from hma_model.config import HMAConfig
-from hma_model.files import read_tensors
 
 if TYPE_CHECKING:
     from hma_model.model import HMA
@@ -123,7 +123,7 @@ class Start:
 
     def fill(self, model: "HMA") -> None:
         """Put the checkpoint's weights in a model that has its embodiments, and freeze what stays."""
-        model.load_trunk(read_tensors(self.checkpoint.trunk()))
+        model.load_trunk(weights.trunk(self.checkpoint))
         for name in model.embodiments:
             if name in self.checkpoint.embodiments:
                 checkpoints.add_embodiment(model, self.checkpoint, name)

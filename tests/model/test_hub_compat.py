@@ -1,0 +1,268 @@
+"""What does not belong together, is older, or is hostile: each refused in one line, and nothing happens."""
+
+import json
+import shutil
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from hma_data.errors import CheckpointError, HMAError
+from hma_data.files import file_sha256
+from hma_model import checkpoint, hub, migrate
+from hma_model.checkpoint import Checkpoint
+from hma_model.files import read_metadata
+from hma_model.hub_list import survey
+from hma_model.migrate import Step
+from hma_model.model import HMA
+from tests.model.robots import make_model, save
+
+ROBOTS = {"arm": 2, "hand": 3}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    save(tmp_path / "model", ROBOTS)
+    return tmp_path / "model"
+
+
+def edit(path: Path, change) -> None:
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
+
+
+def rewrite(path: Path, rename, **metadata: str) -> None:
+    """A safetensors file with other names and metadata."""
+    facts = read_metadata(path) | metadata
+    save_file({rename(name): value for name, value in load_file(path).items()}, path, facts)
+
+
+# -- older versions
+
+
+@pytest.fixture
+def version_0(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkpoint as a version 0 might have been: other names in config, card and tensors; and its step."""
+    config = json.loads((folder / "config.json").read_text())
+    config["format_version"] = 0
+    config["network"] = config.pop("model")
+    config["network"]["depth"] = config["network"].pop("layers")
+    rewrite(folder / "trunk.safetensors", lambda name: name.replace("trunk.", "body."))
+    config["trunk_sha256"] = trunk = file_sha256(folder / "trunk.safetensors")
+    (folder / "config.json").write_text(json.dumps(config))
+    for name in ROBOTS:
+        home = folder / "embodiments" / name
+        for part in ("stem", "head"):
+            path = home / f"{part}.safetensors"
+            rewrite(path, lambda key: f"old.{key}", format_version="0", trunk_sha256=trunk)
+        card = json.loads((home / "card.json").read_text())
+        card |= {"format_version": 0, "trunk_sha256": trunk, "scores": card.pop("metrics")}
+        card["files"] |= {p: file_sha256(home / p) for p in ("stem.safetensors", "head.safetensors")}
+        (home / "card.json").write_text(json.dumps(card))
+
+    def config_to_1(values):
+        model = values.pop("network")
+        return {**values, "model": {"layers": model.pop("depth"), **model}}
+
+    def tensors_to_1(part, tensors):
+        return {
+            (name.replace("body.", "trunk.") if part == "trunk" else name.removeprefix("old.")): value
+            for name, value in tensors.items()
+        }
+
+    step = Step(config_to_1, lambda card: {**card, "metrics": card.pop("scores")}, tensors_to_1)
+    monkeypatch.setitem(migrate.STEPS, 0, step)
+    return folder
+
+
+def test_an_older_version_is_read_as_if_it_were_the_newest(version_0, tmp_path):
+    old = checkpoint.load(version_0)
+    new = save(tmp_path / "new", ROBOTS)
+    assert all(torch.equal(value, new.state_dict()[name]) for name, value in old.state_dict().items())
+    assert Checkpoint.open(version_0).card("arm")["metrics"] == {"val_loss": 1.5}
+
+
+def test_an_older_version_is_pulled_listed_and_pushed(version_0, tmp_path):
+    hub.push(version_0, tmp_path / "hub", ["arm"])
+    assert list(HMA.from_pretrained(str(tmp_path / "hub")).embodiments) == ["arm"]
+    (facts,) = survey(tmp_path / "hub")
+    assert not any("format_version" in problem for problem in facts["problems"])
+
+
+def test_a_new_embodiment_joins_an_older_hub(version_0, tmp_path):
+    old = checkpoint.load(version_0, [])
+    old.add_embodiment(make_model({"leg": 4}).embodiments["leg"])
+    hub.push(version_0, tmp_path / "hub", ["arm"])
+    save(tmp_path / "leg", {"leg": 4}, model=old, base=Checkpoint.open(version_0))
+    hub.push(tmp_path / "leg", tmp_path / "hub", ["leg"])
+    assert list(HMA.from_pretrained(str(tmp_path / "hub")).embodiments) == ["arm", "leg"]
+
+
+def test_without_its_step_an_older_version_is_refused(version_0, monkeypatch):
+    monkeypatch.delitem(migrate.STEPS, 0)
+    with pytest.raises(CheckpointError, match="has format_version 0, this release reads 1"):
+        checkpoint.load(version_0)
+
+
+def test_every_version_from_the_first_to_the_newest_has_its_step():
+    assert sorted(migrate.STEPS) == list(range(1, migrate.FORMAT_VERSION))
+
+
+# -- parts that do not belong together, each with an error of its own
+
+
+def test_each_part_that_does_not_fit_has_its_own_error(folder):
+    home, faults = folder / "embodiments/arm", []
+    cases = {
+        folder / "config.json": lambda v: v["tokenizer"].update(version=9),
+        home / "card.json": lambda v: v.update(trunk_sha256="0" * 64),
+        home / "stats.json": lambda v: v["action"].update(mean=[9.0, 9.0]),
+    }
+    for path, change in cases.items():
+        whole = path.read_bytes()
+        edit(path, change)
+        with pytest.raises(CheckpointError) as found:
+            checkpoint.load(folder, ["arm"])
+        faults.append(found.value.fault)
+        assert found.value.remedy
+        path.write_bytes(whole)
+    edit(folder / "config.json", lambda v: v.update(format_version=7))
+    with pytest.raises(CheckpointError) as found:
+        checkpoint.load(folder, ["arm"])
+    faults.append(found.value.fault)
+    for word, fault in zip(
+        ("another tokenizer", "another trunk", "other statistics", "format_version 7"), faults
+    ):
+        assert word in fault
+    assert len(set(faults)) == 4
+
+
+# -- hostile repositories
+
+
+@pytest.mark.parametrize(
+    "head", [struct.pack("<Q", 2**62), struct.pack("<Q", 99_000_000), b"\xff" * 8, b"",
+             struct.pack("<Q", 2) + b"[]",
+             struct.pack("<Q", 66) + b'{"a":{"dtype":"F32","shape":[99999999999,9],"data_offsets":[0,4]}}'],
+)  # fmt: skip
+def test_a_hostile_safetensors_header_is_refused(folder, head):
+    path = folder / "embodiments/arm/stem.safetensors"
+    path.write_bytes(head + bytes(16))
+    with pytest.raises(CheckpointError, match="is not whole safetensors"):
+        checkpoint.load(folder, ["arm"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"layers": 10**9}, {"width": 2**40, "heads": 8}, {"width": 2**19, "heads": 8},
+        {"factored": [10**6, 10**6]}, {"grid": [10**5, 10**5]}, {"frames": 10**6, "time_position": "learned"},
+        {"mlp_ratio": 1e300}, {"layers": 1.5}, {"layers": "9" * 999}, {"grid": None}, {"frames": 10**30},
+        {"layers": [[]]},
+        {"kind": "continuous", "diffusion_width": 10**6, "grid": [2, 4]}, {"objectives": 7},
+        {"conditioning": [{}]},
+    ],
+)  # fmt: skip
+def test_a_config_that_asks_for_too_much_is_refused_before_anything_is_built(folder, monkeypatch, change):
+    edit(folder / "config.json", lambda values: values["model"].update(change))
+    monkeypatch.setattr(HMA, "__init__", lambda *a: pytest.fail("was built"))
+    with pytest.raises(HMAError) as found:
+        checkpoint.load(folder)
+    assert "\n" not in str(found.value) and found.value.remedy
+
+
+def test_an_embodiment_that_asks_for_too_much_is_refused(folder, monkeypatch):
+    path = folder / "embodiments/arm/embodiment.yaml"
+    path.write_text(path.read_text().replace("stride: 2", "stride: 100000000"))
+    with pytest.raises(HMAError, match=r"too small for chunks|stride"):
+        checkpoint.load(folder, ["arm"])
+
+
+def test_pickles_under_our_names_are_not_unpickled(folder, tmp_path):
+    marker = tmp_path / "ran"
+    bomb = f"cos\nsystem\n(S'touch {marker}'\ntR.".encode()
+    for name in ("trunk.safetensors", "embodiments/arm/stem.safetensors", "embodiments/arm/stats.json"):
+        shutil.copytree(folder, tmp_path / "bad", dirs_exist_ok=True)
+        (tmp_path / "bad" / name).write_bytes(bomb)
+        with pytest.raises(HMAError):
+            checkpoint.load(tmp_path / "bad")
+    assert not marker.exists()
+
+
+def test_yaml_tags_are_not_obeyed(folder, tmp_path):
+    marker = tmp_path / "ran"
+    path = folder / "embodiments/arm/embodiment.yaml"
+    path.write_text(f"id: !!python/object/apply:os.system ['touch {marker}']\n")
+    with pytest.raises(HMAError):
+        checkpoint.load(folder, ["arm"])
+    assert not marker.exists()
+
+
+HOSTILE = (
+    "</td><script>alert(1)</script>| ![x](http://a.b/c) [y](javascript:1)\n\n# Title\n\n---\nlicense: mit"
+)
+
+
+def test_a_hostile_card_stays_text_in_its_cell(folder):
+    for key in ("robot", "license", "description"):
+        edit(folder / "embodiments/arm/card.json", lambda values, key=key: values.update({key: HOSTILE}))
+    edit(
+        folder / "embodiments/arm/card.json",
+        lambda v: v.update(metrics={HOSTILE: 1}, data=[HOSTILE], stride={}),
+    )
+    checkpoint.write_readme(folder)
+    page = (folder / "README.md").read_text()
+    rows = [row for row in page.splitlines() if row.startswith("| `arm`")]
+    assert len(rows) == 1 and rows[0].replace("\\|", "").count("|") == 9
+    assert "<script" not in page and "](http" not in page and "](javascript" not in page
+    assert [line for line in page.splitlines() if line.startswith("# ")] == ["# HMA world model"]
+    assert page.count("\n---\n") == 1 and "license: other" in page
+
+
+@pytest.mark.parametrize(
+    "values", [[], 7, {"metrics": [1], "data": 3, "files": "x", "license": {"a": []}}, {}]
+)
+def test_a_broken_card_of_somebody_else_stops_neither_list_nor_push(folder, tmp_path, values):
+    hub.push(folder, tmp_path / "hub", ["arm"])
+    (tmp_path / "hub/embodiments/arm/card.json").write_text(json.dumps(values))
+    hub.push(folder, tmp_path / "hub", ["hand"])
+    (facts,) = survey(tmp_path / "hub")
+    rows = {row["embodiment"]: row["problems"] for row in facts["embodiments"]}
+    assert rows["arm"] and not rows["hand"]
+    assert list(HMA.from_pretrained(str(tmp_path / "hub"), ["hand"]).embodiments) == ["hand"]
+
+
+# -- stems of different people on one frozen trunk
+
+
+def test_stems_trained_apart_generate_together_what_each_generates_alone(folder, tmp_path):
+    hub.push(folder, tmp_path / "hub", [])
+    for seed, (name, dims) in enumerate({"leg": 4, "gripper": 1, "base.v2": 3}.items()):
+        theirs = checkpoint.load(folder, [])
+        torch.manual_seed(seed)
+        theirs.add_embodiment(make_model({name: dims}, seed).embodiments[name])
+        with torch.no_grad():
+            for part in (theirs.stem(name), theirs.head(name)):
+                for parameter in part.parameters():
+                    parameter += 0.3 * torch.randn_like(parameter)
+        save(tmp_path / name, {name: dims}, model=theirs)
+        hub.push(tmp_path / name, tmp_path / "hub")
+    together = HMA.from_pretrained(str(tmp_path / "hub"))
+    made = []
+    for name, space in together.embodiments.items():
+        alone = HMA.from_pretrained(str(tmp_path / name))
+        assert list(alone.embodiments) == [name]
+        prompt = torch.randint(0, 64, (1, 2, 2, 3), generator=torch.Generator().manual_seed(1))
+        actions = torch.randn(1, 4, space.chunk_dim, generator=torch.Generator().manual_seed(2))
+        one, other = (
+            model.generate(prompt, actions, name, 2, generator=torch.Generator().manual_seed(3))
+            for model in (together, alone)
+        )
+        assert torch.equal(one, other)
+        seen = torch.cat([prompt, one], dim=1)
+        made.append(together.video_logits(seen, actions, name))
+        assert torch.equal(made[-1], alone.video_logits(seen, actions, name))
+    assert len(made) == 3 and not torch.equal(made[0], made[1])
