@@ -18,6 +18,8 @@ from hma_model.resume import seed_for
 if TYPE_CHECKING:
     from hma_model.recipe import Recipe
 
+MEMORY_MIB = 2048  # of decoded rows, of all passes together, so that it is the same on any number of ranks
+
 
 def share(recipe: "Recipe", ranks: int) -> tuple[int, int]:
     """How the windows of a step are shared: (passes of all ranks together, windows a pass).
@@ -58,6 +60,7 @@ class Feed:
         self.own = range(world.rank, self.passes, world.size)
         self._workers = -(-recipe.workers // len(self.own))
         mixture = recipe.mixture
+        samples = recipe.steps * recipe.windows_per_step if mixture.max_epochs else None
         self._data = [
             MixtureDataset(
                 list(sets.values()),
@@ -65,10 +68,16 @@ class Feed:
                 recipe.frames,
                 temperature=mixture.temperature,
                 weights=mixture.weights or None,
+                groups=mixture.groups or None,
+                caps=mixture.caps or None,
+                max_epochs=mixture.max_epochs,
+                samples=samples,
                 draw=mixture.draw,
+                short=recipe.short,
                 seed=seed_for(recipe.seed, "sampler"),
                 rank=number,
                 world=self.passes,
+                memory_mib=max(MEMORY_MIB // self.passes, 1),
             )
             for number in self.own
         ]

@@ -59,6 +59,9 @@ class MixtureSettings(_Settings):
     temperature: Number = Field(3.0, gt=0)
     draw: Literal["per_sample", "per_batch"] = "per_sample"
     weights: dict[str, Number] = Field({}, description="embodiment id -> factor on its probability")
+    groups: dict[str, str] = Field({}, description="embodiment id -> group; groups have equal shares")
+    caps: dict[str, Number] = Field({}, description="embodiment id -> its largest probability")
+    max_epochs: Number | None = Field(None, gt=0, description="passes over an embodiment's windows at most")
 
 
 class Recipe(_Settings):
@@ -69,6 +72,7 @@ class Recipe(_Settings):
     )
     mixture: MixtureSettings = MixtureSettings()
     frames: Count = Field(12, ge=2, le=4096, description="T of a window")
+    short: Literal["drop", "pad"] = Field("drop", description="episodes shorter than a window")
     batch_size: Count = Field(8, ge=1, description="windows a forward pass")
     accumulate: Count = Field(1, ge=1, description="forward passes a step")
     model: dict[str, Any] = Field({}, description="fields of HMAConfig")

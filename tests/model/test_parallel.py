@@ -1,0 +1,169 @@
+"""Ranks, forked here as torchrun starts them: one process's curve, and any number of ranks goes on."""
+
+import json
+import multiprocessing
+import multiprocessing.connection
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from hma_model import checkpoint
+from hma_model.parallel import World
+from hma_model.recipe import make_recipe
+from hma_model.runlog import read_metrics
+from hma_model.train import train
+from tests.model.runs import TINY, weights
+from tests.model.shards import make_shards
+
+ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> list[str]:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("shards")
+    arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
+    return [str(arm), str(hand)]
+
+
+@pytest.fixture(scope="module")
+def recipe(data):
+    def recipe(**changes):
+        # one sample a pass: the ranks of a step often have different robots, and so different stems
+        few = {"batch_size": 1, "accumulate": 4, "eval_every": 0, "ema": 0.5, "weight_decay": 0.5}
+        mixed = {"objectives": {"forward": 1, "policy": 1}, "model": {**TINY["model"], "layers": 2}}
+        return make_recipe({**TINY, "data": data, **few, **mixed, **changes})
+
+    return recipe
+
+
+@pytest.fixture(scope="module")
+def alone(recipe, tmp_path_factory):
+    return train(recipe(), out=tmp_path_factory.mktemp("alone") / "run", show=False)
+
+
+def spread(recipe, out: Path, kill_after: int = 0, ranks: int = 2) -> str:
+    """Train on forked ranks, which spares them torch's import; returns what they said.
+
+    A rank that fails or is killed ends the others, as torchrun does.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    told = out.with_name("told.txt")
+    context = multiprocessing.get_context("fork")
+    processes = [
+        context.Process(target=_rank, args=(rank, ranks, port, recipe, out, kill_after, told))
+        for rank in range(ranks)
+    ]
+    for process in processes:
+        process.start()
+    multiprocessing.connection.wait([p.sentinel for p in processes])
+    for process in processes:
+        process.join(60 if all(p.exitcode in (0, None) for p in processes) else 2)
+        process.kill()
+    return told.read_text()
+
+
+def _rank(rank, ranks, port, recipe, out, kill_after, told) -> None:
+    os.environ.update(
+        RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE=str(ranks),
+        MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port),
+    )  # fmt: skip
+    os.dup2(os.open(told, os.O_CREAT | os.O_WRONLY | os.O_APPEND), 2)
+    sys.stderr = os.fdopen(2, "w")
+
+    def kill(facts) -> None:
+        if facts["step"] == kill_after:
+            os._exit(9)
+
+    train(recipe, out=out, on_progress=kill)
+
+
+def curve(out: Path) -> list[float]:
+    return [line["loss"] for line in read_metrics(out) if line["kind"] == "train"]
+
+
+def train_until(recipe, out: Path, step: int) -> None:
+    """Train and be killed after a step."""
+
+    def kill(facts) -> None:
+        if facts["step"] == step:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe, out=out, show=False, on_progress=kill)
+
+
+def close(one: Path, other: Path) -> None:
+    a, b = weights(one), weights(other)
+    assert a.keys() == b.keys()
+    for name, value in a.items():
+        assert torch.allclose(value.float(), b[name].float(), rtol=1e-3, atol=2e-5), name
+
+
+@pytest.mark.parametrize("mode", ["ddp", "fsdp"])
+def test_two_ranks_give_the_curve_and_the_weights_of_one(recipe, alone, tmp_path, mode):
+    told = spread(recipe(parallel=mode), tmp_path / "run")
+    assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4), told
+    close(alone.checkpoint, checkpoint.resolve(tmp_path / "run"))
+    assert f"4 passes a step over 2 ranks, {mode}" in told
+    assert json.loads((tmp_path / "run" / "environment.json").read_text())["ranks"] == 2
+
+
+def test_a_sharded_run_cut_on_two_ranks_goes_on_on_one(recipe, alone, tmp_path):
+    spread(recipe(parallel="fsdp"), tmp_path / "run", kill_after=5)
+    assert checkpoint.resolve(tmp_path / "run").name == "step-00000004"
+    again = train(recipe(), out=tmp_path / "run", show=False)
+    assert [loss for _, loss in again.losses] == pytest.approx([loss for _, loss in alone.losses], rel=1e-4)
+    close(alone.checkpoint, again.checkpoint)
+
+
+def test_a_run_cut_on_one_rank_goes_on_on_two(recipe, alone, tmp_path):
+    train_until(recipe(), tmp_path / "run", 3)
+    told = spread(recipe(parallel="fsdp"), tmp_path / "run")
+    assert "going on from step 2" in told
+    assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4)
+    close(alone.checkpoint, checkpoint.resolve(tmp_path / "run"))
+
+
+def test_a_step_shared_otherwise_goes_on_with_windows_anew_and_says_so(recipe, tmp_path):
+    given = recipe(accumulate=1, batch_size=4)
+    train_until(given, tmp_path / "run", 3)
+    told = spread(given, tmp_path / "run")
+    assert "the sampler begins anew: " in told and "is of 1 passes a step, this run has 2" in told
+    assert len(curve(tmp_path / "run")) == 6
+
+
+def test_torchrun_starts_the_command(recipe, data, alone, tmp_path):
+    path = tmp_path / "recipe.yaml"
+    path.write_text(json.dumps(recipe(steps=2).values()))
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "hma_model.cli"]
+    done = subprocess.run(
+        [sys.executable, *command, "train", str(path), "--out", str(tmp_path / "run")],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("step 2, ") == 1
+    first, _ = curve(tmp_path / "run")
+    assert first == pytest.approx(alone.losses[0][1], rel=1e-4)
+
+
+def test_ranks_that_cannot_share_a_step_are_told(recipe, tmp_path):
+    told = spread(recipe(batch_size=3, accumulate=1), tmp_path / "run")
+    assert "RecipeError" in told and "3 windows a step cannot be shared evenly by 2 ranks" in told
+
+
+def test_one_process_is_a_world_of_one():
+    world = World()
+    assert world.main and world.gather(3) == [3] and world.once(lambda: 4) == 4
+    assert torch.equal(world.sum(torch.ones(2)), torch.ones(2))
