@@ -20,6 +20,7 @@ from hma_data.video import decode_image
 
 LENGTHS = 1_000  # episodes whose length is told and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
+_BESIDE = ("compress_len",)  # no rows over time: bytes of ALOHA's JPEGs, (cameras, T)
 _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
 
 
@@ -209,6 +210,7 @@ def _keys(group: h5py.Group, place: Place) -> Iterator[KeyInfo]:
     for key, item in walk(group):
         count = item.shape[0] if item.shape else None
         kind, shape, codec = _kind(item, f"{place} {key}")
+        kind = "other" if key in _BESIDE else kind
         yield KeyInfo(key, kind, shape, str(item.dtype), codec=codec, count=count)
 
 

@@ -258,6 +258,8 @@ def test_aloha_asks_for_colours_and_for_the_base(tmp_path: Path, compressed: boo
     assert "bgr" in asked["cameras[0].color"] and "base_action" in asked["provenance.action"]
     assert values["source"]["episodes"] == 2
     np.testing.assert_array_equal(first_clip(path, values).actions, numbers(T, 14).astype(np.float32))
+    said = open_source("hdf5").inspect(str(path)).findings
+    assert not [found for found in said if "compress_len" in str(found)]  # (cameras, T) by design
 
 
 def test_a_simulators_state_is_not_the_robots(tmp_path: Path) -> None:
