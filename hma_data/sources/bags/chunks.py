@@ -11,20 +11,23 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from itertools import count
+from mmap import MAP_ANONYMOUS, MAP_PRIVATE, mmap
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.sources.bags.container import HEAD, MAX_CHUNK, Wanted
+from hma_data.sources.bags.container import HEAD, Wanted, checked_size
 
-CACHED_BYTES = 128 << 20  # of unpacked chunks, of all the bags a process reads
+CACHED_BYTES = 256 << 20  # of unpacked chunks, of all the bags a process reads
 WORTH = 0.8  # of a chunk: where more has to be unpacked, all of it is
 LARGE = 1 << 18  # bytes; memory of fewer is left to the allocator
 GRAIN = 1 << 16  # large memory is a multiple of this, so that chunks of nearly one size fit each other's
 Key = tuple[int, Path, int]
 Take = Callable[[int], memoryview]
+Memory = bytearray | mmap
+_NOTHING = bytearray()
 
 
 class _Kept:
@@ -32,9 +35,9 @@ class _Kept:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._chunks: OrderedDict[Key, bytearray] = OrderedDict()
+        self._chunks: OrderedDict[Key, Memory] = OrderedDict()
         self._sizes: dict[Key, int] = {}
-        self._spare: list[bytearray] = []
+        self._spare: list[Memory] = []
         self.bytes = 0  # of both
 
     def has(self, key: Key) -> bool:
@@ -47,15 +50,15 @@ class _Kept:
             self._chunks.move_to_end(key)
             return memoryview(self._chunks[key])[: self._sizes[key]]
 
-    def put(self, key: Key, memory: bytearray, size: int) -> None:
+    def put(self, key: Key, memory: Memory, size: int) -> None:
         with self._lock:
             self._forget(key)
             self._chunks[key], self._sizes[key] = memory, size
             self.bytes += len(memory)
 
-    def memory(self, size: int) -> bytearray:
+    def memory(self, size: int) -> Memory:
         """At least so many bytes that nobody looks at; others go where there is no room for them."""
-        needed = size if size < LARGE else -(-size // GRAIN) * GRAIN
+        needed = _rounded(size)
         with self._lock:
             for i, spare in enumerate(self._spare):
                 if needed <= len(spare) <= 2 * needed:
@@ -67,7 +70,7 @@ class _Kept:
                 memory = self._forget(next(iter(self._chunks)))
                 if LARGE <= needed <= len(memory) <= 2 * needed and _unseen(memory):
                     return memory
-        return bytearray(needed)
+        return _fresh(needed)
 
     def drop(self, keys: Iterable[Key]) -> None:
         """Those chunks are not needed again; their memory is."""
@@ -78,18 +81,31 @@ class _Kept:
                     self._spare.append(memory)
                     self.bytes += len(memory)
 
-    def _forget(self, key: Key) -> bytearray:
-        memory = self._chunks.pop(key, bytearray())
+    def _forget(self, key: Key) -> Memory:
+        memory = self._chunks.pop(key, _NOTHING)
         self._sizes.pop(key, None)
         self.bytes -= len(memory)
         return memory
 
 
-def _unseen(memory: bytearray) -> bool:
+def _fresh(size: int) -> Memory:
+    """New memory, which takes room only as far as it is written to."""
+    size = _rounded(checked_size(size))
+    return bytearray(size) if size < LARGE else mmap(-1, size, flags=MAP_PRIVATE | MAP_ANONYMOUS)
+
+
+def _rounded(size: int) -> int:
+    return size if size < LARGE else -(-size // GRAIN) * GRAIN
+
+
+def _unseen(memory: Memory) -> bool:
     """Whether there is no view of it: it could be resized."""
     try:
-        memory.append(memory.pop())
-    except BufferError:
+        if isinstance(memory, mmap):
+            memory.resize(len(memory))
+        else:
+            memory.append(memory.pop())
+    except (BufferError, IndexError, SystemError):  # seen, empty, or of a system that cannot resize
         return False
     return True
 
@@ -114,7 +130,7 @@ class ChunkCache:
         self._number = next(_numbers)
         self._sizes: dict[tuple[Path, int], int] = {}
         self._bytes = 0  # of all chunks that were put in
-        self._scratch = bytearray()
+        self._scratch: Memory = _NOTHING
         weakref.finalize(self, _drop, self._number, self._sizes).atexit = False
 
     def get(self, path: Path, offset: int, load: Callable[[Take], memoryview]) -> memoryview:
@@ -123,7 +139,7 @@ class ChunkCache:
         chunk = _kept.take(key)
         if chunk is not None:
             return chunk
-        taken: list[bytearray] = []
+        taken: list[Memory] = []
 
         def take(size: int) -> memoryview:
             taken.append(_kept.memory(size))
@@ -142,7 +158,7 @@ class ChunkCache:
     def scratch(self, size: int) -> memoryview:
         """Memory for the beginning of a chunk that is not kept; another's where that is still looked at."""
         if len(self._scratch) < size or not _unseen(self._scratch):
-            self._scratch = bytearray(size)
+            self._scratch = _fresh(size)
         return memoryview(self._scratch)[:size]
 
     def room(self, size: int) -> bool:
@@ -158,7 +174,7 @@ class Buffer:
     """Memory that is read into again and again; what was read is there until the next time."""
 
     def __init__(self) -> None:
-        self._memory = memoryview(bytearray())
+        self._memory = memoryview(_NOTHING)
 
     def read(self, file: BinaryIO, size: int) -> memoryview:
         """The next `size` bytes of the file.
@@ -167,15 +183,33 @@ class Buffer:
             ValueError: more than MAX_CHUNK.
             EOFError: the file ends before.
         """
-        if size > MAX_CHUNK:
-            raise ValueError(f"a record claims {size:,} bytes, more than {MAX_CHUNK:,}")
+        checked_size(size)
         if size > len(self._memory):
-            self._memory = memoryview(bytearray(size))
+            left = os.fstat(file.fileno()).st_size - file.tell()
+            if size > left:
+                raise EOFError(f"the file ends {size - left:,} bytes before a record does")
+            self._memory = memoryview(_fresh(size))
         view = self._memory[:size]
         got: int = file.readinto(view)  # type: ignore[attr-defined]
         if got != size:
             raise EOFError(f"the file ends {size - got:,} bytes before a record does")
         return view
+
+
+def placed(entries: Mapping[str, NDArray[np.uint64]], chunk: memoryview, mark: bytes, head: int) -> None:
+    """Looks whether messages begin in the chunk where an index says, as far as it was unpacked.
+
+    Args:
+        entries: as `reach` takes them.
+        mark: what a message has in its first `head` bytes.
+
+    Raises:
+        ValueError: one does not.
+    """
+    for found in entries.values():
+        for at in found[found[:, 1] + np.uint64(head) <= len(chunk), 1].tolist():
+            if mark not in bytes(chunk[at : at + head]):
+                raise ValueError("an index tells another place of a message than its own")
 
 
 def reach(entries: Mapping[str, NDArray[np.uint64]], wanted: Wanted, size: int, head: int) -> int:

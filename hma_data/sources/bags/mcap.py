@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from hma_data.sources.bags.chunks import WORTH, ChunkCache, Take, reach
+from hma_data.sources.bags.chunks import WORTH, ChunkCache, Take, placed, reach
 from hma_data.sources.bags.container import (
     Channel,
     Data,
@@ -34,6 +34,7 @@ from hma_data.sources.bags.mcap_records import (
     FRAME,
     LOOSE,
     MAGIC,
+    MESSAGE,
     MESSAGE_HEAD,
     Ask,
     Declared,
@@ -121,8 +122,10 @@ class McapFile:
         if ask and ask.wanted.heads and self._told and not self._may_keep(at, ask.head.size):
             found = entries(file, ask, self._data_end(file))
             size = reach(found, ask.wanted, ask.head.size, FRAME.size + MESSAGE_HEAD.size) if found else None
-            if size is not None and size < WORTH * ask.head.size:
-                return load_begin(file, at, size, self._chunks.scratch)
+            if found and size is not None and size < WORTH * ask.head.size:
+                begin = load_begin(file, at, size, self._chunks.scratch)
+                placed(found, begin, bytes([MESSAGE]), 1)
+                return begin
 
         def load(take: Take) -> memoryview:
             chunk = load_chunk(file, at, take, at not in self._checked)

@@ -6,6 +6,8 @@ Chunks that are not packed need not be read whole: their records are walked in t
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from functools import lru_cache
+from importlib import import_module
 from typing import BinaryIO, NamedTuple
 
 from hma_data.sources.bags.chunks import Take
@@ -189,8 +191,18 @@ def chunk_at(file: BinaryIO, at: int) -> ChunkHead:
 
 def check(chunk: Data, head: ChunkHead) -> None:
     """Looks at the checksum of a chunk's records, where there is one."""
-    if head.checksum and zlib.crc32(chunk) != head.checksum:
+    if head.checksum and _crc32()(chunk) != head.checksum:
         raise ValueError("a chunk's checksum does not fit its content")
+
+
+@lru_cache(maxsize=1)
+def _crc32() -> Callable[[Data], int]:
+    """CRC-32 by ISA-L where the package `isal` is installed, which takes a sixteenth of zlib's time."""
+    try:
+        found: Callable[[Data], int] = import_module("isal.isal_zlib").crc32
+    except ImportError:
+        found = zlib.crc32
+    return found
 
 
 def _in_chunk(

@@ -14,7 +14,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.sources.bags.chunks import WORTH, Buffer, ChunkCache, Take, reach
+from hma_data.sources.bags.chunks import WORTH, Buffer, ChunkCache, Take, placed, reach
 from hma_data.sources.bags.container import (
     FOREVER,
     HEAD,
@@ -105,8 +105,10 @@ class Ros1File:
         if wanted.heads and not kept:
             found = _entries(file, head, channels)
             size = reach(found, wanted, head.size, MESSAGE_BYTES) if found else head.size
-            if size < WORTH * head.size:
-                return _load_begin(file, head, size, self._chunks.scratch)
+            if found and size < WORTH * head.size:
+                begin = _load_begin(file, head, size, self._chunks.scratch)
+                placed(found, begin, b"op=" + bytes([MESSAGE]), MESSAGE_BYTES)
+                return begin
         return self._chunk(file, head)
 
     def _survey(self, file: BinaryIO) -> "_Index":
