@@ -70,12 +70,15 @@ def assemble(sets: Mapping[str, ShardSet], names: list[str], pieces: Pieces, sho
     shape = spec.grid if discrete else (spec.channels or 1, *spec.grid)
     actions = np.zeros((size, frames, width), np.float32)
     pictures = np.empty((size, frames, *shape), np.int64 if discrete else np.float32)
-    known, inside = np.empty((size, frames), np.bool_), np.empty((size, frames), np.bool_)
+    known, inside = np.ones((size, frames), np.bool_), np.ones((size, frames), np.bool_)
     where = {key: np.empty(size, np.int64) for key in ("episode", "frame", "camera")}
     for places, windows in pieces.values():
         actions[places, :, : windows["actions"].shape[2]] = windows["actions"]
         pictures[places] = windows["tokens"].reshape(len(places), frames, *shape)
-        known[places], inside[places] = windows["known"], windows["inside"]
+        if "known" in windows:
+            known[places] = windows["known"]
+        if "inside" in windows:
+            inside[places] = windows["inside"]
         for key, values in where.items():
             values[places] = windows[key]
     return Batch(

@@ -116,15 +116,17 @@ class WindowDataset(Dataset[Batch]):
             which = f"window {outside[0]}" if len(outside) else "no window"
             raise IndexError(f"{which} of the {len(self)} of {self.shards.folder}")
         index = self.index
-        first, last = index.first_rows(wanted), index.last_rows(wanted)
+        first = index.first_rows(wanted)
+        last = index.last_rows(wanted) if index.padded_episodes else None
         group = np.searchsorted(index.edges, first, side="right") - 1
-        over = np.minimum(first + index.span - 1, last) >= index.edges[group + 1]  # goes on in the next
-        places, cuts = [], []
+        over = np.minimum(first + index.span - 1, index.last_rows(wanted)) >= index.edges[group + 1]
+        places, cuts = [], []  # a window may go on in the next row group
         for key in np.unique(2 * group + over):
             chosen = np.flatnonzero(2 * group + over == key)
             rows = self._decoder.rows(int(key // 2), whole=bool(key % 2))
             edge = index.edges[key // 2]
-            cuts.append(rows.cut(first[chosen] - edge, last[chosen] - edge, index))
+            end = None if last is None else last[chosen] - edge
+            cuts.append(rows.cut(first[chosen] - edge, end, index))
             places.append(chosen)
         joined = {name: np.concatenate([cut[name] for cut in cuts]) for name in cuts[0]}
         order = np.concatenate(places)
@@ -274,9 +276,10 @@ class MixtureDataset(IterableDataset[Batch]):
     def _make(self, lane: int, draws: Ints, taken: Ints) -> Batch:
         names = self.mixture.names
         pieces = {}
-        for which in np.unique(draws):
-            places = np.flatnonzero(draws == which)
-            stream = self._stream(lane, int(which))
+        order = np.argsort(draws, kind="stable")
+        for places in np.split(order, np.flatnonzero(np.diff(draws[order])) + 1):
+            which = int(draws[places[0]])
+            stream = self._stream(lane, which)
             pieces[names[which]] = (places, stream.take(int(taken[which]), len(places)))
         return assemble(self.sets, [names[i] for i in draws], pieces, self._short)
 

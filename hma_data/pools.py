@@ -127,7 +127,8 @@ class Stream:
             inside = offset - (int(ends[number - 1]) if number else 0)
             some = min(count, int(ends[number]) - offset)
             chosen = slice(inside, inside + some)
-            cut = rows.cut(self._first[chosen], self._last[chosen], self._decoder.index)
+            last = None if self._last is None else self._last[chosen]
+            cut = rows.cut(self._first[chosen], last, self._decoder.index)
             parts.append(cut | {"camera": self._camera[chosen]})
             start, count = start + some, count - some
         if len(parts) == 1:
@@ -163,7 +164,8 @@ class Stream:
             offset += len(rows)
         first = np.concatenate(firsts)
         mixed, _ = spread(first, index.span, np.random.default_rng([*self._entropy, epoch, number]))
-        self._first, self._last = first[mixed], np.concatenate(lasts)[mixed]
+        self._first = first[mixed]
+        self._last = np.concatenate(lasts)[mixed] if index.padded_episodes else None
         self._camera = np.concatenate(cameras)[mixed]
         self._at, self._rows = (epoch, number), Rows.join(loaded)
         return self._rows

@@ -27,47 +27,71 @@ class Rows:
     actions: NDArray[np.float32]
     episode: NDArray[np.int32]
     frame: NDArray[np.int32]
-    known: NDArray[np.bool_]  # whether the row's action is
+    known: NDArray[np.bool_] | None  # whether the row's action is; None where all are
 
     @classmethod
     def join(cls, parts: "Sequence[Rows]") -> "Rows":
         """One after the other."""
         if len(parts) == 1:
             return parts[0]
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+        columns = [[getattr(part, f.name) for part in parts] for f in fields(cls)]
+        joined: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
+        return cls(*joined)
 
     def __len__(self) -> int:
         return len(self.frame)
 
     def first(self, count: int) -> "Rows":
         """The first `count` rows."""
-        return Rows(*(getattr(self, f.name)[:count] for f in fields(Rows)))
+        columns = [getattr(self, f.name) for f in fields(Rows)]
+        kept: list[Any] = [None if column is None else column[:count] for column in columns]
+        return Rows(*kept)
 
-    def cut(self, first: Ints, last: Ints, index: WindowIndex) -> dict[str, NDArray[Any]]:
-        """Windows that start at rows `first` (n,), of episodes that end at rows `last` (n,).
+    def cut(self, first: Ints, last: Ints | None, index: WindowIndex) -> dict[str, NDArray[Any]]:
+        """Windows that start at rows `first` (n,).
+
+        Args:
+            last: (n,) last rows of their episodes, beyond which a window is padded; None: none is.
 
         Returns:
-            tokens (n, T, S), actions (n, T, K), known (n, T), inside (n, T): the frame is the episode's,
-            episode (n,), frame (n,).
+            tokens (n, T, S), actions (n, T, K), episode (n,), frame (n,); known (n, T) where the set says
+            so or windows may be padded; inside (n, T), whether the frame is the episode's, where they may.
         """
+        found = {"episode": self.episode[first], "frame": self.frame[first]}
+        if last is not None:
+            return found | self._padded(first, last, index)
+        found["tokens"] = self.tokens[first[:, None] + np.arange(0, index.span, index.row_stride)]
+        found["actions"] = _spans(self.actions, index.span)[first].reshape(len(first), index.frames, -1)
+        if self.known is not None:
+            known = _spans(self.known[:, None], index.span)[first]
+            found["known"] = np.all(known.reshape(len(first), index.frames, -1), axis=2)
+        return found
+
+    def _padded(self, first: Ints, last: Ints, index: WindowIndex) -> dict[str, NDArray[Any]]:
         every = first[:, None] + np.arange(index.span)
         inside = every <= last[:, None]
-        whole = bool(inside.all())
-        if not whole:
-            every = np.minimum(every, last[:, None])
-        steps = every[:, :: index.row_stride]
-        actions, known = self.actions[every], self.known[every]
-        if not whole:
-            actions[~inside] = 0
-            known &= inside
+        every = np.minimum(every, last[:, None])
+        actions = self.actions[every]
+        actions[~inside] = 0
+        known = inside if self.known is None else inside & self.known[every]
         return {
-            "tokens": self.tokens[steps],
+            "tokens": self.tokens[every[:, :: index.row_stride]],
             "actions": actions.reshape(len(first), index.frames, -1),
             "known": np.all(known.reshape(len(first), index.frames, -1), axis=2),
             "inside": inside[:, :: index.row_stride],
-            "episode": self.episode[first],
-            "frame": self.frame[first],
         }
+
+
+def _spans(values: NDArray[Any], span: int) -> NDArray[Any]:
+    """(N, A) -> (N - span + 1, span * A): every run of rows, without a copy."""
+    rows, width = values.shape
+    size = values.itemsize
+    return np.ndarray(
+        (max(0, rows - span + 1), span * width),
+        values.dtype,
+        buffer=np.ascontiguousarray(values),
+        strides=(width * size, size),
+    )
 
 
 class Decoder:
@@ -141,9 +165,7 @@ class Decoder:
             values = self.shards.read(self._names[shard], [number], self._columns)
             self._check(group, self._names[shard], values)
             tokens, actions, episode, frame, *known = (values[name] for name in self._columns)
-            self._kept[group] = Rows(
-                tokens, actions, episode, frame, known[0] if known else np.ones(len(frame), np.bool_)
-            )
+            self._kept[group] = Rows(tokens, actions, episode, frame, known[0] if known else None)
             while len(self._kept) > self._keep:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(group)

@@ -91,7 +91,7 @@ def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
         if shard:
             os.link(first, folder / name)
         rows = tuple(
-            replace(row, episode_index=shard * each + i, id=f"{shard}/{i}", shard=name)
+            replace(row, episode_index=shard * each + i, id=str(shard * each + i), shard=name)
             for i, row in enumerate(footer.episodes)
         )
         gathered.add(Footer(plan, name, "train", rows, (), footer.stats))

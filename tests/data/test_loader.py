@@ -97,15 +97,6 @@ def test_a_restart_goes_on_with_the_same_windows(sets: list[Path], stop: int) ->
     assert all(same(a, b) for a, b in zip(whole, begun + rest, strict=True))
 
 
-@pytest.mark.parametrize("workers", [2])
-def test_batches_do_not_depend_on_workers(sets: list[Path], workers: int) -> None:
-    alone = list(islice(MixtureDataset(sets, 4, FRAMES, seed=1).batches(), 12))
-    data = MixtureDataset(sets, 4, FRAMES, seed=1)
-    shared = list(islice(data.batches(workers), 12))
-    assert all(same(a, b) for a, b in zip(alone, shared, strict=True))
-    assert data.state_dict()["step"] == 12
-
-
 def test_ranks_see_disjoint_windows(sets: list[Path]) -> None:
     seen = []
     for rank in (0, 1):

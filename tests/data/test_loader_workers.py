@@ -1,7 +1,7 @@
 """The stream of batches: the same with any workers, in any DataLoader, over stops and ranks."""
 
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         ]
 
 
-def dataset(sets: list[Path], **others: Any) -> MixtureDataset:
+def dataset(sets: Sequence[str | Path], **others: Any) -> MixtureDataset:
     return MixtureDataset(sets, **({"batch_size": SIZE, "frames": FRAMES, "seed": 4, "pool": 2} | others))
 
 
@@ -152,6 +152,25 @@ def test_no_batch_holds_two_windows_that_share_a_frame(sets: list[Path]) -> None
         places = np.array([1_000 * episode + frame for _, episode, frame in windows_of(batch)])
         met += int((np.diff(np.sort(places)) < span).sum())
     assert met <= 200 // 40  # where one pool ends and the next begins
+
+
+def test_a_set_in_a_store_gives_the_same_batches_as_the_folder(sets: list[Path]) -> None:
+    import fsspec
+
+    store = fsspec.filesystem("memory")
+    uris = []
+    for folder in sets:
+        store.put(str(folder), f"/loader-{folder.name}", recursive=True)
+        uris.append(f"memory://loader-{folder.name}")
+    try:
+        assert seen(iter(dataset(uris)), 20) == seen(iter(dataset(sets)), 20)
+        windows = WindowDataset(uris[1], "train", FRAMES)
+        assert windows_of(windows.batch([5, 3])) == windows_of(
+            WindowDataset(sets[1], "train", FRAMES).batch([5, 3])
+        )
+    finally:
+        for uri in uris:
+            store.rm(uri, recursive=True)
 
 
 def stateful(sets: list[Path], workers: int) -> Any:
