@@ -1,0 +1,163 @@
+"""What `hma hub list` says of a folder or repository, and the picture that goes into the card."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from safetensors.torch import save_file
+from typer.testing import CliRunner
+
+from hma_data.errors import CheckpointError, HubError, UsageError
+from hma_data.shards.reader import ShardSet
+from hma_model import hub
+from hma_model.checkpoint import Checkpoint
+from hma_model.cli import app
+from hma_model.hub_list import survey
+from hma_model.hub_sample import add_samples, sample
+from tests.hub_server import connect, serve
+from tests.model.robots import SPEC, make_model, save
+from tests.model.shards import make_shards
+
+ROBOTS = {"arm": 2, "hand": 3}
+
+
+class Flat:
+    """A tokenizer of 16-pixel pictures in six blocks; the token is the block's grey."""
+
+    spec = SPEC
+
+    def decode(self, tokens):
+        blocks = np.repeat(np.repeat((tokens * 4).astype(np.uint8), 8, axis=1), 6, axis=2)[:, :, :16]
+        return np.repeat(blocks[..., None], 3, axis=3)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    save(tmp_path / "model", ROBOTS)
+    return tmp_path / "model"
+
+
+@pytest.fixture
+def shelf(folder: Path, tmp_path: Path) -> Path:
+    """A folder hub with a model of ours, one of the release, and something else."""
+    hub.push(folder, tmp_path / "shelf/team/model")
+    released = tmp_path / "shelf/liruiw/hma-base"
+    released.mkdir(parents=True)
+    values = {
+        "num_layers": 32,
+        "num_heads": 8,
+        "d_model": 256,
+        "action_domains": ["bridge"],
+        "d_actions": [14],
+    }
+    (released / "config.json").write_text(json.dumps(values))
+    save_file(make_model({}).trunk_state(), released / "model.safetensors")
+    (tmp_path / "shelf/bert").mkdir()
+    (tmp_path / "shelf/bert/config.json").write_text('{"model_type": "bert"}')
+    return tmp_path / "shelf"
+
+
+def test_ours_and_the_releases_stand_side_by_side(shelf, folder):
+    released, ours = survey(shelf)
+    assert ours["checkpoint"].endswith("shelf/team/model") and ours["format"] == "hma-toolkit"
+    assert ours["trunk_sha256"] == Checkpoint.open(folder).trunk_sha256
+    assert ours["trunk_bytes"] == (folder / "trunk.safetensors").stat().st_size
+    arm, hand = ours["embodiments"]
+    assert (arm["embodiment"], arm["action_dim"], arm["hz"], arm["val_loss"]) == ("arm", 2, 5.0, 1.5)
+    assert hand["bytes"] > 1000 and hand["problems"] == []
+    assert released["format"] == "released" and "hma hub import" in released["problems"][0]
+    assert [(row["embodiment"], row["chunk_dim"]) for row in released["embodiments"]] == [("bridge", 14)]
+
+
+def test_what_cannot_be_used_here_says_why(folder):
+    def change(path, **values):
+        path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+    change(folder / "embodiments/arm/card.json", trunk_sha256="0" * 64)
+    (folder / "embodiments/hand/head.safetensors").unlink()
+    tokenizer = json.loads((folder / "config.json").read_text())["tokenizer"]
+    change(folder / "config.json", tokenizer={**tokenizer, "name": "theirs"}, format_version=9)
+    (facts,) = survey(folder)
+    assert any("'theirs' is not one of this release" in problem for problem in facts["problems"])
+    assert any("has format_version 9" in problem and "update" in problem for problem in facts["problems"])
+    arm, hand = facts["embodiments"]
+    assert "belongs to another trunk" in arm["problems"] and "lacks head.safetensors" in hand["problems"]
+
+
+def test_a_trainings_folder_lists_its_checkpoints(tmp_path):
+    for step in (10, 20):
+        save(tmp_path / f"run/checkpoints/step-{step:08d}", {"arm": 2}, seed=step)
+    found = survey(tmp_path / "run")
+    assert [facts["checkpoint"][-8:] for facts in found] == ["00000010", "00000020"]
+
+
+def test_a_folder_of_nothing_says_so(tmp_path):
+    with pytest.raises(
+        HubError, match=r"has no config\.json of a checkpoint of hma-toolkit or of the release"
+    ):
+        survey(tmp_path)
+
+
+def test_the_command_prints_a_table_and_the_same_as_json(shelf):
+    shown = CliRunner().invoke(app, ["hub", "list", str(shelf)]).stdout
+    for word in (
+        "hma-toolkit",
+        "released",
+        "bring it in with hma hub import",
+        "arm",
+        "an arm",
+        "1.5",
+        "bridge",
+    ):
+        assert word in shown
+    facts = json.loads(CliRunner().invoke(app, ["hub", "list", str(shelf), "--json"]).stdout)
+    assert facts["checkpoints"] == survey(shelf)
+    one = json.loads(CliRunner().invoke(app, ["hub", "list", str(shelf / "team/model"), "--json"]).stdout)
+    assert [row["embodiment"] for row in one["embodiments"]] == ["arm", "hand"]
+
+
+def test_a_released_repository_is_listed_without_its_weights_being_sent(shelf, tmp_path, monkeypatch):
+    with serve() as server:
+        connect(monkeypatch, server, tmp_path / "cache", None)
+        released = shelf / "liruiw/hma-base"
+        names = ("config.json", "model.safetensors")
+        server.create("liruiw/hma-base").commit({name: (released / name).read_bytes() for name in names})
+        (facts,) = survey("liruiw/hma-base")
+        assert facts["format"] == "released" and set(server.sent()) == {"config.json"}
+
+
+# -- the sample picture
+
+
+def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path):
+    shards = ShardSet(make_shards(tmp_path / "shards", "arm"))
+    (tmp_path / "s.png").write_bytes(sample(folder, shards, Flat()))
+    picture = np.asarray(Image.open(tmp_path / "s.png"))
+    height, width = picture.shape[:2]
+    assert width > height > 3 * 128 and len(np.unique(picture)) > 5
+
+
+def test_the_picture_is_pushed_with_its_embodiment_and_shown_in_the_card(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+    add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
+    hub.push(folder, tmp_path / "hub")
+    page = (tmp_path / "hub/README.md").read_text()
+    assert "(embodiments/arm/sample.png)" in page and "(embodiments/hand/sample.png)" not in page
+    assert (hub.pull(tmp_path / "hub", ["arm"], tmp_path / "out") / "embodiments/arm/sample.png").is_file()
+
+
+def test_the_command_makes_the_picture_on_pushing(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+    shards = make_shards(tmp_path / "shards", "hand", dims=3)
+    call = ["hub", "push", str(folder), str(tmp_path / "hub"), "--sample", str(shards)]
+    assert CliRunner().invoke(app, call).exit_code == 0
+    assert (tmp_path / "hub/embodiments/hand/sample.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_shards_of_another_robot_or_too_short_make_no_picture(folder, tmp_path):
+    with pytest.raises(CheckpointError, match="has no embodiment 'leg'"):
+        add_samples(folder, [make_shards(tmp_path / "leg", "leg")])
+    with pytest.raises(UsageError, match="no window of 4 frames"):
+        add_samples(folder, [make_shards(tmp_path / "short", "arm", length=3)])
