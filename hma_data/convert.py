@@ -25,6 +25,7 @@ from hma_data.errors import OutputError, RegistryError, SourceError
 from hma_data.extend import extended
 from hma_data.files import remove_parts
 from hma_data.output import (
+    Held,
     Journal,
     Made,
     Share,
@@ -34,12 +35,14 @@ from hma_data.output import (
     known_hashes,
     locked,
     remove_journals,
+    shard_names,
 )
 from hma_data.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.shard_work import Job, MakeWork, Tick
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
 from hma_data.shards.schema import flag_counts
 from hma_data.sources.base import open_source
+from hma_data.store import parquet_input, place
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 
@@ -143,15 +146,15 @@ def convert(
         SourceError: the recording cannot be read, or not one of its episodes can be used.
         HMAError: the embodiment or the tokenizer cannot be used.
     """
-    begun = time.monotonic()
+    begun, out = time.monotonic(), place(out)
     conversion = _Conversion(
         embodiment, source, tokenizer, out, settings or Settings(), workers, engine, weights, device, limits
     )
-    with locked(out):
+    with locked(out) as lock:
         if overwrite:
             clear(out)
         plan, base = conversion.plan(extend)
-        done, made = conversion.make(plan, base, None, on_progress)
+        done, made = conversion.make(plan, base, None, on_progress, lock)
         manifest = conversion.finish(plan, base, bool(made))
         reasons = _reasons(out)
         if not any(split["episodes"] for split in manifest.splits.values()):
@@ -184,20 +187,20 @@ def convert_share(
 
     The bytes are those that `convert` alone would make. Arguments as there.
     """
-    begun = time.monotonic()
+    begun, out = time.monotonic(), place(out)
     conversion = _Conversion(
         embodiment, source, tokenizer, out, settings or Settings(), workers, "local", weights, device, limits
     )
-    with locked(out, share):
+    with locked(out, share) as lock:
         plan, base = conversion.plan(extend)
-        done, made = conversion.make(plan, base, share, on_progress)
+        done, made = conversion.make(plan, base, share, on_progress, lock)
     missing = len(plan.units)
     with suppress(OutputError), locked(out):  # others are still writing: the last of them comes here
         missing -= len(finished_shards(out, plan, base, shared=False))
         if not missing:
             conversion.finish(plan, base, True)
     if missing:
-        missing = sum(not (out / unit.name).is_file() for unit in plan.units)
+        missing = len({unit.name for unit in plan.units} - shard_names(out))
     return Shared(out, done, made, missing, time.monotonic() - begun)
 
 
@@ -219,7 +222,8 @@ class _Conversion:
     ) -> None:
         self._embodiment, self._out, self._settings = embodiment, out, settings
         self._named = isinstance(tokenizer, str)
-        self._workers, self._engine, self._limits = workers if self._named else 0, engine, limits
+        alone = not self._named or str(out).startswith("memory:")  # which no other process would see
+        self._workers, self._engine, self._limits = 0 if alone else workers, engine, limits
         self._weights, self._device = weights, device
         self._tokenizer = (
             get_tokenizer(tokenizer, weights=weights, device=device)
@@ -248,6 +252,7 @@ class _Conversion:
         base: Manifest | None,
         share: Share | None,
         on_progress: Callable[[Progress], None],
+        lock: Held,
     ) -> tuple[int, int]:
         """Make the shards that are not there; how many were, and how many are made."""
         mine = plan.units[share.index :: share.count] if share else plan.units
@@ -263,10 +268,12 @@ class _Conversion:
         )
         on_progress(progress)
         if todo:
-            journal = Journal(self._out, share)
-            for made in self._run(todo, plan, _Counter(progress, on_progress)):
-                journal.add(made)
-                on_progress(progress)
+            with Journal(self._out, share) as journal:
+                for made in self._run(todo, plan, _Counter(progress, on_progress)):
+                    lock.check()
+                    journal.add(made)
+                    on_progress(progress)
+            lock.check()
         return progress.kept_shards, len(todo)
 
     def _run(self, todo: list[ShardUnit], plan: Plan, on_event: "_Counter") -> Iterator[Made]:
@@ -305,7 +312,7 @@ class _Conversion:
 
 def _reasons(out: Path) -> dict[str, int]:
     reasons: dict[str, int] = {}
-    for line in (out / "quarantine.jsonl").read_text().splitlines():
+    for line in (out / "quarantine.jsonl").read_text(encoding="utf-8").splitlines():
         item = json.loads(line)
         text = f"{item['type']}: {item['message']}"
         if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
@@ -317,7 +324,9 @@ def _reasons(out: Path) -> dict[str, int]:
 def _flags(out: Path) -> dict[str, int]:
     """Counts of the episodes' flags, added up."""
     totals: Counter[str] = Counter()
-    for item in pq.read_table(out / EPISODES, columns=["flags"])["flags"].value_counts().to_pylist():
+    for item in (
+        pq.read_table(parquet_input(out / EPISODES), columns=["flags"])["flags"].value_counts().to_pylist()
+    ):
         for name, count in flag_counts(item["values"] or "").items():
             totals[name] += count * item["counts"]
     return dict(sorted(totals.items()))

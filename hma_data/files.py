@@ -1,12 +1,14 @@
-"""Files that are whole or absent: written beside, flushed, renamed."""
+"""Files that are whole or absent: written beside, flushed, renamed; for a store, written here, then put."""
 
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from hma_data.errors import OutputError
+from hma_data.store import RemotePath, put_bytes, put_file
 
 PART = ".part"  # ends the name of whatever is not finished
 
@@ -15,9 +17,16 @@ PART = ".part"  # ends the name of whatever is not finished
 def atomic_path(final: Path) -> Iterator[Path]:
     """A path beside `final` to write to; it becomes `final` when the block ends without an error.
 
+    For a file of a store it is a path of this machine, and uploaded when the block ends.
+
     Raises:
         OutputError: the folder cannot be written, or the disk is full.
+        StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
+    if isinstance(final, RemotePath):
+        with _uploaded(final) as part:
+            yield part
+        return
     part = final.with_name(f".{final.name}.{os.getpid()}{PART}")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -34,8 +43,38 @@ def atomic_path(final: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+@contextmanager
+def _uploaded(final: RemotePath) -> Iterator[Path]:
+    part = upload_folder(final.parent) / f".{final.name}.{os.getpid()}{PART}"
+    try:
+        part.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+    except OSError as fault:
+        part.unlink(missing_ok=True)
+        raise OutputError(
+            part,
+            f"cannot be written: {fault.strerror or fault}",
+            "free space, or name a folder by $HMA_CACHE",
+        ) from fault
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    try:
+        put_file(part, final)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def upload_folder(folder: RemotePath) -> Path:
+    """Where files that will go into a folder of a store are written first."""
+    return cache_folder() / "uploads" / hashlib.sha256(str(folder).encode()).hexdigest()[:16]
+
+
 def write_atomic(final: Path, content: str | bytes) -> None:
     """A whole small file; see `atomic_path`."""
+    if isinstance(final, RemotePath):
+        put_bytes(content.encode() if isinstance(content, str) else content, final)
+        return
     with atomic_path(final) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -66,5 +105,8 @@ def file_sha256(path: Path) -> str:
 
 def remove_parts(folder: Path) -> None:
     """Delete what a killed run left unfinished in a folder and the folders right below it."""
+    if isinstance(folder, RemotePath):
+        for place in (folder, folder / "train", folder / "val"):
+            shutil.rmtree(upload_folder(place), ignore_errors=True)
     for part in [*folder.glob(f".*{PART}"), *folder.glob(f"*/.*{PART}")]:
         part.unlink(missing_ok=True)

@@ -5,20 +5,25 @@ import fcntl
 import json
 import os
 import shutil
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from hma_data.errors import OutputError
+from hma_data.errors import HMAError, OutputError
 from hma_data.extend import hashes, ways
-from hma_data.files import PART, file_sha256, remove_parts
+from hma_data.files import PART, remove_parts
 from hma_data.plan import Plan, differences
-from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, Manifest
-from hma_data.shards.schema import read_footer
+from hma_data.remote_lock import PROBE, RemoteLock, held_by, living_holder
+from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SPLITS, Manifest
+from hma_data.shards.schema import Footer, read_footer
+from hma_data.store import RemotePath, is_remote, put_bytes
 
 LOCK, JOURNAL = ".lock", ".journal"
+READERS, JOURNAL_S = 16, 20.0  # footers asked for at a time, and seconds between two writes, in a store
 OURS = {"train", "val", MANIFEST, EPISODES, EMBODIMENT, QUARANTINE}
 
 
@@ -38,13 +43,64 @@ class Share:
 # -- locks
 
 
+class Held(Protocol):
+    """A lock that is held."""
+
+    def check(self) -> None:
+        """Raises OutputError where it was lost, which only one in a store can be."""
+        ...
+
+
+class _Flock:
+    def check(self) -> None:
+        """The kernel keeps it."""
+
+
 @contextmanager
-def locked(out: Path, share: Share | None = None) -> Iterator[None]:
+def locked(out: Path, share: Share | None = None) -> Iterator[Held]:
     """Only one job writes a folder, or a share of it; a lock goes with its process, however that ends.
 
     Raises:
         OutputError: another job is writing, or the folder cannot be written.
     """
+    if isinstance(out, RemotePath):
+        with _locked_in_store(out, share) as held:
+            yield held
+        return
+    with _locked_here(out, share):
+        yield _Flock()
+
+
+@contextmanager
+def _locked_in_store(out: RemotePath, share: Share | None) -> Iterator[Held]:
+    if out.scheme == "hf":
+        raise OutputError(
+            out, "a hub's repository is not written file by file", "write a folder, then upload that"
+        )
+    what = f"share {share.name} of it" if share else "it"
+    _refuse_living(out, share, what)
+    with RemoteLock(out / (f"{LOCK}-{share.name}" if share else LOCK), what) as lock:
+        _refuse_living(out, share, what)  # two that came at once see each other here
+        if share is None:
+            for path in _locks(out):
+                if path.name != LOCK:
+                    path.unlink(missing_ok=True)  # of jobs that are gone
+        yield lock
+
+
+def _refuse_living(out: RemotePath, share: Share | None, what: str) -> None:
+    """A share goes with other shares, and nothing else with anything."""
+    for path in _locks(out):
+        if (path.name == LOCK) == (share is not None) and (holder := living_holder(path)):
+            raise held_by(path, holder, what)
+
+
+def _locks(out: RemotePath) -> list[RemotePath]:
+    return [item for item in out.iterdir() if item.name.startswith(LOCK) and not item.name.startswith(PROBE)]
+
+
+@contextmanager
+def _locked_here(out: Path, share: Share | None) -> Iterator[None]:
     made = not out.exists()
     with ExitStack() as held:
         try:
@@ -101,6 +157,9 @@ def clear(out: Path) -> None:
         OutputError: it holds something else.
     """
     _refuse_foreign(out)
+    if isinstance(out, RemotePath):
+        out.delete_tree(keep=lambda name: name.startswith(LOCK))
+        return
     for item in out.iterdir():
         if not item.name.startswith(LOCK):
             shutil.rmtree(item) if item.is_dir() else item.unlink()
@@ -142,15 +201,11 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
     kept = {shard.path for shard in base.shards} if base else set()
     planned = {unit.name for unit in plan.units}
     done: set[str] = set()
-    for path in sorted([*out.glob("train/[!.]*"), *out.glob("val/[!.]*")]):
-        name = path.relative_to(out).as_posix()
-        if name in kept:
-            continue
-        footer, _ = read_footer(path, str(path))
+    for name, footer in _footers(out, sorted(shard_names(out) - kept)):
         if footer.plan["hash"] == plan.facts["hash"] and name in planned:
             done.add(name)
         elif base and footer.plan.get("extends") and hashes(base.plan) & hashes(footer.plan):
-            path.unlink()  # of an extension that was not finished, and differs from this one
+            (out / name).unlink()  # of an extension that was not finished, and differs from this one
         else:
             raise _other(out, plan, footer.plan)
     if not done and base is None and (out / MANIFEST).is_file():
@@ -158,6 +213,20 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
         if theirs["hash"] != plan.facts["hash"]:
             raise _other(out, plan, theirs)
     return done
+
+
+def shard_names(out: Path) -> set[str]:
+    """What is in the folders of the splits."""
+    return {path.relative_to(out).as_posix() for split in SPLITS for path in out.glob(f"{split}/[!.]*")}
+
+
+def _footers(out: Path, names: list[str]) -> Iterator[tuple[str, Footer]]:
+    """Of each shard; many are asked for at a time in a store, where each takes a while."""
+    readers = READERS if is_remote(out) else 1
+    with ThreadPoolExecutor(readers) as pool:
+        for start in range(0, len(names), 4 * readers):
+            some = names[start : start + 4 * readers]
+            yield from zip(some, pool.map(lambda name: read_footer(out / name, str(out / name))[0], some))
 
 
 def _other(out: Path, plan: Plan, theirs: dict[str, Any]) -> OutputError:
@@ -181,25 +250,52 @@ class Made:
 
 
 class Journal:
-    """What this job's shards hash to, so that finishing reads none of them again; lines are only appended."""
+    """What this job's shards hash to, so that finishing reads none of them again; lines are only appended.
+
+    A store cannot append: there the whole is written now and then, and when the block ends.
+    """
 
     def __init__(self, out: Path, share: Share | None) -> None:
         self._path = out / (f"{JOURNAL}-{share.name}" if share else JOURNAL)
+        self._lines: list[str] = []
+        self._due = time.monotonic() + JOURNAL_S
+
+    def __enter__(self) -> "Journal":
+        if is_remote(self._path) and self._path.is_file():
+            self._lines = self._path.read_text(encoding="utf-8").splitlines(keepends=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._put()
 
     def add(self, made: Made) -> None:
         """Note a shard."""
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(asdict(made)) + "\n")
+        line = json.dumps(asdict(made)) + "\n"
+        if not is_remote(self._path):
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(line)
+            return
+        self._lines.append(line)
+        if time.monotonic() > self._due:
+            self._put()
+
+    def _put(self) -> None:
+        if isinstance(self._path, RemotePath) and self._lines:
+            with suppress(HMAError, OSError):  # without it, finishing reads the shards again
+                put_bytes("".join(self._lines).encode(), self._path)
+        self._due = time.monotonic() + JOURNAL_S
 
 
 def known_hashes(out: Path) -> dict[str, str]:
     """Shard -> sha256, of every journal's shards whose size still is what it was; the rest must be read."""
     found: dict[str, str] = {}
+    sizes = out.listing() if isinstance(out, RemotePath) else None
     for path in sorted(out.glob(f"{JOURNAL}*")):
         for line in path.read_text(encoding="utf-8").splitlines():
             with suppress(ValueError, TypeError, OSError):  # a line cut short by a kill
                 made = Made(**json.loads(line))
-                if (out / made.name).stat().st_size == made.bytes:
+                size = (out / made.name).stat().st_size if sizes is None else sizes.get(made.name)
+                if size == made.bytes:
                     found[made.name] = made.sha256
     return found
 
@@ -208,9 +304,3 @@ def remove_journals(out: Path) -> None:
     """After the manifest is there."""
     for path in out.glob(f"{JOURNAL}*"):
         path.unlink(missing_ok=True)
-
-
-def made(out: Path, name: str) -> Made:
-    """Hash a shard that was just written, while it is in memory."""
-    path = out / name
-    return Made(name, path.stat().st_size, file_sha256(path))

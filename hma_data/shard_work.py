@@ -31,7 +31,7 @@ from hma_data.errors import (
     ShardError,
     TokenizerError,
 )
-from hma_data.output import Made, made
+from hma_data.output import Made
 from hma_data.plan import ShardUnit
 from hma_data.prefetch import prefetch
 from hma_data.retry import WAITS_S, disk_is_full, storage_is_away, worth_another_try
@@ -92,8 +92,7 @@ class MakeWork:
         job = self.job
 
         def work(unit: ShardUnit, report: Report, attempt: Attempt) -> Made:
-            make_shard(job, unit, tokenizer, report, attempt)
-            done = made(job.out, unit.name)
+            done = make_shard(job, unit, tokenizer, report, attempt)
             report(Tick(bytes=done.bytes))
             return done
 
@@ -102,7 +101,7 @@ class MakeWork:
 
 def make_shard(
     job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt = FIRST
-) -> None:
+) -> Made:
     """Read, align, tokenize and write the episodes of one shard."""
     embodiment, strided = job.embodiment, job.facts["frames"] == "strided"
     cameras: list[str] = job.facts["cameras"]
@@ -132,6 +131,7 @@ def make_shard(
             rows.append(_row(item, unit, start, writer.rows - start, len(cameras)))
             report(Tick(episodes=1))
         writer.close(Footer(job.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
+    return Made(unit.name, writer.bytes, writer.sha256)
 
 
 @dataclass

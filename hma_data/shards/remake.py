@@ -32,6 +32,7 @@ from hma_data.shards.schema import (
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.stats import Stats
+from hma_data.store import place
 from hma_data.tokenizers.base import TokenizerSpec
 
 OnProgress = Callable[[int, int], None]
@@ -97,7 +98,7 @@ def remake(
         OutputError: `out` holds something else, or another job is writing it.
         ShardError: an input is damaged.
     """
-    plan = _plan(job)
+    plan, out = _plan(job), place(out)
     with locked(out):
         done = finished_shards(out, plan, None, False)
         todo = [unit for unit in plan.units if unit.name not in done]
@@ -301,7 +302,7 @@ def _together(rows: Sequence[EpisodeRow], by: str) -> list[str]:
 
 def _check_out(out: Path, folders: Sequence[Path]) -> None:
     for folder in folders:
-        mine, theirs = out.resolve(), folder.resolve()
+        mine, theirs = place(out).resolve(), place(folder).resolve()
         if mine == theirs or mine in theirs.parents or theirs in mine.parents:
             raise UsageError(
                 "--out", f"{out} and the shard set {folder} lie in each other", "give a new folder"
