@@ -106,7 +106,7 @@ def _episodes(uri: str, robot: Embodiment, sample: int, inspection: Inspection) 
         yield Finding("usable", "error", f"none of its episodes: {fault.fault}")
         return
     chosen = [names[i] for i in sampled(len(names), sample)]
-    refused: Counter[str] = Counter()
+    refused: Counter[tuple[str, str]] = Counter()
     clips: list[Clip] = []
     for name in chosen:
         try:
@@ -115,11 +115,12 @@ def _episodes(uri: str, robot: Embodiment, sample: int, inspection: Inspection) 
                 clip.frames_at(camera.name, np.array([len(clip) - 1]))
             clips.append(clip)
         except HMAError as fault:
-            refused[fault.fault] += 1
-    for reason, count in refused.most_common(5):
+            refused[fault.fault, fault.remedy] += 1
+    for (reason, remedy), count in refused.most_common(5):
         severity: Severity = "warn" if clips else "error"
         said = f"{count} of {len(chosen)} episodes looked at: {reason}"
-        yield Finding("usable", severity, said, numbers={"refused": count, "looked_at": len(chosen)})
+        numbers = {"refused": count, "looked_at": len(chosen)}
+        yield Finding("usable", severity, said, remedy, numbers=numbers)
     if clips:
         told = any(one.check == "gaps" and one.key == robot.primary_camera.key for one in inspection.findings)
         yield from (one for one in _times(clips, robot) if not (told and one.check == "gaps"))
@@ -184,7 +185,7 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
 
     wrong = verify(folder)
     for problem in wrong:
-        yield Finding("integrity", "error", problem, "run the same hma convert again")
+        yield Finding("integrity", "error", problem)
     if wrong:
         return
     manifest = Manifest.load(folder)

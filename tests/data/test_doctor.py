@@ -158,4 +158,13 @@ def test_a_shard_set_with_changed_bytes_is_an_error(
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 1
     shard.write_bytes(content)
-    assert examine(str(tmp_path / "shards"))[0].check == "integrity"
+    first = examine(str(tmp_path / "shards"))[0]
+    assert first.check == "integrity"
+    assert str(first).count(" — ") <= 1  # verify's line says what to do, and nothing else does
+
+
+def test_episodes_that_are_refused_come_with_what_to_do(tmp_path: Path) -> None:
+    yaml = ARM_YAML.replace("dims: 3, names: [a, b, c]", "dims: 2")
+    (first, *_) = examined(tmp_path, lambda file: None, yaml)
+    assert (first.check, first.severity) == ("usable", "error")
+    assert "dims" in first.remedy or "slice" in first.remedy
