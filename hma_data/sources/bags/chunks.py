@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from hma_data.sources.bags.container import HEAD, Wanted, checked_size
 
-CACHED_BYTES = 256 << 20  # of unpacked chunks, of all the bags a process reads
+CACHED_BYTES = 128 << 20  # of unpacked chunks, of all the bags a process reads
 WORTH = 0.8  # of a chunk: where more has to be unpacked, all of it is
 LARGE = 1 << 18  # bytes; memory of fewer is left to the allocator
 GRAIN = 1 << 16  # large memory is a multiple of this, so that chunks of nearly one size fit each other's
