@@ -36,7 +36,10 @@ def _front(manifest: Manifest) -> dict[str, Any]:
     present = [split for split in _SPLITS if any(shard.split == split for shard in manifest.shards)]
     frames = [{"split": _SPLITS[split], "path": f"{split}/*.parquet"} for split in present]
     configs: list[dict[str, Any]] = [{"config_name": "frames", "data_files": frames, "default": True}]
-    configs.append({"config_name": "episodes", "data_files": [{"split": "all", "path": EPISODES}]})
+    episodes = [
+        {"split": "train", "path": EPISODES}
+    ]  # of both splits; "all" is a word of the datasets library
+    configs.append({"config_name": "episodes", "data_files": episodes})
     return {
         **licence([manifest.embodiment.license]),
         "task_categories": ["robotics"],

@@ -110,7 +110,7 @@ def test_the_viewer_is_told_which_files_are_which_split(server, shards):
         {"split": "train", "path": "train/*.parquet"},
         {"split": "validation", "path": "val/*.parquet"},
     ]
-    assert episodes["data_files"] == [{"split": "all", "path": "episodes.parquet"}]
+    assert episodes["data_files"] == [{"split": "train", "path": "episodes.parquet"}]
     assert front["size_categories"] == ["n<1K"] and front["license"] == "apache-2.0"
     assert {"robotics", "embodiment:arm", "tokenizer:raw"} <= set(front["tags"])
     assert f'load_dataset("{REPO}", "frames")' in page
