@@ -44,6 +44,13 @@ class Cache:
         """Forget every frame."""
         self.times.fill_(_NEVER)
 
+    def hold_still(self) -> None:
+        """Promise a compiler that keys and values stay where they lie, so that it may write them in place."""
+        for layer in self.layers:
+            for kept in (layer.time, layer.action):
+                if kept is not None:
+                    torch._dynamo.mark_static_address(kept)
+
     def clock(self, start: int, frames: int) -> Clock:
         """The clock of a pass over n consecutive frames, which take their slots at once."""
         device = self.times.device

@@ -187,7 +187,7 @@ def _model(checkpoint: str, embodiment: str) -> Any:
 
 mount(app)
 cli_train.mount(app)
-BENCHES.setdefault("mup", "hma_model.bench_mup")
+BENCHES.update({name: f"hma_model.bench_{name}" for name in ("generate", "mup", "train")})
 app.add_typer(hub_app, name="hub")
 
 

@@ -10,7 +10,7 @@ into the cache. `cache=False` computes the whole history in every pass, with the
 B batch, P frames of a prompt, h,w token grid, S = h*w, K = stride * action dim, c channels, H,W latent grid.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from hma_model.conditioning import Groups, Slots, condition
 from hma_model.embed import patchify, unpatchify
 from hma_model.masking import masked_after
 from hma_model.model import HMA
-from hma_model.trunk import Conditioning, window_clock
+from hma_model.trunk import Conditioning, Trunk, window_clock
 from hma_model.unmask import Decoding, PatchFrame, TokenFrame
 
 
@@ -37,6 +37,8 @@ class Rollout:
         batch: B.
         unmask_steps, temperature, order, sample_steps, generator: as in `HMA.generate`.
         cache: keep keys and values of past frames.
+        compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
+            take a minute or more.
     """
 
     def __init__(
@@ -51,11 +53,13 @@ class Rollout:
         sample_steps: int | None = None,
         generator: torch.Generator | None = None,
         cache: bool = True,
+        compile: bool = False,
     ) -> None:
         self.model, self.config = model, model.config
         self.decoding = Decoding(unmask_steps, temperature, order, sample_steps, generator)
         _check(self.decoding, self.config.kind)
         self.caching = cache
+        self.compiled = _compiled(model.trunk) if compile and cache else None
         self.groups = Groups.of(embodiment, batch)
         self.sorted = Groups(self.groups.parts)  # what is kept here is in this order
         self.batch = batch
@@ -126,7 +130,8 @@ class Rollout:
         else:
             clock = self._cache().clock(self.time - fresh, fresh + 1)
             part = conditioning if first else conditioning.last()
-            features = self.model.trunk(x, part, clock, self._cache().layers)
+            trunk = self.compiled if self.compiled and x.shape[1] <= 2 else self.model.trunk
+            features = trunk(x, part, clock, self._cache().layers)
         return features[:, -1], clock.positions[-1:]
 
     def _embed(self, frame: TokenFrame | PatchFrame, fresh: int) -> Tensor:
@@ -147,6 +152,8 @@ class Rollout:
                 like = like.to(torch.get_autocast_dtype(like.device.type))
             tokens = self.config.tokens_per_frame + appended
             self.cache = Cache(self.config, self.batch, tokens, like)
+            if self.compiled is not None:
+                self.cache.hold_still()
         return self.cache
 
     # -- what is kept -------------------------------------------------------------------------------------
@@ -252,6 +259,19 @@ class Rollout:
             raise HMAError("prompt", fault, f"give ({self.batch}, frames, {', '.join(map(str, shape))})")
         if frames.shape[1] < 1:
             raise HMAError("prompt", "has no frames", "give at least one")
+
+
+def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
+    """The trunk for passes of a fixed shape; a result holds until the next pass."""
+    mode = "reduce-overhead" if trunk.position.device.type == "cuda" else "default"
+    compiled = torch.compile(trunk, dynamic=False, mode=mode)
+
+    def call(*arguments: object) -> Tensor:
+        torch.compiler.cudagraph_mark_step_begin()
+        features: Tensor = compiled(*arguments)
+        return features
+
+    return call
 
 
 def _check(decoding: Decoding, kind: str) -> None:

@@ -1,13 +1,20 @@
 """Rollouts: the cache against computing everything again, and what decoding promises."""
 
+from itertools import combinations
+from typing import Any
+
 import pytest
 import torch
 
 from hma_data.errors import HMAError
+from hma_model.config import CONDITIONINGS
 from hma_model.generate import Rollout
 from hma_model.model import HMA
 from tests.model.network_parts import ARM, small_batch, small_model
 
+COMBINATIONS = [
+    names for count in (1, 2, 4) for names in combinations(CONDITIONINGS, count)
+]  # each by itself, in pairs, and all
 LAYOUTS = {
     "rotary": {},
     "learned": {"time_position": "learned"},
@@ -52,6 +59,45 @@ def test_the_cache_changes_no_latents(layout: str) -> None:
         parameter.data *= 0.1  # the noisiest level divides by almost nothing, which would enlarge rounding
     cached, plain = (_rollout(model, cache, 2, 6, unmask_steps=3, temperature=0.5) for cache in (True, False))
     assert (cached - plain).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("conditioning", COMBINATIONS, ids="+".join)
+def test_every_pass_of_a_cached_rollout_has_the_features_of_full_recomputation(
+    kind: str, conditioning: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = small_model(kind=kind, conditioning=conditioning, action_tokens=2, diffusion_clip=1.0)
+    seen: list[list[torch.Tensor]] = []
+    plain = Rollout._features
+
+    def features(self: Rollout, frame: Any, part: Any, first: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        found = plain(self, frame, part, first)
+        seen[-1].append(found[0])
+        return found
+
+    monkeypatch.setattr(Rollout, "_features", features)
+    if kind == "continuous":
+        for parameter in model.latent_readout.diffusion.parameters():
+            parameter.data *= 0.1
+    for cache in (True, False):
+        seen.append([])
+        _rollout(model, cache, 2, 5, unmask_steps=3)
+    assert len(seen[0]) == len(seen[1]) == 15
+    assert max((a - b).abs().max() for a, b in zip(*seen)) < 1e-4
+
+
+def test_bfloat16_keeps_the_features_of_the_cache_near_those_of_float32() -> None:
+    exact, coarse = small_model(), small_model().bfloat16()
+    batch = small_batch(exact.config, ["arm", "hand.v1"], frames=4)
+    features = []
+    for model in (exact, coarse):
+        rollout = Rollout(model, batch.embodiment, 2, generator=_seed())
+        rollout.prompt(batch.tokens[:, :3], batch.actions)
+        rollout._take(batch.actions[:, 2], None)
+        with torch.no_grad():
+            found = rollout._features(rollout._blank(), rollout._condition(4), first=True)[0]
+        features.append(found.float().flatten())
+    assert torch.nn.functional.cosine_similarity(*features, dim=0) > 0.999
 
 
 @pytest.mark.parametrize("order", ["random", "confidence"])

@@ -1,0 +1,92 @@
+"""`hma bench generate` and `hma bench train`: what their results say."""
+
+import json
+from typing import Any
+
+import pytest
+from torch.utils.flop_counter import FlopCounterMode
+from typer.testing import CliRunner
+
+from hma_data.errors import UsageError
+from hma_model import bench_generate, bench_train
+from hma_model.cli import app
+from tests.model.network_parts import small_batch, small_model
+
+SMALL = {
+    "layers": 1, "width": 32, "heads": 4, "window": 3, "device": "cpu", "threads": 1, "diffusion_width": 32
+}  # fmt: skip
+
+
+def _generate(**changes: Any) -> dict[str, Any]:
+    return bench_generate.DEFAULTS | SMALL | {"frames": 1, "ddim_steps": 2} | changes
+
+
+def test_a_results_settings_and_figures_are_named() -> None:
+    words = [f"{key}={value}" for key, value in SMALL.items()] + ["kind=discrete", "cache=true", "frames=1"]
+    done = CliRunner().invoke(app, ["bench", "generate", *words, "--json"])
+    report = json.loads(done.stdout)
+    assert report["bench"] == "generate" and report["settings"]["window"] == 3
+    (result,) = report["results"]
+    told = ("kind", "device", "precision", "batch", "unmask_steps", "window", "cache", "decode")
+    assert [result[key] for key in told] == ["discrete", "cpu", "fp32", 1, 2, 3, True, False]
+    assert result["seconds_per_frame"] * result["frames_per_second"] == pytest.approx(1, rel=0.05)
+    assert result["peak_rss_mib"] > 0
+
+
+def test_each_kind_is_measured_with_the_cache_and_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_generate, "in_fresh_process", lambda task, settings, *case: {"case": case})
+    cases = [result["case"] for result in bench_generate.run(_generate())]
+    assert cases == [(kind, cache) for kind in ("discrete", "continuous") for cache in (True, False)]
+    assert len(bench_generate.run(_generate(kind="discrete", cache=False))) == 1
+
+
+@pytest.mark.parametrize("cache", [True, False])
+def test_latents_are_measured_in_either_precision(cache: bool) -> None:
+    result = bench_generate.measure(_generate(precision="bf16"), "continuous", cache)
+    assert (result["ddim_steps"], result["precision"], result["cache"]) == (2, "bf16", cache)
+
+
+def test_frames_are_decoded_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded = []
+    made = bench_generate._decoder
+
+    def decoder(kind: str, device: str) -> Any:
+        decode = made(kind, device)
+        return lambda frame: decoded.append(decode(frame).shape)
+
+    monkeypatch.setattr(bench_generate, "_decoder", decoder)
+    bench_generate.measure(_generate(decode=True, batch=2), "discrete", True)
+    assert decoded == [(2, 256, 256, 3)] * (bench_generate._WARMUP + 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"precision": "fp8"}, "precision=fp8 is not allowed — give one of fp32, bf16"),
+        ({"kind": "video"}, "kind=video is not allowed"),
+        ({"cache": 3}, "cache=3 is not allowed — give one of True, False"),
+        ({"frames": 0}, "frames=0 is not allowed — give at least 1"),
+        ({"window": 1}, "a window of 1 has no prompt"),
+    ],
+)
+def test_a_wrong_setting_is_named(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        bench_generate.run(_generate(**change))
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("changes", [{}, {"checkpointing": True, "optimizer": False, "precision": "bf16"}])
+def test_a_training_step_is_measured(kind: str, changes: dict[str, Any]) -> None:
+    result = bench_train.measure(bench_train.DEFAULTS | SMALL | {"steps": 1} | changes, kind)
+    assert result["windows_per_second"] == pytest.approx(2 / result["seconds_per_step"], rel=0.05)
+    assert result["kind"] == kind and "mfu" not in result
+
+
+def test_the_operations_of_a_step_are_those_torch_counts() -> None:
+    model = small_model(conditioning=("concat",), action_tokens=2, factored=(2,), frames=3, layers=3)
+    batch = small_batch(model.config, ["arm", "arm"])
+    with FlopCounterMode(display=False) as counter:
+        model(batch).loss.backward()
+    counts = bench_train.step_flops(model, {"batch": 2, "window": 3})
+    counted = sum(counter.get_flop_counts()["HMA.trunk"].values())
+    assert counts == pytest.approx(counted, rel=0.1)
