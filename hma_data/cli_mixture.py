@@ -17,8 +17,9 @@ Pairs = list[str] | None
 def mixture(
     folders: Annotated[list[str], typer.Argument(help="Shard sets.")],
     temperature: Annotated[
-        float, typer.Option("--temperature", help="τ: 1 proportional, large uniform.")
-    ] = 3.0,
+        float | None,
+        typer.Option("--temperature", help="τ: 1 proportional, large uniform; default 3, for val 4."),
+    ] = None,
     frames: Annotated[int, typer.Option("--frames", min=1, help="T of a window.")] = 12,
     split: Annotated[str, typer.Option("--split", help="train or val.")] = "train",
     short: Annotated[str, typer.Option("--short", help="Short episodes: drop or pad.")] = "drop",
@@ -44,7 +45,7 @@ def mixture(
     """
     from hma_data.errors import UsageError
     from hma_data.loader import open_sets
-    from hma_data.mixture import Mixture
+    from hma_data.mixture import TEMPERATURES, Mixture
     from hma_data.shards.manifest import SPLITS
     from hma_data.windows import WindowIndex
 
@@ -54,6 +55,7 @@ def mixture(
         raise UsageError("--short", f"must be drop or pad, is {short!r}")
     if plot and plot.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise UsageError("--plot", f"must end in .png, .svg or .pdf, is {plot}")
+    tau = TEMPERATURES[split] if temperature is None else temperature
     sets = open_sets(folders)
     indexes = {
         name: WindowIndex.of(shards, split, frames, short="pad" if short == "pad" else "drop")
@@ -63,7 +65,7 @@ def mixture(
     planned = samples or max(1, sum(counts.values()))
     mix = Mixture.of(
         counts,
-        temperature,
+        tau,
         weights=_numbers("--weight", weight),
         groups=_pairs("--group", group),
         caps=_numbers("--cap", cap),
@@ -75,13 +77,13 @@ def mixture(
     if plot:
         from hma_data.plots import plot_mixture
 
-        plot_mixture(mix, temperature, plot)
+        plot_mixture(mix, tau, plot)
     if json:
-        said = temperature if temperature != float("inf") else "inf"
+        said = tau if tau != float("inf") else "inf"
         facts = {"temperature": said, "frames": frames, "split": split, "samples": planned}
         print_json({**facts, "embodiments": rows})
         return
-    columns = ["windows", "episodes", "too short", "frames", "proportional", f"p at τ = {temperature:g}"]
+    columns = ["windows", "episodes", "too short", "frames", "proportional", f"p at τ = {tau:g}"]
     print_table(["embodiment", *columns, "p uniform", "epochs"], [list(row.values()) for row in rows])
     print(f"epochs: passes over a set's windows while {planned:,} samples are drawn in all")
 

@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 
 from hma_data.batch import Batch, as_batch, assemble
 from hma_data.errors import HMAError, ShardError, UsageError
-from hma_data.mixture import Draw, Mixture
+from hma_data.mixture import TEMPERATURES, Draw, Mixture
 from hma_data.pools import Deal, Stream, pool_size
 from hma_data.row_groups import MIB, Decoder
 from hma_data.shards.reader import ShardSet
@@ -149,7 +149,8 @@ class MixtureDataset(IterableDataset[Batch]):
         data: shard sets, each of another embodiment.
         batch_size: B on this rank.
         frames: T.
-        temperature, weights, groups, caps, max_epochs, samples, draw: of the mixture, see `Mixture.of`.
+        temperature, weights, groups, caps, max_epochs, samples, draw: of the mixture, see `Mixture.of`;
+            without a temperature it is 3 for train and 4 for val.
         seed: of draws and shuffles.
         rank, world: this process among those that train together; their windows are disjoint.
         split: train or val.
@@ -169,7 +170,7 @@ class MixtureDataset(IterableDataset[Batch]):
         batch_size: int,
         frames: int = 12,
         *,
-        temperature: float = 3.0,
+        temperature: float | None = None,
         weights: Mapping[str, float] | None = None,
         groups: Mapping[str, str] | None = None,
         caps: Mapping[str, float] | None = None,
@@ -202,7 +203,7 @@ class MixtureDataset(IterableDataset[Batch]):
         counts = {name: decoder.index.count for name, decoder in self._decoders.items()}
         self.mixture = Mixture.of(
             counts,
-            temperature,
+            TEMPERATURES.get(split, 3.0) if temperature is None else temperature,
             weights=weights,
             groups=groups,
             caps=caps,

@@ -18,6 +18,7 @@ from hma_data.errors import UsageError
 
 Floats = NDArray[np.float64]
 Draw = Literal["per_sample", "per_batch"]
+TEMPERATURES = {"train": 3.0, "val": 4.0}  # τ of the paper's code, by split
 
 
 def probabilities(

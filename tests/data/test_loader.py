@@ -11,6 +11,7 @@ from hma_data.convert import convert
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError, UsageError
 from hma_data.loader import Batch, MixtureDataset, WindowDataset
+from hma_data.mixture import probabilities
 from hma_data.plan import Settings
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
@@ -225,3 +226,10 @@ def test_windows_of_an_episode_longer_than_a_row_group_are_whole(tmp_path: Path)
                 found.tokens[i].reshape(10, -1), rows["tokens"][first : first + 20 : 2]
             )
             np.testing.assert_array_equal(found.actions[i].reshape(20, 3), rows["action"][first : first + 20])
+
+
+@pytest.mark.parametrize(("split", "temperature"), [("train", 3), ("val", 4)])
+def test_each_split_has_the_papers_temperature(sets: list[Path], split: str, temperature: float) -> None:
+    mixture = MixtureDataset(sets, 4, 1, split=split).mixture
+    assert mixture.counts[0] != mixture.counts[1]
+    np.testing.assert_allclose(mixture.p, probabilities(mixture.counts, temperature))
