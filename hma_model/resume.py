@@ -8,7 +8,7 @@ There is no state of random numbers: every draw of a step comes from (seed, what
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from hma_data.errors import CheckpointError, RecipeError
 from hma_model.checkpoint import HEAD, STEM, TRAINING, Checkpoint, inside
 from hma_model.files import read_json, read_tensors, to_json, write_tensors
 from hma_model.recipe import Recipe, differences
-from hma_model.state import check_fit
+from hma_model.state import check_fit, module_key
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -117,24 +117,30 @@ class Kept:
             CheckpointError: parts that do not fit the model.
         """
         model.load_trunk(self.shown[""][0])
-        for name in model.embodiments:
+        for name in self.shown.keys() - {""}:
             model.load_embodiment(name, *self.shown[name])
         if not self.weights:
             return
         self._averages.update({n: p.detach().cpu().clone() for n, p in model.named_parameters()})
-        check_fit(f"{TRAINING}/{WEIGHTS}", self.weights, model.state_dict())
-        model.load_state_dict(self.weights)
+        fresh = _prefixes(model.embodiments.keys() - self.shown.keys())
+        own = {name: tensor for name, tensor in model.state_dict().items() if not name.startswith(fresh)}
+        weights = {name: self.weights[name] for name in self.weights.keys() & own.keys()}
+        check_fit(f"{TRAINING}/{WEIGHTS}", weights, own)
+        model.load_state_dict(weights, strict=False)
 
 
-def read_kept(checkpoint: Checkpoint, model: "HMA") -> Kept:
-    """What a checkpoint keeps of a run with this model's embodiments.
+def _prefixes(embodiments: Iterable[str]) -> tuple[str, ...]:
+    return tuple(f"{part}.{module_key(name)}." for name in embodiments for part in ("stems", "heads"))
+
+
+def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) -> Kept:
+    """What a checkpoint keeps of a run with these embodiments; of those it does not know, nothing.
 
     Raises:
         CheckpointError: parts are missing, damaged, or do not belong together.
     """
-    state = _read_state(checkpoint)
     shown: dict[str, tuple[dict[str, Tensor], ...]] = {"": (read_tensors(checkpoint.trunk()),)}
-    for name in model.embodiments:
+    for name in set(embodiments) & set(checkpoint.embodiments):
         checkpoint.check(name)
         shown[name] = tuple(read_tensors(checkpoint.path(name, part)) for part in (STEM, HEAD))
     averaged = (checkpoint.folder / TRAINING / WEIGHTS).is_file()
@@ -143,7 +149,12 @@ def read_kept(checkpoint: Checkpoint, model: "HMA") -> Kept:
     return Kept(state, shown, weights, moments)
 
 
-def _read_state(checkpoint: Checkpoint) -> State:
+def read_state(checkpoint: Checkpoint) -> State:
+    """Where the run stood.
+
+    Raises:
+        CheckpointError: it is not said, or damaged.
+    """
     path = inside(checkpoint.folder, f"{TRAINING}/{STATE}")
     try:
         return State(**read_json(path))

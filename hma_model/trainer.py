@@ -30,7 +30,7 @@ from hma_model.optim import load_optimizer_state, lr_scale, make_optimizer, opti
 from hma_model.parallel import Spread, World, gathered
 from hma_model.pictures import newest_pictures, sample_pictures
 from hma_model.recipe import Recipe
-from hma_model.resume import Kept, State, data_digests, read_kept, seed_for, write_state
+from hma_model.resume import Kept, State, data_digests, read_kept, read_state, seed_for, write_state
 from hma_model.runtime import ENVIRONMENT, RECIPE, environment
 from hma_model.start import Start
 from hma_model.tally import Tally, peak_memory_mib
@@ -138,7 +138,9 @@ class Run:
         self.average = Average(self.model, self.recipe.ema) if self.recipe.ema else None
         if kept is None:
             return
-        load_optimizer_state(self.optimizer, kept.moments, self.out)
+        own = {name for group in self.optimizer.param_groups for name in group["names"]}
+        moments = {key: value for key, value in kept.moments.items() if key.rpartition("/")[0] in own}
+        load_optimizer_state(self.optimizer, moments, self.out)
         if self.average and kept.averages:
             self.average.load(kept.averages)
 
@@ -320,19 +322,41 @@ class Run:
         paths = training_checkpoints(self.out)
         for path in reversed(paths):
             try:
-                kept = read_kept(Checkpoint.open(path), self.model)
+                checkpoint = Checkpoint.open(path)
+                state = read_state(checkpoint)
                 if not force:
-                    kept.state.require_same(self.recipe.identity(), self.digests, self.out)
+                    state.require_same(self.recipe.identity(), self.digests, self.out)
+                kept = read_kept(checkpoint, state, self.sets)
+                notes += self._adopt(checkpoint)
                 kept.fill(self.model)
             except CheckpointError as fault:
                 if path == paths[0]:
                     raise
                 notes.append(f"passed over a damaged checkpoint: {fault}")
                 continue
-            notes += self._continue(kept.state, force)
+            notes += self._continue(state, force)
             break
         self.world.once(self._describe)
         return kept, notes
+
+    def _adopt(self, checkpoint: Checkpoint) -> list[str]:
+        """Keep the statistics that stems were trained with, where the shards have others by now."""
+        notes = []
+        for name, shards in self.sets.items():
+            if name not in checkpoint.embodiments:
+                notes.append(f"{name} is new here: fresh stem and head")
+                continue
+            stats = checkpoint.stats(name)
+            space = ActionSpace.of(shards.embodiment, action_stats(stats, name))
+            if not self.model.embodiments[name].agrees_with(space):
+                self.stats[name] = stats
+                notes.append(f"{name} keeps the statistics it was begun with")
+        if notes:
+            self.model = self._network().to(self.device).train()
+            self.model.trunk.checkpointing = self.recipe.checkpointing
+            if self.start:
+                self.start.fill(self.model)
+        return notes
 
     def _describe(self) -> None:
         write_atomic(self.out / RECIPE, to_json(self.recipe.values()))

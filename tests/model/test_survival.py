@@ -1,0 +1,213 @@
+"""What a run survives: kills at any moment, full disks, other hands in its folder. Each fault in one line."""
+
+import errno
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError
+from hma_model import checkpoint
+from hma_model.recipe import make_recipe
+from hma_model.runlog import read_metrics
+from hma_model.train import train
+from tests.model.runs import TINY, same
+from tests.model.shards import make_shards
+
+ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> list[str]:
+    torch.set_num_threads(1)
+    return [str(make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm"))]
+
+
+@pytest.fixture
+def recipe(data):
+    def recipe(**changes):
+        return make_recipe({**TINY, "data": data, **changes})
+
+    return recipe
+
+
+def test_kills_at_random_moments_leave_the_run_that_was_never_killed(recipe, tmp_path):
+    long = recipe(steps=60, checkpoint_every=3, eval_every=20, keep_last=2)
+    whole = train(long, out=tmp_path / "whole", show=False)
+    moments, cuts = random.Random(7), 0
+    for _ in range(12):
+        pid = os.fork()  # a process of its own without torch's import
+        if not pid:
+            code = 1
+            try:
+                train(long, out=tmp_path / "cut", show=False)
+                code = 0
+            finally:
+                os._exit(code)
+        time.sleep(moments.uniform(0.05, 0.6))
+        os.kill(pid, signal.SIGKILL)
+        _, status = os.waitpid(pid, 0)
+        cuts += os.WIFSIGNALED(status)
+        if not os.WIFSIGNALED(status):
+            break
+    again = train(long, out=tmp_path / "cut", show=False)
+    assert cuts >= 2
+    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
+    assert sorted(p.name for p in (again.out / "checkpoints").iterdir()) == ["step-00000057", "step-00000060"]
+
+
+def test_the_command_saves_on_sigterm_and_says_how_to_go_on(recipe, tmp_path):
+    path = tmp_path / "recipe.yaml"
+    path.write_text(json.dumps(recipe(steps=100_000, checkpoint_every=0, eval_every=0).values()))
+    run = subprocess.Popen(
+        [sys.executable, "-m", "hma_model.cli", "train", str(path), "--out", str(tmp_path / "run")],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not read_metrics(tmp_path / "run") and run.poll() is None:
+        time.sleep(0.05)
+    run.terminate()
+    _, said = run.communicate(timeout=120)
+    assert run.returncode == 130 and "the same command goes on" in said and "Traceback" not in said
+    step = int(checkpoint.resolve(tmp_path / "run").name.removeprefix("step-"))
+    assert step == read_metrics(tmp_path / "run")[-1]["step"] > 0
+
+
+@pytest.fixture
+def full(monkeypatch):
+    """The disk is full from the second checkpoint on."""
+    from hma_model import files
+
+    plain, calls = files.write_tensors, []
+
+    def write(path, tensors, metadata):
+        calls.append(path)
+        if "step-00000004" in str(path):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        plain(path, tensors, metadata)
+
+    monkeypatch.setattr("hma_model.checkpoint.write_tensors", write)
+    return calls
+
+
+def test_a_full_disk_is_one_error_and_leaves_the_last_checkpoint(recipe, tmp_path, full, monkeypatch):
+    with pytest.raises(
+        CheckpointError, match=r"step-00000004: .*No space left.*older checkpoints are intact"
+    ):
+        train(recipe(), out=tmp_path / "run", show=False)
+    last = checkpoint.resolve(tmp_path / "run")
+    assert last.name == "step-00000002" and checkpoint.load(last)
+    assert [p.name for p in (tmp_path / "run/checkpoints").iterdir()] == ["step-00000002"]
+    monkeypatch.undo()
+    assert train(recipe(), out=tmp_path / "run", show=False).step == 6
+
+
+def test_a_disk_that_takes_no_more_bytes_is_one_error(recipe, tmp_path):
+    program = (
+        "import json, resource, sys, torch\n"
+        "torch.set_num_threads(1)\n"
+        "from hma_model.recipe import make_recipe\n"
+        "from hma_model.train import train\n"
+        "def limit(facts):\n"
+        "    if facts['step'] == 3:\n"
+        "        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        "from hma_data.errors import HMAError\n"
+        "try:\n"
+        "    train(make_recipe(json.loads(sys.argv[1])), out=sys.argv[2], show=False, on_progress=limit)\n"
+        "except HMAError as fault:\n"
+        "    print(type(fault).__name__, fault)\n"
+    )
+    values = json.dumps(recipe().values())
+    done = subprocess.run(
+        [sys.executable, "-c", program, values, str(tmp_path / "run")],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stdout.startswith("CheckpointError") and "cannot be written" in done.stdout, done.stderr
+    assert checkpoint.resolve(tmp_path / "run").name == "step-00000002"
+
+
+@pytest.mark.parametrize("place", ["file/run", "run"])
+def test_a_folder_that_cannot_be_written_is_said(recipe, tmp_path, place, monkeypatch):
+    (tmp_path / "file").write_text("a file")
+    if place == "run":
+        (tmp_path / "run").write_text("a file too")
+    with pytest.raises(OutputError, match=r"cannot be used: (Not a directory|File exists)"):
+        train(recipe(), out=tmp_path / place, show=False)
+
+
+def test_the_folder_of_another_run_is_refused_with_what_differs(recipe, data, tmp_path):
+    train(recipe(steps=2), out=tmp_path / "run", show=False)
+    other = make_shards(tmp_path / "hand", "hand", dims=3)
+    with pytest.raises(RecipeError, match=r"seed: 42, now 1; data\.arm: .* now None; data\.hand: None, now "):
+        train(recipe(steps=2, data=[str(other)], seed=1), out=tmp_path / "run", show=False)
+    assert checkpoint.resolve(tmp_path / "run").name == "step-00000002"
+
+
+def test_shards_of_another_tokenizer_are_refused_in_the_folder_of_a_run(recipe, tmp_path):
+    from hma_data.tokenizers.base import TokenizerSpec
+    from tests.model.robots import SPEC
+
+    train(recipe(steps=2), out=tmp_path / "run", show=False)
+    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "coded", "weights_sha256": "ab" * 32})
+    other = make_shards(tmp_path / "arm", "arm", spec=spec)
+    with pytest.raises((RecipeError, CheckpointError), match="data.arm"):
+        train(recipe(steps=2, data=[str(other)]), out=tmp_path / "run", show=False)
+
+
+def test_shards_of_two_tokenizers_are_refused_with_both_names(recipe, data, tmp_path):
+    from hma_data.tokenizers.base import TokenizerSpec
+    from tests.model.robots import SPEC
+
+    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "coded"})
+    other = make_shards(tmp_path / "hand", "hand", spec=spec)
+    with pytest.raises(ShardError, match="tokenized by coded .* by raw"):
+        train(recipe(data=[*data, str(other)]), out=tmp_path / "run", show=False)
+
+
+def test_a_run_may_go_on_with_other_workers(recipe, tmp_path):
+    whole = train(recipe(), out=tmp_path / "whole", show=False)
+
+    def kill(facts):
+        if facts["step"] == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe(), out=tmp_path / "cut", show=False, on_progress=kill)
+    again = train(recipe(workers=2), out=tmp_path / "cut", show=False)
+    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
+
+
+def test_a_run_of_an_older_release_goes_on_with_keys_at_their_defaults(recipe, tmp_path):
+    train(recipe(), out=tmp_path / "run", show=False)
+    for path in (tmp_path / "run/checkpoints").glob("*/training/state.json"):
+        state = json.loads(path.read_text())
+        for key in ("ema", "spike", "short", "freeze"):
+            del state["recipe"][key]
+        del state["norms"]
+        path.write_text(json.dumps(state))
+    assert train(recipe(), out=tmp_path / "run", show=False).step == 6
+
+
+@pytest.mark.parametrize("ema", [0.0, 0.9])
+def test_force_goes_on_with_other_shards_and_other_robots(recipe, tmp_path, capsys, ema):
+    arm, leg = make_shards(tmp_path / "arm", "arm", seed=4), make_shards(tmp_path / "leg", "leg", dims=3)
+    train(recipe(steps=2, ema=ema), out=tmp_path / "run", show=False)
+    before = checkpoint.load(tmp_path / "run").embodiments["arm"]
+    both = recipe(steps=4, data=[str(arm), str(leg)], ema=ema)
+    result = train(both, out=tmp_path / "run", force=True)
+    said = capsys.readouterr().err
+    assert result.step == 4 and "arm keeps the statistics" in said and "leg is new here" in said
+    after = checkpoint.load(tmp_path / "run").embodiments
+    assert after["arm"].agrees_with(before) and set(after) == {"arm", "leg"}
+    last = train(recipe(steps=5, data=[str(leg)], ema=ema), out=tmp_path / "run", force=True, show=False)
+    assert last.step == 5 and set(checkpoint.load(last.checkpoint).embodiments) == {"leg"}
