@@ -48,6 +48,10 @@ class Store(Protocol):
         """A small file."""
         ...
 
+    def warm(self, names: list[str]) -> None:
+        """Say which small files will be read."""
+        ...
+
     def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str:
         """Put files in place, delete where None, return the address; `changes` is asked again if somebody
         else was faster."""
@@ -188,6 +192,7 @@ def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
     store = open_store(source, revision)
     files = store.files()
     values = _config(store, files)
+    store.warm([f"embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
     return {
         "source": store.name,
         **{key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
@@ -293,7 +298,9 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
         sample = source.folder / "embodiments" / name / SAMPLE
         parts = (SAMPLE, *PARTS) if sample.is_file() else PARTS
         present.update({f"embodiments/{name}/{part}": source.path(name, part) for part in parts})
-    cards = {name: _readable_card(store, name) for name in embodiment_ids(files)}
+    others = [name for name in embodiment_ids(files) if name not in ids]
+    store.warm([f"embodiments/{name}/{CARD}" for name in others])
+    cards = {name: _readable_card(store, name) for name in others}
     cards.update({name: source.card(name) for name in ids})
     suffix = f"/{SAMPLE}"
     samples = {path.split("/")[1] for path in (*files, *present) if path.endswith(suffix)}

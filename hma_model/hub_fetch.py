@@ -16,7 +16,7 @@ from hma_data.files import PART, file_sha256
 from hma_model.hub_errors import waiting
 
 ATTEMPTS = 5  # without a new byte
-LARGE = 1_000_000  # bytes; below it the client starts again
+LARGE = 100_000  # bytes; below it the client starts again
 
 
 def fetch(repo: str, kind: str, name: str, commit: str) -> None:

@@ -52,15 +52,15 @@ class FolderStore:
 
     def files(self) -> dict[str, int]:
         """Sizes by name, without what is being written."""
-        self._fs.invalidate_cache()
-        found: dict[str, Any] = self._fs.find(self._root, detail=True)
-        root = self._root.rstrip("/")
-        names = {path.removeprefix(root).lstrip("/"): facts for path, facts in found.items()}
+        sizes = _local_sizes(Path(self._root)) if self._local else self._remote_sizes()
         return {
-            name: int(facts.get("size") or 0)
-            for name, facts in names.items()
+            name: size
+            for name, size in sizes.items()
             if ".partial-" not in name and not name.startswith("training/")
         }
+
+    def warm(self, names: list[str]) -> None:
+        """Nothing: reading files one by one is quick here."""
 
     def read(self, name: str) -> bytes:
         """A file of at most 16 MB; links are refused."""
@@ -128,6 +128,14 @@ class FolderStore:
             finally:
                 beside.unlink(missing_ok=True)
         return out
+
+    def _remote_sizes(self) -> dict[str, int]:
+        self._fs.invalidate_cache()
+        found: dict[str, Any] = self._fs.find(self._root, detail=True)
+        root = self._root.rstrip("/")
+        return {
+            path.removeprefix(root).lstrip("/"): int(facts.get("size") or 0) for path, facts in found.items()
+        }
 
     def _put(self, files: Mapping[str, Path | bytes | None]) -> bool:
         """False where somebody else has put a config there first."""
@@ -205,6 +213,16 @@ class FolderStore:
                 break
             if part.is_symlink():
                 raise HubError(part, "is a link", "only files and folders themselves are written to")
+
+
+def _local_sizes(root: Path) -> dict[str, int]:
+    """Sizes by name; folders that are links are not entered, since they may lead in circles."""
+    sizes = {}
+    for folder, _, names in os.walk(root):
+        for path in (Path(folder, name) for name in names):
+            if path.is_file():
+                sizes[path.relative_to(root).as_posix()] = path.stat().st_size
+    return sizes
 
 
 def _beside(path: Path) -> Path:

@@ -97,6 +97,19 @@ class HuggingFaceStore:
                 return path.read_bytes()
         raise HubError(where, f"is larger than {MAX_JSON_BYTES:,} bytes", "this is not a file of ours")
 
+    def warm(self, names: list[str]) -> None:
+        """Bring small files to the cache together, for `read`."""
+        from huggingface_hub import snapshot_download
+
+        commit = self._commit
+        small = [name for name in names if 0 < (self._sizes or {}).get(name, 0) <= MAX_JSON_BYTES]
+        if commit and small:
+            self._patiently(
+                lambda: snapshot_download(
+                    self.repo, repo_type=self._kind, revision=commit, allow_patterns=small
+                )
+            )
+
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """One commit, prepared again while others commit first."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete

@@ -79,6 +79,7 @@ def _ours(
     facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
     if TRUNK not in files:
         facts["problems"].append(f"has no {TRUNK}")
+    store.warm([f"{root}embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
     for name in embodiment_ids(files):
         place = f"embodiments/{name}"
         size = sum(files.get(f"{place}/{part}", 0) for part in PARTS)

@@ -248,6 +248,15 @@ def test_strange_files_in_a_hub_are_never_pulled(source, tmp_path):
     ]
 
 
+def test_links_in_circles_are_not_followed(source, tmp_path):
+    hub.push(source, tmp_path / "hub", ["arm"])
+    for name in ("one", "two", "three"):
+        (tmp_path / "hub/embodiments" / name).symlink_to(tmp_path / "hub")
+    assert published(tmp_path / "hub") == ["arm"]
+    hub.push(source, tmp_path / "hub", ["hand"])
+    assert sorted(HMA.from_pretrained(str(tmp_path / "hub")).embodiments) == ["arm", "hand"]
+
+
 def test_a_failed_push_leaves_the_hub_as_it_was(source, tmp_path, monkeypatch):
     hub.push(source, tmp_path / "hub", ["arm"])
     before = contents(tmp_path / "hub")

@@ -15,7 +15,7 @@ import torch
 import yaml as plain_yaml
 from huggingface_hub import constants
 
-from hma_data.errors import HubError
+from hma_data.errors import CheckpointError, HubError
 from hma_model import checkpoint, hub, hub_fetch, hub_hf
 from hma_model.checkpoint import PARTS
 from hma_model.model import HMA
@@ -367,6 +367,17 @@ def test_a_repository_of_another_library_is_called_so(server, source, files, mes
         with pytest.raises(HubError, match=message):
             hub.push(source, REPO)
         assert server.model(REPO).files == before
+
+
+@pytest.mark.parametrize("name", ["../arm", "Arm", "arm\n", "a/b", ""])
+def test_a_name_that_is_no_id_is_called_so(published, name):
+    with pytest.raises(CheckpointError, match=r"is not an embodiment's id.*a-z 0-9"):
+        HMA.from_pretrained(REPO, embodiments=[name])
+
+
+def test_an_embodiment_that_is_not_published_is_called_so(published):
+    with pytest.raises(HubError, match=r"no embodiment 'leg'.*it has: arm, hand"):
+        hub.pull(REPO, ["leg"])
 
 
 def test_an_endpoint_that_is_no_hub_is_called_so(server, monkeypatch):
