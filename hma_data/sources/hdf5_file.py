@@ -25,6 +25,7 @@ CHUNK_CACHE = 16 << 20  # bytes a dataset, where its chunks are not larger
 HELD_BYTES = 512 << 20  # of chunks kept inflated, over all datasets of pictures
 MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
+MAX_ROW = 1 << 28  # values of a row: more than any picture has
 MAX_KEYS, MAX_DEPTH = 5_000, 16
 
 
@@ -182,9 +183,14 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
         raise EpisodeError(where, f"{key!r} is a single value, not one a frame")
     if not found.shape[0]:
         raise EpisodeError(where, f"{key!r} is empty")
-    if found.chunks and np.prod(found.chunks, dtype=float) * found.dtype.itemsize > MAX_BYTES:
+    if chunk_bytes(found) > MAX_BYTES:
         raise EpisodeError(where, f"{key!r} has chunks of {found.chunks}, too large to read")
     return found
+
+
+def chunk_bytes(found: h5py.Dataset) -> float:
+    """Bytes of a chunk when it is unpacked; 0 without chunks."""
+    return float(np.prod(found.chunks, dtype=float) * found.dtype.itemsize) if found.chunks else 0.0
 
 
 def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
@@ -242,7 +248,13 @@ def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDA
     """The rows of those indices (n, …), in the order asked for.
 
     Neighbours are read as one slice. So are rows of one chunk too large for the cache, to inflate it once.
+
+    Raises:
+        EpisodeError: a row or a chunk is larger than any picture.
     """
+    if np.prod(found.shape[1:], dtype=float) > MAX_ROW or chunk_bytes(found) > MAX_BYTES:
+        fault = f"has rows of {found.shape[1:]} in chunks of {found.chunks}, too large to read"
+        raise EpisodeError(f"{found.file.filename}:{found.name}", fault)
     wanted = np.asarray(indices, np.int64).reshape(-1)
     if not len(wanted):
         return np.zeros((0, *found.shape[1:]), found.dtype)

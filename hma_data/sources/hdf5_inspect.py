@@ -1,6 +1,7 @@
 """What is in HDF5 recordings, without an embodiment: keys, lengths, what looks wrong."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -12,10 +13,22 @@ from hma_data.errors import HMAError
 from hma_data.sources import clocks, looks
 from hma_data.sources.base import Inspection, KeyInfo
 from hma_data.sources.facts import is_times, one_channel, seconds_a_unit, seconds_of
+from hma_data.sources.findings import Finding
 from hma_data.sources.hdf5 import TEXT_KEYS, as_rgb, encoded, environment, picture_kind
-from hma_data.sources.hdf5_file import OpenFiles, child, explained, numbers, rows, text, walk
+from hma_data.sources.hdf5_file import (
+    MAX_BYTES,
+    MAX_ROW,
+    OpenFiles,
+    child,
+    chunk_bytes,
+    explained,
+    numbers,
+    rows,
+    text,
+    walk,
+)
 from hma_data.sources.hdf5_layout import WHOLE_FILE, Place, Places
-from hma_data.sources.survey import MAX_VALUES, Survey, sampled
+from hma_data.sources.survey import MAX_VALUES, Survey, listed, sampled
 from hma_data.video import decode_image
 
 LENGTHS = 1_000  # episodes whose length is told and whose keys are compared
@@ -28,6 +41,7 @@ _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.t
 class _First:
     """What the first episode that can be read says of all."""
 
+    name: str = ""
     keys: dict[str, KeyInfo] = field(default_factory=dict)
     facts: dict[str, str] = field(default_factory=dict)
     rate: float | None = None
@@ -45,6 +59,7 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
     chosen = {order[i] for i in sampled(len(order), episodes)}
     survey, first = Survey(len(order)), _First()
     lengths: dict[str, int] = {}
+    held: Counter[str] = Counter()
     pairs = max(1, looks.PAIRS // len(chosen))
     for name in [*order[:LENGTHS], *(name for name in order[LENGTHS:] if name in chosen)]:
         place = found[name]
@@ -54,7 +69,9 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
                 sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
                 lengths[name] = _length(sizes)
                 if not first.keys:
+                    first.name = name
                     _tell(first, group, files, place)
+                held.update(sizes)
                 series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
                 survey.lengths(name, lengths[name], sizes, series)
                 if name in chosen:
@@ -62,6 +79,9 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
                     _look(name, group, first, survey, pairs)
         except HMAError as fault:
             survey.fault(name, fault)
+    lacking = [key for key, count in held.items() if key not in first.keys and 2 * count >= len(lengths)]
+    if lacking:
+        survey.note(Finding("keys", "warn", f"{first.name}: has no {listed(lacking)}, which others have"))
     keys = tuple(
         survey.key(replace(info, hz=first.rate if info.count else None)) for info in first.keys.values()
     )
@@ -217,7 +237,8 @@ def _keys(group: h5py.Group, place: Place) -> Iterator[KeyInfo]:
 def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | None]:
     """Kind, shape of one sample, codec."""
     shape = item.shape or ()
-    pictures = picture_kind(item) if shape and shape[0] else None
+    small = np.prod(shape[1:], dtype=float) <= MAX_ROW and chunk_bytes(item) <= MAX_BYTES
+    pictures = picture_kind(item) if shape and shape[0] and small else None
     if pictures == "raw":
         shape = as_rgb(rows(item, [0])).shape[1:]
         return "camera", (*shape[:2], 1) if _is_grey(item.shape) else shape, "raw"

@@ -234,12 +234,12 @@ class Survey:
             together.setdefault(tuple(names), []).append(key)
         for episodes, keys in together.items():
             more = f" (and {len(episodes) - 1:,} more episodes)" if len(episodes) > 1 else ""
-            said = f"{episodes[0]}: has no {_listed(keys)}{more}"
+            said = f"{episodes[0]}: has no {listed(keys)}{more}"
             yield Finding("keys", "warn", said, numbers={"keys": keys, "episodes": len(episodes)})
 
     def _rows(self) -> Iterator[Finding]:
         for name, length, odd in self._odd[:SHOWN]:
-            said = _listed([f"{key} has {size}" for key, size in odd.items()])
+            said = listed([f"{key} has {size}" for key, size in odd.items()])
             yield Finding("rows", "warn", f"{name}: of {length} frames, {said}", numbers=odd)
         if len(self._odd) > SHOWN:
             said = f"{len(self._odd) - SHOWN} more episodes have keys of different length"
@@ -279,13 +279,13 @@ class Survey:
             stated = names.get(key)
             said = "" if len(held.low) == 1 else f" in dims {', '.join(map(str, still))}"
             if stated and len(stated) == len(held.low):
-                said = f" in {_listed([stated[i] for i in still])}"
+                said = f" in {listed([stated[i] for i in still])}"
             severity: Severity = "warn" if command and not self.by_field else "info"
             numbers = {"dims": still, "rows": held.rows}
             yield Finding("constant", severity, f"{key} never changes{said}", key=key, numbers=numbers)
         if whole:
             yield Finding(
-                "constant", "info", f"never change at all: {_listed(whole)}", numbers={"keys": whole}
+                "constant", "info", f"never change at all: {listed(whole)}", numbers={"keys": whole}
             )
 
     @staticmethod
@@ -308,6 +308,7 @@ def sampled(count: int, wanted: int) -> list[int]:
     return [int(i) for i in np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(np.int64))]
 
 
-def _listed(words: Sequence[str], limit: int = 8) -> str:
+def listed(words: Sequence[str], limit: int = 8) -> str:
+    """The first of the words, and how many more there are."""
     more = f" and {len(words) - limit} more" if len(words) > limit else ""
     return ", ".join(words[:limit]) + more

@@ -1,6 +1,7 @@
 """hma inspect: the same checks for every format, each finding one defect and none where there is none."""
 
 import json
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -132,6 +133,28 @@ def test_only_so_many_episodes_are_looked_into(tmp_path: Path) -> None:
         file["data/demo_1/actions"][4, 2] = np.nan
 
     assert "finite" not in damaged(tmp_path, spoil, episodes=1)
+
+
+def test_a_key_that_only_the_first_episode_lacks_is_told(tmp_path: Path) -> None:
+    def spoil(file: h5py.File) -> None:
+        del file["data/demo_0/actions"]
+
+    (said,) = damaged(tmp_path, spoil)["keys"]
+    assert said == "demo_0: has no actions, which others have"
+
+
+@pytest.mark.parametrize("shape", [(4, 20_000, 20_000, 3), (4, 1 << 30)])
+def test_pictures_that_claim_more_than_any_have_are_not_read(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    def bomb(file: h5py.File) -> None:
+        file.create_dataset(
+            "data/demo_0/bomb", shape, "u1", chunks=(1, *(1000,) * len(shape[1:3]), *shape[3:])
+        )
+
+    tracemalloc.start()
+    damaged(tmp_path, bomb)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100 << 20
 
 
 def test_a_damaged_episode_is_named_and_the_others_are_told(tmp_path: Path) -> None:
