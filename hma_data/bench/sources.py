@@ -113,11 +113,12 @@ def _work(
 def _episode(source: Any, uri: str, name: str, robot: Any, limit: int | None = None) -> int:
     """Frames of one episode brought to the tokenizer's square."""
     from hma_data.align import to_clip
-    from hma_data.video import prepare
+    from hma_data.video import prepared
 
     clip = to_clip(source.read(uri, name, robot), robot)
     grid = np.arange(0, len(clip), robot.stride)[:limit]
     camera = robot.primary_camera
     for at in range(0, len(grid), BATCH):
-        prepare(clip.frames_at(camera.name, grid[at : at + BATCH]), camera, SIZE)
+        indices = clip.frame_indices[camera.name][grid[at : at + BATCH]]
+        prepared(clip.episode.streams[camera.name], indices, camera, SIZE)
     return len(grid)
