@@ -310,14 +310,15 @@ def test_other_weights_are_another_tokenizer(tmp_path, fsq8):
     assert other.encode(scenes(2, 128)).shape == (2, 8, 8)
 
 
-def test_weights_say_how_they_were_trained():
+def test_the_shipped_weights_are_of_the_shipped_recipe():
     from safetensors import safe_open
 
     with safe_open(WEIGHTS, "pt") as file:
         facts = json.loads(file.metadata()["training"])
-    assert facts["recipe"] == load_recipe(RECIPE).name
-    assert facts["steps"] > 0
-    assert len(facts["recipe_sha256"]) == len(facts["corpus_sha256"]) == 64
+    recipe = load_recipe(RECIPE)
+    assert facts["recipe_sha256"] == recipe.digest()
+    assert (facts["steps"], facts["seed"]) == (recipe.training.steps, recipe.seed)
+    assert len(facts["corpus_sha256"]) == 64 and facts["seconds"] > 0 and facts["machine"]
 
 
 def test_weights_hold_nothing_but_the_network():
@@ -384,4 +385,4 @@ def test_real_robot_frames_come_back_as_promised(real_data, fsq16):
     assert result["psnr_db"] >= PROMISED_PSNR_DB and result["ssim"] >= PROMISED_SSIM
 
 
-PROMISED_PSNR_DB, PROMISED_SSIM = 25.0, 0.80
+PROMISED_PSNR_DB, PROMISED_SSIM = 26.0, 0.83
