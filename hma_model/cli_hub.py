@@ -71,10 +71,15 @@ def listing(
     if json:
         print_json(found[0] if len(found) == 1 else {"checkpoints": found})
         return
-    columns = ["robot", "action_dim", "hz", *FIGURES, "licence"]
+    columns = ["robot", "action_dim", "chunk_dim", "hz", *FIGURES, "licence"]
     for facts in found:
         rows = [
-            [row["embodiment"], *(row[key] for key in columns), _megabytes(row["bytes"]), _state(row)]
+            [
+                _cell(row["embodiment"]),
+                *(_cell(row[key]) for key in columns),
+                _megabytes(row["bytes"]),
+                _state(row),
+            ]
             for row in facts["embodiments"]
         ]
         print(_summary(facts))
@@ -155,17 +160,21 @@ def export_released(
 
 
 def _summary(facts: dict[str, Any]) -> str:
-    model, tokenizer = facts["model"] or {}, facts["tokenizer"] or {}
+    model, tokenizer = (facts[key] if isinstance(facts[key], dict) else {} for key in ("model", "tokenizer"))
     parts = [facts["format"]]
     if facts["origin"]:
-        parts.append(facts["origin"])
+        parts.append(_cell(facts["origin"]))
     if model:
-        parts.append(f"{model.get('layers')} layers, width {model.get('width')}")
+        parts.append(f"{_cell(model.get('layers'))} layers, width {_cell(model.get('width'))}")
     if tokenizer:
-        parts.append(f"tokenizer {tokenizer.get('name')}")
-    trunk = f"trunk {facts['trunk_sha256'][:12]}, " if isinstance(facts["trunk_sha256"], str) else "weights "
+        parts.append(f"tokenizer {_cell(tokenizer.get('name'))}")
+    trunk = (
+        f"trunk {_cell(facts['trunk_sha256'])[:12]}, "
+        if isinstance(facts["trunk_sha256"], str)
+        else "weights "
+    )
     parts.append(f"{trunk}{_megabytes(facts['trunk_bytes'])} MB")
-    return f"{facts['checkpoint']}: {'; '.join(parts)}; {_state(facts)}"
+    return f"{_cell(facts['checkpoint'], 1000)}: {'; '.join(parts)}; {_state(facts)}"
 
 
 def _megabytes(size: int) -> float:
@@ -173,4 +182,11 @@ def _megabytes(size: int) -> float:
 
 
 def _state(facts: dict[str, Any]) -> str:
-    return "; ".join(facts["problems"]) or "usable here"
+    return _cell("; ".join(facts["problems"]), 400) or "usable here"
+
+
+def _cell(value: Any, most: int = 80) -> Any:
+    """A stranger's value as a terminal may show it: numbers as they are, text without control characters."""
+    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+        return value
+    return "".join(c if c.isprintable() else "?" for c in str(value))[:most]

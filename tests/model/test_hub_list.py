@@ -118,6 +118,16 @@ def test_the_command_prints_a_table_and_the_same_as_json(shelf):
     assert [row["embodiment"] for row in one["embodiments"]] == ["arm", "hand"]
 
 
+def test_a_strangers_text_cannot_steer_the_terminal(folder):
+    for path in (folder / "embodiments/arm/card.json", folder / "config.json"):
+        values = json.loads(path.read_text())
+        values |= {"robot": "\x1b[2J\x1b]0;gone\x07[red]", "model": {"layers": "\x1b[31m", "width": [1]}}
+        path.write_text(json.dumps(values))
+    shown = CliRunner().invoke(app, ["hub", "list", str(folder)])
+    assert shown.exit_code == 0 and "?[2J?]0;gone?[red]" in shown.stdout
+    assert "\x1b" not in shown.stdout and "\x07" not in shown.stdout
+
+
 def test_a_released_repository_is_listed_without_its_weights_being_sent(shelf, tmp_path, monkeypatch):
     with serve() as server:
         connect(monkeypatch, server, tmp_path / "cache", None)
