@@ -1,11 +1,13 @@
 """Recipes: what is accepted, merged and refused, and what follows from the shards."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from hma_data.errors import RecipeError, UsageError
+from hma_data.shipped import shipped
+from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.recipe import differences, load_recipe, make_recipe, parse_overrides
 from tests.model.robots import SPEC
 
@@ -18,13 +20,6 @@ def write(tmp_path: Path):
         return path
 
     return write
-
-
-def test_the_shipped_recipes_are_valid_and_make_networks():
-    continuous = replace(SPEC, kind="continuous", vocab_size=None, factored=(), channels=4, grid=(16, 16))
-    for name in ("discrete_tiny", "discrete_base", "continuous_tiny"):
-        spec = continuous if name.startswith("continuous") else SPEC
-        assert load_recipe(name).network(spec).kind == spec.kind
 
 
 def test_overrides_reach_nested_keys_and_are_yaml():
@@ -145,3 +140,79 @@ def test_the_difference_names_keys_with_both_values():
 
 def test_overrides_of_one_mapping_gather():
     assert parse_overrides(["model.layers=2", "model.width=64"]) == {"model": {"layers": 2, "width": 64}}
+
+
+# -- what is shipped
+
+SHIPPED = sorted(path.stem for path in (shipped("recipes") / "train").glob("*.yaml"))
+
+
+def test_every_kind_of_recipe_is_shipped():
+    sizes = {f"{kind}_{size}" for kind in ("discrete", "continuous") for size in ("tiny", "base", "xl")}
+    others = {"pretrain40", "finetune", "full_dynamics", "passive", "policy", "inverse"}
+    assert set(SHIPPED) >= sizes | others
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_recipe_validates_and_makes_a_network(name):
+    recipe = load_recipe(name)
+    spec = SPEC
+    if name.startswith("continuous"):
+        spec = TokenizerSpec(
+            name="svd-vae", version=1, kind="continuous", image_size=256, grid=(32, 32), channels=4,
+            dtype="float16", latent_scale=0.18215,
+        )  # fmt: skip
+    config = recipe.network(spec)
+    assert config.kind == spec.kind and config.frames == recipe.frames
+
+
+def test_the_xl_model_has_the_papers_parameters_with_one_robot():
+    spec = TokenizerSpec(
+        name="magvit2", version=1, kind="discrete", image_size=256, grid=(16, 16), vocab_size=2**18,
+        factored=(512, 512),
+    )  # fmt: skip
+    from hma_model.config import ActionSpace
+    from hma_model.model import HMA
+
+    for name, low, high in (("discrete_base", 40e6, 50e6), ("discrete_xl", 640e6, 720e6)):
+        with torch.device("meta"):
+            model = HMA(load_recipe(name).network(spec))
+            model.add_embodiment(ActionSpace("arm", 7, 5, (0.0,) * 7, (1.0,) * 7, (True,) * 7))
+        assert low < sum(p.numel() for p in model.parameters()) < high
+
+
+def test_the_mixture_of_forty_names_forty_embodiments_of_the_registry():
+    from hma_data.embodiment import find
+
+    names = [folder.removeprefix("shards/") for folder in load_recipe("pretrain40").data]
+    assert len(set(names)) == 40
+    for name in names:
+        assert find(name).id == name
+
+
+def test_the_paper_rule_and_batch_are_those_of_the_mixture_of_forty():
+    recipe = load_recipe("pretrain40")
+    assert (recipe.windows_per_step, recipe.steps, recipe.lr, recipe.warmup) == (64, 60_000, 1e-4, 500)
+    assert recipe.mixture.temperature == 3.0 and recipe.lr_rule == "paper"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("track: [tensorbord]", r"track\.0: .*'tensorboard', 'trackio' or 'wandb'"),
+        ("ema: 1", "ema: .*less than 1"),
+        ("spike: -1", "spike: .*greater than or equal to 0"),
+        ("freeze: all", "freeze: .*'nothing' or 'trunk'"),
+        ("parallel: dp", "parallel: .*'ddp' or 'fsdp'"),
+        ("self_forwrd: 1", r"self_forwrd: unknown key, did you mean 'self_forward'\?"),
+        ("mixture: {caps: {arm: .inf}}", r"mixture\.caps\.arm: .*finite"),
+        ("mixture: {max_epochs: 0}", r"mixture\.max_epochs: .*greater than 0"),
+        ("short: cut", "short: .*'drop' or 'pad'"),
+        ("project: 3", "project: .*string"),
+        ("compile: perhaps", "compile: .*boolean"),
+        ("data: [3]", r"data\.0: .*string"),
+    ],
+)
+def test_options_of_the_trainer_are_checked(write, text, message):
+    with pytest.raises(RecipeError, match=message):
+        load_recipe(write("broken", text))

@@ -1,0 +1,183 @@
+"""What a run leaves to read: TensorBoard's files, trackio and wandb, pictures, the report."""
+
+import json
+import re
+import struct
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import google_crc32c
+import numpy as np
+import pytest
+import torch
+
+from hma_data.errors import MissingDependencyError
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model import checkpoint
+from hma_model.recipe import make_recipe
+from hma_model.report import write_report
+from hma_model.runlog import read_metrics
+from hma_model.train import train
+from tests.model.runs import TINY
+from tests.model.shards import make_shards
+
+SEEN = {"report": True, "pictures": 2, "track": ["tensorboard"]}
+
+
+class Painter:
+    """Decodes a token to a patch of its grey."""
+
+    spec = TokenizerSpec(
+        name="raw", version=1, kind="discrete", image_size=16, grid=(2, 3), vocab_size=64, factored=(8, 8)
+    )
+
+    def decode(self, tokens):
+        grey = (tokens * 4).astype(np.uint8)
+        return np.repeat(np.repeat(np.repeat(grey[..., None], 3, -1), 8, 1), 6, 2)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> list[str]:
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("shards")
+    arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
+    return [str(arm), str(hand)]
+
+
+@pytest.fixture
+def painter(monkeypatch):
+    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Painter())
+
+
+@pytest.fixture
+def run(data, painter, tmp_path) -> Path:
+    """The folder of a short run with everything to see."""
+    train(make_recipe({**TINY, **SEEN, "data": data}), out=tmp_path / "run", show=False)
+    return tmp_path / "run"
+
+
+def events(path: Path) -> list[bytes]:
+    """The records of an event file, their checksums compared."""
+    content, found, at = path.read_bytes(), [], 0
+    while at < len(content):
+        (length,) = struct.unpack_from("<Q", content, at)
+        record = content[at + 12 : at + 12 + length]
+        for part, place in ((content[at : at + 8], at + 8), (record, at + 12 + length)):
+            crc = google_crc32c.value(part)
+            masked = ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+            assert struct.unpack_from("<I", content, place) == (masked,)
+        found.append(record)
+        at += 16 + length
+    return found
+
+
+# -- trackers
+
+
+def test_event_files_have_a_version_every_step_and_every_evaluation(run):
+    (path,) = (run / "tensorboard").iterdir()
+    first, *rest = events(path)
+    assert b"brain.Event:2" in first
+    scalars = [record for record in rest if b"train/loss" in record]
+    assert len(scalars) == 6 and sum(b"eval/loss" in record for record in rest) == 2
+    assert all(b"train_loss/" in record for record in scalars)
+    assert sum(b"\x89PNG" in record for record in rest) == 4
+
+
+def test_figures_in_event_files_are_those_of_the_metrics(run):
+    (path,) = (run / "tensorboard").iterdir()
+    record = next(r for r in events(path) if b"train/loss" in r)
+    at = record.index(b"train/loss") + len(b"train/loss")
+    assert record[at] == 0x15  # field 2, four bytes
+    (value,) = struct.unpack_from("<f", record, at + 1)
+    assert value == pytest.approx(read_metrics(run)[0]["loss"], rel=1e-6)
+
+
+def test_a_resumed_run_supersedes_what_was_written_beyond_its_step(data, tmp_path):
+    given = {**TINY, "data": data, "track": ["tensorboard"]}
+
+    def kill(facts):
+        if facts["step"] == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(make_recipe(given), out=tmp_path / "run", show=False, on_progress=kill)
+    train(make_recipe(given), out=tmp_path / "run", show=False)
+    first, second = sorted((tmp_path / "run" / "tensorboard").iterdir())
+    assert sum(b"train/loss" in r for r in events(first)) == 5
+    start, *rest = events(second)[1:]
+    assert start[9:] == bytes([0x10, 5, 0x3A, 2, 0x08, 1])  # step 5, session log: start
+    assert sum(b"train/loss" in r for r in rest) == 2
+
+
+@pytest.fixture(params=["trackio", "wandb"])
+def package(request, monkeypatch) -> ModuleType:
+    """A stand-in that notes its calls."""
+    module = ModuleType(request.param)
+    module.calls = []
+    module.init = lambda **given: module.calls.append(("init", given))
+    module.log = lambda values, step: module.calls.append(("log", step, values))
+    module.finish = lambda: module.calls.append(("finish",))
+    module.Image = lambda path: ("image", path)
+    monkeypatch.setitem(sys.modules, request.param, module)
+    return module
+
+
+def test_trackio_and_wandb_get_the_recipe_the_figures_and_the_pictures(package, data, painter, tmp_path):
+    given = {**TINY, "data": data, "pictures": 1, "track": [package.__name__], "project": "arms"}
+    train(make_recipe(given), out=tmp_path / "first", show=False)
+    (_, init), *logged, last = package.calls
+    assert (init["project"], init["name"], init["config"]["steps"]) == ("arms", "first", 6)
+    assert [step for _, step, values in logged if "train/loss" in values] == [1, 2, 3, 4, 5, 6]
+    assert sum(value[0] == "image" for _, _, v in logged for value in v.values() if type(value) is tuple) == 4
+    assert last == ("finish",)
+
+
+@pytest.mark.parametrize("name", ["trackio", "wandb"])
+def test_a_package_that_is_missing_is_said_with_how_to_install_it(data, tmp_path, monkeypatch, name):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingDependencyError, match=f"{name} is not installed — pip install {name}"):
+        train(make_recipe({**TINY, "data": data, "track": [name]}), out=tmp_path / "run", show=False)
+
+
+# -- pictures and the report
+
+
+def test_evaluations_leave_pictures_and_the_card_shows_the_last(run):
+    names = sorted(path.name for path in (run / "pictures").iterdir())
+    assert names == [f"step-{step:08d}-{name}.png" for step in (3, 6) for name in ("arm", "hand")]
+    folder = checkpoint.resolve(run)
+    sample = folder / "embodiments" / "arm" / "sample.png"
+    assert sample.read_bytes() == (run / "pictures" / "step-00000006-arm.png").read_bytes()
+    assert "embodiments/arm/sample.png" in (folder / "README.md").read_text()
+
+
+def test_without_the_tokenizer_there_is_a_word_and_no_picture(data, tmp_path, capsys):
+    train(make_recipe({**TINY, "data": data, "pictures": 1}), out=tmp_path / "run")
+    assert "no pictures: " in capsys.readouterr().err and not (tmp_path / "run/pictures").exists()
+
+
+def test_the_report_is_one_file_with_curves_samples_recipe_and_environment(run):
+    page = (run / "report.html").read_text()
+    assert not re.search(r"(src|href)=.?https?:", page)
+    assert page.count("data:image/png") == 2 and page.count("data:image/svg+xml") == 4
+    last = read_metrics(run)[-1]
+    for text in ("arm", "hand", "6 of 6", f"{last['loss']:.3f}", "temperature", "git_revision", "platform"):
+        assert text in page, text
+
+
+def test_the_report_of_a_run_without_a_step_or_with_losses_that_are_no_numbers_can_be_made(run):
+    lines = read_metrics(run)
+    lines[2]["loss"] = None
+    lines[2]["loss_by_embodiment"] = {"arm": None}
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_report(run)
+    (run / "metrics.jsonl").write_text("")
+    write_report(run)
+
+
+def test_the_run_folder_has_its_recipe_and_ground(run):
+    ground = json.loads((run / "environment.json").read_text())
+    assert {"git_revision", "torch", "python", "device", "ranks"} <= ground.keys()
+    assert json.loads((run / "recipe.json").read_text())["steps"] == 6
