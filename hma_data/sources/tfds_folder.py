@@ -260,6 +260,8 @@ def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], p
     if not shards:
         shards, more = _named_shards(root, listing or [], info)
         problems += more
+    if only:  # the others were left out on purpose
+        problems = []
     folder = Folder(
         uri,
         files,
@@ -324,7 +326,7 @@ def _stated_shards(
     """The shards dataset_info.json names, with `first` set; those that are not there are left out."""
     there = None if listing is None else set(listing)
     shards: dict[str, list[Shard]] = {}
-    problems = []
+    problems, absent = [], []
     for split in info.get("splits", []):
         name, counts = str(split.get("name", "")), _counts(split)
         template = split.get("filepathTemplate") or split.get("filepath_template") or TEMPLATE
@@ -338,7 +340,9 @@ def _stated_shards(
             problems.append(_missing(name, len(items) - len(present), len(items)))
         if present:
             shards[name] = present
-    return shards, problems
+        elif first:
+            absent.append(f"split {name} of {first:,} episodes is not there")
+    return shards, problems + absent if shards else problems
 
 
 def _counts(split: dict[str, Any]) -> list[int]:

@@ -283,6 +283,14 @@ def test_missing_shards_keep_the_ids_of_the_others(tmp_path, caplog):
         read(folder, "train/000002")
 
 
+def test_a_split_without_its_files_is_told(tmp_path):
+    names = [f"toy-{split}.tfrecord-00000-of-00001" for split in ("train", "test")]
+    folder = write(tmp_path / "d", {name: [record(0, 2)] for name in names})
+    (folder / names[1]).unlink()
+    assert "split test of 1 episodes is not there" in RLDS.inspect(str(folder)).problems
+    assert not RLDS.inspect(str(folder / names[0])).problems  # named by itself, the rest is not missed
+
+
 def test_a_renamed_dataset_is_found_by_its_files(tmp_path):
     folder = toy(tmp_path / "d")
     shard = next(folder.glob("*.tfrecord*"))
