@@ -73,24 +73,24 @@ class Hdf5Source:
         Raises:
             SourceError: nothing there, a single file that is damaged, or no mask of the name `source.split`.
         """
-        places = self._places.all(uri, layout_of(embodiment).episodes)
-        fingerprints = {file: file_fingerprint(file) for file in {place.file for place in places.values()}}
-        whole = {place.file for place in places.values() if place.group == WHOLE_FILE}
-        masks = {file: {} if file in whole else self._masks(file) for file in fingerprints}
         chosen = embodiment.source.split if embodiment else None
-        if chosen and not any(chosen in found for found in masks.values()):
-            known = sorted({name for found in masks.values() for name in found})
-            raise SourceError(uri, f"has no mask {chosen!r}", f"its masks: {', '.join(known) or 'none'}")
-        refs = []
-        for episode_id, place in places.items():
-            found, name = masks[place.file], place.group.rsplit("/", 1)[-1]
-            if chosen and name not in found.get(chosen, ()):
-                continue
-            split = None
-            if not chosen and {_SPLITS.get(mask) for mask in found} >= {"train", "val"}:
-                split = next((ours for mask, ours in _SPLITS.items() if name in found.get(mask, ())), None)
-            digest = hashlib.sha256(f"{fingerprints[place.file]} {place.group}".encode()).hexdigest()[:16]
-            refs.append(EpisodeRef(episode_id, self._length(place, embodiment), split, digest))
+        refs: list[EpisodeRef] = []
+        known: set[str] = set()
+        for file, places in self._places.by_file(uri, layout_of(embodiment).episodes):
+            fingerprint = file_fingerprint(file)
+            whole = any(place.group == WHOLE_FILE for place in places.values())
+            masks = {} if whole else self._masks(file)
+            known |= set(masks)
+            for episode_id, place in places.items():
+                name = place.group.rsplit("/", 1)[-1]
+                if chosen and name not in masks.get(chosen, ()):
+                    continue
+                split = None if chosen else _split_of(name, masks)
+                digest = hashlib.sha256(f"{fingerprint} {place.group}".encode()).hexdigest()[:16]
+                refs.append(EpisodeRef(episode_id, self._length(place, embodiment), split, digest))
+        if chosen and chosen not in known:
+            said = ", ".join(sorted(known)) or "none"
+            raise SourceError(uri, f"has no mask {chosen!r}", f"its masks: {said}")
         return refs
 
     def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
@@ -170,6 +170,13 @@ class Hdf5Source:
                 for name, found in lists.items()
                 if isinstance(found, h5py.Dataset) and found.ndim == 1
             }
+
+
+def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
+    """Ours, by robomimic's masks, where they tell both."""
+    if not {_SPLITS.get(mask) for mask in masks} >= {"train", "val"}:
+        return None
+    return next((ours for mask, ours in _SPLITS.items() if demo in masks.get(mask, ())), None)
 
 
 class _Series:

@@ -6,6 +6,7 @@ that `source.layout` may say.
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -74,11 +75,23 @@ class Places:
         Raises:
             SourceError: a damaged file that is alone, no episodes, or two with one id.
         """
+        found: dict[str, Place] = {}
+        for _, places in self.by_file(uri, pattern):
+            found |= places
+        return found
+
+    def by_file(self, uri: str, pattern: str | None = None) -> Iterator[tuple[Path, dict[str, Place]]]:
+        """The same, a file at a time, while it is open: opening many once more takes as long again.
+
+        Raises:
+            SourceError: as `all`.
+        """
         self._seen.clear()
         stems = self._stems[uri] = _stems(uri)
         in_folder = local_path(uri).is_dir()
-        found: dict[str, Place] = {}
+        taken: set[str] = set()
         for stem, file in stems.items():
+            found: dict[str, Place] = {}
             try:
                 places = self._inside(file, pattern)
             except SourceError:
@@ -87,12 +100,13 @@ class Places:
                 places = {"": Place(file, WHOLE_FILE)}
             for name, place in places.items():
                 episode_id = "/".join(part for part in (stem if in_folder else "", name) if part) or stem
-                if episode_id in found:
+                if episode_id in taken:
                     raise SourceError(place, f"is a second episode called {episode_id!r}", "rename one")
+                taken.add(episode_id)
                 found[episode_id] = place
-        if not found:
+            yield file, found
+        if not taken:
             raise SourceError(uri, "holds no episodes", f"looked for groups {pattern or 'data/*'}")
-        return found
 
     def find(self, uri: str, episode_id: str, pattern: str | None = None) -> Place:
         """The place of an id, opening only the file it is in.

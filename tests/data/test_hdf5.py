@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment
 from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.sources import hdf5_file
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.hdf5_file import rows
+from hma_data.sources.hdf5_file import OPEN_FILES, rows
 from tests.data.hdf5_files import H, T, W, embodiment, fill
 from tests.data.hub_cache import as_snapshot
 
@@ -372,6 +373,21 @@ def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(demos: Path, tmp_pat
     snapshot = as_snapshot(folder, tmp_path / "cache")
     source = open_source("hdf5")
     assert source.episode_ids(str(snapshot)) == source.episode_ids(str(folder))
+
+
+def test_indexing_opens_each_of_many_files_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for i in range(2 * OPEN_FILES):
+        with h5py.File(tmp_path / f"episode_{i}.h5", "w") as file:
+            fill(file)
+    opened: list[Path] = []
+    plain = hdf5_file._open
+
+    def counted(path: Path) -> h5py.File:
+        opened.append(path)
+        return plain(path)
+
+    monkeypatch.setattr(hdf5_file, "_open", counted)
+    assert len(open_source("hdf5").index(str(tmp_path))) == len(opened) == 2 * OPEN_FILES
 
 
 def test_two_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
