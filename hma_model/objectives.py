@@ -64,7 +64,12 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     frames, count, size = _frames(model, batch), batch.actions.shape[1], len(batch.actions)
     groups, clock = Groups.of(batch.embodiment, size), model.clock(count)
 
+    own = getattr(batch, "context", None)  # what the model sees where that is not the truth
+    seen = frames if own is None else _frames(model, batch, own)
     video = draw_video_mask(config, size, count, generator)
+    inside = getattr(batch, "frame_mask", None)
+    if inside is not None:  # no loss is due where a short episode was padded
+        video.masked &= inside.to(video.masked.device).unsqueeze(-1)
     if objective in ("policy", "inverse"):
         video.masked = torch.zeros_like(video.masked)
     dropped = torch.zeros_like(batch.action_mask)
@@ -77,7 +82,7 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     if objective != "passive":
         slots = align(config, batch.actions, batch.action_mask & ~dropped, count)
     conditioning = condition(model, slots, groups, clock.positions)
-    x = _embed(model, frames, video, groups, generator)
+    x = _embed(model, seen, video, groups, generator)
     features = model.trunk(x, conditioning, clock)
 
     video_loss = action_loss = logits = None
@@ -110,10 +115,11 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
     return names[min(index, len(names) - 1)]
 
 
-def _frames(model: "HMA", batch: Windows) -> Tensor:
+def _frames(model: "HMA", batch: Windows, instead: Tensor | None = None) -> Tensor:
     """Token ids (B, T, S), or scaled patches (B, T, S, c*p*p), in the batch's order."""
     config = model.config
     values = batch.tokens if config.kind == "discrete" else batch.latents
+    values = values if instead is None else instead
     if values is None:
         have = "latents" if config.kind == "discrete" else "tokens"
         raise HMAError("batch", f"has {have} for a {config.kind} model", "use the tokenizer the model is for")

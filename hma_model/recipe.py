@@ -106,6 +106,7 @@ class Recipe(_Settings):
     self_forward: Number = Field(
         0.0, ge=0, le=1, description="share of the windows whose past is the model's own prediction"
     )
+    self_forward_frames: Count = Field(2, ge=1, description="frames in a row of such a past")
     self_forward_from: Count = Field(0, ge=0, description="step from which that share rises,")
     self_forward_over: Count = Field(0, ge=0, description="and in how many steps it is reached")
 

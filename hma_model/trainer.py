@@ -32,6 +32,7 @@ from hma_model.pictures import newest_pictures, sample_pictures
 from hma_model.recipe import Recipe
 from hma_model.resume import Kept, State, data_digests, read_kept, read_state, seed_for, write_state
 from hma_model.runtime import ENVIRONMENT, RECIPE, environment
+from hma_model.self_forward import forwarded, share_at
 from hma_model.start import Start
 from hma_model.tally import Tally, peak_memory_mib
 from hma_model.validation import validate
@@ -55,6 +56,9 @@ class Run:
         if not recipe.data:
             raise RecipeError("recipe: data", "names no shards", "add data=[FOLDER, …]")
         self.out, self.device, self.world = out, device, world or World()
+        if recipe.self_forward and recipe.parallel == "fsdp" and self.world.size > 1:
+            fault = "needs a network that each rank can call by itself"
+            raise RecipeError("recipe: self_forward", fault, "use parallel=ddp")
         self.sets = open_sets(recipe.data)
         self.start = self._fetch(recipe)
         if self.start and "frames" not in recipe.model_fields_set:
@@ -80,7 +84,7 @@ class Run:
         self.evaluation: dict[str, Any] = {}
         self._baseline: Means | None = None
         self._twin: HMA | None = None
-        self._unseen = ""
+        self._unseen, self._complained = "", False
 
     def _fetch(self, recipe: Recipe) -> Start | None:
         if recipe.start is None:
@@ -194,9 +198,19 @@ class Run:
         generator = torch.Generator().manual_seed(seed_for(self.recipe.seed, "masks", self.step, number))
         with self.spread.passing(last):
             with self._autocast():
+                batch = self._past(number, batch)
                 output = self.spread(batch, generator=generator)
             (output.loss / len(self.feed.own)).backward()
         return output
+
+    def _past(self, number: int, batch: Batch) -> Batch:
+        """The batch as the model is to see it: with frames of its own where the recipe asks for them."""
+        share = share_at(self.step, self.recipe)
+        if not share:
+            return batch
+        seed = seed_for(self.recipe.seed, "self_forward", self.step, number)
+        draws = torch.Generator().manual_seed(seed)
+        return forwarded(self.model, batch, share, self.recipe.self_forward_frames, draws)
 
     def _autocast(self) -> AbstractContextManager[Any]:
         if self.recipe.precision == "fp32":
@@ -251,7 +265,8 @@ class Run:
 
     def complaint(self) -> str:
         """Why there are no pictures, once; nothing where there are."""
-        text, self._unseen = self._unseen, ""
+        text = "" if self._complained else self._unseen
+        self._complained = self._complained or bool(text)
         return text
 
     def save(self) -> Path:

@@ -1,0 +1,164 @@
+"""Training on the model's own past: which frames, from what, and that the loss still asks for the truth."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hma_data.errors import RecipeError
+from hma_data.loader import Batch
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.parallel import World
+from hma_model.recipe import make_recipe
+from hma_model.self_forward import Forwarded, forwarded, share_at
+from hma_model.train import train
+from hma_model.trainer import Run
+from tests.model.robots import CONFIG, make_model
+from tests.model.runs import TINY
+from tests.model.shards import make_shards
+
+FRAMES = 6
+ROBOTS = {"arm": 2, "hand": 3}
+
+
+def batch(size: int = 4, continuous: bool = False) -> Batch:
+    g = torch.Generator().manual_seed(0)
+    names = ["arm", "hand"] * (size // 2)
+    actions = torch.randn(size, FRAMES, 6, generator=g)
+    known = torch.ones(size, FRAMES, dtype=torch.bool)
+    if continuous:
+        return Batch(names, actions, known, latents=torch.randn(size, FRAMES, 2, 4, 4, generator=g))
+    return Batch(names, actions, known, tokens=torch.randint(64, (size, FRAMES, 2, 3), generator=g))
+
+
+@pytest.fixture
+def model():
+    return make_model(ROBOTS, config=CONFIG.replace(frames=FRAMES)).train()
+
+
+def changed(given: Batch, true: torch.Tensor) -> torch.Tensor:
+    """(B, T) where a frame is not the true one."""
+    assert isinstance(given, Forwarded)
+    return (given.context != true).flatten(2).any(2)
+
+
+@pytest.mark.parametrize("depth", [1, 2, 4])
+def test_so_many_frames_in_a_row_are_replaced_and_the_first_and_last_stay(model, depth):
+    torch.manual_seed(1)
+    true = batch(16)
+    given = forwarded(model, true, 1.0, depth, torch.Generator().manual_seed(3))
+    for row in changed(given, true.tokens):
+        where = row.nonzero().flatten().tolist()
+        assert where == list(range(where[0], where[0] + depth)) and where[0] >= 1 and where[-1] < FRAMES - 1
+    assert torch.equal(given.tokens, true.tokens) and model.training
+
+
+def test_a_replaced_frame_is_what_the_model_predicts_from_the_true_past(model):
+    true = batch()
+    given = forwarded(model, true, 1.0, 1, torch.Generator().manual_seed(3))
+    for i, row in enumerate(changed(given, true.tokens)):
+        (at,) = row.nonzero().flatten().tolist()
+        seen = true.tokens[i : i + 1, : at + 1].clone()
+        seen[:, at] = model.config.vocab_size
+        name = true.embodiment[i]
+        logits = model.eval().video_logits(seen, true.actions[i : i + 1, : at + 1], name)[0, at]
+        digits = logits.argmax(-1)
+        assert torch.equal(given.context[i, at], digits[..., 0] + 8 * digits[..., 1])
+
+
+def test_a_second_frame_is_predicted_from_the_first(model):
+    true = batch(2)
+    given = forwarded(model, true, 1.0, 2, torch.Generator().manual_seed(3))
+    row = changed(given, true.tokens)[0].nonzero().flatten().tolist()
+    seen = given.context[:1, : row[1] + 1].clone()
+    seen[:, row[1]] = model.config.vocab_size
+    digits = model.eval().video_logits(seen, true.actions[:1], "arm")[0, row[1]].argmax(-1)
+    assert torch.equal(given.context[0, row[1]], digits[..., 0] + 8 * digits[..., 1])
+
+
+def test_only_a_share_of_the_windows_gets_one(model):
+    true = batch(64)
+    given = forwarded(model, true, 0.25, 1, torch.Generator().manual_seed(1))
+    assert 6 <= int(changed(given, true.tokens).any(1).sum()) <= 26
+    assert forwarded(model, true, 0.0, 1) is true
+
+
+def test_windows_too_short_for_a_past_stay_as_they_are(model):
+    true = batch()
+    short = replace(
+        true, tokens=true.tokens[:, :2], actions=true.actions[:, :2], action_mask=true.action_mask[:, :2]
+    )
+    assert forwarded(model, short, 1.0, 2) is short
+
+
+def test_the_loss_asks_for_the_truth_and_its_gradient_reaches_every_layer(model):
+    true = batch()
+    given = forwarded(model, true, 1.0, 2, torch.Generator().manual_seed(3))
+    other = replace(given, context=true.tokens)
+    losses = [model(b, "forward", torch.Generator().manual_seed(5)).loss for b in (given, other, true)]
+    assert losses[0] != losses[1] and losses[1] == losses[2]
+    losses[0].backward()
+    for name, parameter in model.trunk.named_parameters():
+        if name != "absent":
+            assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
+
+
+def test_latents_are_replaced_by_what_the_diffusion_head_samples():
+    config = CONFIG.replace(
+        kind="continuous", grid=(4, 4), channels=2, patch=2, diffusion_width=16, diffusion_depth=1,
+        frames=FRAMES, latent_scale=0.5,
+    )  # fmt: skip
+    model = make_model(ROBOTS, config=config).train()
+    true = batch(4, continuous=True)
+    given = forwarded(model, true, 1.0, 2, torch.Generator().manual_seed(3))
+    assert given.context.shape == true.latents.shape and given.context.isfinite().all()
+    assert changed(given, true.latents).sum(1).tolist() == [2] * 4
+    model(given, "forward", torch.Generator().manual_seed(5)).loss.backward()
+
+
+def test_the_share_rises_from_a_step_over_a_number_of_steps():
+    recipe = make_recipe({"self_forward": 0.5, "self_forward_from": 10, "self_forward_over": 4})
+    assert [share_at(step, recipe) for step in (0, 9, 10, 11, 13, 14, 99)] == [
+        0, 0, 0.125, 0.25, 0.5, 0.5, 0.5,
+    ]  # fmt: skip
+    assert share_at(0, make_recipe({"self_forward": 0.5})) == 0.5
+    assert share_at(50, make_recipe({})) == 0
+
+
+def test_a_run_with_a_past_of_its_own_goes_on_bit_for_bit(tmp_path):
+    data = [str(make_shards(tmp_path / "arm", "arm"))]
+    recipe = make_recipe({**TINY, "data": data, "self_forward": 0.5, "self_forward_from": 2})
+    whole = train(recipe, out=tmp_path / "whole", show=False)
+
+    def kill(facts):
+        if facts["step"] == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe, out=tmp_path / "cut", show=False, on_progress=kill)
+    assert train(recipe, out=tmp_path / "cut", show=False).losses == whole.losses
+    plain = train(make_recipe({**TINY, "data": data}), out=tmp_path / "plain", show=False)
+    assert [a == b for (_, a), (_, b) in zip(plain.losses, whole.losses)][:2] == [True, True]
+    assert plain.losses != whole.losses
+
+
+def test_sharded_ranks_are_refused(tmp_path):
+    recipe = make_recipe({**TINY, "data": ["x"], "self_forward": 0.5, "parallel": "fsdp"})
+    with pytest.raises(RecipeError, match="use parallel=ddp"):
+        Run(recipe, tmp_path, torch.device("cpu"), World(0, 2))
+
+
+def test_no_loss_is_due_on_padded_frames(model):
+    true = batch(2)
+    padded = replace(true, frame_mask=torch.tensor([[True] * 3 + [False] * 3, [True] * 6]))
+    output = model(padded, "forward", torch.Generator().manual_seed(5))
+    assert not output.masked[0, 3:].any() and output.masked[1, 3:].any()
+
+
+def test_a_run_pads_short_episodes_when_asked(tmp_path):
+    spec = TokenizerSpec(
+        name="raw", version=1, kind="discrete", image_size=16, grid=(2, 3), vocab_size=64, factored=(8, 8)
+    )
+    data = [str(make_shards(tmp_path / "arm", "arm", spec=spec, length=6, episodes=8))]
+    recipe = make_recipe({**TINY, "data": data, "short": "pad", "eval_every": 0, "steps": 2})
+    assert train(recipe, out=tmp_path / "run", show=False).step == 2
