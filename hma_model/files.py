@@ -118,7 +118,7 @@ def read_metadata(path: Path) -> dict[str, str]:
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(path, framework="pt") as file:
+        with safe_open(path, framework="np") as file:  # the header alone needs no torch
             return file.metadata() or {}
     except (SafetensorError, OSError) as fault:
         raise CheckpointError(path, f"is not whole safetensors: {fault}", "pull or save it again") from fault

@@ -10,6 +10,7 @@ from hma_data.errors import HubError
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
 LONGEST_WAIT = 300.0  # seconds; the hub counts requests over five minutes
+SILENCE = 300.0  # seconds without an answer; a commit of many files takes the hub minutes
 
 
 @contextmanager
@@ -19,8 +20,21 @@ def explained(where: str) -> Iterator[None]:
         yield
     except HubError:
         raise
-    except _raised() as fault:
+    except raised() as fault:
         raise explain(where, fault) from fault
+
+
+@contextmanager
+def bounded() -> Iterator[None]:
+    """Let no request of the client in this block wait for ever, which is what it does by default."""
+    from huggingface_hub import get_session
+
+    client = get_session()
+    before, client.timeout = client.timeout, SILENCE
+    try:
+        yield
+    finally:
+        client.timeout = before
 
 
 def explain(where: str, fault: BaseException) -> HubError:
@@ -79,7 +93,8 @@ def cuts() -> tuple[type[BaseException], ...]:
     return (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError)
 
 
-def _raised() -> tuple[type[BaseException], ...]:
+def raised() -> tuple[type[BaseException], ...]:
+    """What the client raises when something goes wrong."""
     import httpx
     from huggingface_hub import errors
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from hma_data.errors import HubError
 from hma_model.files import MAX_JSON_BYTES
-from hma_model.hub_errors import LOG_IN, cuts, explain, explained, waiting
+from hma_model.hub_errors import LOG_IN, bounded, cuts, explain, explained, raised, waiting
 from hma_model.hub_fetch import LARGE, fetch, fetch_to
 
 ATTEMPTS = 8
@@ -113,9 +113,7 @@ class HuggingFaceStore:
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """One commit, prepared again while others commit first."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
-        from huggingface_hub.errors import HfHubHTTPError
 
-        transient: tuple[type[BaseException], ...] = (HfHubHTTPError, *cuts())
         for attempt in range(ATTEMPTS):
             operations: list[CommitOperationAdd | CommitOperationDelete] = [
                 CommitOperationAdd(name, str(content) if isinstance(content, Path) else content)
@@ -124,22 +122,21 @@ class HuggingFaceStore:
                 for name, content in changes().items()
             ]
             try:
-                self._api.create_commit(
-                    self.repo,
-                    operations,
-                    repo_type=self._kind,
-                    commit_message=message,
-                    parent_commit=self._commit,
-                )
+                with bounded():
+                    self._api.create_commit(
+                        self.repo,
+                        operations,
+                        repo_type=self._kind,
+                        commit_message=message,
+                        parent_commit=self._commit,
+                    )
                 return self.address
-            except transient as fault:
+            except raised() as fault:
                 response = getattr(fault, "response", None)
                 conflict = response is not None and response.status_code in _CONFLICTS
                 seconds = min(0.2 * 2**attempt, 10.0) if conflict else waiting(fault, attempt)
                 if seconds is None or (not conflict and attempt >= ATTEMPTS // 2):
                     raise explain(self.name, fault) from fault
-            except (OSError, ValueError, RuntimeError, KeyError) as fault:
-                raise explain(self.name, fault) from fault
             time.sleep(seconds * (0.5 + random.random()) if conflict else seconds)
         raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
 
@@ -207,7 +204,7 @@ class HuggingFaceStore:
 
         for attempt in range(ATTEMPTS // 2):
             try:
-                with explained(self.name):
+                with explained(self.name), bounded():
                     return call()
             except HubError as fault:
                 cause = fault.__cause__

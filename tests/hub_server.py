@@ -68,6 +68,7 @@ class Fault:
         status: answered instead; None cuts the connection.
         after: bytes of the body, coming or going, before the cut.
         times: how often; then all is well.
+        stall: seconds without an answer before.
     """
 
     request: str
@@ -75,6 +76,7 @@ class Fault:
     headers: dict[str, str] = field(default_factory=dict)
     after: int = 0
     times: int = 1
+    stall: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,7 @@ class Hub(ThreadingHTTPServer):
         self.before_commit: list[Any] = []
         self.page = 1000
         self.waits: list[float] = []
+        self.stalled = threading.Event()
         self.lock = threading.RLock()
 
     @property
@@ -168,6 +171,8 @@ class _Handler(BaseHTTPRequestHandler):
         with self.server.lock:
             self.fault = self._fault()
         try:
+            if self.fault and self.fault.stall:
+                self.server.stalled.wait(self.fault.stall)
             if self.fault and self.fault.status:
                 self._body()
                 self._answer(self.fault.status, {"error": "made up"}, self.fault.headers)
