@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hma_data.errors import HMAError
+from hma_data.errors import EpisodeError, HMAError
 from hma_data.sources import clocks, looks
 from hma_data.sources.base import Inspection, KeyInfo
 from hma_data.sources.facts import is_times, one_channel, seconds_a_unit, seconds_of
@@ -68,6 +68,8 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
                 group = places.group(place)
                 sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
                 lengths[name] = _length(sizes)
+                if not lengths[name]:
+                    raise EpisodeError(name, "has no frames")
                 if not first.keys:
                     first.name = name
                     _tell(first, group, files, place)

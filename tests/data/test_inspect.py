@@ -135,6 +135,15 @@ def test_only_so_many_episodes_are_looked_into(tmp_path: Path) -> None:
     assert "finite" not in damaged(tmp_path, spoil, episodes=1)
 
 
+def test_an_empty_episode_is_told_and_no_example_of_the_others(tmp_path: Path) -> None:
+    def empty(file: h5py.File) -> None:
+        del file["data/demo_0"]
+        file["data/demo_0/actions"] = np.zeros((0, 3))
+
+    said = damaged(tmp_path, empty)
+    assert said["readable"] == ["demo_0: has no frames"] and "keys" not in said
+
+
 def test_a_key_that_only_the_first_episode_lacks_is_told(tmp_path: Path) -> None:
     def spoil(file: h5py.File) -> None:
         del file["data/demo_0/actions"]
