@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from hma_data.errors import HMAError, OutputError
+from hma_data.errors import HMAError, OutputError, StorageAwayError
 from hma_data.extend import hashes, ways
 from hma_data.files import PART, remove_parts
 from hma_data.plan import Plan, differences
@@ -265,8 +265,9 @@ class Journal:
             self._lines = self._path.read_text(encoding="utf-8").splitlines(keepends=True)
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._put()
+    def __exit__(self, kind: object, fault: BaseException | None, trace: object) -> None:
+        if not isinstance(fault, StorageAwayError):  # else it would only wait for the store once more
+            self._put()
 
     def add(self, made: Made) -> None:
         """Note a shard."""

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 
-from hma_data.errors import HMAError, OutputError
+from hma_data.errors import HMAError, OutputError, StorageAwayError
 from hma_data.store import RemotePath, put_bytes
 
 REFRESH_S, STALE_S, SETTLE_S = 30.0, 180.0, 2.0
@@ -88,6 +88,8 @@ class RemoteLock:
     ) -> None:
         self._ended.set()
         self._thread.join()
+        if isinstance(fault, StorageAwayError):  # it would only be waited for once more
+            return
         with suppress(HMAError, OSError):  # what was done stays done; the lock is forgotten by itself
             read = _read(self._path)
             if read and read.job == self._me.job:
