@@ -332,7 +332,7 @@ def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
         raise CheckpointError(
             where,
             f"is not of {LIBRARY}: library is {values.get('library')!r}",
-            "give a checkpoint of hma train",
+            "give a checkpoint of hma train; hma hub import brings in one of the paper's release",
         )
     values = migrate.config(values, where)
     model, tokenizer = values.get("model"), values.get("tokenizer")

@@ -91,10 +91,12 @@ class HuggingFaceStore:
         sizes = self.files() if self._sizes is None else self._sizes
         where, revision = f"{self.name}/{name}", self._commit or self._revision
         if sizes.get(name, 0) <= MAX_JSON_BYTES:
-            with explained(where):
-                path = Path(hf_hub_download(self.repo, name, repo_type=self._kind, revision=revision))
+            path = self._patiently(
+                lambda: Path(hf_hub_download(self.repo, name, repo_type=self._kind, revision=revision)), where
+            )
             if path.stat().st_size <= MAX_JSON_BYTES:
-                return path.read_bytes()
+                content: bytes = path.read_bytes()
+                return content
         raise HubError(where, f"is larger than {MAX_JSON_BYTES:,} bytes", "this is not a file of ours")
 
     def warm(self, names: list[str]) -> None:
@@ -198,13 +200,13 @@ class HuggingFaceStore:
         self._revision = folder.name
         return dict(self._sizes)
 
-    def _patiently(self, call: Callable[[], Any]) -> Any:
+    def _patiently(self, call: Callable[[], Any], where: str = "") -> Any:
         """What a call returns; it is made again where the hub is busy or the connection was cut."""
         from huggingface_hub.errors import HfHubHTTPError
 
         for attempt in range(ATTEMPTS // 2):
             try:
-                with explained(self.name), bounded():
+                with explained(where or self.name), bounded():
                     return call()
             except HubError as fault:
                 cause = fault.__cause__

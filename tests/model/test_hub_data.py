@@ -4,10 +4,12 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from hma_data.errors import HubError, ShardError
+from hma_data.shards.reader import ShardSet
 from hma_model import hub_data
 from hma_model.hub_data import pull_data, push_data
 from tests.hub_server import Hub, connect, serve
@@ -47,6 +49,20 @@ def test_what_is_pushed_and_pulled_is_the_same(server, shards, tmp_path, target)
     push_data(shards, target)
     out = pull_data(target, tmp_path / "out")
     assert contents(out) == contents(shards)
+
+
+def test_a_published_set_is_read_in_place_by_its_uri(server, shards):
+    from huggingface_hub import HfFileSystem
+
+    push_data(shards, REPO)
+    server.log.clear()
+    HfFileSystem.clear_instance_cache()
+    there, here = ShardSet(f"hf://datasets/{REPO}"), ShardSet(shards)
+    assert there.episodes.equals(here.episodes)
+    rows = [one.read("val/shard-00000.parquet", [0], ["action"])["action"] for one in (there, here)]
+    assert np.array_equal(*rows)
+    assert "train/shard-00000.parquet" not in server.sent()
+    HfFileSystem.clear_instance_cache()
 
 
 def test_a_small_set_is_one_commit(server, shards):

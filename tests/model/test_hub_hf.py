@@ -278,7 +278,7 @@ def test_a_download_with_other_content_than_stated_is_thrown_away(published, mon
 
 @pytest.mark.parametrize("fault", [{"status": 503}, {"status": 429, "headers": {"Retry-After": "3"}}])
 def test_a_passing_fault_does_not_stop_a_pull(published, fault):
-    for request in ("GET /api/models", "GET /cdn/", "HEAD .*/resolve/", "GET .*/tree/"):
+    for request in ("GET /api/models", "GET /cdn/", "GET .*/resolve/", "HEAD .*/resolve/", "GET .*/tree/"):
         published.fail(request, **fault)
     assert list(HMA.from_pretrained(REPO, embodiments=["arm"]).embodiments) == ["arm"]
 
@@ -348,6 +348,19 @@ def test_a_repository_or_revision_that_is_not_there_is_called_so(published):
         hub.pull("team/none")
     with pytest.raises(HubError, match=r"no such revision.*branch, tag or commit"):
         hub.pull(REPO, revision="v9")
+
+
+def test_a_gated_repository_says_how_to_get_in(published):
+    published.fail("GET /api/models", 403, headers={"X-Error-Code": "GatedRepo"}, times=9)
+    with pytest.raises(HubError, match=r"is gated.*ask for access on its page"):
+        hub.pull(REPO)
+
+
+def test_a_wait_that_is_too_long_is_not_waited(published):
+    published.fail("GET /api/models", 429, headers={"Retry-After": "86400"}, times=9)
+    with pytest.raises(HubError, match=r"answered 429.*too many requests"):
+        hub.pull(REPO)
+    assert max(published.waits, default=0) < 300
 
 
 def test_a_private_repository_without_a_token_may_be_there(published, monkeypatch):
