@@ -55,14 +55,15 @@ class RunLog:
         show: anything at all on standard error.
         write: keep metrics.jsonl; the ranks but the first do not.
         trackers: get the same figures.
+        nats: losses are nats a token, of which a perplexity can be told.
     """
 
     def __init__(
         self, out: Path, steps: int, begin: int, show: bool = True, write: bool = True,
-        trackers: Sequence[Tracker] = (),
+        trackers: Sequence[Tracker] = (), nats: bool = True,
     ) -> None:  # fmt: skip
         self._steps, self._begin, self._show, self._write_it = steps, begin, show, write
-        self._trackers = trackers
+        self._trackers, self._nats = trackers, nats
         self._path = out / METRICS
         kept = [line for line in read_metrics(out) if line["step"] <= begin]
         if write:
@@ -168,10 +169,10 @@ class RunLog:
     def _text(self) -> str:
         rate, left = self._pace()
         losses = ", ".join(f"{name} {value:.3f}" for name, value in self._smooth().items())
-        held = f", validation {self._evaluation['loss']:.3f}" if self._evaluation else ""
-        return (
-            f"step {self._last['step']}/{self._steps}: loss {losses}{held}, {rate:.1f} windows/s, {left} left"
-        )
+        held = f", validation {_number(self._evaluation.get('loss'))}" if self._evaluation else ""
+        skipped = f", {self._last['skipped']} steps left out" if self._last.get("skipped") else ""
+        where = f"step {self._last['step']}/{self._steps}"
+        return f"{where}: loss {losses}{held}, {rate:.1f} windows/s, {left} left{skipped}"
 
     def _table(self) -> "Group":
         from rich.box import SIMPLE
@@ -183,11 +184,17 @@ class RunLog:
         held = self._evaluation.get("loss_by_embodiment", {})
         ignoring = self._evaluation.get("baseline_by_embodiment", {})
         for name, loss in self._smooth().items():
-            known = [f"{values[name]:.3f}" if name in values else "-" for values in (held, ignoring)]
-            table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.0f}", *known)
-        step, lr = self._last["step"], self._last["lr"]
-        head = f"step {step:,}/{self._steps:,}   {rate:.1f} windows/s   {left} left   lr {lr:.2e}"
-        return Group(head, table)
+            known = [_number(values.get(name)) for values in (held, ignoring)]
+            table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.0f}" if self._nats else "-", *known)
+        last = self._last
+        head = f"step {last['step']:,}/{self._steps:,}   {rate:.1f} windows/s   {left} left"
+        rest = f"lr {last['lr']:.2e}   {last.get('memory_mib', 0):,.0f} MiB"
+        skipped = f"   {last['skipped']} steps left out" if last.get("skipped") else ""
+        return Group(f"{head}   {rest}{skipped}", table)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
 
 
 def _line(values: dict[str, Any]) -> str:

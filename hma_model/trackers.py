@@ -4,6 +4,7 @@ Event files need no package: a TFRecord frame around a small protobuf, in `tenso
 `pip install tensorboard && tensorboard --logdir RUN` shows them.
 """
 
+import hashlib
 import importlib
 import struct
 import time
@@ -73,7 +74,11 @@ class Remote:
                 f"recipe: track={name}", f"{name} is not installed", f"pip install {name}, or leave it out"
             ) from fault
         run = out.absolute().name
-        self._package.init(project=recipe.project, name=run, config=recipe.values(), resume="allow")
+        given = {"project": recipe.project, "name": run, "config": recipe.values(), "resume": "allow"}
+        if name == "wandb":  # knows a run that goes on by its id, trackio by its name
+            folder = hashlib.sha256(str(out.absolute()).encode()).hexdigest()
+            given["id"] = f"{run[:40]}-{folder[:12]}"
+        self._package.init(**given)
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """See `Tracker`."""

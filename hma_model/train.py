@@ -96,7 +96,8 @@ def train(
         run.prepare(kept)
         trackers: list[Tracker] = []
         world.once(lambda: trackers.extend(open_trackers(recipe, folder, run.step)))
-        with RunLog(folder, recipe.steps, run.step, show and world.main, world.main, trackers) as log:
+        shown = show and world.main
+        with RunLog(folder, recipe.steps, run.step, shown, world.main, trackers, run.nats) as log:
             for text in noted + run.remarks():
                 log.note(text)
             with stop_on_signals() as stop:

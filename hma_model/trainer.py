@@ -35,7 +35,7 @@ from hma_model.runtime import ENVIRONMENT, RECIPE, environment
 from hma_model.self_forward import forwarded, share_at
 from hma_model.start import Start
 from hma_model.tally import Tally, peak_memory_mib
-from hma_model.validation import validate
+from hma_model.validation import main_objective, validate
 
 
 class Run:
@@ -101,6 +101,12 @@ class Run:
         for name, shards in self.sets.items():
             model.add_embodiment(ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name)))
         return model
+
+    @property
+    def nats(self) -> bool:
+        """Whether the losses are nats a token."""
+        video = main_objective(self.recipe.objectives) in ("forward", "passive", "full")
+        return self.model.config.kind == "discrete" and video
 
     def remarks(self) -> list[str]:
         """What somebody who watches should know."""

@@ -1,5 +1,6 @@
 """What a run leaves to read: TensorBoard's files, trackio and wandb, pictures, the report."""
 
+import io
 import json
 import re
 import struct
@@ -131,7 +132,7 @@ def test_trackio_and_wandb_get_the_recipe_the_figures_and_the_pictures(package, 
     assert (init["project"], init["name"], init["config"]["steps"]) == ("arms", "first", 6)
     assert [step for _, step, values in logged if "train/loss" in values] == [1, 2, 3, 4, 5, 6]
     assert sum(value[0] == "image" for _, _, v in logged for value in v.values() if type(value) is tuple) == 4
-    assert last == ("finish",)
+    assert last == ("finish",) and ("id" in init) == (package.__name__ == "wandb")
 
 
 @pytest.mark.parametrize("name", ["trackio", "wandb"])
@@ -181,3 +182,40 @@ def test_the_run_folder_has_its_recipe_and_ground(run):
     ground = json.loads((run / "environment.json").read_text())
     assert {"git_revision", "torch", "python", "device", "ranks"} <= ground.keys()
     assert json.loads((run / "recipe.json").read_text())["steps"] == 6
+
+
+# -- the console
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """Standard error as a terminal that keeps what is shown."""
+    from rich import console, live
+
+    shown = []
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setattr(live.Live, "__enter__", lambda self: self)
+    monkeypatch.setattr(live.Live, "__exit__", lambda *given: None)
+
+    def update(self, group, refresh=False):
+        page = console.Console(width=120, record=True, file=io.StringIO())
+        page.print(group)
+        shown.append(page.export_text())
+
+    monkeypatch.setattr(live.Live, "update", update)
+    return shown
+
+
+def test_the_live_table_has_losses_by_robot_perplexity_speed_and_time_left(data, tmp_path, terminal):
+    train(make_recipe({**TINY, "data": data}), out=tmp_path / "run")
+    last = terminal[-1]
+    for text in ("step 6/6", "windows/s", "left", "MiB", "arm", "hand", "perplexity", "ignoring all"):
+        assert text in last
+    lines = read_metrics(tmp_path / "run")
+    assert f"{lines[-1]['loss_by_embodiment']['arm']:.3f}" in last
+
+
+def test_action_losses_have_no_perplexity(data, tmp_path, terminal):
+    train(make_recipe({**TINY, "data": data, "objectives": {"policy": 1}}), out=tmp_path / "run")
+    (row,) = [line for line in terminal[0].splitlines() if line.strip().startswith("arm")]
+    assert row.split()[2] == "-"
