@@ -367,7 +367,7 @@ def training_checkpoints(run: Path) -> list[Path]:
 def inside(folder: Path, name: str) -> Path:
     """The path of a file that lies in the folder itself.
 
-    A link is refused, but for those of a Hugging Face cache, which point at its own blobs.
+    A link is refused, but for those of a Hugging Face cache, which point at its blobs.
 
     Raises:
         CheckpointError: there is none, or it leads out of the folder.
@@ -376,8 +376,9 @@ def inside(folder: Path, name: str) -> Path:
     if not path.is_file():
         raise CheckpointError(path, "no such file", "pull or save the checkpoint again")
     real, home = path.resolve(), folder.resolve()
-    blobs = home.parent.parent / "blobs" if home.parent.name == "snapshots" else None
-    if real == home / name or (blobs is not None and real.parent == blobs):
+    repo = home.parent.parent if home.parent.name == "snapshots" else None
+    blobs = (repo / "blobs", repo.parent / "blobs" / real.parent.name) if repo else ()  # its own, the shared
+    if real == home / name or real.parent in blobs:
         return path
     raise CheckpointError(path, "is a link, or lies outside the checkpoint", "put the file itself there")
 

@@ -235,6 +235,24 @@ def test_a_broken_card_of_somebody_else_stops_neither_list_nor_push(folder, tmp_
     assert list(HMA.from_pretrained(str(tmp_path / "hub"), ["hand"]).embodiments) == ["hand"]
 
 
+def test_the_blobs_that_repositories_of_a_cache_share_are_followed_and_no_others(folder, tmp_path):
+    snapshot = tmp_path / "cache/models--a--b/snapshots" / ("0" * 40)
+    for path in [path for path in folder.rglob("*") if path.is_file()]:
+        shared = tmp_path / "cache/blobs/ab" / file_sha256(path)
+        blob = tmp_path / "cache/models--a--b/blobs" / shared.name
+        link = snapshot / path.relative_to(folder)
+        for place in (shared, blob, link):
+            place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, shared)
+        blob.symlink_to(f"../../blobs/ab/{shared.name}") if not blob.is_symlink() else None
+        link.symlink_to(blob)
+    assert set(checkpoint.load(snapshot).embodiments) == set(ROBOTS)
+    (snapshot / "trunk.safetensors").unlink()
+    (snapshot / "trunk.safetensors").symlink_to(folder / "trunk.safetensors")
+    with pytest.raises(CheckpointError, match="is a link"):
+        checkpoint.load(snapshot)
+
+
 # -- stems of different people on one frozen trunk
 
 
