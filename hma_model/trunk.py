@@ -244,7 +244,16 @@ class MLP(nn.Module):
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.dropout(self.fc2(self.dropout(F.gelu(self.fc1(x)))))
+        hidden = self.fc1(x)
+        if self.dropout.p or not torch.is_grad_enabled():
+            return self.dropout(self._out(hidden))
+        # The largest activation is not kept but computed again: the product after it is not, since the
+        # recomputation ends when what the backward pass wants is there.
+        out: Tensor = checkpoint(self._out, hidden, use_reentrant=False, preserve_rng_state=False)
+        return out
+
+    def _out(self, hidden: Tensor) -> Tensor:
+        return self.fc2(self.dropout(F.gelu(hidden)))
 
 
 class Block(nn.Module):
