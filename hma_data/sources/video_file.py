@@ -144,6 +144,7 @@ class VideoFile:
         self._next = 0  # index of the frame the decoder gives next
         self._entry = -1  # index of the keyframe that was last sought
         self._counts, self._seeks = False, True  # whether frames are counted; whether keyframes are sought
+        self._spoilt = False  # whether the last frame, or one it may be made from, is damaged
         self._reformatter: Any = None
 
     def __len__(self) -> int:
@@ -194,8 +195,8 @@ class VideoFile:
                 raise
             self._count()
             frame = self._frame(index)
-        if frame.is_corrupt:
-            raise EpisodeError(self.path, f"frame {index} is damaged")
+        if self._spoilt:
+            raise EpisodeError(self.path, f"frame {index} is damaged, or one before it that it is made from")
         return self._to_rgb(frame)
 
     def _count(self) -> None:
@@ -221,6 +222,7 @@ class VideoFile:
 
     def _decode_up_to(self, index: int) -> Any:
         for frame in self._decoder:
+            self._spoilt = frame.is_corrupt or (self._spoilt and not frame.key_frame)
             found = self._next if self._counts else self._index_of(frame)
             if found == self._entry and self.table.codec in _REFRESHED and frame.pict_type != _INTRA:
                 self._seeks = False  # a refresh spread over many frames: what follows is not whole
@@ -240,7 +242,7 @@ class VideoFile:
         elif index < self._next or self.table.keys[index] > self._next:
             stream = self._container.streams.best("video")
             self._container.seek(int(self.table.seek_stamps[index]), stream=stream, backward=True)
-            self._decoder = self._container.decode(stream)
+            self._decoder, self._spoilt = self._container.decode(stream), False
             self._next = self._entry = int(self.table.keys[index])
 
     def _reopen(self) -> None:
@@ -252,6 +254,7 @@ class VideoFile:
         stream.codec_context.thread_count = self._threads
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         self._decoder, self._next, self._entry = self._container.decode(stream), 0, -1
+        self._spoilt = False
         self._reformatter = VideoReformatter()  # one for all frames: making it costs a third of the time
 
     def _index_of(self, frame: Any) -> int:

@@ -155,3 +155,29 @@ def test_a_group_is_decoded_no_further_back_than_its_keyframe(
     monkeypatch.setattr(VideoFile, "_index_of", lambda self, frame: seen.append(1) or inner(self, frame))
     file.frames(range(0, N, 5))
     assert len(seen) <= 2 * len(range(0, N, 5))
+
+
+def test_frames_made_from_a_damaged_one_are_refused_up_to_the_next_keyframe(tmp_path: Path) -> None:
+    whole = make(tmp_path / "whole.mp4", "libx264", {"crf": "4", "bf": "0"}, gop=13)
+    intact = VideoFile(whole).frames(range(N))
+    path, content, hit = tmp_path / "hit.mp4", whole.read_bytes(), 6
+    with av.open(str(whole)) as container:
+        packet = [found for found in container.demux(video=0) if found.size][hit]
+        begin, end = packet.pos, packet.pos + packet.size
+    for seed in range(60):
+        spoilt = bytearray(content)
+        draw = np.random.default_rng(seed)
+        spoilt[begin + 12 : end] = draw.integers(0, 256, end - begin - 12, np.uint8).tobytes()
+        path.write_bytes(bytes(spoilt))
+        with av.open(str(path)) as container:
+            frames = [(f.is_corrupt, f.to_ndarray(format="rgb24")) for f in container.decode(video=0)]
+        silent = [i for i, (told, shown) in enumerate(frames) if not told and (shown != intact[i]).any()]
+        if len(frames) == N and silent and any(told for told, _ in frames):
+            break
+    for i in range(N):
+        try:
+            assert np.array_equal(VideoFile(path).frames([i])[0], intact[i])
+        except EpisodeError:
+            assert i < 13
+    with pytest.raises(EpisodeError, match="damaged"):
+        VideoFile(path).frames([silent[0]])
