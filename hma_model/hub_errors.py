@@ -120,11 +120,13 @@ def _answered(where: str, fault: Any) -> HubError:
 
 
 def _plain(where: str, fault: BaseException) -> HubError:
-    text = " ".join(str(fault).split())[:300]
+    text = re.sub(r"(?i)\b(hf_|bearer )\w+", r"\1…", " ".join(str(fault).split()))[:300]
     if isinstance(fault, ValueError) and "metadata in README" in text:
         return HubError(where, f"the hub refuses the card: {text}", "correct the licence in embodiment.yaml")
     if isinstance(fault, OSError) and fault.errno is not None:
         return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
     if isinstance(fault, OSError):
         return HubError(where, f"did not come whole: {text}", "pull again")
+    if isinstance(fault, RuntimeError):  # what the transfer library of the hub raises
+        return HubError(where, f"the transfer failed: {text}", "run it again; HF_HUB_DISABLE_XET=1 may help")
     return HubError(where, f"did not answer as a hub does: {type(fault).__name__}", "check HF_ENDPOINT")

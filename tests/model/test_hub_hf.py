@@ -191,7 +191,11 @@ def test_a_new_repository_can_be_private(server, source):
 # -- pulling
 
 
-def test_one_embodiment_brings_config_trunk_and_its_own_files_byte_for_byte(published, source):
+@pytest.mark.parametrize("large", [0, 10**9], ids=["by us", "by the client"])
+def test_one_embodiment_brings_config_trunk_and_its_own_files_byte_for_byte(
+    published, source, monkeypatch, large
+):
+    monkeypatch.setattr(hub_hf, "LARGE", large)
     model = HMA.from_pretrained(REPO, embodiments=["arm"])
     assert list(model.embodiments) == ["arm"]
     wanted = ["config.json", "trunk.safetensors", *(f"embodiments/arm/{part}" for part in PARTS)]
@@ -464,6 +468,13 @@ def test_the_command_never_shows_or_stores_the_token(server, source, tmp_path):
     assert "token is not valid" in shown[3] and "Traceback" in shown[3]
     stored = [path for path in tmp_path.rglob("*") if path.is_file() and TOKEN.encode() in path.read_bytes()]
     assert stored == [] and all(TOKEN.encode() not in c for c in server.model(REPO).files.values())
+
+
+def test_what_the_transfer_library_says_is_shown_without_a_token():
+    said = RuntimeError(f"denied for {TOKEN}\nAuthorization: Bearer {TOKEN}")
+    with pytest.raises(HubError, match="the transfer failed: .*denied") as found, hub_errors.explained(REPO):
+        raise said
+    assert TOKEN not in str(found.value) and "\n" not in str(found.value)
 
 
 def test_the_large_files_limit_is_what_the_client_is_left_with():
