@@ -24,6 +24,7 @@ from hma_data.engines.local import run as run_local
 from hma_data.errors import OutputError, RegistryError, SourceError
 from hma_data.extend import extended
 from hma_data.files import remove_parts
+from hma_data.hub_output import HubOutput
 from hma_data.output import (
     Held,
     Journal,
@@ -147,25 +148,42 @@ def convert(
         HMAError: the embodiment or the tokenizer cannot be used.
     """
     begun, out = time.monotonic(), place(out)
+    hub = HubOutput.of(out)
+    folder = hub.staging if hub else out
     conversion = _Conversion(
-        embodiment, source, tokenizer, out, settings or Settings(), workers, engine, weights, device, limits
+        embodiment,
+        source,
+        tokenizer,
+        folder,
+        settings or Settings(),
+        workers,
+        engine,
+        weights,
+        device,
+        limits,
     )
-    with locked(out) as lock:
+    with locked(folder) as lock:
         if overwrite:
-            clear(out)
+            clear(folder)
         plan, base = conversion.plan(extend)
+        if hub:
+            hub.prepare()
+            if not overwrite:
+                hub.refuse_other(plan.facts)
         done, made = conversion.make(plan, base, None, on_progress, lock)
         manifest = conversion.finish(plan, base, bool(made))
-        reasons = _reasons(out)
+        reasons, flags = _reasons(folder), _flags(folder)
         if not any(split["episodes"] for split in manifest.splits.values()):
-            clear(out)
+            clear(folder)
             worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
             raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
+        if hub:
+            hub.upload()
     episodes = sum(split["episodes"] for split in manifest.splits.values())
     too_many = manifest.quarantined > max_quarantine * (episodes + manifest.quarantined)
     seconds = time.monotonic() - begun
-    return Summary(out, manifest, done, made, seconds, reasons, _flags(out), too_many)
+    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many)
 
 
 def convert_share(

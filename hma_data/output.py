@@ -75,7 +75,9 @@ def locked(out: Path, share: Share | None = None) -> Iterator[Held]:
 def _locked_in_store(out: RemotePath, share: Share | None) -> Iterator[Held]:
     if out.scheme == "hf":
         raise OutputError(
-            out, "a hub's repository is not written file by file", "write a folder, then upload that"
+            out,
+            "a hub's repository is written by one whole hma convert only",
+            "write a folder, then upload it",
         )
     what = f"share {share.name} of it" if share else "it"
     _refuse_living(out, share, what)

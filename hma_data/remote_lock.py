@@ -88,9 +88,11 @@ class RemoteLock:
     ) -> None:
         self._ended.set()
         self._thread.join()
-        if isinstance(fault, StorageAwayError):  # it would only be waited for once more
-            return
-        with suppress(HMAError, OSError):  # what was done stays done; the lock is forgotten by itself
+        with suppress(Exception):  # what was done stays done; the lock is forgotten by itself
+            if isinstance(fault, StorageAwayError):  # one try: it was waited for long enough
+                if self._taken_by is None and time.monotonic() - self._written < STALE_S:
+                    self._path.files.rm_file(self._path.key)
+                return
             read = _read(self._path)
             if read and read.job == self._me.job:
                 self._path.unlink(missing_ok=True)

@@ -164,8 +164,9 @@ class RemotePath(PosixPath):
             found = attempt(self, "listed", ask)
         except FileNotFoundError:
             return {}
-        begin = len(self.key) + 1
-        return {name[begin:]: int(found[name]["size"] or 0) for name in sorted(found) if name[begin:]}
+        begin = f"{self.key}/"
+        sizes = {name: int(found[name]["size"] or 0) for name in sorted(found)}
+        return {name.removeprefix(begin): size for name, size in sizes.items() if name.startswith(begin)}
 
     def exists(self, **_: Any) -> bool:
         try:

@@ -286,7 +286,9 @@ class _Handler(BaseHTTPRequestHandler):
         if verb == "resolve":
             return self._resolve(commit, path)
         if verb == "tree":
-            return self._tree(commit)
+            return self._tree(commit, path)
+        if verb == "paths-info":
+            return self._paths(commit)
         siblings = []
         for path, content in commit.files.items():
             siblings.append({"rfilename": path, "size": len(content), "blobId": _oid(content)})
@@ -298,13 +300,19 @@ class _Handler(BaseHTTPRequestHandler):
 
     # -- reading
 
-    def _tree(self, commit: Commit) -> None:
+    def _paths(self, commit: Commit) -> None:
         entries = []
-        for path, content in sorted(commit.files.items()):
-            entry = {"type": "file", "path": path, "size": len(content), "oid": _oid(content)}
-            if _by_lfs(path, len(content)):
-                entry["lfs"] = {"oid": _sha256(content), "size": len(content), "pointerSize": 134}
-            entries.append(entry)
+        for path in parse_qs(self.content.decode()).get("paths", []):
+            if path in commit.files:
+                entries.append(_entry(path, commit.files[path]))
+            elif any(name.startswith(f"{path}/") for name in commit.files):
+                entries.append({"type": "directory", "path": path, "oid": _oid(path.encode())})
+        self._answer(200, entries)
+
+    def _tree(self, commit: Commit, below: str) -> None:
+        begin = f"{below}/" if below else ""
+        files = sorted(commit.files.items())
+        entries = [_entry(path, content) for path, content in files if path.startswith(begin)]
         start = int(self.query.get("cursor", ["0"])[0])
         headers = {}
         if start + self.server.page < len(entries):
@@ -423,6 +431,13 @@ class _Handler(BaseHTTPRequestHandler):
             return self._cut()
         self.wfile.write(body)
         return None
+
+
+def _entry(path: str, content: bytes) -> dict[str, Any]:
+    entry: dict[str, Any] = {"type": "file", "path": path, "size": len(content), "oid": _oid(content)}
+    if _by_lfs(path, len(content)):
+        entry["lfs"] = {"oid": _sha256(content), "size": len(content), "pointerSize": 134}
+    return entry
 
 
 def _by_lfs(path: str, size: int) -> bool:

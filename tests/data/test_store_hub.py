@@ -1,0 +1,150 @@
+"""Shard sets on the Hugging Face Hub, written and read by `hf://datasets/…`, against a hub on loopback."""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hma_data import hub_output, store
+from hma_data.convert import convert, convert_share
+from hma_data.embodiment import Embodiment
+from hma_data.errors import HubError, OutputError, ShardError, StorageAwayError, StorageError
+from hma_data.files import cache_folder
+from hma_data.output import Share
+from hma_data.plan import Settings
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from tests.conftest import BlockTokenizer
+from tests.hub_server import Hub, Repository, connect, serve
+
+SMALL = Settings(val_fraction=0.2, shard_frames=60)
+OUT = "hf://datasets/team/arm/sets/one"
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    from huggingface_hub import HfFileSystem
+    from huggingface_hub.utils import close_session
+
+    monkeypatch.setattr(store, "WAITS_S", (0.0, 0.0, 0.0))
+    monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma"))
+    monkeypatch.setattr(hub_output, "FILES", 2)
+    HfFileSystem.clear_instance_cache()
+    with serve() as made:
+        made.tokens = {"token": "write", "reader": "read"}
+        connect(monkeypatch, made, tmp_path / "cache", "token")
+        yield made
+        close_session()
+    HfFileSystem.clear_instance_cache()
+
+
+def run(arm: Embodiment, recording: Path, settings: Settings = SMALL, out: str = OUT, **options):
+    return convert(arm, str(recording), BlockTokenizer(), Path(out), settings=settings, **options)
+
+
+def dataset(hub: Hub) -> Repository:
+    return hub.repositories["datasets/team/arm"]
+
+
+def published(hub: Hub) -> dict[str, bytes]:
+    files = dataset(hub).files
+    return {
+        name.removeprefix("sets/one/"): data for name, data in files.items() if name.startswith("sets/one/")
+    }
+
+
+@pytest.fixture
+def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
+    folder = tmp_path / "whole"
+    convert(toy_arm, str(toy_recording), BlockTokenizer(), folder, settings=SMALL)
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_repository_gets_the_bytes_that_a_folder_gets_in_few_commits(
+    toy_arm, toy_recording, hub, whole
+) -> None:
+    summary = run(toy_arm, toy_recording)
+    assert str(summary.out) == OUT
+    assert published(hub) == whole
+    _initial, *commits = dataset(hub).commits
+    shards = sum("shard-" in name for name in whole)
+    assert len(commits) == (shards + 1) // 2
+    assert ["sets/one/manifest.json" in commit.files for commit in commits] == [
+        *[False] * (len(commits) - 1),
+        True,
+    ]
+    assert run(toy_arm, toy_recording).made_shards == 0
+    assert len(dataset(hub).commits) == len(commits) + 1
+
+
+def test_a_set_on_the_hub_is_read_and_verified_by_its_uri(
+    toy_arm, toy_recording, hub, tmp_path, whole
+) -> None:
+    run(toy_arm, toy_recording)
+    here = ShardSet(tmp_path / "whole")
+    for cache in (False, True):
+        there = ShardSet(OUT, cache=cache)
+        assert there.episodes.equals(here.episodes)
+        for index in here.episodes["episode_index"].to_pylist()[:3]:
+            for name, values in here.episode_rows(index).items():
+                np.testing.assert_array_equal(there.episode_rows(index)[name], values)
+    assert verify(Path(OUT)) == []
+    with pytest.raises(ShardError, match="is not a folder"):
+        ShardSet("hf://datasets/team/arm/none")
+
+
+def test_an_upload_that_was_cut_off_goes_on_with_what_is_missing(toy_arm, toy_recording, hub, whole) -> None:
+    hub.fail("POST .*/commit/", 500, times=0)
+    act = hub.before_commit
+    act += [lambda: None, lambda: hub.fail("POST .*/commit/", 503, times=50)]
+    with pytest.raises(StorageAwayError, match=f"{OUT}: cannot be uploaded: .*run the same command again"):
+        run(toy_arm, toy_recording)
+    assert "manifest.json" not in published(hub) and published(hub)
+    hub.faults.clear()
+    before = len(dataset(hub).commits)
+    assert run(toy_arm, toy_recording).made_shards == 0
+    assert published(hub) == whole
+    assert sum(whole[name] != b"" for name in whole) and len(dataset(hub).commits) > before
+
+
+def test_lost_staging_makes_the_same_shards_and_uploads_none_again(
+    toy_arm, toy_recording, hub, whole
+) -> None:
+    run(toy_arm, toy_recording)
+    before = len(dataset(hub).commits)
+    shutil.rmtree(cache_folder() / "staging")
+    run(toy_arm, toy_recording)
+    assert published(hub) == whole and len(dataset(hub).commits) == before
+
+
+def test_another_conversion_is_refused_before_anything_is_made_and_overwrite_replaces_it(
+    toy_arm, toy_recording, hub, whole
+) -> None:
+    run(toy_arm, toy_recording, replace(SMALL, seed=3, shard_frames=30))
+    dataset(hub).commit({"README.md": b"# mine"})
+    shutil.rmtree(cache_folder() / "staging")
+    with pytest.raises(OutputError, match=f"{OUT}: belongs to another conversion; different: settings"):
+        run(toy_arm, toy_recording)
+    assert not list((cache_folder() / "staging").rglob("shard-*"))
+    run(toy_arm, toy_recording, overwrite=True)
+    assert published(hub) == whole
+    assert dataset(hub).files["README.md"] == b"# mine"
+
+
+def test_no_token_and_no_rights_are_clear_errors(toy_arm, toy_recording, hub, monkeypatch) -> None:
+    monkeypatch.delenv("HF_TOKEN")
+    with pytest.raises(HubError, match=f"{OUT}: needs a token to be written — log in with hf auth login"):
+        run(toy_arm, toy_recording)
+    monkeypatch.setenv("HF_TOKEN", "reader")
+    with pytest.raises(StorageError, match="403.*with a token that may write"):
+        run(toy_arm, toy_recording)
+
+
+def test_what_a_hub_cannot_take_is_told(toy_arm, toy_recording, hub) -> None:
+    with pytest.raises(OutputError, match="names no dataset of the hub"):
+        run(toy_arm, toy_recording, out="hf://team/arm")
+    with pytest.raises(OutputError, match="one whole hma convert only"):
+        convert_share(toy_arm, str(toy_recording), BlockTokenizer(), Path(OUT), Share(0, 2), settings=SMALL)
