@@ -7,8 +7,8 @@ from hma_data.errors import HMAError
 from hma_model.config import ActionSpace
 from hma_model.model import HMA
 from hma_model.stem import Normalizer
-from hma_model.trunk import rotary_angles, rotate, rotate_qkv
-from tests.model.network_parts import ARM, HAND, small_batch, small_model
+from hma_model.trunk import MLP, rotary_angles, rotate, rotate_qkv
+from tests.model.network_parts import ARM, HAND, small_batch, small_config, small_model
 
 LAYOUTS = [
     {"conditioning": ("modulation",)},
@@ -186,6 +186,16 @@ def test_absent_chunks_are_not_read() -> None:
         batch.actions[:, 1:3] = float("nan")
         two = model.video_logits(batch.tokens, batch.actions, "arm", batch.action_mask)
     assert torch.equal(one, two)
+
+
+def test_what_an_mlp_computes_again_gives_the_gradients_of_its_formula() -> None:
+    mlp = MLP(small_config())
+    x = torch.randn(2, 3, 32, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    plain = mlp.fc2(torch.nn.functional.gelu(mlp.fc1(x)))
+    found, expected = (
+        torch.autograd.grad(out.square().sum(), [x, *mlp.parameters()]) for out in (mlp(x), plain)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(found, expected))
 
 
 def test_checkpointed_blocks_give_the_same_gradients() -> None:
