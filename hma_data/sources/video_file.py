@@ -222,7 +222,7 @@ class VideoFile:
 
     def _decode_up_to(self, index: int) -> Any:
         for frame in self._decoder:
-            self._spoilt = frame.is_corrupt or (self._spoilt and not frame.key_frame)
+            self._spoilt = is_spoilt(frame, self._spoilt)
             found = self._next if self._counts else self._index_of(frame)
             if found == self._entry and self.table.codec in _REFRESHED and frame.pict_type != _INTRA:
                 self._seeks = False  # a refresh spread over many frames: what follows is not whole
@@ -272,6 +272,16 @@ class VideoFile:
         picture: Images = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
         quarters = round(frame.rotation / 90) % 4  # a telephone's way to say it was held upright
         return np.ascontiguousarray(np.rot90(picture, quarters)) if quarters else picture
+
+
+def is_spoilt(frame: Any, before: bool) -> bool:
+    """Whether a decoded frame is damaged, or may be made from one that is.
+
+    Args:
+        frame: PyAV's.
+        before: the same of the frame that was decoded before it.
+    """
+    return bool(frame.is_corrupt or (before and not frame.key_frame))
 
 
 @contextmanager

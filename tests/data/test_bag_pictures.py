@@ -5,13 +5,16 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.pictures import picture
+from hma_data.sources.bags.video import VideoDecoder
 from tests.data.bag_files import SOURCE, arm, read
+from tests.data.test_video_kinds import make
 
 
 def image(encoding: str, data: np.ndarray, width: int, height: int, step: int) -> dict[str, Any]:
@@ -248,6 +251,29 @@ def test_an_episode_that_begins_between_key_frames_is_decoded_from_the_one_befor
         found = SOURCE.read(str(tmp_path / "v.mcap"), refs[i].id, parted).streams["cam"]
         assert found.timestamps.tolist() == [1 + i]
         np.testing.assert_array_equal(found.frames([0])[0], whole[i])
+
+
+def test_frames_made_from_a_damaged_message_are_refused_up_to_the_next_keyframe(tmp_path: Path) -> None:
+    made, group, hit = make(tmp_path / "v.h264", "libx264", {"crf": "4", "bf": "0"}, gop=13), 13, 6
+    with av.open(str(made)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    keyframes = np.arange(len(packets)) % group == 0
+    spoilt = bytearray(packets[hit])
+    spoilt[12:] = np.random.default_rng(0).integers(0, 256, len(spoilt) - 12, np.uint8).tobytes()
+    damaged = [*packets[:hit], bytes(spoilt), *packets[hit + 1 :]]
+
+    def decoder(messages: list[bytes]) -> VideoDecoder:
+        return VideoDecoder("h264", keyframes, lambda start: iter(messages[start:]), "v.mcap /video")
+
+    whole = decoder(packets).frames(range(len(packets)))
+    going_on = decoder(damaged)
+    for i in range(len(packets)):
+        for asked in (going_on, decoder(damaged)):
+            if hit <= i < group:
+                with pytest.raises(EpisodeError, match=f"frame {i} of the video is damaged"):
+                    asked.frames([i])
+            else:
+                np.testing.assert_array_equal(asked.frames([i])[i], whole[i])
 
 
 @pytest.mark.parametrize(

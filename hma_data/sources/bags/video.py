@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError
+from hma_data.sources.video_file import is_spoilt
 from hma_data.video import MAX_PIXELS, Images
 
 CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}  # Foxglove's and FFmpeg's names
@@ -78,7 +79,8 @@ class VideoDecoder:
         self._context: Any = None
         self._next = 0  # message the decoder takes next
         self._taken = -1  # last picture given out
-        self._ready: dict[int, Any] = {}  # decoded, not given out
+        self._ready: dict[int, Any] = {}  # decoded, not given out; None for a damaged one
+        self._spoilt = False  # whether the last one decoded, or one it may be made from, is damaged
 
     def frames(self, indices: Sequence[int]) -> dict[int, Images]:
         """Picture (H, W, 3) of each of those indices.
@@ -95,9 +97,15 @@ class VideoDecoder:
             while index not in self._ready:
                 packets = packets or self._fetch(self._next)
                 self._decode(next(packets, None), index)
-            found[index] = self._ready[index].to_ndarray(format="rgb24")
+            frame = self._ready[index]
             self._ready = {i: frame for i, frame in self._ready.items() if i >= index}
             self._taken = index
+            if frame is None:
+                raise EpisodeError(
+                    self._where,
+                    f"frame {index} of the video is damaged, or one before it that it is made from",
+                )
+            found[index] = frame.to_ndarray(format="rgb24")
         return found
 
     def _must_begin(self, index: int) -> bool:
@@ -109,7 +117,7 @@ class VideoDecoder:
 
         self._context = av.CodecContext.create(CODECS[self._codec], "r")
         self._context.thread_count = 1
-        self._ready = {}
+        self._ready, self._spoilt = {}, False
         self._next = int(np.flatnonzero(self._keyframes[: index + 1])[-1])
         self._taken = self._next - 1
 
@@ -134,5 +142,6 @@ class VideoDecoder:
         for frame in frames:
             if frame.width * frame.height > MAX_PIXELS:
                 raise EpisodeError(self._where, f"the video claims {frame.width}×{frame.height} pixels")
+            self._spoilt = is_spoilt(frame, self._spoilt)
             if frame.pts is not None:
-                self._ready[frame.pts] = frame
+                self._ready[frame.pts] = None if self._spoilt else frame
