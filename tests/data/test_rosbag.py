@@ -31,6 +31,7 @@ from tests.data.bag_files import (
     read,
     write_ros1,
 )
+from tests.data.hub_cache import as_snapshot
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -286,6 +287,20 @@ def test_a_link_out_of_the_folder_is_refused(bags: dict[str, Path], tmp_path: Pa
     (folder / "run.db3").symlink_to(bags["ros2-sqlite3"] / "run.db3")
     with pytest.raises(EpisodeError, match="link to a file outside"):
         read(folder, arm())
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2-mcap", "ros2-sqlite3", "ros2-sqlite3-file-zstd"])
+def test_links_of_the_hub_cache_are_followed(
+    bags: dict[str, Path], recording: Recording, kind: str, tmp_path: Path
+) -> None:
+    place = tmp_path / "set" / bags[kind].name
+    place.parent.mkdir()
+    (shutil.copytree if bags[kind].is_dir() else shutil.copy)(bags[kind], place)
+    snapshot = as_snapshot(place.parent, tmp_path / "cache")
+    for uri in (snapshot, snapshot / place.name):
+        ref = SOURCE.index(str(uri), arm())[0]
+        episode = SOURCE.read(str(uri), ref.id, arm())
+        np.testing.assert_array_equal(episode.streams["front"].frames([0, 9]), recording.pictures[[0, 9]])
 
 
 def test_a_ros2_folder_in_several_files_is_one_episode(tmp_path: Path, recording: Recording) -> None:

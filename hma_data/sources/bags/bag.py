@@ -27,7 +27,7 @@ from hma_data.sources.bags.mcap_records import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.ros1 import Ros1File
 from hma_data.sources.bags.sqlite import MAGIC as SQLITE_MAGIC
 from hma_data.sources.bags.sqlite import SqliteFile
-from hma_data.sources.base import file_fingerprint, first_bytes
+from hma_data.sources.base import file_fingerprint, first_bytes, leaves
 from hma_data.yaml_io import read_yaml
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -223,7 +223,7 @@ def _is_bag_file(path: Path) -> bool:
 
 def _refuse_link(path: Path, root: Path) -> None:
     folder = root if root.is_dir() else root.parent
-    if root != path and not path.resolve().is_relative_to(folder.resolve()):
+    if root != path and leaves(path, folder):
         raise EpisodeError(
             path, "is a link to a file outside its folder", "copy the file in, or name it itself"
         )
