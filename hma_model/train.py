@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from hma_data.errors import UsageError
+from hma_data.errors import OutputError, UsageError
 from hma_model import checkpoint as checkpoints
 from hma_model.parallel import World, join
 from hma_model.recipe import Recipe
@@ -85,6 +85,21 @@ def train(
     if out is None and recipe.out is None:
         raise UsageError("out", "is not given", "name the run's folder with --out or out=DIR")
     folder = Path(out or recipe.out or "")
+    try:
+        return _trained(recipe, folder, on_progress, show, force)
+    except OSError as fault:
+        where, why = fault.filename or folder, fault.strerror or str(fault)
+        remedy = "free space or choose another folder; checkpoints that are there are intact"
+        raise OutputError(where, f"cannot be written: {why}", remedy) from fault
+
+
+def _trained(
+    recipe: Recipe,
+    folder: Path,
+    on_progress: Callable[[dict[str, Any]], None] | None,
+    show: bool,
+    force: bool,
+) -> TrainResult:
     device = choose_device(recipe.device)
     cuda = [device] if device.type == "cuda" else []
     with join(device) as world, ExitStack() as stack, torch.random.fork_rng(devices=cuda):

@@ -206,6 +206,9 @@ class Run:
             with self._autocast():
                 batch = self._past(number, batch)
                 output = self.spread(batch, generator=generator)
+            if not output.loss.requires_grad:
+                fault = f"nothing that may learn takes part in the objective {output.objective}"
+                raise RecipeError("recipe: freeze", fault, "use freeze=nothing, or another objective")
             (output.loss / len(self.feed.own)).backward()
         return output
 

@@ -136,6 +136,24 @@ def test_a_disk_that_takes_no_more_bytes_is_one_error(recipe, tmp_path):
     assert checkpoint.resolve(tmp_path / "run").name == "step-00000002"
 
 
+@pytest.mark.parametrize("writer", ["trainer", "runlog", "report"])
+def test_whatever_cannot_be_written_is_one_error(recipe, tmp_path, monkeypatch, writer):
+    def write(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(f"hma_model.{writer}.write_atomic", write)
+    with pytest.raises(OutputError, match="cannot be written: No space left on device"):
+        train(recipe(report=True, steps=1), out=tmp_path / "run", show=False)
+
+
+def test_a_step_in_which_nothing_may_learn_is_said(recipe, tmp_path):
+    skipping = recipe(steps=1, model={**TINY["model"], "absent_action": "skip"})
+    base = train(skipping, out=tmp_path / "a", show=False)
+    frozen = recipe(start=str(base.out), freeze="trunk", objectives={"passive": 1}, model={})
+    with pytest.raises(RecipeError, match="nothing that may learn takes part in the objective passive"):
+        train(frozen, out=tmp_path / "b", show=False)
+
+
 @pytest.mark.parametrize("place", ["file/run", "run"])
 def test_a_folder_that_cannot_be_written_is_said(recipe, tmp_path, place, monkeypatch):
     (tmp_path / "file").write_text("a file")
