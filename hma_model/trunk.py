@@ -7,7 +7,9 @@ past frames can be kept (`cache`).
 B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers, R cache slots.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -127,6 +129,18 @@ def rotate_qkv(
     return q, k, v
 
 
+def light(function: Callable[..., Tensor], *inputs: Any) -> Tensor:
+    """Call a function that ends in a product, keeping for the backward pass no more than its inputs.
+
+    What leads to the product is computed again there; the product is not, since the recomputation ends when
+    what the backward pass wants is there.
+    """
+    if not torch.is_grad_enabled():
+        return function(*inputs)
+    out: Tensor = checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
+    return out
+
+
 class Attention(nn.Module):
     """Projections around scaled dot-product attention."""
 
@@ -141,10 +155,10 @@ class Attention(nn.Module):
         self.k_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
 
     def project(
-        self, x: Tensor, rotary: tuple[Tensor, Tensor] | None, within: bool = False
+        self, x: Tensor, norm: nn.Module, rotary: tuple[Tensor, Tensor] | None, within: bool = False
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(..., length, D), or `within` frames (..., T, N, D) -> three times (..., heads, head_dim)."""
-        qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1))
+        qkv = light(lambda x: self.qkv(norm(x)), x).unflatten(-1, (3, self.heads, -1))
         if rotary is not None and not self.normed:
             return rotate_qkv(qkv, rotary, within)
         q, k, v = qkv.unbind(-3)
@@ -169,17 +183,17 @@ class TemporalAttention(Attention):
         super().__init__(config)
         self.rotary = config.time_position == "rotary"
 
-    def forward(self, x: Tensor, clock: Clock, cache: LayerCache | None) -> Tensor:
-        """(B, T, N, D) -> the same shape."""
+    def forward(self, x: Tensor, norm: nn.Module, clock: Clock, cache: LayerCache | None) -> Tensor:
+        """(B, T, N, D), to be normed -> the same shape."""
         rotary = clock.rotary if self.rotary else None
         if cache is not None:
-            q, k, v = self.project(x, rotary, within=True)
+            q, k, v = self.project(x, norm, rotary, within=True)
             assert clock.slots is not None
             for values, kept in zip((k, v), cache.time):
                 kept.index_copy_(0, clock.slots, values.transpose(0, 1))
             return self.proj(self._recall(q, clock, cache.time))
         b, t, n, width = x.shape
-        q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), rotary)
+        q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), norm, rotary)
         mask = None if clock.causal else clock.allowed
         return self.merge(q, k, v, mask, clock.causal).view(b, n, t, width).transpose(1, 2)
 
@@ -243,14 +257,12 @@ class MLP(nn.Module):
         self.fc2 = nn.Linear(hidden, config.width, bias=config.mlp_bias)
         self.dropout = nn.Dropout(config.dropout)
 
-    def forward(self, x: Tensor) -> Tensor:
-        hidden = self.fc1(x)
-        if self.dropout.p or not torch.is_grad_enabled():
+    def forward(self, x: Tensor, norm: nn.Module) -> Tensor:
+        """(..., D), to be normed -> the same shape."""
+        hidden = light(lambda x: self.fc1(norm(x)), x)
+        if self.dropout.p:
             return self.dropout(self._out(hidden))
-        # The largest activation is not kept but computed again: the product after it is not, since the
-        # recomputation ends when what the backward pass wants is there.
-        out: Tensor = checkpoint(self._out, hidden, use_reentrant=False, preserve_rng_state=False)
-        return out
+        return light(self._out, hidden)
 
     def _out(self, hidden: Tensor) -> Tensor:
         return self.fc2(self.dropout(F.gelu(hidden)))
@@ -281,16 +293,16 @@ class Block(nn.Module):
         self, x: Tensor, conditioning: Conditioning, layer: int, clock: Clock, cache: LayerCache | None
     ) -> Tensor:
         """(B, T, N, D) -> the same shape."""
-        frames = self.space_norm(x).flatten(0, 1)
-        x = x + self.space.merge(*self.space.project(frames, None)).view(x.shape)
+        qkv = self.space.project(x.flatten(0, 1), self.space_norm, None)
+        x = x + self.space.merge(*qkv).view(x.shape)
         if self.adds and conditioning.embedding is not None:
             x = x + conditioning.embedding.unsqueeze(2)
         if conditioning.modulation is not None:
-            x = x + self.modulate(x, conditioning, layer)
+            x = x + light(self.modulate, x, conditioning, layer)
         if self.action is not None and conditioning.embedding is not None:
             x = x + self.action(self.action_norm(x), conditioning.embedding, clock, cache)
-        x = x + self.time(self.time_norm(x), clock, cache)
-        return x + self.mlp(self.mlp_norm(x))
+        x = x + self.time(x, self.time_norm, clock, cache)
+        return x + self.mlp(x, self.mlp_norm)
 
     def modulate(self, x: Tensor, conditioning: Conditioning, layer: int) -> Tensor:
         """The modulated norm of all tokens, projected."""

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from hma_data.errors import HMAError
 from hma_model.config import ActionSpace
@@ -189,13 +190,28 @@ def test_absent_chunks_are_not_read() -> None:
 
 
 def test_what_an_mlp_computes_again_gives_the_gradients_of_its_formula() -> None:
-    mlp = MLP(small_config())
+    mlp, norm = MLP(small_config()), torch.nn.LayerNorm(32)
     x = torch.randn(2, 3, 32, generator=torch.Generator().manual_seed(0), requires_grad=True)
-    plain = mlp.fc2(torch.nn.functional.gelu(mlp.fc1(x)))
-    found, expected = (
-        torch.autograd.grad(out.square().sum(), [x, *mlp.parameters()]) for out in (mlp(x), plain)
-    )
+    plain = mlp.fc2(torch.nn.functional.gelu(mlp.fc1(norm(x))))
+    inputs = [x, *norm.parameters(), *mlp.parameters()]
+    found, expected = (torch.autograd.grad(out.square().sum(), inputs) for out in (mlp(x, norm), plain))
     assert all(torch.equal(a, b) for a, b in zip(found, expected))
+
+
+def test_no_product_is_computed_again() -> None:
+    model = small_model(conditioning=("modulation",)).train()
+    batch = small_batch(model.config, ["arm"])
+    with FlopCounterMode(display=False) as forward:
+        loss = model(batch, generator=torch.Generator().manual_seed(0)).loss
+    with FlopCounterMode(display=False) as backward:
+        loss.backward()
+    products = ("aten.addmm", "aten.mm", "aten.bmm", "aten.baddbmm")
+
+    def count(counter: FlopCounterMode) -> int:
+        found = counter.get_flop_counts()["Global"]
+        return sum(value for name, value in found.items() if str(name) in products)
+
+    assert count(backward) <= 2 * count(forward)
 
 
 def test_checkpointed_blocks_give_the_same_gradients() -> None:
