@@ -57,7 +57,7 @@ def head_stamp(channel: Channel) -> Callable[[Data], int] | None:
 def _head_stamp(channel: Channel) -> Callable[[Data], int] | None:
     if channel.encoding not in ("ros1", "cdr"):
         return None
-    store, kind = _ros_store(channel)
+    store, kind = ros_store(channel)
     fields = [(name, spec[1]) for name, spec in store.fielddefs[kind][1]]
     at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes on its encoding
     if fields and fields[0] == ("header", "std_msgs/msg/Header"):
@@ -101,13 +101,13 @@ def _decoder(channel: Channel) -> Decode:
 def _ros_decoder(channel: Channel) -> Decode:
     from rosbags.serde import SerdeError
 
-    store, kind = _ros_store(channel)
+    store, kind = ros_store(channel)
     read = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
     return _telling(partial(read, typename=kind), SerdeError)
 
 
 @lru_cache(maxsize=256)
-def _ros_store(channel: Channel) -> tuple[Any, str]:
+def ros_store(channel: Channel) -> tuple[Any, str]:
     """A store that knows the channel's type, and its name there."""
     from rosbags.typesys import Stores, TypesysError, get_typestore
     from rosbags.typesys.msg import normalize_msgtype

@@ -17,6 +17,7 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources import looks
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.dtypes import stated_dtype
 from hma_data.sources.bags.fields import Field, parse_key
 from hma_data.sources.bags.messages import child, decode, field_names, is_list, is_message, numbers
 from hma_data.sources.bags.pictures import VIDEO, codec, is_grey, picture_kind
@@ -224,7 +225,7 @@ class _Telling:
         clock = clock_of(times) if topic.track.topic in LOGS else self._times(topic, times, bool(kind))
         found: list[KeyInfo] = []
         if not topic.fault:
-            found = [self._camera(topic, kind)] if kind else _values(topic.track.topic, topic.sample)
+            found = [self._camera(topic, kind)] if kind else _recorded(topic)
         found = found or [KeyInfo(topic.track.topic, "other", (), stated.type or stated.encoding)]
         for value in topic.values:
             value.hand_on(self._survey, self._name)
@@ -304,6 +305,20 @@ def _about(topic: _Topic, times: Floats, kind: str) -> TopicInfo:
     )
 
 
+def _recorded(topic: _Topic) -> list[KeyInfo]:
+    """The keys of a topic without pictures, with the dtypes their definition states."""
+    name, channel = topic.track.topic, topic.track.channels[0]
+    found = _values(name, topic.sample)
+    if channel.encoding == "json":
+        return found
+    steps = [parse_key(key.key, (name,), name).steps for key in found]
+    stated = [stated_dtype(channel, topic.sample, path) for path in steps]
+    return [
+        replace(key, dtype=dtype) if dtype and key.kind == "vector" else key
+        for key, dtype in zip(found, stated, strict=True)
+    ]
+
+
 def _values(key: str, value: Any) -> list[KeyInfo]:
     """What a YAML could name at or below that key."""
     if isinstance(value, str):
@@ -347,7 +362,9 @@ def _vector(key: str, value: Any) -> list[KeyInfo]:
         count = len(numbers(value))
     except TypeError:
         return []
-    dtype = str(value.dtype) if isinstance(value, np.ndarray) else "float64"
+    dtype = "bool" if isinstance(value, bool) else "float64"
+    if isinstance(value, np.ndarray | np.generic):
+        dtype = str(value.dtype)
     return [KeyInfo(key, "vector", (count,), dtype)] if count else []
 
 
