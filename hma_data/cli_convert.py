@@ -218,6 +218,7 @@ def _planned(
 ) -> bool:
     from hma_data.convert import plan_conversion
     from hma_data.estimate import estimate
+    from hma_data.store import place
     from hma_data.tokenizers.base import get_tokenizer
 
     robot = _robot(job)
@@ -229,7 +230,7 @@ def _planned(
     ]
     facts = {
         "source": uri,
-        "out": str(job.out),
+        "out": str(place(job.out)),
         "episodes": plan.episodes,
         "frames": plan.frames,
         "bytes": cost.bytes,

@@ -106,11 +106,14 @@ def shards_verify(
     Example: hma shards verify shards/my_arm
     """
     from hma_data.shards.verify import verify
+    from hma_data.store import place
 
     found = {}
     with progress("verify", unit="MB") as update:
         for folder in folders:
-            found[str(folder)] = verify(folder, workers=workers, quick=quick, on_progress=_in(update, 1e6))
+            found[str(place(folder))] = verify(
+                folder, workers=workers, quick=quick, on_progress=_in(update, 1e6)
+            )
     if json:
         print_json(found)
     else:
