@@ -21,6 +21,7 @@ from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.findings import Finding
+from hma_data.sources.links import nothing_there
 from hma_data.spec import Vector
 
 FORMATS = {
@@ -212,8 +213,9 @@ def detect(uri: str) -> str:
             return "hdf5"
     if any(item.suffix.lower() in VIDEO_SUFFIXES for item in files):
         return "hands"
-    raise SourceError(
+    raise nothing_there(
         uri,
+        path,
         "is not a recording of a known format" if files else "holds no files",
         "expected RLDS (features.json, *.tfrecord*), HDF5, a ROS bag or MCAP, "
         "a LeRobotDataset (meta/info.json), or videos of hands",

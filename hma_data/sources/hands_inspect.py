@@ -6,12 +6,13 @@ import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError, MissingDependencyError
 from hma_data.sources import clocks, looks
-from hma_data.sources.base import Inspection, KeyInfo
+from hma_data.sources.base import Inspection, KeyInfo, local_path
 from hma_data.sources.findings import Finding
 from hma_data.sources.hands_layout import Header, Video, header_of, videos_of
 from hma_data.sources.hands_models import load_models
 from hma_data.sources.hands_runs import POINTS
 from hma_data.sources.hands_scan import scan
+from hma_data.sources.links import unfollowed
 from hma_data.sources.survey import Survey, sampled
 from hma_data.sources.video_file import VideoFile
 
@@ -23,6 +24,8 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     """See HandsSource.inspect."""
     videos = videos_of(uri)
     survey = Survey(len(videos))
+    for link in unfollowed(local_path(uri)):
+        survey.note(link)
     headers: dict[str, Header] = {}
     for name, video in videos.items():
         try:

@@ -31,6 +31,7 @@ from pathlib import Path, PurePosixPath
 from hma_data.embodiment import Embodiment
 from hma_data.errors import EpisodeError, RegistryError, SourceError
 from hma_data.sources.base import VIDEO_SUFFIXES, leaves, local_path
+from hma_data.sources.links import nothing_there
 
 LABELS = ("detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose")
 _CHOICES = {
@@ -151,7 +152,7 @@ def videos_of(uri: str) -> dict[str, Video]:
                 )
             paths[path.relative_to(root).as_posix()] = path
     if not paths:
-        raise SourceError(uri, "holds no videos", f"looked for {', '.join(VIDEO_SUFFIXES)}")
+        raise nothing_there(uri, root, "holds no videos", f"looked for {', '.join(VIDEO_SUFFIXES)}")
     short = Counter(alias for name in paths for alias in _short_names(name))
     return {
         name: Video(paths[name], name, _aliases(name, short)) for name in sorted(paths, key=natural_order)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.sources import clocks, looks
-from hma_data.sources.base import Inspection, KeyInfo
+from hma_data.sources.base import Inspection, KeyInfo, local_path
 from hma_data.sources.facts import is_times, one_channel, seconds_a_unit, seconds_of
 from hma_data.sources.findings import Finding
 from hma_data.sources.hdf5 import TEXT_KEYS, as_rgb, encoded, environment, picture_kind
@@ -28,6 +28,7 @@ from hma_data.sources.hdf5_file import (
     walk,
 )
 from hma_data.sources.hdf5_layout import WHOLE_FILE, Place, Places
+from hma_data.sources.links import unfollowed
 from hma_data.sources.survey import MAX_VALUES, Survey, listed, sampled
 from hma_data.video import decode_image
 
@@ -58,6 +59,8 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
     order = list(found)
     chosen = {order[i] for i in sampled(len(order), episodes)}
     survey, first = Survey(len(order)), _First()
+    for link in unfollowed(local_path(uri)):
+        survey.note(link)
     lengths: dict[str, int] = {}
     held: Counter[str] = Counter()
     pairs = max(1, looks.PAIRS // len(chosen))

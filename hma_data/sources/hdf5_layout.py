@@ -17,6 +17,7 @@ from hma_data.embodiment import Embodiment
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import leaves, local_path
 from hma_data.sources.hdf5_file import OpenFiles, child, explained, member
+from hma_data.sources.links import nothing_there
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
 PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
@@ -236,5 +237,5 @@ def _stems(uri: str) -> dict[str, Path]:
             raise SourceError(file, f"has the name of {found[stem].name} but for its suffix", "rename one")
         found[stem] = file
     if not found:
-        raise SourceError(uri, "holds no HDF5 files", f"looked for {', '.join(SUFFIXES)}")
+        raise nothing_there(uri, path, "holds no HDF5 files", f"looked for {', '.join(SUFFIXES)}")
     return found

@@ -21,6 +21,7 @@ from hma_data.sources.bags.pictures import picture_kind
 from hma_data.sources.bags.reading import Reading
 from hma_data.sources.bags.report import report
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, local_path
+from hma_data.sources.links import nothing_there
 from hma_data.spec import Segments
 
 PART = re.compile(r"[0-9]{4,9}")
@@ -81,7 +82,8 @@ class RosbagSource:
 def _bags(uri: str) -> dict[str, Path]:
     bags = find_bags(local_path(uri))
     if not bags:
-        raise SourceError(uri, "holds no bags", "expected .bag, .mcap, .db3, or folders with a metadata.yaml")
+        remedy = "expected .bag, .mcap, .db3, or folders with a metadata.yaml"
+        raise nothing_there(uri, local_path(uri), "holds no bags", remedy)
     return bags
 
 

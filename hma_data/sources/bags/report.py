@@ -26,6 +26,7 @@ from hma_data.sources.bags.track import Track
 from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
 from hma_data.sources.clocks import Clock, clock_of, skew
 from hma_data.sources.findings import Finding
+from hma_data.sources.links import unfollowed
 from hma_data.sources.survey import Survey, sampled
 
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
@@ -110,6 +111,8 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
         SourceError: none of them can be read.
     """
     survey = Survey(len(bags), alone=len(bags) == 1, by_field=True)
+    for link in unfollowed(root, set(bags.values())):
+        survey.note(link)
     counted: dict[str, Counter[Channel]] = {}
     opened: dict[str, Bag] = {}
     for name, path in bags.items():
