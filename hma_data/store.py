@@ -17,8 +17,6 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from hma_data.errors import HMAError, MissingDependencyError, StorageAwayError, StorageError
 from hma_data.retry import worth_another_try
 from hma_data.sources.fetching import ABSENT, may_pass, said
@@ -384,7 +382,9 @@ def parquet_input(path: Path) -> Any:
     return RangeFile(path) if isinstance(path, RemotePath) else path
 
 
-def parquet_file(path: Path, **options: Any) -> pq.ParquetFile:
-    """Open a parquet file wherever it is; of a remote one, the bytes of a row group come in few requests."""
+def parquet_file(path: Path, **options: Any) -> Any:
+    """A pyarrow ParquetFile wherever it is; of a remote one, a row group's bytes come in few requests."""
+    import pyarrow.parquet as pq
+
     remote = is_remote(path)
     return pq.ParquetFile(parquet_input(path), pre_buffer=remote, **options)

@@ -104,7 +104,11 @@ def prepare(
 
 
 def prepared(
-    stream: Stream, indices: Sequence[int], camera: Camera, size: int, resize_filter: Filter = "area"
+    stream: Stream,
+    indices: Sequence[int] | NDArray[np.int64],
+    camera: Camera,
+    size: int,
+    resize_filter: Filter = "area",
 ) -> Images:
     """Pictures of a stream -> (n, size, size, 3) RGB, as `prepare` makes them of `stream.frames`.
 

@@ -66,7 +66,7 @@ def test_a_robot_goes_from_a_recording_to_the_hub_by_its_yaml_alone(
     assert facts["totals"]["episodes"] == 3 and facts["totals"]["quarantined"] == 0
     run("train", "discrete_tiny", "data=[shards]", *TINY, "--out", "run")
     run("hub", "push", "run", "my-hub/team/model", "-e", "friday")
-    (row,) = json.loads(run("hub", "list", "my-hub/team/model", "--json"))
+    (row,) = json.loads(run("hub", "list", "my-hub/team/model", "--json"))["embodiments"]
     assert "friday" in row.values()
     run("hub", "pull", "my-hub/team/model", "-e", "friday", "--out", "pulled")
     assert (tmp_path / "pulled/embodiments/friday/embodiment.yaml").is_file()
