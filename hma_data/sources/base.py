@@ -36,6 +36,12 @@ VIDEO_SUFFIXES = (
     ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".ogv", ".flv", ".gif",
 )  # fmt: skip
 
+PACKED = {  # what unpacks a file, by the end of its name
+    ".tar": "tar xf", ".tar.gz": "tar xf", ".tgz": "tar xf", ".tar.bz2": "tar xf", ".tar.xz": "tar xf",
+    ".tar.zst": "tar xf", ".zip": "unzip", ".7z": "7z x", ".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz",
+    ".zst": "unzstd", ".zstd": "unzstd", ".lz4": "unlz4",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class EpisodeRef:
@@ -217,9 +223,19 @@ def detect(uri: str) -> str:
         uri,
         path,
         "is not a recording of a known format" if files else "holds no files",
-        "expected RLDS (features.json, *.tfrecord*), HDF5, a ROS bag or MCAP, "
+        _unpack_first(files)
+        or "expected RLDS (features.json, *.tfrecord*), HDF5, a ROS bag or MCAP, "
         "a LeRobotDataset (meta/info.json), or videos of hands",
     )
+
+
+def _unpack_first(files: Sequence[Path]) -> str:
+    """What to do about the first packed file; empty where none is."""
+    for file in files:
+        for suffix, tool in PACKED.items():
+            if file.name.lower().endswith(suffix):
+                return f"{file.name} is packed: unpack it first, as with `{tool} {file.name}`"
+    return ""
 
 
 def _names_a_dataset(uri: str) -> bool:
