@@ -1,6 +1,5 @@
 """What is in RLDS folders, without an embodiment: keys, lengths, what looks wrong."""
 
-import logging
 import math
 
 from hma_data.errors import EpisodeError, SourceError
@@ -13,8 +12,6 @@ from hma_data.sources.survey import Survey, sampled
 from hma_data.sources.tfds_folder import Folder, open_folder
 
 INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20  # whose lengths are told
-
-log = logging.getLogger(__name__)
 
 
 def inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
@@ -32,7 +29,7 @@ def inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
     lengths, first = _survey(folder, refs, chosen, survey)
     if first is None:
         raise SourceError(uri, f"holds no readable episode: {_why(survey, folder)}", "copy its files again")
-    keys = tuple(survey.key(key_info(first, key)) for key in folder.step_features)
+    keys = tuple(survey.key(_key_info(first, key, survey)) for key in folder.step_features)
     return Inspection(
         format="rlds",
         uri=uri,
@@ -118,8 +115,8 @@ def facts(folder: Folder) -> dict[str, str]:
     return {name: value for name, value in found.items() if value}
 
 
-def key_info(steps: Steps, key: str) -> KeyInfo:
-    """One key as this episode holds it."""
+def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
+    """One key as this episode holds it; as features.json states it where it cannot be read."""
     feature = steps.features[key]
     shape = tuple(size or 0 for size in (*feature.nesting[1:], *feature.shape))
     kind, codec = "other", None
@@ -134,7 +131,10 @@ def key_info(steps: Steps, key: str) -> KeyInfo:
             shape = steps.numbers(key).shape[1:]
             kind = "vector" if math.prod(shape) <= MAX_VECTOR else "other"
     except EpisodeError as fault:
-        log.warning("%s", fault)  # listed as features.json states it
+        if feature.kind == "number" and feature.width is None:  # of any length, which is no fault
+            survey.note(Finding("rows", "info", str(fault), key=key))
+        else:
+            survey.fault(f"{steps.name} {key}", fault)
     return KeyInfo(key, kind, shape, feature.dtype, codec=codec, count=steps.count)
 
 

@@ -159,6 +159,16 @@ def test_a_nested_sequence_of_one_length_is_a_vector_and_a_varying_one_is_refuse
         read(folder, "train/000000", numbers_only(key="found", dims=2))
 
 
+def test_inspect_tells_of_a_key_of_varying_length_as_a_finding(tmp_path, caplog, capsys):
+    steps = STEPS | {"found": sequence(tensor((), "int32"))}
+    stored = {"steps/found/ragged_flat_values": [1, 2, 3], "steps/found/ragged_row_lengths_0": [0, 3]}
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | stored]}, steps)
+    told = [one for one in RLDS.inspect(str(folder)).findings if one.key == "found"]
+    assert [(one.check, one.severity) for one in told] == [("rows", "info")]
+    assert "found varies from 0 to 3 entries a step" in told[0].message
+    assert not caplog.records and capsys.readouterr().err == ""
+
+
 def test_unpacked_lists_are_read_like_packed_ones():
     unpacked = b"\x0d" + struct.pack("<f", 1.5) + b"\x0a\x04" + struct.pack("<f", -2.0)
     feature = b"\x12" + bytes([len(unpacked)]) + unpacked
