@@ -6,9 +6,11 @@ whole or absent. Whatever engine runs it, the bytes are the same.
 
 import json
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +45,7 @@ from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.video import prepared
 
 BATCH = 32  # frames decoded and tokenized together
+BEAT_S = 20.0
 FATAL = (
     TokenizerError,
     OutputError,
@@ -114,7 +117,8 @@ def make_shard(
     if state_width:
         stats["state"] = Stats.empty(state_width)
 
-    with ShardWriter(job.out / unit.name, schema, tokenizer.spec) as writer:
+    with ExitStack() as committing:
+        writer = committing.enter_context(ShardWriter(job.out / unit.name, schema, tokenizer.spec))
         decoded = _decoded(job, unit, tokenizer, report, attempt)
         ahead = prefetch(decoded) if not attempt.number else decoded  # one at a time shows whose fault it is
         for item in _tokenized(ahead, tokenizer, report):
@@ -131,7 +135,26 @@ def make_shard(
             rows.append(_row(item, unit, start, writer.rows - start, len(cameras)))
             report(Tick(episodes=1))
         writer.close(Footer(job.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
+        with _signs_of_life(report):  # an upload may take longer than a hanging episode is waited for
+            committing.close()
     return Made(unit.name, writer.bytes, writer.sha256)
+
+
+@contextmanager
+def _signs_of_life(report: Report) -> Iterator[None]:
+    over = threading.Event()
+
+    def beat() -> None:
+        while not over.wait(BEAT_S):
+            report(Tick())
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 @dataclass

@@ -276,16 +276,16 @@ hma_data.convert.get_tokenizer = shard_work.get_tokenizer
 if __name__ == "__main__":
     summary = convert(
         Embodiment.from_yaml(ARM_YAML), sys.argv[1], "block", Path(sys.argv[2]), workers=2,
-        settings=Settings(val_fraction=0.2, shard_frames=60), limits=Limits(quiet_s=2, kills=50),
-        max_quarantine=1,
+        settings=Settings(val_fraction=0.2, shard_frames=60), max_quarantine=1,
+        limits=Limits(quiet_s=float(sys.argv[4]), kills=50),
     )
     print("made", summary.made_shards, flush=True)
 """
 
 
-def job(script: Path, recording: Path, out: Path, trouble: Path) -> subprocess.Popen:
+def job(script: Path, recording: Path, out: Path, trouble: Path, quiet_s: float = 120) -> subprocess.Popen:
     return subprocess.Popen(
-        [sys.executable, str(script), str(recording), str(out), str(trouble)],
+        [sys.executable, str(script), str(recording), str(out), str(trouble), str(quiet_s)],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         cwd=ROOT,
         stdout=subprocess.PIPE,
@@ -339,12 +339,12 @@ def test_an_episode_that_crashes_or_hangs_its_reader_is_refused_and_the_rest_kep
     kind: str, script: Path, toy_recording: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "trouble" / "demo_5").write_text(kind)
-    process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble")
+    process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble", 8)
     _, errors = process.communicate(timeout=100)
     assert process.returncode == 0, errors
     lines = [json.loads(line) for line in (tmp_path / "out" / "quarantine.jsonl").read_text().splitlines()]
     assert [line["id"] for line in lines] == ["demo_5"]
-    said = "made no progress for 2 s" if kind == "hang" else "ended the process by SIGSEGV"
+    said = "made no progress for 8 s" if kind == "hang" else "ended the process by SIGSEGV"
     assert said in lines[0]["message"]
     assert verify(tmp_path / "out") == []
     splits = Manifest.load(tmp_path / "out").splits
