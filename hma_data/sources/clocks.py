@@ -119,10 +119,12 @@ def findings(key: str, clock: Clock, camera: bool = False, episode: str = "") ->
         yield found("frames", said, lost=clock.lost, count=clock.count)
 
 
-def drift(key: str, measured_hz: float | None, stated_hz: float | None) -> Iterator[Finding]:
-    """Stamps that tick at another rate than the recording states."""
+def drift(
+    key: str, measured_hz: float | None, stated_hz: float | None, source: str = "the recording states"
+) -> Iterator[Finding]:
+    """Stamps that tick at another rate than the recording states, or than `source` says was measured."""
     if measured_hz and stated_hz and abs(measured_hz / stated_hz - 1) > DRIFT:
-        said = f"{key}: ticks at {measured_hz:.4g} Hz, the recording states {stated_hz:.4g}"
+        said = f"{key}: ticks at {measured_hz:.4g} Hz, {source} {stated_hz:.4g}"
         numbers = {"measured_hz": measured_hz, "stated_hz": stated_hz}
         yield Finding("rate", "warn", said, "frequency_hz is what the YAML says", key, numbers)
 

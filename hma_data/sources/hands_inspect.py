@@ -83,7 +83,8 @@ def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -
         file = VideoFile(video.path)
         survey.episode(name)
         clock = survey.times(name, "video", file.timestamps, camera=True)
-        for found in clocks.drift(f"{name}: video", clock.hz, header.hz or None):
+        source = "measured over its whole length"  # few containers state a rate
+        for found in clocks.drift(f"{name}: video", clock.hz, header.hz or None, source):
             survey.note(found)
         if header.frames and abs(len(file) - header.frames) > 1:
             said = f"{name}: holds {len(file):,} frames, its header states {header.frames:,}"

@@ -35,6 +35,7 @@ from hma_data.video import decode_image
 LENGTHS = 1_000  # episodes whose length is told and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
 _BESIDE = ("compress_len",)  # no rows over time: bytes of ALOHA's JPEGs, (cameras, T)
+_MEASURED = "measured from"
 _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
 
 
@@ -127,18 +128,20 @@ def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: in
                 if info.kind == "camera":
                     _pictures(name, key, item, info, survey, pairs)
                 elif info.kind == "vector" and item.size <= MAX_VALUES:
-                    _values(name, key, numbers(group, key, name), info, survey, first.rate)
+                    _values(name, key, numbers(group, key, name), info, survey, first)
         except HMAError as fault:
             survey.fault(where, fault)
 
 
-def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, stated_hz: float | None) -> None:
+def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, first: _First) -> None:
     survey.numbers(name, key, values)
     seconds = seconds_of(values) if is_times(key, info.shape) else None
     if seconds is not None:
         clock = survey.times(name, key, seconds)
         survey.made.add("rate")
-        for found in clocks.drift(f"{name}: {key}", clock.hz, stated_hz):
+        measured = first.facts["rate"].startswith(_MEASURED)
+        source = f"{first.name} at" if measured else "the recording states"
+        for found in clocks.drift(f"{name}: {key}", clock.hz, first.rate, source):
             survey.note(found)
 
 
@@ -215,7 +218,7 @@ def _rate(
         return stated, holder, ""
     measured = 1 / (float(np.median(np.diff(values.astype(np.float64)))) * unit)
     seconds = key if unit == 1.0 else ""
-    return (stated, holder, seconds) if stated else (measured, f"measured from {key}", seconds)
+    return (stated, holder, seconds) if stated else (measured, f"{_MEASURED} {key}", seconds)
 
 
 def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None, str]:

@@ -24,6 +24,7 @@ from hma_data.sources.hands_runs import (
     values_of,
 )
 from tests.data import hands_files as made
+from tests.data.test_video_kinds import make
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of
 
 LENGTH = 30
@@ -372,3 +373,10 @@ def test_a_folder_of_videos_is_recognised_and_inspected(folder: Path, monkeypatc
         found.episodes == 2 and found.frames == LENGTH and {key.key for key in found.keys[1:]} == set(POINTS)
     )
     assert "not looked for" in found.facts["hands"] and "broken.mp4" in found.problems[0]
+
+
+def test_a_rate_that_nothing_states_is_called_measured(folder: Path, monkeypatch) -> None:
+    monkeypatch.delenv("HMA_HAND_MODELS", raising=False)
+    make(folder / "a.mp4", "libx264", {}, times=[*range(20), *range(24, 30)])
+    (told,) = (one for one in open_source("hands").inspect(str(folder)).findings if one.check == "rate")
+    assert "a.mp4: video: ticks at 10 Hz, measured over its whole length " in told.message

@@ -194,6 +194,15 @@ def test_stamps_of_hdf5_are_checked_against_the_stated_rate(tmp_path: Path) -> N
     assert "timestamps: ticks at 20 Hz, the recording states 30" in said["rate"][0]
 
 
+def test_a_rate_measured_in_one_episode_is_not_called_stated(tmp_path: Path) -> None:
+    def stamp(file: h5py.File) -> None:
+        for hz, demo in zip((20, 30, 30), file["data"].values(), strict=True):
+            demo["timestamps"] = 1.7e9 + np.arange(len(demo["actions"])) / hz
+
+    told = damaged(tmp_path, stamp)["rate"]
+    assert told and all("timestamps: ticks at 30 Hz, demo_0 at 20" in one for one in told)
+
+
 def test_a_bag_tells_skew_and_lost_frames(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "run.bag", make_recording())
     inspection = open_source("rosbag").inspect(str(path))
