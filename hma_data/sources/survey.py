@@ -46,6 +46,7 @@ CHECKS = {  # what a look at a recording can check, in the order it is printed
 }
 LOSSY = ("jpeg", "h264", "av1", "hevc", "vp8", "vp9", "mpeg4", "mjpeg")
 SHOWN = 5  # faults and episodes named
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 MAX_VALUES = 20_000_000  # numbers of one key of an episode
 _COMMANDS = re.compile(r"(^|[^a-z])(actions?|commands?|cmd|ctrl|control|targets?)([^a-z]|$)")
 
@@ -264,6 +265,15 @@ class Survey:
                 said += f", in {held.episodes} episodes)" if held.episodes > 1 else ")"
                 yield Finding("finite", "warn", said, key=key,
                               numbers={"count": held.infinite, "values": held.values})  # fmt: skip
+            ends = np.array([*held.low, *held.high])
+            ends = ends[np.isfinite(ends)]
+            furthest = float(ends[np.argmax(np.abs(ends))]) if len(ends) else 0.0
+            if abs(furthest) > FLOAT32_MAX:
+                said = f"{key} reaches {furthest:.3g}, float32 holds up to {FLOAT32_MAX:.3g}"
+                numbers = {"value": furthest}
+                yield Finding(
+                    "finite", "warn", said, "as an action or state its episode is refused", key, numbers
+                )
 
     def _constant(self, keys: Sequence[KeyInfo]) -> Iterator[Finding]:
         names = {info.key: info.names for info in keys}

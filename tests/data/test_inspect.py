@@ -194,6 +194,14 @@ def test_stamps_of_hdf5_are_checked_against_the_stated_rate(tmp_path: Path) -> N
     assert "timestamps: ticks at 20 Hz, the recording states 30" in said["rate"][0]
 
 
+@pytest.mark.parametrize("value", [1e300, -1e39])
+def test_a_number_that_float32_cannot_hold_is_told(tmp_path: Path, value: float) -> None:
+    def raise_it(file: h5py.File) -> None:
+        file["data/demo_1/actions"][4, 2] = value
+
+    assert f"actions reaches {value:.3g}" in damaged(tmp_path, raise_it)["finite"][0]
+
+
 def test_a_rate_measured_in_one_episode_is_not_called_stated(tmp_path: Path) -> None:
     def stamp(file: h5py.File) -> None:
         for hz, demo in zip((20, 30, 30), file["data"].values(), strict=True):
