@@ -47,7 +47,8 @@ def main() -> None:
         if not fault.format_message().strip() or type(fault).__name__ == "NoArgsIsHelpError":
             sys.exit(2)  # the help has been shown
         hint = f" — see {context.command_path} --help" if context else ""
-        sys.exit(_fail(fault.format_message() + hint, 2))
+        said = fault.format_message().replace("Value error, ", "")  # of the enum options
+        sys.exit(_fail(said + hint, 2))
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(_fail("interrupted; run the same command again to continue", 130))
     except BrokenPipeError:

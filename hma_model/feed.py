@@ -102,6 +102,11 @@ class Feed:
         for number, batches in zip(self.own, self._batches):
             yield number, next(batches)
 
+    def realised(self) -> list[dict[str, Any]]:
+        """What this rank has drawn of each embodiment, beside what was intended: `Mixture.table`."""
+        drawn = [[int(row["samples"]) for row in data.realised()] for data in self._data]
+        return self.mixture.table([sum(column) for column in zip(*drawn, strict=True)])
+
     def state(self, world: World) -> dict[str, Any]:
         """Where all passes stand after whole steps; every rank must ask."""
         mine = dict(zip(self.own, (data.state_dict() for data in self._data)))

@@ -123,6 +123,8 @@ def test_a_killed_run_goes_on_bit_for_bit(recipe, tmp_path, killed_after):
     again = train(recipe(**changes), out=tmp_path / "cut", show=False)
     assert again.losses == whole.losses and [step for step, _ in again.losses] == list(range(1, 7))
     assert same(whole.checkpoint, again.checkpoint)
+    rows = whole.evaluations[-1]["mixture"]
+    assert sum(row["realised"] for row in rows) == pytest.approx(1) and all(row["samples"] for row in rows)
     strip = [{k: v for k, v in e.items() if k != "seconds"} for e in whole.evaluations]
     assert [{k: v for k, v in e.items() if k != "seconds"} for e in again.evaluations] == strip
 
