@@ -41,7 +41,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         recording = Path(folder) / "recording.hdf5"
         _record(recording, settings)
         rows = settings["episodes"] * settings["frames"]
-        alone = _tokenizer_alone(settings, rows)
+        alone, alone_cpu = _tokenizer_alone(settings, rows)
         watch = _Watch()
         with watch:
             began = time.perf_counter()
@@ -58,7 +58,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             )
             seconds = time.perf_counter() - began
         starting = watch.first_frame_s - began if watch.first_frame_s else 0.0
-        working = (seconds - starting) * settings["workers"]
+        working = (seconds - starting) * max(settings["workers"], 1)
+        working_cpu = watch.cpu_s - watch.starting_cpu_s
         return [
             {
                 "engine": settings["engine"],
@@ -69,6 +70,9 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
                 "frames_per_second": round(rows / (seconds - starting), 1),
                 "tokenizer_seconds": round(alone, 2),
                 "overhead_share": round(1 - alone / working, 4),
+                "tokenizer_cpu_seconds": round(alone_cpu, 2),
+                "worker_cpu_seconds": round(working_cpu, 2),
+                "overhead_cpu_share": round(1 - alone_cpu / working_cpu, 4) if working_cpu else None,
                 "worker_rss_mib_at_a_tenth": watch.at(0.1),
                 "worker_rss_mib_at_half": watch.at(0.5),
                 "worker_rss_mib_at_the_end": watch.at(1.0),
@@ -103,8 +107,8 @@ def _record(path: Path, settings: dict[str, Any]) -> None:
                 images[t] = pictures[(7 * i + t) % len(pictures)]
 
 
-def _tokenizer_alone(settings: dict[str, Any], rows: int) -> float:
-    """Seconds for `rows` frames in batches as a worker makes them, measured on a part of them."""
+def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]:
+    """Seconds and CPU seconds for `rows` frames in a worker's batches, measured on a part of them."""
     import sys
 
     from hma_data.engines.local import usable_cores
@@ -117,11 +121,11 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> float:
     size = tokenizer.spec.image_size
     frames = np.random.default_rng(1).integers(0, 256, (BATCH, size, size, 3), np.uint8)
     tokenizer.encode(frames)
-    done, began = 0, time.perf_counter()
+    done, began, used = 0, time.perf_counter(), time.process_time()
     while done < min(rows, 4_096):
         tokenizer.encode(frames)
         done += BATCH
-    return (time.perf_counter() - began) * rows / done
+    return (time.perf_counter() - began) * rows / done, (time.process_time() - used) * rows / done
 
 
 @dataclass
@@ -130,13 +134,15 @@ class _Watch:
 
     share: float = 0.0
     first_frame_s: float = 0.0
+    starting_cpu_s: float = 0.0  # of the workers until their first frame
+    cpu_s: float = 0.0  # of the workers, as last seen
     samples: list[tuple[float, float, float]] = field(default_factory=list)  # share done, workers, parent
     _stop: threading.Event = field(default_factory=threading.Event)
 
     def mark(self, progress: Any) -> None:
         """Where the conversion stands."""
         if progress.frames and not self.first_frame_s:
-            self.first_frame_s = time.perf_counter()
+            self.first_frame_s, self.starting_cpu_s = time.perf_counter(), self.cpu_s
         self.share = progress.frames / max(progress.total_frames, 1)
 
     def __enter__(self) -> "_Watch":
@@ -160,8 +166,12 @@ class _Watch:
 
         while not self._stop.wait(0.2):
             mine = _rss_mib(os.getpid())
-            workers = [_rss_mib(pid) for pid in _workers(os.getpid())]
-            self.samples.append((self.share, max(workers, default=mine), mine))
+            found = _workers(os.getpid())
+            if found:
+                self.cpu_s = max(self.cpu_s, sum(map(_cpu_s, found)))
+            elif self.samples:
+                continue  # the workers are gone, the manifest is being written
+            self.samples.append((self.share, max(map(_rss_mib, found), default=mine), mine))
 
 
 def _workers(pid: int) -> list[int]:
@@ -177,6 +187,17 @@ def _workers(pid: int) -> list[int]:
         if ours or command.startswith((b"ray::Worker", b"ray::_Worker")):
             found.append(int(entry.name))
     return found
+
+
+def _cpu_s(pid: int) -> float:
+    """CPU seconds of a process, its threads included."""
+    import os
+
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _rss_mib(pid: int) -> float:
