@@ -17,7 +17,7 @@ import pytest
 from hma_data import shard_work
 from hma_data.convert import convert, convert_share
 from hma_data.convert_recipe import load_jobs
-from hma_data.embodiment import Embodiment
+from hma_data.embodiment import Embodiment, find
 from hma_data.engines.base import Limits
 from hma_data.errors import HMAError, OutputError, RecipeError
 from hma_data.output import LOCK, Share, locked
@@ -417,7 +417,8 @@ def test_a_wrong_recipe_is_one_clear_error(text: str, said: str, tmp_path: Path)
 
 def test_the_shipped_recipes_are_valid() -> None:
     for path in sorted((ROOT / "recipes" / "convert").glob("*.yaml")):
-        assert load_jobs(path)
+        for job in load_jobs(path):
+            find(job.embodiment)
 
 
 def test_limits_are_kept_apart_from_errors_of_the_job(
