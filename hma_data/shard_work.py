@@ -90,11 +90,12 @@ class MakeWork:
         tokenizer = self.tokenizer
         if tokenizer is None:
             tokenizer = get_tokenizer(self.job.tokenizer, weights=self.job.weights, device=self.job.device)
-            if "torch" in sys.modules:
-                sys.modules["torch"].set_num_threads(max(1, usable_cores() // workers))
+        threads = max(1, usable_cores() // workers) if self.tokenizer is None else None
         job = self.job
 
         def work(unit: ShardUnit, report: Report, attempt: Attempt) -> Made:
+            if threads and "torch" in sys.modules:  # holds for the calling thread alone
+                sys.modules["torch"].set_num_threads(threads)
             done = make_shard(job, unit, tokenizer, report, attempt)
             report(Tick(bytes=done.bytes))
             return done
