@@ -47,19 +47,15 @@ def atomic_path(final: Path) -> Iterator[Path]:
 def _uploaded(final: RemotePath) -> Iterator[Path]:
     part = upload_folder(final.parent) / f".{final.name}.{os.getpid()}{PART}"
     try:
-        part.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-    except OSError as fault:
-        part.unlink(missing_ok=True)
-        raise OutputError(
-            part,
-            f"cannot be written: {fault.strerror or fault}",
-            "free space, or name a folder by $HMA_CACHE",
-        ) from fault
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
-    try:
+        try:
+            part.parent.mkdir(parents=True, exist_ok=True)
+            yield part
+        except OSError as fault:
+            raise OutputError(
+                part,
+                f"cannot be written: {fault.strerror or fault}",
+                "free space, or name a folder by $HMA_CACHE",
+            ) from fault
         put_file(part, final)
     finally:
         part.unlink(missing_ok=True)
