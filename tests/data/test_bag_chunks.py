@@ -1,5 +1,6 @@
 """Chunks of bags: what is kept of them, what is unpacked in part, and that pictures come out the same."""
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +178,33 @@ def test_memory_of_a_bag_is_used_for_the_next(monkeypatch: pytest.MonkeyPatch) -
     held = cache.get(Path("x"), 0, load)
     del cache
     assert chunks._kept.bytes == 2 * 5 * (1 << 16) and len(held) == 300_000  # what is looked at is not kept
+
+
+def test_a_bag_collected_amid_the_reading_of_another_waits_for_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The collector may find a bag in any line, in the ones that hold the lock too."""
+    monkeypatch.setattr(chunks, "_kept", chunks._Kept())
+    lost = [ChunkCache()]
+    lost[0].get(Path("x"), 0, lambda take: take(300_000))
+
+    class Collecting(type(Path())):  # type: ignore[misc]
+        def __hash__(self) -> int:
+            lost.clear()
+            return super().__hash__()
+
+    cache = ChunkCache()
+
+    def read() -> None:
+        cache.get(Collecting("y"), 0, lambda take: take(300_000))
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    reader.join(20)
+    assert not reader.is_alive() and not lost
+    del cache
+    chunks._kept.memory(1)
+    assert chunks._kept.bytes == 5 * (1 << 16)  # the memory of the one was used for the other
 
 
 def test_sizes_that_are_claimed_take_no_memory() -> None:

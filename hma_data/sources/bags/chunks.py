@@ -8,7 +8,7 @@ Memory is used again wherever nobody looks at it any more: fresh pages cost as m
 import os
 import threading
 import weakref
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping
 from itertools import count
 from mmap import MAP_ANONYMOUS, MAP_PRIVATE, mmap
@@ -38,6 +38,7 @@ class _Kept:
         self._chunks: OrderedDict[Key, Memory] = OrderedDict()
         self._sizes: dict[Key, int] = {}
         self._spare: list[Memory] = []
+        self._dropped: deque[Iterable[Key]] = deque()
         self.bytes = 0  # of both
 
     def has(self, key: Key) -> bool:
@@ -60,6 +61,7 @@ class _Kept:
         """At least so many bytes that nobody looks at; others go where there is no room for them."""
         needed = _rounded(size)
         with self._lock:
+            self._sweep()
             for i, spare in enumerate(self._spare):
                 if needed <= len(spare) <= 2 * needed:
                     self.bytes -= len(spare)
@@ -73,9 +75,21 @@ class _Kept:
         return _fresh(needed)
 
     def drop(self, keys: Iterable[Key]) -> None:
-        """Those chunks are not needed again; their memory is."""
-        with self._lock:
-            for key in keys:
+        """Those chunks are not needed again; their memory is.
+
+        The garbage collector calls this at any moment, in a thread that holds the lock too: it never
+        waits. What cannot be dropped now is dropped with the next keys, or when memory is asked for.
+        """
+        self._dropped.append(keys)
+        if self._lock.acquire(blocking=False):
+            try:
+                self._sweep()
+            finally:
+                self._lock.release()
+
+    def _sweep(self) -> None:
+        while self._dropped:
+            for key in self._dropped.popleft():
                 memory = self._forget(key)
                 if len(memory) >= LARGE and _unseen(memory):
                     self._spare.append(memory)
