@@ -17,6 +17,8 @@ Progress = Callable[[int, int], None]
 RECORDERS = {
     "pusht_fast": "hma_data.lab.pusht",
     "pusht_slow": "hma_data.lab.pusht",
+    "pendulum": "hma_data.lab.pendulum",
+    "planar_arm": "hma_data.lab.planar_arm",
 }
 
 

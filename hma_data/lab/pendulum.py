@@ -1,0 +1,205 @@
+"""Record gymnasium's Pendulum-v1 into RLDS: a rod on an axle, driven by a torque at 20 Hz.
+
+The physics and the picture are the environment's own; the camera is zoomed in on the rod, and an arrow
+round the axle shows the torque that was last applied. The torque in a step is applied between its
+picture and the next.
+
+Who drives changes from episode to episode, in the order of DRIVERS: swinging up and balancing, smooth
+random torques, full torque one way or the other, random torques held for a while. Episodes begin at
+random angles and speeds and last 5 s.
+
+Angles are radians from upright, speeds rad/s, torques N·m. T frames.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import MissingDependencyError, UsageError
+from hma_data.lab import Progress, written_beside
+from hma_data.lab.write_rlds import RldsEpisode, write_rlds
+
+Floats = NDArray[np.float64]
+Driver = Callable[[float, float], float]  # torque at an angle and a speed
+
+ROBOT = "pendulum"
+STEPS, PERIOD_S = 100, 0.05
+TORQUE = 2.0  # the environment's limit
+SIZE, ZOOMED, DRAWN = 128, 256, 464  # of the picture, of the square about the axle it is of, of the whole
+
+
+def record(out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
+    """Record the pendulum as the TFDS folder `out/pendulum`.
+
+    Same arguments, same bytes. See `hma_data.lab.record`.
+    """
+    if robot != ROBOT:
+        raise UsageError(robot, "is not this recorder's robot", f"known: {ROBOT}")
+
+    def made() -> Iterator[RldsEpisode]:
+        for episode in range(episodes):
+            yield _episode(seed, episode)
+            if on_progress:
+                on_progress(episode + 1, episodes)
+
+    final = Path(out) / ROBOT
+    with written_beside(final) as part:
+        write_rlds(part, ROBOT, {"observation/image": (SIZE, SIZE)}, "png", made())
+    return final
+
+
+class Pendulum:
+    """The environment at a given start.
+
+    Args:
+        angle, speed: to begin with.
+
+    Raises:
+        MissingDependencyError: gymnasium or pygame is not installed.
+    """
+
+    def __init__(self, angle: float, speed: float) -> None:
+        environment, surface, clock = _simulator()
+        self._env = environment(render_mode="rgb_array")
+        self._env.screen_dim = DRAWN
+        self._env.screen, self._env.clock = surface((DRAWN, DRAWN)), clock()  # else it looks for a display
+        self._env.reset(seed=0)
+        self._env.state = np.array([angle, speed])
+
+    @property
+    def angle(self) -> float:
+        """From upright, within ±π."""
+        angle = float(self._env.state[0])
+        return (angle + np.pi) % (2 * np.pi) - np.pi
+
+    @property
+    def speed(self) -> float:
+        """Of turning."""
+        return float(self._env.state[1])
+
+    @property
+    def observation(self) -> NDArray[np.float32]:
+        """(3,) cosine and sine of the angle, and the speed: the environment's own."""
+        return np.array([np.cos(self.angle), np.sin(self.angle), self.speed], dtype=np.float32)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(SIZE, SIZE, 3) RGB."""
+        import cv2
+
+        edge = (DRAWN - ZOOMED) // 2
+        pixels = self._env.render()[edge : edge + ZOOMED, edge : edge + ZOOMED]
+        small: NDArray[np.uint8] = cv2.resize(
+            np.ascontiguousarray(pixels), (SIZE, SIZE), interpolation=cv2.INTER_AREA
+        )
+        return small
+
+    def advance(self, action: NDArray[np.float32]) -> None:
+        """One period under a torque (1,)."""
+        self._env.step(action)
+
+
+def start(seed: int, episode: int) -> tuple[Pendulum, np.random.Generator]:
+    """The pendulum as an episode finds it, and the generator of its driver."""
+    rng = np.random.default_rng((seed, 2, episode))
+    return Pendulum(rng.uniform(-np.pi, np.pi), rng.uniform(-4, 4)), rng
+
+
+def _episode(seed: int, episode: int) -> RldsEpisode:
+    import cv2
+
+    world, rng = start(seed, episode)
+    instruction, driver = DRIVERS[episode % len(DRIVERS)]
+    drive = driver(rng)
+    pictures, observations, actions = [], [], []
+    for _ in range(STEPS):
+        _, png = cv2.imencode(".png", world.picture()[..., ::-1])
+        pictures.append(png.tobytes())
+        observations.append(world.observation)
+        torque = np.clip(drive(world.angle, world.speed), -TORQUE, TORQUE)
+        actions.append(np.array([torque], dtype=np.float32))
+        world.advance(actions[-1])
+    vectors = {"action": np.stack(actions), "observation/state": np.stack(observations)}
+    return RldsEpisode({"observation/image": pictures}, vectors, instruction)
+
+
+def _simulator() -> tuple[Any, Any, Any]:
+    """The environment's class, pygame's Surface and its Clock."""
+    import os
+    import warnings
+
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            from gymnasium.envs.classic_control.pendulum import PendulumEnv
+            from pygame import Surface
+            from pygame.time import Clock
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "gymnasium's Pendulum-v1", f"cannot be imported: {fault}", "pip install gymnasium pygame"
+        ) from fault
+    return PendulumEnv, Surface, Clock
+
+
+# -- drivers
+
+
+def _upward(rng: np.random.Generator) -> Driver:
+    """Pumps energy until the rod can stand, then balances it; now and then it is knocked off."""
+    gain, noise, clumsy = rng.uniform(0.5, 2.0), rng.uniform(0.05, 0.4), rng.uniform(0.0, 0.04)
+    knock = [0, 0.0]  # steps left, torque
+
+    def drive(angle: float, speed: float) -> float:
+        if knock[0] <= 0 and rng.random() < clumsy:
+            knock[:] = [int(rng.integers(4, 9)), float(rng.choice((-TORQUE, TORQUE)))]
+        if knock[0] > 0:
+            knock[0] -= 1
+            return knock[1]
+        if abs(angle) < 0.35 and abs(speed) < 2.5:
+            return -10 * angle - 2 * speed + rng.normal(0, noise)
+        lacking = 5 * (1 - np.cos(angle)) - speed**2 / 6
+        return float(gain * lacking * (1 if speed >= 0 else -1) + rng.normal(0, noise))
+
+    return drive
+
+
+def _smooth(rng: np.random.Generator) -> Driver:
+    """Three sine waves of random frequency."""
+    hz, phase = rng.uniform(0.1, 1.5, 3), rng.uniform(0, 2 * np.pi, 3)
+    strength = rng.uniform(0.4, 1.6, 3)
+    seconds = iter(np.arange(STEPS) * PERIOD_S)
+    return lambda angle, speed: float(strength @ np.sin(2 * np.pi * hz * next(seconds) + phase))
+
+
+def _held(torque: Callable[[], float], shortest: int, longest: int, rng: np.random.Generator) -> Driver:
+    """A torque for some steps, then another."""
+    values: list[float] = []
+
+    def drive(angle: float, speed: float) -> float:
+        if not values:
+            values.extend([torque()] * int(rng.integers(shortest, longest + 1)))
+        return values.pop()
+
+    return drive
+
+
+def _bang_bang(rng: np.random.Generator) -> Driver:
+    return _held(lambda: float(rng.choice((-TORQUE, TORQUE))), 2, 12, rng)
+
+
+def _steps(rng: np.random.Generator) -> Driver:
+    def torque() -> float:
+        return 0.0 if rng.random() < 0.15 else float(rng.uniform(-TORQUE, TORQUE))
+
+    return _held(torque, 4, 20, rng)
+
+
+DRIVERS: tuple[tuple[str, Callable[[np.random.Generator], Driver]], ...] = (
+    ("swing the rod up and hold it there", _upward),
+    ("turn the rod with smooth torques", _smooth),
+    ("turn the rod with full torque either way", _bang_bang),
+    ("turn the rod with held torques", _steps),
+)

@@ -1,0 +1,330 @@
+"""Record a two-joint arm seen from above into HDF5: physics by pymunk, driven by joint velocities at 30 Hz.
+
+The arm stands in the middle of a walled square and shoves three loose blocks about. Each joint has a
+motor of limited torque, and the elbow has stops; blocks are slowed by the table. The velocities in a
+frame are applied between its picture and the next. Recorded beside them are joint angles and
+velocities; the reward is how far the blocks moved, in px, and success that some block ended 20 px or
+more from where it lay.
+
+A driver strings manoeuvres together at random: going to a point or to a block, weaving, holding
+a velocity, resting.
+
+Lengths are pixels of the 512 × 512 arena with y downward, angles radians (the shoulder's clockwise from
++x, the elbow's from the upper arm on), velocities rad/s. J = 2 joints, B = 3 blocks, T frames.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import MissingDependencyError, UsageError
+from hma_data.lab import Progress, written_beside
+
+if TYPE_CHECKING:
+    import pymunk
+
+    from hma_data.lab.write_hdf5 import Demo
+
+Floats = NDArray[np.float64]
+Manoeuvre = Callable[["Arm"], Floats]  # velocities (J,) now
+
+ROBOT = "planar_arm"
+STEPS, HZ, TICKS = 96, 30, 8  # frames of an episode, their rate, ticks of the physics a frame
+ARENA, BASE = 512.0, np.array([256.0, 256.0])
+UPPER, FORE, RADIUS = 122.0, 102.0, 21.0  # lengths of the links, and half their width
+BLOCK = 46.0  # edge
+SPEED = 2.6  # fastest command
+ELBOW_STOP, ELBOW_TURN = 2.5, 2.2  # where the elbow cannot go on, and where drivers turn it back
+MOVED = 20.0  # of a block, for success
+
+SIZE, DRAWN, SHIFT = 128, 256, 4  # of the picture; of the drawing; its coordinates' fractional bits
+TABLE, DARK = (226, 226, 220), (45, 45, 50)  # colours are RGB
+UPPER_COLOR, FORE_COLOR = (40, 90, 200), (240, 145, 30)
+BLOCK_COLORS = ((200, 40, 50), (30, 150, 90), (140, 60, 170))
+
+
+def record(out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
+    """Record the arm as `out/planar_arm.hdf5`.
+
+    Same arguments, same bytes. See `hma_data.lab.record`.
+    """
+    from hma_data.lab.write_hdf5 import write_demos
+
+    if robot != ROBOT:
+        raise UsageError(robot, "is not this recorder's robot", f"known: {ROBOT}")
+
+    def demos() -> "Iterator[Demo]":
+        for episode in range(episodes):
+            yield _demo(seed, episode)
+            if on_progress:
+                on_progress(episode + 1, episodes)
+
+    final = Path(out) / f"{ROBOT}.hdf5"
+    with written_beside(final) as part:
+        write_demos(part, demos(), {"env_name": ROBOT, "type": 2, "env_kwargs": {"control_freq": HZ}})
+    return final
+
+
+class Arm:
+    """The arm and its blocks.
+
+    Args:
+        joints: (J,) angles to begin with.
+        blocks: (B, 3) x, y, angle of each block.
+
+    Raises:
+        MissingDependencyError: pymunk is not installed.
+    """
+
+    def __init__(self, joints: Floats, blocks: Floats) -> None:
+        munk = _pymunk()
+        self._space = munk.Space()
+        self._space.iterations = 20
+        self._space.damping = 0.02
+        elbow, _ = elbow_and_tip(joints)
+        self._upper = self._link(BASE, joints[0], UPPER)
+        self._fore = self._link(elbow, joints[0] + joints[1], FORE)
+        self._motors = self._joints()
+        self._blocks = [self._block(pose) for pose in blocks]
+        self._walls()
+
+    def _link(self, start: Floats, angle: float, length: float) -> "pymunk.Body":
+        munk = _pymunk()
+        body = munk.Body(1.0, munk.moment_for_segment(1.0, (-length / 2, 0), (length / 2, 0), RADIUS))
+        body.center_of_gravity = (length / 2, 0)  # turning is about it, so the place comes last
+        body.angle, body.position = float(angle), (float(start[0]), float(start[1]))
+        shape = munk.Segment(body, (0, 0), (length, 0), RADIUS)
+        shape.filter, shape.friction = munk.ShapeFilter(group=1), 0.4
+        self._space.add(body, shape)
+        return body
+
+    def _joints(self) -> "list[pymunk.SimpleMotor]":
+        munk, ground = _pymunk(), self._space.static_body
+        shoulder = munk.PivotJoint(ground, self._upper, tuple(BASE), (0, 0))
+        elbow = munk.PivotJoint(self._upper, self._fore, (UPPER, 0), (0, 0))
+        stop = munk.RotaryLimitJoint(self._upper, self._fore, -ELBOW_STOP, ELBOW_STOP)
+        motors = [munk.SimpleMotor(ground, self._upper, 0), munk.SimpleMotor(self._upper, self._fore, 0)]
+        for motor, torque in zip(motors, (2e6, 8e5), strict=True):
+            motor.max_force = torque
+        self._space.add(shoulder, elbow, stop, *motors)
+        return motors
+
+    def _block(self, pose: Floats) -> "pymunk.Body":
+        munk = _pymunk()
+        body = munk.Body(0.05, munk.moment_for_box(0.05, (BLOCK, BLOCK)))
+        body.position, body.angle = (float(pose[0]), float(pose[1])), float(pose[2])
+        shape = munk.Poly.create_box(body, (BLOCK, BLOCK))
+        shape.friction = 0.4
+        self._space.add(body, shape)
+        return body
+
+    def _walls(self) -> None:
+        munk = _pymunk()
+        corners = [(0.0, 0.0), (ARENA, 0.0), (ARENA, ARENA), (0.0, ARENA)]
+        for here, there in zip(corners, corners[1:] + corners[:1], strict=True):
+            self._space.add(munk.Segment(self._space.static_body, here, there, 4))
+
+    @property
+    def joints(self) -> Floats:
+        """(J,) angles; the shoulder's within ±π."""
+        shoulder = (self._upper.angle + np.pi) % (2 * np.pi) - np.pi
+        return np.array([shoulder, self._fore.angle - self._upper.angle])
+
+    @property
+    def velocities(self) -> Floats:
+        """(J,) of the joints."""
+        upper, fore = self._upper.angular_velocity, self._fore.angular_velocity
+        return np.array([upper, fore - upper])
+
+    @property
+    def blocks(self) -> Floats:
+        """(B, 3) x, y, angle of each block."""
+        return np.array([[*body.position, body.angle] for body in self._blocks])
+
+    @property
+    def state(self) -> Floats:
+        """(2·J + 3·B,) joint angles and velocities, poses of the blocks."""
+        return np.concatenate([self.joints, self.velocities, self.blocks.ravel()])
+
+    def advance(self, action: NDArray[np.float32]) -> None:
+        """One frame with the motors set to velocities (J,)."""
+        for motor, velocity in zip(self._motors, action, strict=True):
+            motor.rate = -float(velocity)  # pymunk's rate is of the first body against the second
+        for _ in range(TICKS):
+            self._space.step(1 / (HZ * TICKS))
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(SIZE, SIZE, 3) RGB."""
+        import cv2
+
+        image = np.full((DRAWN, DRAWN, 3), TABLE, dtype=np.uint8)
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * BLOCK / 2
+        for (x, y, angle), color in zip(self.blocks, BLOCK_COLORS, strict=True):
+            cos, sin = np.cos(angle), np.sin(angle)
+            outline = corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+            cv2.fillConvexPoly(image, _fixed(outline), color, cv2.LINE_AA, SHIFT)
+        elbow, tip = elbow_and_tip(self.joints)
+        _draw_link(image, BASE, elbow, UPPER_COLOR)
+        _draw_link(image, elbow, tip, FORE_COLOR)
+        for point, radius in ((BASE, RADIUS * 0.7), (elbow, RADIUS * 0.45)):
+            cv2.circle(image, _fixed(point), int(_fixed(radius)), DARK, -1, cv2.LINE_AA, SHIFT)
+        small: NDArray[np.uint8] = cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
+        return small
+
+
+def elbow_and_tip(joints: Floats) -> tuple[Floats, Floats]:
+    """Where the elbow and the tip are, (2,) each."""
+    shoulder, whole = joints[0], joints[0] + joints[1]
+    elbow = BASE + UPPER * np.array([np.cos(shoulder), np.sin(shoulder)])
+    return elbow, elbow + FORE * np.array([np.cos(whole), np.sin(whole)])
+
+
+def joints_at(tip: Floats, bend: int) -> Floats:
+    """(J,) angles that bring the tip to a point (2,), or as near as the arm reaches, bent +1 or -1."""
+    x, y = tip - BASE
+    cos = (x * x + y * y - UPPER**2 - FORE**2) / (2 * UPPER * FORE)
+    elbow = bend * np.arccos(np.clip(cos, np.cos(ELBOW_TURN), 1.0))
+    shoulder = np.arctan2(y, x) - np.arctan2(FORE * np.sin(elbow), UPPER + FORE * np.cos(elbow))
+    return np.array([shoulder, elbow])
+
+
+def start(seed: int, episode: int) -> tuple[Arm, np.random.Generator]:
+    """The arm as an episode finds it, blocks clear of it and of each other, and its driver's generator."""
+    rng = np.random.default_rng((seed, 3, episode))
+    joints = np.array([rng.uniform(-np.pi, np.pi), rng.uniform(-ELBOW_TURN, ELBOW_TURN)])
+    elbow, tip = elbow_and_tip(joints)
+    taken = np.concatenate([np.linspace(BASE, elbow, 9), np.linspace(elbow, tip, 9)])
+    blocks: list[Floats] = []
+    while len(blocks) < len(BLOCK_COLORS):
+        angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(80, 225)
+        place = BASE + far * np.array([np.cos(angle), np.sin(angle)])
+        if np.linalg.norm(taken - place, axis=1).min() > BLOCK * 0.75 + RADIUS + 8:
+            blocks.append(np.array([*place, rng.uniform(-np.pi, np.pi)]))
+            taken = np.concatenate([taken, place[None]])
+    return Arm(joints, np.stack(blocks)), rng
+
+
+def _demo(seed: int, episode: int) -> "Demo":
+    from hma_data.lab.write_hdf5 import Demo
+
+    arm, rng = start(seed, episode)
+    drive = _driver(rng)
+    images, joints, velocities, states, rewards = [], [], [], [], []
+    actions: list[NDArray[np.float32]] = []
+    lay = arm.blocks
+    for _ in range(STEPS):
+        images.append(arm.picture())
+        joints.append(arm.joints)
+        velocities.append(arm.velocities)
+        states.append(arm.state)
+        before = arm.blocks
+        actions.append(drive(arm).astype(np.float32))
+        arm.advance(actions[-1])
+        rewards.append(float(_distances(before, arm.blocks).sum()))
+    return Demo(
+        actions=np.stack(actions),
+        observations={
+            "image": np.stack(images),
+            "joint_pos": np.stack(joints),
+            "joint_vel": np.stack(velocities),
+        },
+        states=np.stack(states),
+        rewards=np.array(rewards),
+        success=bool(_distances(lay, arm.blocks).max() >= MOVED),
+        facts={"seed": seed},
+    )
+
+
+def _distances(before: Floats, after: Floats) -> Floats:
+    moved: Floats = np.linalg.norm(after[:, :2] - before[:, :2], axis=1)
+    return moved
+
+
+def _fixed(points: Floats | float) -> NDArray[np.int32]:
+    """Arena to drawing, in OpenCV's fixed point; pixel centres are whole there."""
+    scaled = np.asarray(points) * (DRAWN / ARENA)
+    return np.rint((scaled - 0.5 * (scaled.ndim > 0)) * 2**SHIFT).astype(np.int32)
+
+
+def _draw_link(image: NDArray[np.uint8], here: Floats, there: Floats, color: tuple[int, int, int]) -> None:
+    import cv2
+
+    side = (there - here)[::-1] * (1, -1) * RADIUS / np.linalg.norm(there - here)
+    outline = np.array([here + side, there + side, there - side, here - side])
+    cv2.fillConvexPoly(image, _fixed(outline), color, cv2.LINE_AA, SHIFT)
+    for end in (here, there):
+        cv2.circle(image, _fixed(end), int(_fixed(RADIUS)), color, -1, cv2.LINE_AA, SHIFT)
+
+
+def _pymunk() -> Any:
+    try:
+        import pymunk
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "pymunk", f"cannot be imported: {fault}", "pip install pymunk"
+        ) from fault
+    return pymunk
+
+
+# -- driver
+
+
+def _driver(rng: np.random.Generator) -> Manoeuvre:
+    """One manoeuvre after another, each for 0.3 to 1.5 s; never on into the elbow's stops."""
+    left = 0
+    manoeuvre: Manoeuvre = _rest
+
+    def drive(arm: Arm) -> Floats:
+        nonlocal left, manoeuvre
+        if left == 0:
+            kind = rng.choice(4, p=(0.45, 0.25, 0.2, 0.1))
+            manoeuvre = (_go, _weave, _hold)[kind](arm, rng) if kind < 3 else _rest
+            left = int(rng.integers(9, 25 if kind == 3 else 46))
+        left -= 1
+        velocities = np.clip(manoeuvre(arm), -SPEED, SPEED)
+        elbow = arm.joints[1]
+        if abs(elbow) > ELBOW_TURN and elbow * velocities[1] > 0:
+            velocities[1] = -velocities[1]
+        return velocities
+
+    return drive
+
+
+def _rest(arm: Arm) -> Floats:
+    return np.zeros(2)
+
+
+def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
+    """To a block, and through it, or to any point in reach."""
+    angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(60, 220)
+    point = BASE + far * np.array([np.cos(angle), np.sin(angle)])
+    if rng.random() < 0.6:
+        _, tip = elbow_and_tip(arm.joints)
+        block = arm.blocks[rng.integers(len(BLOCK_COLORS)), :2]
+        point = block + (block - tip) * 0.3
+    goal, gain = joints_at(point, int(rng.choice((-1, 1)))), rng.uniform(3, 7)
+
+    def drive(arm: Arm) -> Floats:
+        error = goal - arm.joints
+        error[0] = (error[0] + np.pi) % (2 * np.pi) - np.pi
+        return gain * error
+
+    return drive
+
+
+def _weave(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
+    """Each joint at its own slow sine."""
+    strength, hz, phase = rng.uniform(0.8, 2.4, 2), rng.uniform(0.2, 0.9, 2), rng.uniform(0, 2 * np.pi, 2)
+    seconds = iter(np.arange(STEPS) / HZ)
+    return lambda arm: strength * np.sin(2 * np.pi * hz * next(seconds) + phase)
+
+
+def _hold(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
+    """One velocity; now and then of one joint alone."""
+    velocities = rng.uniform(-SPEED, SPEED, 2)
+    if rng.random() < 0.4:
+        velocities[rng.integers(2)] = 0.0
+    return lambda arm: velocities.copy()
