@@ -1,14 +1,16 @@
 """Fixtures shared by all tests."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from hypothesis import settings
 
+from hma_data.bench.recordings import ordinary_priority
 from hma_data.embodiment import Embodiment
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
@@ -16,6 +18,20 @@ from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 settings.register_profile("same", derandomize=True, database=None)
 settings.register_profile("new", print_blob=True)
 settings.load_profile("new" if os.environ.get("HMA_FUZZ") else "same")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup() -> Generator[None, Any, Any]:
+    """Videos are encoded in fixtures too."""
+    with ordinary_priority():
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Generator[None, Any, Any]:
+    """A test that encodes AV1 leaves the others, and the processes that they start, their turns."""
+    with ordinary_priority():
+        return (yield)
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,9 @@ A writer takes (folder, episodes, length, seed) and returns the recording's path
 """
 
 import json
+import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -201,13 +203,27 @@ def packets(pictures: Iterator[Images], encoder: str, gop: int = HZ) -> Iterator
     yield from (bytes(packet) for packet in context.encode(None)) if context else ()
 
 
+@contextmanager
+def ordinary_priority() -> Iterator[None]:
+    """Undoes what SVT-AV1 does to a process of root: real-time priority, which starves all the others."""
+    if not hasattr(os, "sched_getscheduler"):
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        if os.sched_getscheduler(0) != policy:
+            os.sched_setscheduler(0, policy, parameters)
+
+
 def _video(path: Path, pictures: Iterator[Images], encoder: str, gop: int) -> None:
     import av
 
     options = {"libsvtav1": {"preset": "10", "crf": "30"}, "libx264": {"preset": "veryfast", "crf": "23"}}
     path.parent.mkdir(parents=True, exist_ok=True)
     stream: Any = None
-    with av.open(str(path), "w") as container:
+    with ordinary_priority(), av.open(str(path), "w") as container:
         for picture in pictures:
             if stream is None:
                 stream = container.add_stream(encoder, rate=HZ, options=options[encoder])

@@ -1,5 +1,6 @@
 """Containers and codecs as they are met, and containers that lie: any frame equals decoding in order."""
 
+import os
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -9,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from hma_data.bench.recordings import ordinary_priority
 from hma_data.errors import EpisodeError
 from hma_data.sources.video_file import VideoFile, frame_table
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
@@ -181,3 +183,11 @@ def test_frames_made_from_a_damaged_one_are_refused_up_to_the_next_keyframe(tmp_
             assert i < 13
     with pytest.raises(EpisodeError, match="damaged"):
         VideoFile(path).frames([silent[0]])
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no schedulers to choose from")
+def test_encoding_av1_leaves_the_process_its_turn_among_others(tmp_path: Path) -> None:
+    before = os.sched_getscheduler(0)
+    with ordinary_priority():
+        make(tmp_path / "v.mp4", *AV1, gop=2)
+    assert os.sched_getscheduler(0) == before
