@@ -193,16 +193,13 @@ def test_a_bag_collected_amid_the_reading_of_another_waits_for_nothing(
             lost.clear()
             return super().__hash__()
 
-    cache = ChunkCache()
-
     def read() -> None:
-        cache.get(Collecting("y"), 0, lambda take: take(300_000))
+        ChunkCache().get(Collecting("y"), 0, lambda take: take(300_000))
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
     reader.join(20)
     assert not reader.is_alive() and not lost
-    del cache
     chunks._kept.memory(1)
     assert chunks._kept.bytes == 5 * (1 << 16)  # the memory of the one was used for the other
 
