@@ -1,0 +1,255 @@
+"""The laboratory's pendulum and planar arm: what is recorded happened, and the actions made it happen."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hma_data.convert import convert
+from hma_data.embodiment import Embodiment, find
+from hma_data.episode import Episode
+from hma_data.errors import MissingDependencyError, UsageError
+from hma_data.lab import pendulum, planar_arm, record
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from hma_data.sources.base import open_source
+from tests.conftest import BlockTokenizer
+
+EPISODES, SEED = 4, 3
+ROBOTS = ("pendulum", "planar_arm")
+RECORDERS = {"pendulum": pendulum, "planar_arm": planar_arm}
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A robot's recording, read by the source of its format."""
+
+    robot: Embodiment
+    path: Path
+    episodes: list[Episode]
+
+    def pictures(self, episode: int) -> NDArray[np.uint8]:
+        stream = self.episodes[episode].streams[self.robot.cameras[0].name]
+        return stream.frames(np.arange(len(stream.timestamps)))
+
+    def actions(self, episode: int) -> NDArray[np.float32]:
+        return np.asarray(self.episodes[episode].actions[0].values, dtype=np.float32)
+
+    def states(self, episode: int) -> NDArray[np.float64]:
+        return np.concatenate([signal.values for signal in self.episodes[episode].states], axis=1)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Recorded]:
+    made = {}
+    for name in ROBOTS:
+        robot = find(name)
+        path = record(name, tmp_path_factory.mktemp(name), EPISODES, SEED)
+        source = open_source(robot.source.format)
+        episodes = [source.read(str(path), one, robot) for one in source.episode_ids(str(path))]
+        made[name] = Recorded(robot, path, episodes)
+    return made
+
+
+def replayed(robot: str, episode: int, actions: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Pictures before each action, from the episode's start."""
+    world: Any = RECORDERS[robot].start(SEED, episode)[0]
+    pictures = []
+    for action in actions:
+        pictures.append(world.picture())
+        world.advance(action)
+    return np.stack(pictures)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_recording_reads_as_the_registry_describes(robot: str, recordings: dict[str, Recorded]) -> None:
+    recorded = recordings[robot]
+    assert len(recorded.episodes) == EPISODES
+    low, high = recorded.robot.action.components[0].range or (0, 0)
+    for i in range(EPISODES):
+        actions, pictures = recorded.actions(i), recorded.pictures(i)
+        assert actions.shape[1] == recorded.robot.action_dim and 60 <= len(actions) <= 120
+        assert pictures.shape == (len(actions), *(recorded.robot.cameras[0].size or ()), 3)
+        assert recorded.states(i).shape == (len(actions), recorded.robot.state.dims)
+        assert low <= actions.min() and actions.max() <= high
+
+
+@pytest.mark.parametrize(("robot", "stride"), [("pendulum", 2), ("planar_arm", 3)])
+def test_recording_converts(
+    robot: str,
+    stride: int,
+    recordings: dict[str, Recorded],
+    block_tokenizer: BlockTokenizer,
+    tmp_path: Path,
+) -> None:
+    recorded = recordings[robot]
+    assert recorded.robot.stride == stride
+    convert(recorded.robot, str(recorded.path), block_tokenizer, tmp_path / "shards")
+    assert verify(tmp_path / "shards") == []
+    shards = ShardSet(tmp_path / "shards")
+    rows = [shards.episode_rows(row["episode_index"]) for row in shards.episodes.to_pylist()]
+    kept = sorted(values["action"].tobytes() for values in rows)
+    assert kept == sorted(recorded.actions(i).tobytes() for i in range(EPISODES))
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_recorded_actions_make_the_recorded_pictures(robot: str, recordings: dict[str, Recorded]) -> None:
+    again = replayed(robot, 1, recordings[robot].actions(1))
+    np.testing.assert_array_equal(again, recordings[robot].pictures(1))
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_other_actions_make_other_pictures(robot: str, recordings: dict[str, Recorded]) -> None:
+    actions = recordings[robot].actions(1)
+    seen, other = recordings[robot].pictures(1), replayed(robot, 1, -actions)
+    first = int(np.flatnonzero(np.abs(actions).max(axis=1) > 0.2)[0])
+    np.testing.assert_array_equal(other[0], seen[0])
+    moved = np.abs(other[first + 5 :].astype(int) - seen[first + 5 :]).max(axis=-1) > 60
+    assert np.median(moved.sum(axis=(1, 2))) > 200
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_recorder_refuses_another_robot(robot: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=f"known: {robot}"):
+        RECORDERS[robot].record(tmp_path, "pusht_fast", 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("robot", "module"),
+    [("pendulum", "gymnasium.envs.classic_control.pendulum"), ("planar_arm", "pymunk")],
+)
+def test_missing_simulator_says_how_to_install_it(
+    robot: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingDependencyError, match="pip install"):
+        record(robot, tmp_path, 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- pendulum
+
+
+def test_gymnasium_replays_the_pendulum(recordings: dict[str, Recorded]) -> None:
+    import gymnasium
+
+    for i in range(EPISODES):
+        begun, _ = pendulum.start(SEED, i)
+        env: Any = gymnasium.make("Pendulum-v1")
+        env.reset(seed=0)
+        env.unwrapped.state = np.array([begun.angle, begun.speed])
+        observations = [env.unwrapped._get_obs()]
+        observations += [env.step(action)[0] for action in recordings["pendulum"].actions(i)[:-1]]
+        np.testing.assert_allclose(np.stack(observations), recordings["pendulum"].states(i), atol=1e-4)
+
+
+def test_pictures_show_the_rod_at_its_recorded_angle(recordings: dict[str, Recorded]) -> None:
+    recorded, errors = recordings["pendulum"], []
+    for picture, state in zip(recorded.pictures(0), recorded.states(0), strict=True):
+        red, green, _ = np.moveaxis(picture.astype(int), -1, 0)
+        rows, columns = np.nonzero(red - green > 80)
+        right, up = columns.mean() - 63.5, 63.5 - rows.mean()
+        errors.append(np.hypot(up / np.hypot(right, up) - state[0], -right / np.hypot(right, up) - state[1]))
+    assert max(errors) < 0.1
+
+
+def test_swing_up_brings_the_rod_to_rest_upright() -> None:
+    stood = []
+    for seed in range(12):
+        world, rng = pendulum.start(seed, 0)
+        drive = pendulum.DRIVERS[0][1](rng)
+        angles = []
+        for _ in range(pendulum.STEPS):
+            torque = np.clip(drive(world.angle, world.speed), -pendulum.TORQUE, pendulum.TORQUE)
+            world.advance(np.array([torque], dtype=np.float32))
+            angles.append(abs(world.angle))
+        stood.append(max(np.convolve(np.array(angles) < 0.35, np.ones(10), "valid")) == 10)
+    assert sum(stood) >= 6
+
+
+def test_pendulum_needs_no_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pygame
+
+    pygame.display.quit()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+    monkeypatch.setenv("DISPLAY", ":987")
+    record("pendulum", tmp_path, 1)
+    assert not pygame.display.get_init()
+
+
+# -- planar arm
+
+
+def test_joints_move_as_commanded(recordings: dict[str, Recorded]) -> None:
+    recorded = recordings["planar_arm"]
+    for i in range(EPISODES):
+        moving = recorded.states(i)[1:, 2:]
+        assert np.median(np.abs(moving - recorded.actions(i)[:-1])) < 0.01
+
+
+def test_recorded_angles_are_the_integral_of_recorded_velocities(recordings: dict[str, Recorded]) -> None:
+    states = recordings["planar_arm"].states(0)
+    turned = np.diff(np.unwrap(states[:, 0]))
+    np.testing.assert_allclose(turned, states[1:, 2] / planar_arm.HZ, atol=0.05)
+    assert np.corrcoef(turned, states[1:, 2])[0, 1] > 0.98
+
+
+def test_pictures_show_the_links_at_their_recorded_angles(recordings: dict[str, Recorded]) -> None:
+    upper, fore = list(planar_arm.UPPER_COLOR), list(planar_arm.FORE_COLOR)
+    recorded = recordings["planar_arm"]
+    for picture, state in zip(recorded.pictures(2), recorded.states(2), strict=True):
+        elbow, tip = planar_arm.elbow_and_tip(state[:2])
+        first, second = (
+            (point / 4).astype(int) for point in ((planar_arm.BASE + elbow) / 2, (elbow + tip) / 2)
+        )
+        assert picture[first[1], first[0]].tolist() in (upper, fore)  # the forearm may lie on top
+        assert picture[second[1], second[0]].tolist() == fore
+
+
+def test_tip_goes_to_the_point_asked_for() -> None:
+    rng = np.random.default_rng(0)
+    for bend in (-1, 1):
+        for _ in range(50):
+            angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(140, 220)
+            point = planar_arm.BASE + far * np.array([np.cos(angle), np.sin(angle)])
+            joints = planar_arm.joints_at(point, bend)
+            np.testing.assert_allclose(planar_arm.elbow_and_tip(joints)[1], point, atol=1e-6)
+            assert joints[1] * bend >= 0
+
+
+def test_nothing_moves_until_commanded() -> None:
+    for episode in range(5):
+        arm, _ = planar_arm.start(SEED, episode)
+        before = arm.state
+        for _ in range(10):
+            arm.advance(np.zeros(2, dtype=np.float32))
+        np.testing.assert_allclose(arm.state, before, atol=1e-6)
+
+
+def test_reward_is_the_blocks_way_and_they_stay_within_the_walls(recordings: dict[str, Recorded]) -> None:
+    with h5py.File(recordings["planar_arm"].path) as file:
+        for demo in file["data"].values():
+            places = demo["states"][:, 4:].reshape(-1, 3, 3)[..., :2]
+            moved = np.linalg.norm(np.diff(places, axis=0), axis=-1).sum(axis=-1)
+            np.testing.assert_allclose(demo["rewards"][:-1], moved, atol=1e-9)
+            assert places.min() > 20 and places.max() < planar_arm.ARENA - 20
+            assert (demo["rewards"][:] > 0.5).any() or not demo.attrs["success"]
+
+
+def test_arm_shoves_blocks_in_most_episodes(tmp_path: Path) -> None:
+    with h5py.File(record("planar_arm", tmp_path, 10, seed=1)) as file:
+        outcomes = [bool(demo.attrs["success"]) for demo in file["data"].values()]
+    assert sum(outcomes) >= 5
+
+
+def test_elbow_holds_at_its_stop() -> None:
+    arm, _ = planar_arm.start(SEED, 0)
+    for _ in range(90):
+        arm.advance(np.array([0.0, 2.6], dtype=np.float32))
+    assert arm.joints[1] == pytest.approx(planar_arm.ELBOW_STOP, abs=0.05)
