@@ -194,7 +194,8 @@ def test_a_bag_collected_amid_the_reading_of_another_waits_for_nothing(
             return super().__hash__()
 
     def read() -> None:
-        ChunkCache().get(Collecting("y"), 0, lambda take: take(300_000))
+        cache = ChunkCache()
+        cache.get(Collecting("y"), 0, lambda take: take(300_000))
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
