@@ -9,24 +9,25 @@ A recipe refuses what it does not know. What the shards state (kind, grid, vocab
 derived from them and cannot be given.
 """
 
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hma_data.errors import RecipeError, UsageError
 from hma_data.shipped import shipped
 from hma_data.yaml_io import parse_yaml, read_yaml
 from hma_model.config import HMAConfig
+from hma_model.recipe_faults import DERIVED, network_values, problem
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import TokenizerSpec
 
 MAX_EXTENDS = 8
-_DERIVED = {"kind", "grid", "factored", "channels", "latent_scale", "frames", "objectives", "tokenizer"}
+MAX_NAME = 200  # characters of a name that are shown
 # what may differ when a run goes on: where and how often, but nothing that changes the weights
 _FREE = {
     *("data", "out", "start", "device", "workers", "parallel", "compile", "checkpointing"),
@@ -45,8 +46,17 @@ def _listed(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
 
 
+def _named(value: str) -> str:
+    if not value.strip():
+        raise ValueError("must name a folder or URI")
+    return value
+
+
 Count = Annotated[int, BeforeValidator(_no_bool)]
 Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
+Beta = Annotated[Number, Field(ge=0, lt=1)]
+Cap = Annotated[Number, Field(gt=0, le=1)]
+Place = Annotated[str, AfterValidator(_named)]
 
 
 class _Settings(BaseModel):
@@ -60,14 +70,14 @@ class MixtureSettings(_Settings):
     draw: Literal["per_sample", "per_batch"] = "per_sample"
     weights: dict[str, Number] = Field({}, description="embodiment id -> factor on its probability")
     groups: dict[str, str] = Field({}, description="embodiment id -> group; groups have equal shares")
-    caps: dict[str, Number] = Field({}, description="embodiment id -> its largest probability")
+    caps: dict[str, Cap] = Field({}, description="embodiment id -> its largest probability")
     max_epochs: Number | None = Field(None, gt=0, description="passes over an embodiment's windows at most")
 
 
 class Recipe(_Settings):
     """A training run. Made by `load_recipe`, which explains its errors."""
 
-    data: Annotated[tuple[str, ...], BeforeValidator(_listed)] = Field(
+    data: Annotated[tuple[Place, ...], BeforeValidator(_listed)] = Field(
         (), description="folders of shards, one an embodiment"
     )
     mixture: MixtureSettings = MixtureSettings()
@@ -78,21 +88,21 @@ class Recipe(_Settings):
     model: dict[str, Any] = Field({}, description="fields of HMAConfig")
     objectives: dict[str, Number] = Field({"forward": 1.0}, description="how often each is drawn")
 
-    start: str | None = Field(None, description="a checkpoint to begin from: folder, run, URI or hub repo")
+    start: Place | None = Field(None, description="a checkpoint to begin from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
     readout_bias: Literal["frequencies", "zero"] = Field(
         "frequencies", description="what the token readout begins with: the training tokens' log frequencies"
     )
 
-    steps: Count = Field(1000, ge=1)
-    lr: Number = Field(3e-4, gt=0)
+    steps: Count = Field(1000, ge=1, le=10**12)
+    lr: Number = Field(3e-4, gt=0, le=1e6)
     lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")
     warmup: Count = Field(100, ge=0, description="steps in which lr rises from 0")
     schedule: Literal["constant_with_warmup", "cosine"] = "constant_with_warmup"
     lr_end: Number = Field(0.1, ge=0, le=1, description="cosine: the last step's share of lr")
-    betas: tuple[Number, Number] = (0.9, 0.95)
-    eps: Number = Field(1e-8, gt=0)
-    weight_decay: Number = Field(0.05, ge=0)
+    betas: tuple[Beta, Beta] = (0.9, 0.95)
+    eps: Number = Field(1e-8, gt=0, le=1e6)
+    weight_decay: Number = Field(0.05, ge=0, le=1e6)
     clip: Number = Field(1.0, gt=0, description="of the gradient's norm")
     nonfinite: Literal["stop", "skip"] = Field(
         "stop", description="at a loss that is not a number, or at a spike"
@@ -116,7 +126,7 @@ class Recipe(_Settings):
     parallel: Literal["ddp", "fsdp"] = Field("ddp", description="with torchrun: how ranks hold the network")
     compile: bool = Field(False, description="torch.compile of the trunk's blocks")
     checkpointing: bool = Field(False, description="recompute activations: less memory, a third more time")
-    workers: Count = Field(0, ge=0, description="processes that decode batches, a rank")
+    workers: Count = Field(0, ge=0, le=512, description="processes that decode batches, a rank")
     eval_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
     eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
     pictures: Count = Field(1, ge=0, description="windows rolled out for a picture at evaluations, a robot")
@@ -127,7 +137,7 @@ class Recipe(_Settings):
         "tensorboard",
     )
     project: str = Field("hma", description="the name trackio and wandb file the run under")
-    out: str | None = Field(None, description="the run's folder")
+    out: Place | None = Field(None, description="the run's folder")
 
     @property
     def windows_per_step(self) -> int:
@@ -178,29 +188,50 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Reci
 
 def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
     """The recipe of plain values; errors as `load_recipe`."""
-    found = _model_problems(values.get("model"))
+    found: list[str] = []
+    model = network_values(values.get("model", {}), values.get("objectives", {"forward": 1.0}), found)
+    given = {**values, "model": model} if isinstance(values.get("model"), dict) else dict(values)
     try:
-        recipe = Recipe.model_validate(dict(values))
+        recipe = Recipe.model_validate(given)
     except ValidationError as fault:
-        found += [_problem(item) for item in fault.errors(include_url=False)]
+        known = {"": list(Recipe.model_fields), "mixture": list(MixtureSettings.model_fields)}
+        known["model"] = [f for f in HMAConfig.__dataclass_fields__ if f not in DERIVED]
+        found += [problem(item, known) for item in fault.errors(include_url=False)]
     if found:
         raise RecipeError(where, "; ".join(found), "correct the recipe or the override")
     return recipe
 
 
-def find_recipe(name_or_path: str | Path) -> Path:
-    """The file of a recipe: a path, or a name below the shipped `recipes/` or `recipes/train/`."""
-    given = Path(name_or_path)
-    if given.is_file():
-        return given
-    folder = shipped("recipes")
-    for candidate in (folder / "train" / f"{given}.yaml", folder / f"{given}.yaml", folder / given):
-        if candidate.is_file() and not given.is_absolute():
+def find_recipe(name_or_path: str | Path, where: object = None) -> Path:
+    """The file of a recipe: a path, or a name below the shipped `recipes/` or `recipes/train/`.
+
+    Args:
+        name_or_path: what was given.
+        where: the recipe that extends it, for the error.
+
+    Raises:
+        RecipeError: there is none.
+    """
+    given, folder = Path(name_or_path), shipped("recipes")
+    said = str(name_or_path) if len(str(name_or_path)) <= MAX_NAME else f"{str(name_or_path)[:MAX_NAME]}…"
+    for candidate in (given, folder / "train" / f"{given}.yaml", folder / f"{given}.yaml", folder / given):
+        if _is_file(candidate) and (candidate == given or not given.is_absolute()):
             return candidate
+    fault = f"extends {said!r}: no such recipe" if where else "no such recipe"
+    if str(name_or_path) and os.path.lexists(given) and len(said) <= MAX_NAME:
+        fault = f"extends {said!r}, which is no file" if where else "is no file of YAML"
     known = sorted(path.stem for path in (folder / "train").glob("*.yaml"))
-    near = get_close_matches(str(given), known, n=1)
+    near = get_close_matches(given.stem.lower(), known, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
-    raise RecipeError(given, "no such recipe", f"{hint}give a YAML file or one of {', '.join(known)}")
+    remedy = f"{hint}give a YAML file or one of {', '.join(known)}"
+    raise RecipeError(where or said or "recipe", fault, remedy)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long for any file
+        return False
 
 
 def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
@@ -252,40 +283,15 @@ def _extended(path: Path, seen: list[Path]) -> dict[str, Any]:
     if values is None:
         values = {}
     if not isinstance(values, dict):
-        raise RecipeError(path, f"must be a mapping, is {type(values).__name__}")
+        fault = f"must be a mapping, is {type(values).__name__}"
+        raise RecipeError(path, fault, "write keys with values, as in steps: 1000")
     base = values.pop("extends", None)
     if base is None:
         return values
     if not isinstance(base, str):
-        raise RecipeError(path, f"extends must name a recipe, is {base!r}")
-    beside = path.parent / base
-    beside = beside if beside.suffix else beside.with_suffix(".yaml")
-    found = beside if beside.is_file() else find_recipe(base)
+        raise RecipeError(
+            path, f"extends must name a recipe, is {base!r}", "name one, as in extends: discrete_tiny"
+        )
+    beside = path.parent / (base if base.endswith((".yaml", ".yml")) else f"{base}.yaml")
+    found = next((p for p in (path.parent / base, beside) if _is_file(p)), None) or find_recipe(base, path)
     return merge(_extended(found, [*seen, path.resolve()]), values, path)
-
-
-def _model_problems(model: Any) -> list[str]:
-    if not isinstance(model, dict):
-        return []
-    allowed = [f.name for f in fields(HMAConfig) if f.name not in _DERIVED]
-    found = []
-    for key in model:
-        if key in _DERIVED:
-            found.append(f"model.{key}: follows from the shards and the recipe, and cannot be given")
-        elif key not in allowed:
-            found.append(_unknown(f"model.{key}", allowed))
-    return found
-
-
-def _problem(item: Any) -> str:
-    path = ".".join(str(part) for part in item["loc"])
-    if item["type"] == "extra_forbidden":
-        settings = MixtureSettings if path.startswith("mixture.") else Recipe
-        return _unknown(path, list(settings.model_fields))
-    message = item["msg"].removeprefix("Value error, ").replace("valid tuple", "list")
-    return f"{path}: {message} (is {item['input']!r})"
-
-
-def _unknown(path: str, known: list[str]) -> str:
-    near = get_close_matches(path.rsplit(".", 1)[-1], known, n=1)
-    return f"{path}: unknown key" + (f", did you mean {near[0]!r}?" if near else "")

@@ -1,5 +1,6 @@
 """Recipes: what is accepted, merged and refused, and what follows from the shards."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -79,7 +80,7 @@ def test_recipes_that_extend_each_other_are_refused(write):
         ("steps: true", "steps: must be a number, not true or false"),
         ("steps: 0", "steps: .*greater than or equal to 1"),
         ("lr: .nan", "lr: .*is nan"),
-        ("lr: .inf", "lr: .*finite"),
+        ("lr: .inf", "lr: .*is inf"),
         ("lr: -1", "lr: .*greater than 0"),
         ("schedule: linear", r"schedule: .*'constant_with_warmup' or 'cosine'.*is 'linear'"),
         ("device: gpu", "device: .*is 'gpu'"),
@@ -94,6 +95,66 @@ def test_what_is_wrong_is_said_with_key_value_and_remedy(write, text, message):
         load_recipe(write("broken", text))
     assert "broken.yaml" in caught.value.where
     assert caught.value.exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("model: {layers: true}", r"model\.layers: must be a whole number \(is True\)"),
+        ("model: {layers: 1.5}", r"model\.layers: must be a whole number \(is 1\.5\)"),
+        ("model: {layers: two}", r"model\.layers: must be a whole number \(is 'two'\)"),
+        ("model: {layers: null}", r"model\.layers: must be a whole number \(is None\)"),
+        ("model: {layers: 100000000000}", r"model\.layers: must be at most 2,048"),
+        ("model: {mup: 'yes please'}", r"model\.mup: must be true or false"),
+        ("model: {dropout: .nan}", r"model\.dropout: must be a number"),
+        ("model: {conditioning: modulatio}", r"model\.conditioning: .*not allowed.*modulation"),
+        ("model: {conditioning: [3]}", r"model\.conditioning: must be a word or a list"),
+        ("model: {width: 33, heads: 2}", r"model\.heads: 2 is not allowed: give a divisor of the width, 33"),
+        ("objectives: {forwrd: 1}", "objectives: .*forwrd.*forward, passive"),
+        ("objectives: {}", "objectives: .*not all vanish"),
+        ("betas: [2.0, 0.9]", r"betas\.0: must be less than 1"),
+        ("lr: 1e300", "lr: must be less than or equal to 1000000"),
+        ("workers: 1000000000", "workers: must be less than or equal to 512"),
+        ("steps: 1000000000000000000000", "steps: must be less than"),
+        ("mixture: {caps: {arm: 3}}", r"mixture\.caps\.arm: must be less than or equal to 1"),
+        ("data: ['']", r"data\.0: must name a folder or URI"),
+        ("layers: 3", r"layers: unknown key, did you mean 'model\.layers'\?"),
+        ("temperature: 3", r"temperature: unknown key, did you mean 'mixture\.temperature'\?"),
+        ("LR: 3", r"LR: unknown key, did you mean 'lr'\?"),
+        ("schedule: cosin", r"schedule: .*did you mean 'cosine'\?"),
+        ("mixture: [1]", "mixture: must be a mapping"),
+        ("3: 4", "3: keys must be words"),
+        ("a" * 900 + ": 1", "…: unknown key"),
+        ("extends: nowhere", r"broken\.yaml: extends 'nowhere': no such recipe"),
+        ("extends: .", r"broken\.yaml: extends '\.', which is no file"),
+        ("extends: " + "a" * 3000, r"broken\.yaml: extends 'a+…': no such recipe"),
+    ],
+)
+def test_slips_of_the_hand_are_told_before_any_shard_is_opened(write, text, message):
+    with pytest.raises(RecipeError, match=message) as caught:
+        load_recipe(write("broken", text))
+    assert "broken.yaml" in caught.value.where and "Input should" not in str(caught.value)
+
+
+def test_numbers_of_the_network_may_be_written_as_yaml_reads_texts():
+    model = load_recipe("discrete_tiny", ["model.dropout=1e-1", "model.layers=2.0"]).model
+    assert (model["dropout"], model["layers"]) == (0.1, 2) and isinstance(model["layers"], int)
+
+
+def test_what_a_recipe_extends_cannot_be_overridden():
+    with pytest.raises(RecipeError, match="extends: cannot be an override"):
+        load_recipe("discrete_tiny", ["extends=discrete_base"])
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "long"])
+def test_what_is_no_file_is_no_recipe(tmp_path, kind):
+    path = tmp_path / "it.yaml" if kind != "long" else "a" * 5000
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    with pytest.raises(RecipeError, match="no such recipe" if kind == "long" else "is no file of YAML"):
+        load_recipe(path)
 
 
 def test_all_problems_are_told_at_once(write):
