@@ -9,8 +9,14 @@ from hma_data.errors import HubError
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
+AGAIN = "run the same command again; it goes on where it stopped"
 LONGEST_WAIT = 300.0  # seconds; the hub counts requests over five minutes
-SILENCE = 300.0  # seconds without an answer; a commit of many files takes the hub minutes
+CHAIN = 20  # causes of an error that are looked through
+_SECRET = re.compile(r"(?i)\b(hf_|bearer )\w+")
+
+
+class CutShortError(OSError):
+    """A file's bytes ended before its size."""
 
 
 @contextmanager
@@ -21,20 +27,7 @@ def explained(where: str) -> Iterator[None]:
     except HubError:
         raise
     except raised() as fault:
-        raise explain(where, fault) from fault
-
-
-@contextmanager
-def bounded() -> Iterator[None]:
-    """Let no request of the client in this block wait for ever, which is what it does by default."""
-    from huggingface_hub import get_session
-
-    client = get_session()
-    before, client.timeout = client.timeout, SILENCE
-    try:
-        yield
-    finally:
-        client.timeout = before
+        raise explain(where, without_token(fault)) from fault
 
 
 def explain(where: str, fault: BaseException) -> HubError:
@@ -65,7 +58,7 @@ def explain(where: str, fault: BaseException) -> HubError:
             return HubError(where, f"is out of reach: {name}", "check the network, try again")
         case httpx.HTTPError():
             fault_text = f"the connection was cut: {type(fault).__name__}"
-            return HubError(where, fault_text, "run the same command again; it goes on where it stopped")
+            return HubError(where, fault_text, AGAIN)
         case errors.FileMetadataError():
             return HubError(where, "was not answered by a hub", "check HF_ENDPOINT and your proxy")
     if isinstance(fault, RuntimeError) and cause is not None:  # wraps what went wrong in an upload
@@ -107,26 +100,57 @@ def _answered(where: str, fault: Any) -> HubError:
     status = response.status_code if response is not None else None
     if status == 401 and "authorization" not in response.request.headers:
         return HubError(where, "no such repository, or it is private", "check the name; " + LOG_IN)
+    reading = response is not None and response.request.method in ("GET", "HEAD")
     remedies = {
+        400: "what it says should tell what to change",
         401: "the token is not valid: " + LOG_IN,
-        403: "the token may not write here: use one with write access to this organisation",
+        402: "its plan does not cover this: see the account's billing page",
+        403: "the token may not read this: ask its owners for access"
+        if reading
+        else "the token may not write here: use one with write access to this organisation",
         404: "check the name",
         413: "a file is too large for the hub",
         429: "too many requests: wait some minutes and run it again",
         507: "the storage of this account is full",
     }
     remedy = remedies.get(status or 0, "try again later; what was there is as it was")
-    return HubError(where, f"the hub answered {status}", remedy)
+    said = _shown(getattr(fault, "server_message", None) or "")
+    return HubError(where, f"the hub answered {status}" + (f": {said}" if said else ""), remedy)
 
 
 def _plain(where: str, fault: BaseException) -> HubError:
-    text = re.sub(r"(?i)\b(hf_|bearer )\w+", r"\1…", " ".join(str(fault).split()))[:300]
+    text = _shown(str(fault))
     if isinstance(fault, ValueError) and "metadata in README" in text:
         return HubError(where, f"the hub refuses the card: {text}", "correct the licence in embodiment.yaml")
     if isinstance(fault, OSError) and fault.errno is not None:
         return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
     if isinstance(fault, OSError):
-        return HubError(where, f"did not come whole: {text}", "pull again")
+        return HubError(where, f"did not come whole: {text}", AGAIN)
     if isinstance(fault, RuntimeError):  # what the transfer library of the hub raises
         return HubError(where, f"the transfer failed: {text}", "run it again; HF_HUB_DISABLE_XET=1 may help")
     return HubError(where, f"did not answer as a hub does: {type(fault).__name__}", "check HF_ENDPOINT")
+
+
+def _shown(text: str) -> str:
+    """What a stranger said, as one short line without a token."""
+    plain = "".join(c if c.isprintable() else " " for c in text)
+    return _hidden(" ".join(plain.split()))[:300]
+
+
+def _hidden(text: str) -> str:
+    from huggingface_hub import get_token
+
+    token = get_token()
+    return _SECRET.sub(r"\1…", text.replace(token, "…") if token else text)
+
+
+def without_token(fault: BaseException) -> BaseException:
+    """The error, whose text and causes a traceback may show though the hub has put the token into them."""
+    link: BaseException | None = fault
+    for _ in range(CHAIN):
+        if link is None:
+            break
+        if any(isinstance(part, str) and part != _hidden(part) for part in link.args):
+            link.args = tuple(_hidden(part) if isinstance(part, str) else part for part in link.args)
+        link = link.__cause__ or link.__context__
+    return fault

@@ -1,23 +1,32 @@
 """A hub that is a repository of the Hugging Face Hub.
 
 A push is one commit on top of the commit it was prepared for; when somebody else has committed in between, it
-is prepared again. What is downloaded goes through the client's own cache, which works offline.
+is prepared again. What is downloaded lies in the client's own cache, which works offline.
 """
 
 import random
+import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HubError
+from hma_data.files import write_atomic
 from hma_model.files import MAX_JSON_BYTES
-from hma_model.hub_errors import LOG_IN, bounded, cuts, explain, explained, raised, waiting
-from hma_model.hub_fetch import LARGE, fetch, fetch_to
+from hma_model.hub_bounds import bounded, downloading
+from hma_model.hub_errors import LOG_IN, cuts, explain, explained, raised, waiting, without_token
+from hma_model.hub_fetch import Wanted, cache_of, cached, fetch, fetch_to, forget_damaged
 
 ATTEMPTS = 8
 TIMEOUT = 30.0  # seconds for a listing
+AT_ONCE = 4  # downloads
+MOST_FILES = 300_000  # of a listing
+MOST_WARM = 256_000_000  # bytes of cards brought together
 _CONFLICTS = (409, 412)
+_COMMIT = re.compile(r"[0-9a-f]{40}|[0-9a-f]{64}")
 
 
 class HuggingFaceStore:
@@ -49,6 +58,7 @@ class HuggingFaceStore:
         self._api = HfApi(library_name="hma-toolkit")
         self.address = f"{self._api.endpoint}/{prefix}{repo}"
         self._commit: str | None = None
+        self._offline: Path | None = None
         self._sizes: dict[str, int] | None = None
         self._digests: dict[str, str] = {}
         if write:
@@ -65,11 +75,7 @@ class HuggingFaceStore:
         def ask() -> Any:
             try:
                 return self._api.repo_info(
-                    self.repo,
-                    repo_type=self._kind,
-                    revision=self._revision,
-                    files_metadata=True,
-                    timeout=TIMEOUT,
+                    self.repo, repo_type=self._kind, revision=self._revision, timeout=TIMEOUT
                 )
             except _unreachable():
                 return None
@@ -78,69 +84,94 @@ class HuggingFaceStore:
         if info is None:
             with explained(self.name):
                 return self._cached_files()
-        self._commit = info.sha
-        lfs = {item.rfilename: item.lfs for item in info.siblings or [] if item.lfs}
-        self._digests = {name: str(facts["sha256"]) for name, facts in lfs.items()}
-        self._sizes = {item.rfilename: int(item.size or 0) for item in info.siblings or []}
+        self._commit, self._offline = self._named(info.sha), None
+        entries = self._patiently(self._listing) if info.sha else []
+        self._digests = {item.path: item.lfs.sha256 for item in entries if item.lfs}
+        self._sizes = {item.path: int(item.size or 0) for item in entries}
         return dict(self._sizes)
+
+    def _named(self, commit: str | None) -> str | None:
+        """A commit's name, which becomes a folder's; None in a repository without any."""
+        if commit is not None and not _COMMIT.fullmatch(commit):
+            raise HubError(self.name, f"names a commit {commit[:60]!r}", "check HF_ENDPOINT and your proxy")
+        return commit
+
+    def _listing(self) -> list[Any]:
+        """The files of the commit; pages that lead in a circle, or never end, are left."""
+        found: dict[str, Any] = {}
+        for item in self._api.list_repo_tree(
+            self.repo, repo_type=self._kind, revision=self._commit, recursive=True
+        ):
+            if item.path in found or len(found) >= MOST_FILES:
+                fault = f"lists {item.path[:60]!r} twice" if item.path in found else "has too many files"
+                raise HubError(self.name, fault, "do not use this repository, or check HF_ENDPOINT")
+            found[item.path] = item
+        return [item for item in found.values() if hasattr(item, "blob_id")]
 
     def read(self, name: str) -> bytes:
         """A file of at most 16 MB at the commit that `files` saw."""
-        from huggingface_hub import hf_hub_download
-
         sizes = self.files() if self._sizes is None else self._sizes
-        where, revision = f"{self.name}/{name}", self._commit or self._revision
-        if sizes.get(name, 0) <= MAX_JSON_BYTES:
-            path = self._patiently(
-                lambda: Path(hf_hub_download(self.repo, name, repo_type=self._kind, revision=revision)), where
-            )
-            if path.stat().st_size <= MAX_JSON_BYTES:
-                content: bytes = path.read_bytes()
-                return content
-        raise HubError(where, f"is larger than {MAX_JSON_BYTES:,} bytes", "this is not a file of ours")
+        if sizes.get(name, 0) > MAX_JSON_BYTES:
+            fault = f"is larger than {MAX_JSON_BYTES:,} bytes"
+            raise HubError(f"{self.name}/{name}", fault, "this is not a file of ours")
+        content: bytes = self._brought([name])[0].read_bytes()
+        return content
 
     def warm(self, names: list[str]) -> None:
         """Bring small files to the cache together, for `read`."""
-        from huggingface_hub import snapshot_download
-
-        commit = self._commit
-        small = [name for name in names if 0 < (self._sizes or {}).get(name, 0) <= MAX_JSON_BYTES]
-        if commit and small:
-            self._patiently(
-                lambda: snapshot_download(
-                    self.repo, repo_type=self._kind, revision=commit, allow_patterns=small
-                )
-            )
+        sizes, total, small = self._sizes or {}, 0, []
+        for name in names:
+            total += sizes.get(name, 0)
+            if sizes.get(name, MAX_JSON_BYTES + 1) <= MAX_JSON_BYTES and total <= MOST_WARM:
+                small.append(name)
+        if self._commit:
+            self._brought(small)
 
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """One commit, prepared again while others commit first."""
-        from huggingface_hub import CommitOperationAdd, CommitOperationDelete
-
         for attempt in range(ATTEMPTS):
-            operations: list[CommitOperationAdd | CommitOperationDelete] = [
-                CommitOperationAdd(name, str(content) if isinstance(content, Path) else content)
-                if content is not None
-                else CommitOperationDelete(name)
-                for name, content in changes().items()
-            ]
+            files = changes()
             try:
                 with bounded():
-                    self._api.create_commit(
-                        self.repo,
-                        operations,
-                        repo_type=self._kind,
-                        commit_message=message,
-                        parent_commit=self._commit,
-                    )
+                    self._send(files, message)
                 return self.address
+            except HubError:
+                raise
             except raised() as fault:
-                response = getattr(fault, "response", None)
+                response = getattr(without_token(fault), "response", None)
+                if _by_chunks_alone(fault):
+                    continue
                 conflict = response is not None and response.status_code in _CONFLICTS
                 seconds = min(0.2 * 2**attempt, 10.0) if conflict else waiting(fault, attempt)
                 if seconds is None or (not conflict and attempt >= ATTEMPTS // 2):
                     raise explain(self.name, fault) from fault
             time.sleep(seconds * (0.5 + random.random()) if conflict else seconds)
         raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
+
+    def _send(self, files: Mapping[str, Path | bytes | None], message: str) -> None:
+        """Upload what is large, then commit all of it, or nothing."""
+        from huggingface_hub import CommitOperationAdd, CommitOperationDelete
+
+        added = [
+            CommitOperationAdd(name, str(content) if isinstance(content, Path) else content)
+            for name, content in files.items()
+            if content is not None
+        ]
+        deleted = [CommitOperationDelete(name) for name, content in files.items() if content is None]
+        self._api.preupload_lfs_files(
+            self.repo, added, repo_type=self._kind, free_memory=False, gitignore_content=""
+        )  # a .gitignore of the repository would silently leave files out
+        ignored = [item.path_in_repo for item in added if getattr(item, "_should_ignore", False)]
+        if ignored:
+            fault = f"leaves out {ignored[0]}, by its .gitignore"
+            raise HubError(self.name, fault, "delete that line there, and push again")
+        self._api.create_commit(
+            self.repo,
+            [*added, *deleted],
+            repo_type=self._kind,
+            commit_message=message,
+            parent_commit=self._commit,
+        )
 
     def digests(self) -> dict[str, str]:
         """SHA-256 by name of the large files, at the commit that `files` saw."""
@@ -152,61 +183,80 @@ class HuggingFaceStore:
         sizes = self.files() if self._sizes is None else self._sizes
         if self._commit is None:
             raise HubError(self.name, "is out of reach", "go online and pull again")
-        commit = self._commit
-        for name in names:
-            if name in sizes:
-                self._patiently(lambda: fetch_to(self.repo, self._kind, name, commit, out / name))  # noqa: B023
+        self._each(lambda name: fetch_to(self._wanted(name), out / name), [n for n in names if n in sizes])
 
     def pull(self, names: list[str], out: Path | None) -> Path:
         """The client's cache, or a folder with copies of its own."""
-        folder = self._patiently(lambda: self._fetched(names))
+        if self._commit:
+            forget_damaged(self.repo, self._kind, [cached(self._wanted(name)) for name in names])
+        self._brought(names)
+        folder = self._offline or self._snapshot()
+        self._remember()
         if out is None:
             return folder
         from hma_model.hub_folder import FolderStore
 
         return FolderStore(folder).pull(names, out)
 
-    def _fetched(self, names: list[str]) -> Path:
-        from huggingface_hub import snapshot_download
+    def _brought(self, names: list[str]) -> list[Path]:
+        """Paths of files in the cache."""
+        if self._offline is None:
+            return self._each(lambda name: fetch(self._wanted(name)), names)
+        paths = [self._offline / name for name in names]
+        if missing := [path.name for path in paths if not path.is_file()]:
+            fault = f"is out of reach, and not in the cache: {missing[0]}"
+            raise HubError(self.name, fault, "go online and pull again")
+        return paths
 
-        for name in names:
-            if self._commit and (self._sizes or {}).get(name, 0) >= LARGE:
-                fetch(self.repo, self._kind, name, self._commit)
-        folder = snapshot_download(
-            self.repo,
-            repo_type=self._kind,
-            revision=self._revision,  # by its name, so that it is found under it offline
-            allow_patterns=names,
-            local_files_only=self._commit is None,
-            max_workers=4,
-        )
-        return Path(folder)
+    def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
+        """An action for each file, a few at once; the first error ends it."""
+
+        def one(name: str) -> T:
+            return self._patiently(lambda: act(name), f"{self.name}/{name}", downloading)
+
+        pool = ThreadPoolExecutor(AT_ONCE, "hub")
+        try:
+            return list(pool.map(one, names))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def _wanted(self, name: str) -> Wanted:
+        size = (self._sizes or {}).get(name)
+        commit = self._commit or ""
+        return Wanted(self.repo, self._kind, name, commit, size, self._digests.get(name))
+
+    def _snapshot(self) -> Path:
+        return cache_of(self.repo, self._kind) / "snapshots" / (self._commit or "")
+
+    def _remember(self) -> None:
+        """Which commit a branch or tag stood for, so that it is found under its name offline."""
+        name = self._revision or "main"
+        if self._commit and not _COMMIT.fullmatch(name) and ".." not in name:
+            with explained(self.name):
+                write_atomic(cache_of(self.repo, self._kind) / "refs" / name, self._commit)
 
     def _cached_files(self) -> dict[str, int]:
-        from huggingface_hub import snapshot_download
-        from huggingface_hub.errors import IncompleteSnapshotError
-
-        self._commit = None
-        try:
-            folder = Path(
-                snapshot_download(
-                    self.repo, repo_type=self._kind, revision=self._revision, local_files_only=True
-                )
-            )
-        except IncompleteSnapshotError as fault:  # only some embodiments were pulled
-            folder = Path(fault.snapshot_path)
+        """What the cache has of the revision."""
+        self._commit, name = None, self._revision or "main"
+        ref = cache_of(self.repo, self._kind) / "refs" / name
+        commit = ref.read_text().strip() if ".." not in name and ref.is_file() else name
+        folder = cache_of(self.repo, self._kind) / "snapshots" / commit
+        if not _COMMIT.fullmatch(commit) or not folder.is_dir():
+            raise HubError(self.name, "is out of reach, and not in the cache", "go online and pull again")
+        self._offline = folder
         paths = (path for path in folder.rglob("*") if path.is_file())
         self._sizes = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
-        self._revision = folder.name
         return dict(self._sizes)
 
-    def _patiently(self, call: Callable[[], Any], where: str = "") -> Any:
+    def _patiently(
+        self, call: Callable[[], Any], where: str = "", within: Callable[[], Any] = nullcontext
+    ) -> Any:
         """What a call returns; it is made again where the hub is busy or the connection was cut."""
         from huggingface_hub.errors import HfHubHTTPError
 
         for attempt in range(ATTEMPTS // 2):
             try:
-                with explained(where or self.name), bounded():
+                with explained(where or self.name), bounded(), within():
                     return call()
             except HubError as fault:
                 cause = fault.__cause__
@@ -223,3 +273,21 @@ def _unreachable() -> tuple[type[BaseException], ...]:
     from huggingface_hub.errors import OfflineModeIsEnabled
 
     return (OfflineModeIsEnabled, httpx.ConnectError, httpx.TimeoutException)
+
+
+def _by_chunks_alone(fault: BaseException) -> bool:
+    """Whether an upload in chunks failed; the process goes on by plain LFS, which every hub takes.
+
+    The hub's library of that protocol raises plain errors, also where a hub or a firewall has none of it.
+    """
+    import httpx
+    from huggingface_hub import constants
+    from huggingface_hub.utils._runtime import is_xet_available
+
+    of_library = isinstance(fault, ConnectionError | RuntimeError | TimeoutError) or (
+        type(fault).__module__.startswith("hf_xet")
+    )
+    if isinstance(fault, httpx.HTTPError) or not of_library or not is_xet_available():
+        return False
+    constants.HF_HUB_DISABLE_XET = True
+    return True

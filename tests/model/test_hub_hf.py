@@ -16,7 +16,7 @@ import yaml as plain_yaml
 from huggingface_hub import constants
 
 from hma_data.errors import CheckpointError, HubError
-from hma_model import checkpoint, hub, hub_errors, hub_fetch, hub_hf
+from hma_model import checkpoint, hub, hub_bounds, hub_errors
 from hma_model.checkpoint import PARTS
 from hma_model.model import HMA
 from tests.hub_server import Hub, connect, serve
@@ -176,7 +176,7 @@ def test_a_commit_whose_answer_was_lost_is_not_made_twice(server, source, monkey
 
 @pytest.mark.parametrize("request_", ["POST .*/commit/", "POST /api/repos/create", "POST /api/validate"])
 def test_a_hub_that_never_answers_is_given_up(server, source, monkeypatch, request_):
-    monkeypatch.setattr(hub_errors, "SILENCE", 0.2)
+    monkeypatch.setattr(hub_bounds, "SILENCE", 0.2)
     server.fail(request_, stall=20.0, times=99)
     with pytest.raises(HubError, match=r"out of reach: ReadTimeout.*check the network"):
         hub.push(source, REPO)
@@ -191,11 +191,7 @@ def test_a_new_repository_can_be_private(server, source):
 # -- pulling
 
 
-@pytest.mark.parametrize("large", [0, 10**9], ids=["by us", "by the client"])
-def test_one_embodiment_brings_config_trunk_and_its_own_files_byte_for_byte(
-    published, source, monkeypatch, large
-):
-    monkeypatch.setattr(hub_hf, "LARGE", large)
+def test_one_embodiment_brings_config_trunk_and_its_own_files_byte_for_byte(published, source):
     model = HMA.from_pretrained(REPO, embodiments=["arm"])
     assert list(model.embodiments) == ["arm"]
     wanted = ["config.json", "trunk.safetensors", *(f"embodiments/arm/{part}" for part in PARTS)]
@@ -244,7 +240,6 @@ def test_the_token_is_not_shown_to_the_host_of_the_files(published):
 
 
 def test_a_cut_download_goes_on_where_it_was_cut(published, source, monkeypatch):
-    monkeypatch.setattr(hub_hf, "LARGE", 0)
     published.fail("GET /cdn/.*trunk", after=1000)
     hub.pull(REPO, ["arm"])
     asked = [a for a in published.log if a.method == "GET" and a.path.endswith("trunk.safetensors")]
@@ -258,7 +253,6 @@ def test_a_cut_download_of_a_small_file_is_made_again(published):
 
 
 def test_a_killed_pull_goes_on_where_it_stopped(published, source, monkeypatch):
-    monkeypatch.setattr(hub_hf, "LARGE", 0)
     published.fail("GET /cdn/.*trunk", after=1000)
     published.fail("GET /cdn/.*trunk", after=0, times=99)
     with pytest.raises(HubError, match=r"connection was cut.*goes on where it stopped"):
@@ -271,7 +265,6 @@ def test_a_killed_pull_goes_on_where_it_stopped(published, source, monkeypatch):
 
 
 def test_a_download_with_other_content_than_stated_is_thrown_away(published, monkeypatch, tmp_path):
-    monkeypatch.setattr(hub_hf, "LARGE", 0)
     trunk = published.model(REPO).files["trunk.safetensors"]
     name = next(name for name, content in published.objects.items() if content == trunk)
     published.objects[name] = bytes(len(trunk))
@@ -312,7 +305,6 @@ def test_what_was_never_pulled_is_not_there_offline(published, monkeypatch):
 
 
 def test_a_full_disk_says_so_and_the_pull_goes_on_later(published, tmp_path, monkeypatch):
-    monkeypatch.setattr(hub_hf, "LARGE", 0)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
     try:
@@ -475,7 +467,3 @@ def test_what_the_transfer_library_says_is_shown_without_a_token():
     with pytest.raises(HubError, match="the transfer failed: .*denied") as found, hub_errors.explained(REPO):
         raise said
     assert TOKEN not in str(found.value) and "\n" not in str(found.value)
-
-
-def test_the_large_files_limit_is_what_the_client_is_left_with():
-    assert hub_fetch.LARGE == hub_hf.LARGE < 10**7
