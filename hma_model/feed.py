@@ -59,28 +59,7 @@ class Feed:
         self.passes, size = share(recipe, world.size)
         self.own = range(world.rank, self.passes, world.size)
         self._workers = -(-recipe.workers // len(self.own))
-        mixture = recipe.mixture
-        samples = recipe.steps * recipe.windows_per_step if mixture.max_epochs else None
-        self._data = [
-            MixtureDataset(
-                list(sets.values()),
-                size,
-                recipe.frames,
-                temperature=mixture.temperature,
-                weights=mixture.weights or None,
-                groups=mixture.groups or None,
-                caps=mixture.caps or None,
-                max_epochs=mixture.max_epochs,
-                samples=samples,
-                draw=mixture.draw,
-                short=recipe.short,
-                seed=seed_for(recipe.seed, "sampler"),
-                rank=number,
-                world=self.passes,
-                memory_mib=max(MEMORY_MIB // self.passes, 1),
-            )
-            for number in self.own
-        ]
+        self._data = [self._dataset(recipe, sets, size, self.own[0])]
         self._batches: list[Iterator[Batch]] = []
         count = sum(self.mixture.counts)
         if recipe.windows_per_step > count:
@@ -89,6 +68,34 @@ class Feed:
                 f"{recipe.windows_per_step} windows a step are more than the {count} there are",
                 "lower batch_size or accumulate, or add data",
             )
+        self._data += [self._dataset(recipe, sets, size, number) for number in self.own[1:]]
+
+    def _dataset(
+        self, recipe: "Recipe", sets: Mapping[str, ShardSet], size: int, number: int
+    ) -> MixtureDataset:
+        mixture = recipe.mixture
+        try:
+            return MixtureDataset(
+                list(sets.values()),
+                size,
+                recipe.frames,
+                temperature=mixture.temperature,
+                weights=mixture.weights or None,
+                groups=mixture.groups or None,
+                caps=mixture.caps or None,
+                max_epochs=mixture.max_epochs,
+                samples=recipe.steps * recipe.windows_per_step if mixture.max_epochs else None,
+                draw=mixture.draw,
+                short=recipe.short,
+                seed=seed_for(recipe.seed, "sampler"),
+                rank=number,
+                world=self.passes,
+                memory_mib=max(MEMORY_MIB // self.passes, 1),
+            )
+        except UsageError as fault:
+            remedy = fault.remedy or f"the data has {', '.join(sets)}"
+            where = fault.where.replace("mixture ", "mixture.")
+            raise RecipeError(f"recipe: {where}", fault.fault, remedy) from fault
 
     @property
     def mixture(self) -> Mixture:

@@ -8,6 +8,7 @@ stay whole, because the ranks of one step may use different ones.
 """
 
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from hma_data.errors import HMAError, RecipeError
+from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
 
 if TYPE_CHECKING:
     from hma_model.model import HMA
@@ -60,19 +61,31 @@ class World:
         return found
 
     def once[T](self, action: Callable[[], T]) -> T:
-        """What `action` gives on rank 0, to all ranks; an error of ours is raised on all of them."""
+        """What `action` gives on rank 0, to all ranks; an error is raised on all of them."""
         if self.size == 1:
             return action()
         outcome: list[Any] = [None, None]
+        own: Exception | None = None
         if self.main:
             try:
                 outcome[0] = action()
-            except HMAError as fault:
-                outcome[1] = fault
+            except Exception as fault:  # whatever it is, the others must not wait for a rank that has ended
+                own, outcome[1] = fault, _told(fault)
         dist.broadcast_object_list(outcome, src=0)
+        if own is not None:
+            raise own
         if outcome[1] is not None:
             raise outcome[1]
         return outcome[0]
+
+
+def _told(fault: Exception) -> HMAError:
+    """An error as the other ranks raise it."""
+    if isinstance(fault, HMAError):
+        return fault
+    if isinstance(fault, OSError):
+        return OutputError(fault.filename or "rank 0", f"cannot be written: {fault.strerror or fault}")
+    return TrainingError("rank 0", f"{type(fault).__name__}: {fault}", "see what it has said itself")
 
 
 @contextmanager
@@ -99,8 +112,18 @@ def join(device: torch.device) -> Iterator[World]:
             raise RecipeError("ranks", text, "start them with torchrun") from fault
     try:
         yield World(dist.get_rank(), dist.get_world_size(), local_rank())
+    except RuntimeError as fault:
+        if not isinstance(fault, dist.DistError) and "gloo" not in str(fault):
+            raise
+        raise TrainingError(
+            f"rank {dist.get_rank()}",
+            f"has lost the others: {str(fault).splitlines()[0][:200]}",
+            "see what ended another rank; the same command goes on from the last checkpoint",
+        ) from fault
     finally:
-        if ours:
+        if ours and (
+            device.type != "cuda" or sys.exc_info()[0] is None
+        ):  # NCCL waits for a rank that is gone
             dist.destroy_process_group()
 
 

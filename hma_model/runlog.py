@@ -5,6 +5,7 @@ terminal there is a live table; elsewhere a plain line every few seconds.
 """
 
 import json
+import os
 import sys
 import time
 from collections import deque
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from rich.console import Group
     from rich.live import Live
 
-METRICS = "metrics.jsonl"
+METRICS, KINDS = "metrics.jsonl", ("train", "eval")
 PLAIN_SECONDS = 10.0
 SMOOTHING = 20  # steps a shown loss is averaged over
 
@@ -35,13 +36,14 @@ def read_metrics(out: Path) -> list[dict[str, Any]]:
     path = out / METRICS
     if not path.is_file():
         return []
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    found = []
-    for line in lines:
+    found: list[dict[str, Any]] = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:
-            break  # a killed run's last line
+            values = json.loads(line)
+        except (ValueError, RecursionError):  # a killed run's last line
+            continue
+        if isinstance(values, dict) and isinstance(values.get("step"), int) and values.get("kind") in KINDS:
+            found.append(values)
     return found
 
 
@@ -120,6 +122,15 @@ class RunLog:
         self._evaluation = facts
         if not self._live:
             self._present(force=True)
+
+    def sync(self) -> None:
+        """Make the lines so far durable: a checkpoint that is about to be written goes on from them."""
+        if self._file is None:
+            return
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as fault:
+            raise OutputError(self._path, f"cannot be written: {fault.strerror}", "free space") from fault
 
     def pictures(self, out: Path, step: int) -> None:
         """Hand the pictures of an evaluation on to the trackers."""

@@ -1,23 +1,29 @@
 """A run's ground: its folder, its device, the signals that end it, and what its figures may depend on."""
 
 import fcntl
+import os
 import platform
+import re
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import torch
 
-from hma_data.errors import OutputError, RecipeError
+from hma_data.errors import OutputError, RecipeError, TrainingError
 from hma_model.parallel import local_rank
 
-RECIPE, ENVIRONMENT = "recipe.json", "environment.json"
+if TYPE_CHECKING:
+    from hma_model.config import HMAConfig
+
+RECIPE, ENVIRONMENT, LOCK = "recipe.json", "environment.json", ".lock"
+_NO_MEMORY = re.compile("out of memory|can't allocate memory|not enough memory|bad_alloc", re.IGNORECASE)
 
 
 def choose_device(name: str) -> torch.device:
@@ -66,21 +72,98 @@ def _git_revision() -> str:
 
 @contextmanager
 def own_folder(out: Path) -> Iterator[None]:
-    """The run's folder, made if need be, and nobody else's while the block runs."""
+    """The run's folder, made if need be, and nobody else's while the block runs.
+
+    A block that leaves nothing in it leaves no folder either, where there was none before.
+
+    Raises:
+        OutputError: it cannot be made, holds something else, or another run is at work in it.
+    """
+    made = [path for path in (out, *out.parents) if not path.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
         others = [path.name for path in out.iterdir() if not path.name.startswith(".")]
         if others and not (out / RECIPE).is_file():
             raise OutputError(out, f"holds {others[0]} and no {RECIPE}", "train into a folder of its own")
-        lock = (out / ".lock").open("w")
+        ours = not (out / LOCK).exists()
+        lock = (out / LOCK).open("a")
     except OSError as fault:
         raise OutputError(out, f"cannot be used: {fault.strerror}", "choose another folder") from fault
     with lock:
+        _hold(lock, out)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as fault:
-            raise OutputError(out, "another training is at work here", "wait for it or stop it") from fault
+            yield
+        finally:
+            if ours and [path.name for path in out.iterdir()] == [LOCK]:
+                _remove_empty(out, made)
+
+
+def _hold(lock: TextIO, out: Path) -> None:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        held = os.path.samestat(os.fstat(lock.fileno()), (out / LOCK).stat())
+    except (BlockingIOError, FileNotFoundError):
+        held = False
+    except OSError:  # a file system without locks
+        return
+    if not held:
+        raise OutputError(out, "another training is at work here", "wait for it or stop it")
+
+
+def _remove_empty(out: Path, made: list[Path]) -> None:
+    with suppress(OSError):  # somebody has put something there meanwhile
+        (out / LOCK).unlink()
+        for path in made:
+            path.rmdir()
+
+
+@contextmanager
+def enough_memory() -> Iterator[None]:
+    """Around what may ask for more memory than there is.
+
+    Raises:
+        TrainingError: it did.
+    """
+    try:
         yield
+    except (RuntimeError, MemoryError) as fault:
+        text = (str(fault).splitlines() or [""])[0]
+        if isinstance(fault, RuntimeError) and not _NO_MEMORY.search(text):
+            raise
+        raise TrainingError(
+            "memory",
+            f"there is not enough for this model and batch: {text[:200] or type(fault).__name__}",
+            "lower batch_size (accumulate makes up for it), frames or model.width, or set checkpointing=true",
+        ) from fault
+
+
+def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen: bool) -> None:
+    """Refuse a network of which the weights and what training keeps for each cannot fit.
+
+    Args:
+        config: of the network.
+        device: where it is to be.
+        parts: over how many ranks it is spread.
+        frozen: the trunk's weights have no gradients and moments.
+
+    Raises:
+        RecipeError: the smallest estimate is above the memory of the device.
+    """
+    values = config.layers * config.width**2 * (8 + 2 * config.mlp_ratio)
+    if config.kind == "continuous":
+        values += config.diffusion_depth * config.diffusion_width**2
+    needed = values * (4 if frozen else 16) / parts
+    if device.type == "cuda":
+        there = float(torch.cuda.get_device_properties(device).total_memory)
+    else:
+        there = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    if needed > there:
+        raise RecipeError(
+            "recipe: model",
+            f"{values / 1e9:,.1f} billion weights take {needed / 2**30:,.0f} GiB in training, "
+            f"here are {there / 2**30:,.0f} GiB",
+            "lower model.width or model.layers",
+        )
 
 
 @contextmanager
@@ -94,7 +177,8 @@ def stop_on_signals() -> Iterator[threading.Event]:
     def ask(number: int, frame: FrameType | None) -> None:
         stop.set()
         signal.signal(signal.SIGINT, before[signal.SIGINT])
-        print("saving; a second Ctrl-C stops at once", file=sys.stderr)
+        if os.environ.get("RANK", "0") == "0":
+            print("saving; a second Ctrl-C stops at once", file=sys.stderr)
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGTERM, signal.SIGINT)}
     try:

@@ -7,6 +7,7 @@ again resumes from the newest checkpoint: on a CPU bit for bit as if it had neve
 save before they end the run.
 """
 
+import re
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -22,7 +23,7 @@ from hma_model.parallel import World, join
 from hma_model.recipe import Recipe
 from hma_model.report import write_report
 from hma_model.runlog import RunLog, read_metrics
-from hma_model.runtime import choose_device, own_folder, stop_on_signals
+from hma_model.runtime import choose_device, enough_memory, own_folder, stop_on_signals
 from hma_model.trackers import Tracker, open_trackers
 from hma_model.trainer import Run
 
@@ -79,14 +80,18 @@ def train(
         RecipeError: the recipe does not fit the data, or differs from that of the run in the folder.
         ShardError: the shards do not go together.
         OutputError: the folder holds something else, cannot be written, or another run is at work in it.
-        TrainingError: a loss is not a number; it names the windows.
+        TrainingError: a loss is not a number, and it names the windows; memory is short; a rank is lost.
         CheckpointError: a checkpoint cannot be written or none of them can be read.
     """
     if out is None and recipe.out is None:
         raise UsageError("out", "is not given", "name the run's folder with --out or out=DIR")
-    folder = Path(out or recipe.out or "")
+    named = str(recipe.out if out is None else out)
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", named):
+        raise UsageError("out", f"is {named!r}, no folder of this machine", "train here, then hma hub push")
+    folder = Path(named)
     try:
-        return _trained(recipe, folder, on_progress, show, force)
+        with enough_memory():
+            return _trained(recipe, folder, on_progress, show, force)
     except OSError as fault:
         where, why = fault.filename or folder, fault.strerror or str(fault)
         remedy = "free space or choose another folder; checkpoints that are there are intact"
@@ -140,6 +145,7 @@ def _loop(
             if complaint := run.complaint():
                 log.note(complaint)
         if last or stopped or _due(run.step, recipe.checkpoint_every):
+            log.sync()
             run.save()
     if run.world.rank == 0:
         log.note(f"drawn: {_shares(run)}")

@@ -31,7 +31,7 @@ from hma_model.parallel import Spread, World, gathered
 from hma_model.pictures import newest_pictures, sample_pictures
 from hma_model.recipe import Recipe
 from hma_model.resume import Kept, State, data_digests, read_kept, read_state, seed_for, write_state
-from hma_model.runtime import ENVIRONMENT, RECIPE, environment
+from hma_model.runtime import ENVIRONMENT, RECIPE, environment, require_memory
 from hma_model.self_forward import forwarded, share_at
 from hma_model.start import Start
 from hma_model.tally import Tally, peak_memory_mib
@@ -97,6 +97,8 @@ class Run:
     def _network(self) -> HMA:
         spec = next(iter(self.sets.values())).spec
         config: HMAConfig = self.start.network(self.recipe) if self.start else self.recipe.network(spec)
+        spread = self.world.size if self.recipe.parallel == "fsdp" else 1
+        require_memory(config, self.device, spread, bool(self.start and self.start.frozen))
         model = HMA(config)
         for name, shards in self.sets.items():
             model.add_embodiment(ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name)))
@@ -113,6 +115,10 @@ class Run:
         missing = sorted(set(self.sets) - set(self.held_out))
         frames = self.recipe.frames
         notes = [f"no validation windows of {frames} frames: {', '.join(missing)}"] if missing else []
+        if self.recipe.warmup > self.recipe.steps:
+            notes.append(
+                f"lr never reaches its value: warmup {self.recipe.warmup} of {self.recipe.steps} steps"
+            )
         if self.start and not self.step:
             notes += self.start.remarks(self.sets)
         if self.world.size > 1:

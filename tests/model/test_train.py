@@ -302,15 +302,39 @@ def test_two_trainings_in_one_folder_are_refused(recipe, tmp_path):
         ({"frames": 20}, ShardError, "no window of 20 frames"),
         ({"device": "cuda:99"}, RecipeError, "cuda:99 is not there"),
         ({"model": {"width": 15, "heads": 2}}, RecipeError, "heads"),
-        ({"mixture": {"weights": {"leg": 2}}}, UsageError, "leg"),
-        ({"objectives": {"foward": 1}}, RecipeError, "foward"),
+        ({"mixture": {"weights": {"leg": 2}}}, RecipeError, r"recipe: mixture\.weights: name leg.* has arm"),
+        ({"mixture": {"weights": {"arm": 0, "hand": 0}}}, RecipeError, r"mixture\.weights: leave nothing"),
+        ({"accumulate": 1_000_000_000}, RecipeError, r"4000000000 windows a step are more"),
+        ({"model": {"width": 131_072, "layers": 999}}, RecipeError, "weights take .* GiB in training, here"),
     ],
 )
 def test_what_does_not_fit_the_data_is_said_before_anything_is_trained(
     recipe, tmp_path, changes, error, message
 ):
     with pytest.raises(error, match=message):
-        train(recipe(**changes), out=tmp_path / "run", show=False)
+        train(recipe(**changes), out=tmp_path / "new/run", show=False)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_was_there_stays_and_a_run_in_it_is_not_harmed(recipe, tmp_path):
+    (tmp_path / "run").mkdir()
+    with pytest.raises(ShardError):
+        train(recipe(data=["nowhere"]), out=tmp_path / "run", show=False)
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+def test_a_store_is_no_folder_for_a_run(recipe):
+    with pytest.raises(UsageError, match="no folder of this machine"):
+        train(recipe(), out="s3://bucket/run", show=False)
+
+
+@pytest.mark.parametrize("fault", [torch.OutOfMemoryError("CUDA out of memory. Tried"), MemoryError()])
+def test_too_little_memory_is_said_with_what_lowers_it(recipe, tmp_path, fault):
+    def fail(facts):
+        raise fault
+
+    with pytest.raises(TrainingError, match="memory: there is not enough .*lower batch_size"):
+        train(recipe(), out=tmp_path / "run", show=False, on_progress=fail)
 
 
 def test_a_run_needs_a_folder(recipe):
