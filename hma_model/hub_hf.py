@@ -4,6 +4,7 @@ A push is one commit on top of the commit it was prepared for; when somebody els
 is prepared again. What is downloaded lies in the client's own cache, which works offline.
 """
 
+import hashlib
 import random
 import re
 import time
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HubError
-from hma_data.files import write_atomic
+from hma_data.files import file_sha256, write_atomic
 from hma_model.files import MAX_JSON_BYTES
 from hma_model.hub_bounds import bounded, downloading
 from hma_model.hub_errors import LOG_IN, cuts, explain, explained, raised, waiting, without_token
@@ -61,6 +62,7 @@ class HuggingFaceStore:
         self._offline: Path | None = None
         self._sizes: dict[str, int] | None = None
         self._digests: dict[str, str] = {}
+        self._blobs: dict[str, str] = {}
         if write:
             if get_token() is None:
                 remedy = f"{LOG_IN}; for a folder write ./{repo}"
@@ -87,6 +89,7 @@ class HuggingFaceStore:
         self._commit, self._offline = self._named(info.sha), None
         entries = self._patiently(self._listing) if info.sha else []
         self._digests = {item.path: item.lfs.sha256 for item in entries if item.lfs}
+        self._blobs = {item.path: str(item.blob_id) for item in entries if not item.lfs}
         self._sizes = {item.path: int(item.size or 0) for item in entries}
         return dict(self._sizes)
 
@@ -155,9 +158,11 @@ class HuggingFaceStore:
         added = [
             CommitOperationAdd(name, str(content) if isinstance(content, Path) else content)
             for name, content in files.items()
-            if content is not None
+            if content is not None and not self._has(name, content)
         ]
         deleted = [CommitOperationDelete(name) for name, content in files.items() if content is None]
+        if not added and not deleted:
+            return
         self._api.preupload_lfs_files(
             self.repo, added, repo_type=self._kind, free_memory=False, gitignore_content=""
         )  # a .gitignore of the repository would silently leave files out
@@ -172,6 +177,20 @@ class HuggingFaceStore:
             commit_message=message,
             parent_commit=self._commit,
         )
+
+    def _has(self, name: str, content: Path | bytes) -> bool:
+        """Whether the commit has the same under this name; a commit whose answer was lost is found so."""
+        if name in self._digests:
+            digest = (
+                file_sha256(content) if isinstance(content, Path) else hashlib.sha256(content).hexdigest()
+            )
+            return self._digests[name] == digest
+        size = content.stat().st_size if isinstance(content, Path) else len(content)
+        if name not in self._blobs or size > MAX_JSON_BYTES or (self._sizes or {}).get(name) != size:
+            return False
+        whole = content.read_bytes() if isinstance(content, Path) else content
+        git = hashlib.sha1(b"blob %d\0" % size + whole, usedforsecurity=False)
+        return self._blobs[name] == git.hexdigest()
 
     def digests(self) -> dict[str, str]:
         """SHA-256 by name of the large files, at the commit that `files` saw."""
