@@ -5,17 +5,23 @@
     weights.safetensors       of training, where the checkpoint's own are averages of them
 
 There is no state of random numbers: every draw of a step comes from (seed, what, step) by `seed_for`.
+
+A run goes on only in the format versions that it was written in: what an optimizer knows of its weights
+cannot be brought to others. The weights can: a new run starts from such a checkpoint with `start`.
 """
 
 import hashlib
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, RecipeError
-from hma_model.checkpoint import HEAD, STEM, TRAINING, Checkpoint, inside
-from hma_model.files import read_json, read_tensors, to_json, write_tensors
+from hma_data.files import file_sha256
+from hma_model.checkpoint import CONFIG, HEAD, STEM, TRAINING, Checkpoint, inside
+from hma_model.files import finite, read_json, read_tensors, to_json, write_tensors
+from hma_model.migrate import FORMAT_VERSION
 from hma_model.recipe import Recipe, differences
 from hma_model.state import check_fit, module_key
 
@@ -26,6 +32,11 @@ if TYPE_CHECKING:
     from hma_model.model import HMA
 
 STATE, OPTIMIZER, WEIGHTS = "state.json", "optimizer.safetensors", "weights.safetensors"
+VERSION = 1  # of `training/`; it rises with any change of what its files mean
+
+
+class OtherVersionError(CheckpointError):
+    """A checkpoint of another format version: whole, but not to be passed over for an older one."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +96,33 @@ def write_state(
     write_tensors(folder / OPTIMIZER, moments, {"format": "pt"})
     if weights:
         write_tensors(folder / WEIGHTS, weights, {"format": "pt"})
-    (folder / STATE).write_bytes(to_json(asdict(state)))
+    files = {path.name: file_sha256(path) for path in sorted(folder.iterdir())}
+    values = finite({"version": VERSION, **asdict(state), "files": files})
+    (folder / STATE).write_bytes(to_json({**values, "sha256": _digest(values)}))
+
+
+def _digest(values: Mapping[str, Any]) -> str:
+    content = json.dumps({key: value for key, value in values.items() if key != "sha256"}, sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def require_version(path: Path) -> None:
+    """Raise unless a run can go on from the checkpoint in a folder with this release.
+
+    Raises:
+        OtherVersionError: it names both versions.
+        CheckpointError: a file that says so is missing or damaged.
+    """
+    checks = (
+        (path / CONFIG, "format_version", FORMAT_VERSION, None),
+        (path / TRAINING / STATE, "version", VERSION, 1),
+    )
+    for file, key, own, absent in checks:
+        found = read_json(file).get(key, absent)
+        if isinstance(found, int) and found != own:
+            newer = "update hma-toolkit, or begin" if found > own else "begin"
+            remedy = f"{newer} a new run from its weights with start={path}"
+            raise OtherVersionError(file, f"is of {key} {found}, this release trains on with {own}", remedy)
 
 
 @dataclass(frozen=True)
@@ -143,10 +180,25 @@ def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) 
     for name in set(embodiments) & set(checkpoint.embodiments):
         checkpoint.check(name)
         shown[name] = tuple(read_tensors(checkpoint.path(name, part)) for part in (STEM, HEAD))
-    averaged = (checkpoint.folder / TRAINING / WEIGHTS).is_file()
-    weights = read_tensors(inside(checkpoint.folder, f"{TRAINING}/{WEIGHTS}")) if averaged else {}
-    moments = read_tensors(inside(checkpoint.folder, f"{TRAINING}/{OPTIMIZER}"))
+    weights = _own_file(checkpoint, WEIGHTS) if WEIGHTS in _files(checkpoint) else {}
+    moments = _own_file(checkpoint, OPTIMIZER)
     return Kept(state, shown, weights, moments)
+
+
+def _files(checkpoint: Checkpoint) -> dict[str, str]:
+    """The files of `training/` by their hashes; an older release has left none of these."""
+    folder = checkpoint.folder / TRAINING
+    there = {name: "" for name in (OPTIMIZER, WEIGHTS) if (folder / name).is_file()}
+    files = read_json(folder / STATE).get("files")
+    return files if isinstance(files, dict) else there
+
+
+def _own_file(checkpoint: Checkpoint, name: str) -> "dict[str, Tensor]":
+    path = inside(checkpoint.folder, f"{TRAINING}/{name}")
+    recorded = _files(checkpoint).get(name)
+    if recorded and recorded != file_sha256(path):
+        raise CheckpointError(path, f"is not the file that {STATE} names", "delete this checkpoint")
+    return read_tensors(path)
 
 
 def read_state(checkpoint: Checkpoint) -> State:
@@ -156,7 +208,11 @@ def read_state(checkpoint: Checkpoint) -> State:
         CheckpointError: it is not said, or damaged.
     """
     path = inside(checkpoint.folder, f"{TRAINING}/{STATE}")
+    values = read_json(path)
+    stated = values.pop("sha256", None)
+    if stated is not None and stated != _digest(values):
+        raise CheckpointError(path, "is not what was written", "delete this checkpoint")
     try:
-        return State(**read_json(path))
+        return State(**{key: value for key, value in values.items() if key not in ("version", "files")})
     except TypeError as fault:
         raise CheckpointError(path, f"is damaged: {fault}", "delete this checkpoint") from fault

@@ -30,7 +30,17 @@ from hma_model.optim import load_optimizer_state, lr_scale, make_optimizer, opti
 from hma_model.parallel import Spread, World, gathered
 from hma_model.pictures import newest_pictures, sample_pictures
 from hma_model.recipe import Recipe
-from hma_model.resume import Kept, State, data_digests, read_kept, read_state, seed_for, write_state
+from hma_model.resume import (
+    Kept,
+    OtherVersionError,
+    State,
+    data_digests,
+    read_kept,
+    read_state,
+    require_version,
+    seed_for,
+    write_state,
+)  # fmt: skip
 from hma_model.runtime import ENVIRONMENT, RECIPE, environment, require_memory
 from hma_model.self_forward import forwarded, share_at
 from hma_model.start import Start
@@ -344,6 +354,7 @@ class Run:
 
         Raises:
             RecipeError: recipe or shards differ from the run's.
+            OtherVersionError: the newest checkpoint is of another format version.
             CheckpointError: there are checkpoints, and none can be read.
         """
         self.world.once(lambda: remove_partial(self.out / "checkpoints"))
@@ -352,6 +363,7 @@ class Run:
         paths = training_checkpoints(self.out)
         for path in reversed(paths):
             try:
+                require_version(path)
                 checkpoint = Checkpoint.open(path)
                 state = read_state(checkpoint)
                 if not force:
@@ -359,9 +371,12 @@ class Run:
                 kept = read_kept(checkpoint, state, self.sets)
                 notes += self._adopt(checkpoint)
                 kept.fill(self.model)
+            except OtherVersionError:
+                raise
             except CheckpointError as fault:
                 if path == paths[0]:
-                    raise
+                    remedy = "no checkpoint here can be read: restore one, or train into another folder"
+                    raise CheckpointError(fault.where, fault.fault, remedy) from fault
                 notes.append(f"passed over a damaged checkpoint: {fault}")
                 continue
             notes += self._continue(state, force)

@@ -208,7 +208,7 @@ def test_a_damaged_newest_checkpoint_is_passed_over(recipe, tmp_path, capsys):
 def test_when_every_checkpoint_is_damaged_nothing_is_overwritten(recipe, tmp_path):
     result = train(recipe(keep_last=1), out=tmp_path / "run", show=False)
     (result.checkpoint / "training/optimizer.safetensors").write_bytes(b"")
-    with pytest.raises(CheckpointError, match="not whole safetensors"):
+    with pytest.raises(CheckpointError, match=r"optimizer.safetensors: .*no checkpoint here can be read"):
         train(recipe(keep_last=1), out=tmp_path / "run", show=False)
 
 
