@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError
+from hma_data.sources.bags.nal import order
 from hma_data.sources.video_file import is_spoilt
 from hma_data.video import MAX_PIXELS, Images
 
@@ -81,6 +82,9 @@ class VideoDecoder:
         self._taken = -1  # last picture given out
         self._ready: dict[int, Any] = {}  # decoded, not given out; None for a damaged one
         self._spoilt = False  # whether the last one decoded, or one it may be made from, is damaged
+        self._order = order(codec)
+        self._lost = -1  # the first message since the last key frame that misses one before it
+        self._made_without: dict[int, int] = {}  # message -> the one from which on a picture is missing
 
     def frames(self, indices: Sequence[int]) -> dict[int, Images]:
         """Picture (H, W, 3) of each of those indices.
@@ -100,6 +104,9 @@ class VideoDecoder:
             frame = self._ready[index]
             self._ready = {i: frame for i, frame in self._ready.items() if i >= index}
             self._taken = index
+            if index in self._made_without:
+                fault = f"a picture before frame {self._made_without[index]} of the video is missing"
+                raise EpisodeError(self._where, f"{fault}, and frame {index} is made from it")
             if frame is None:
                 raise EpisodeError(
                     self._where,
@@ -118,8 +125,19 @@ class VideoDecoder:
         self._context = av.CodecContext.create(CODECS[self._codec], "r")
         self._context.thread_count = 1
         self._ready, self._spoilt = {}, False
+        self._order, self._lost, self._made_without = order(self._codec), -1, {}
         self._next = int(np.flatnonzero(self._keyframes[: index + 1])[-1])
         self._taken = self._next - 1
+
+    def _follow(self, data: bytes) -> None:
+        """Notes whether messages are missing before the next one."""
+        whole = self._order.complete(data)
+        if self._keyframes[self._next]:
+            self._lost = -1
+        elif not whole and self._lost < 0:
+            self._lost = self._next
+        if self._lost >= 0:
+            self._made_without[self._next] = self._lost
 
     def _decode(self, data: bytes | None, wanted: int) -> None:
         """Gives the decoder its next message, or with None lets it finish."""
@@ -131,6 +149,7 @@ class VideoDecoder:
         if data is not None:
             packet = av.Packet(data)
             packet.pts = packet.dts = self._next
+            self._follow(data)
             self._next += 1
         try:
             frames = self._context.decode(packet)

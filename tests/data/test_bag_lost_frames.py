@@ -1,0 +1,114 @@
+"""H.264 and H.265 pictures that were never recorded: none is made from them, none refused for others."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hma_data.errors import EpisodeError
+from hma_data.sources.bags.nal import Bits, order
+from hma_data.sources.bags.video import VideoDecoder, is_keyframe
+from hma_data.video import Images
+
+GROUP, FRAMES = 9, 27
+QUIET = "log-level=none:keyint=9:min-keyint=9:scenecut=0"
+STREAMS = {
+    "x264": ("h264", "libx264", {"bf": "0"}),
+    "x264 zero latency, slices": ("h264", "libx264", {"tune": "zerolatency", "slices": "3"}),
+    "x264 baseline": ("h264", "libx264", {"profile": "baseline", "refs": "1"}),
+    "x264 high 4:4:4": ("h264", "libx264", {"profile": "high444", "bf": "0", "x264-params": "cqm=jvt"}),
+    "x265": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=0"}),
+    "x265 one reference": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=0:ref=1:repeat-headers=1"}),
+    "x265 scaling lists": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=0:scaling-list=default"}),
+}
+REORDERED = {
+    "x264 with b-frames": ("h264", "libx264", {"bf": "3", "x264-params": "b-pyramid=normal"}),
+    "x264 interlaced": ("h264", "libx264", {"bf": "0", "flags": "+ildct+ilme"}),
+    "x264 intra refresh": ("h264", "libx264", {"bf": "0", "x264-params": "intra-refresh=1"}),
+    "x265 with b-frames": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=4:b-pyramid=1"}),
+    "x265 open groups": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=3:open-gop=1"}),
+    "x265 layers in time": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=3:temporal-layers=1"}),
+}
+
+
+def messages(folder: Path, codec: str, encoder: str, options: dict[str, str]) -> list[bytes]:
+    """The packets of a moving picture, as a recorder would put them into messages."""
+    path = folder / ("v.h264" if codec == "h264" else "v.hevc")
+    draw = np.random.default_rng(0)
+    ground = draw.integers(0, 255, (12, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream(encoder, rate=10, options=options)
+        stream.width, stream.height = 128, 96
+        stream.pix_fmt = "yuv444p" if options.get("profile") == "high444" else "yuv420p"
+        stream.codec_context.gop_size = GROUP
+        for i in range(FRAMES):
+            picture = np.ascontiguousarray(np.roll(ground, (3 * i, 5 * i), (0, 1)))
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        out.mux(stream.encode(None))
+    with av.open(str(path)) as container:
+        return [bytes(packet) for packet in container.demux(video=0) if packet.size]
+
+
+def decoded(packets: list[bytes], codec: str, in_order: bool) -> list[Images | None]:
+    """Each picture, or None where it is refused."""
+    keyframes = np.array([is_keyframe(packet, codec) for packet in packets])
+    decoder, found = None, []
+    for i in range(len(packets)):
+        if decoder is None or not in_order:
+            decoder = VideoDecoder(codec, keyframes, lambda start: iter(packets[start:]), "x")
+        try:
+            found.append(decoder.frames([i])[i])
+        except EpisodeError:
+            found.append(None)
+    return found
+
+
+@pytest.mark.parametrize("name", STREAMS)
+@pytest.mark.parametrize("in_order", [True, False])
+def test_no_picture_is_made_from_one_that_is_missing(tmp_path: Path, name: str, in_order: bool) -> None:
+    codec = STREAMS[name][0]
+    packets = messages(tmp_path, *STREAMS[name])
+    whole = decoded(packets, codec, in_order=True)
+    assert len(packets) == FRAMES and all(picture is not None for picture in whole)
+    for lost in (1, 5, 8, 13):
+        found = decoded(packets[:lost] + packets[lost + 1 :], codec, in_order)
+        following = -(-(lost + 1) // GROUP) * GROUP
+        for i, picture in enumerate(found):
+            at = i + (i >= lost)
+            assert (picture is None) == (lost < at < following), (lost, at)
+            assert picture is None or np.array_equal(picture, whole[at])
+
+
+@pytest.mark.parametrize("name", [*STREAMS, *REORDERED])
+def test_nothing_is_missed_where_nothing_is_missing(tmp_path: Path, name: str) -> None:
+    codec, encoder, options = {**STREAMS, **REORDERED}[name]
+    follow = order(codec)
+    assert all(follow.complete(packet) for packet in messages(tmp_path, codec, encoder, options))
+
+
+def test_of_other_codecs_nothing_is_looked_into() -> None:
+    assert order("vp9").complete(b"\x00\x00\x01") and order("av1").complete(b"")
+
+
+@given(st.lists(st.integers(0, 2**16)), st.integers(0, 255))
+def test_numbers_are_read_as_they_are_written(numbers: list[int], tail: int) -> None:
+    text = "".join("0" * ((n + 1).bit_length() - 1) + f"{n + 1:b}" for n in numbers) + f"{tail:08b}"
+    text += "0" * (-len(text) % 8)
+    data = bytes(int(text[i : i + 8], 2) for i in range(0, len(text), 8))
+    escaped = bytearray()
+    for byte in data:
+        if byte <= 3 and escaped[-2:] == b"\x00\x00":
+            escaped.append(3)
+        escaped.append(byte)
+    bits = Bits(bytes(escaped))
+    assert [bits.ue() for _ in numbers] == numbers and bits.u(8) == tail
+
+
+@given(st.binary(max_size=200), st.sampled_from(["h264", "h265"]))
+def test_no_bytes_are_too_odd(data: bytes, codec: str) -> None:
+    follow = order(codec)
+    for kind in (b"", b"\x67", b"\x68", b"\x41", b"\x42\x01", b"\x44\x01", b"\x02\x01", b"\x2a\x01"):
+        assert follow.complete(b"\x00\x00\x01" + kind + data) in (True, False)
