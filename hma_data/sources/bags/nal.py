@@ -32,7 +32,8 @@ class Anything:
 
 def order(codec: str) -> Order:
     """For h264 and h265; of other codecs every message is taken for complete."""
-    return {"h264": Avc, "h265": Hevc}.get(codec, Anything)()
+    kinds: dict[str, type[Order]] = {"h264": Avc, "h265": Hevc}
+    return kinds.get(codec, Anything)()
 
 
 class Bits:
