@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 from hma_data.errors import CheckpointError
 from hma_model import checkpoint
 from hma_model.checkpoint import Checkpoint
+from hma_model.files import read_metadata
 from tests.model.robots import CONFIG, SPEC, make_model, save, yaml
 from tests.model.robots import stats as stats_of
 
@@ -54,7 +55,7 @@ def test_the_cards_and_stems_name_the_trunk_by_its_sha256(folder):
     for name in ROBOTS:
         assert Checkpoint.open(folder).card(name)["trunk_sha256"] == trunk
         stem = folder / "embodiments" / name / "stem.safetensors"
-        assert checkpoint.read_metadata(stem)["trunk_sha256"] == trunk
+        assert read_metadata(stem)["trunk_sha256"] == trunk
 
 
 def test_saving_a_loaded_model_gives_the_same_files(folder, tmp_path):
@@ -115,7 +116,7 @@ def test_changed_statistics_are_refused(folder):
 
 def test_a_stem_of_another_push_than_its_card_is_refused(folder):
     stem = folder / "embodiments/arm/stem.safetensors"
-    tensors, metadata = load_file(stem), checkpoint.read_metadata(stem)
+    tensors, metadata = load_file(stem), read_metadata(stem)
     tensors["input.weight"] += 1
     save_file(tensors, stem, metadata)
     with pytest.raises(CheckpointError, match=r"not the file that card\.json names"):
