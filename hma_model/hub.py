@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from hma_model.model import HMA
 
 Content = Path | bytes
+SHOWN = 50  # ids that an error lists
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
 
 
@@ -163,8 +164,14 @@ def _pull(
     for name in wanted:
         check_id(name, store.name)
         if name not in there:
-            known = ", ".join(there) or "none"
+            known = ", ".join(there[:SHOWN]) or "none"
             raise HubError(store.name, f"has no embodiment {name!r}", f"it has: {known}")
+        lacking = [part for part in PARTS if f"embodiments/{name}/{part}" not in files]
+        if lacking:
+            fault = f"lacks {lacking[0]} of embodiment {name!r}"
+            raise HubError(store.name, fault, "name the embodiments you want, or have it pushed again")
+    if TRUNK not in files:
+        raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
     names = [f"embodiments/{name}/{part}" for name in wanted for part in (SAMPLE, *PARTS)]
     place = out
     if place is None and "://" in str(source) and not is_repository(source):

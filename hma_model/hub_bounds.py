@@ -5,6 +5,7 @@ makes of them. The bounds hold inside `bounded` alone; outside it the client is 
 """
 
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -15,7 +16,9 @@ from hma_data.errors import HubError
 SILENCE = 300.0  # seconds without an answer; a commit of many files takes the hub minutes
 LONGEST_ANSWER = 40_000_000  # bytes of what is not a file; a page of a listing has some 300 kB
 LONGEST_REFUSAL = 1_000_000
-_bounded: ContextVar[bool] = ContextVar("bounded", default=False)
+ROUNDS = 50  # of one address asked for, as by a listing whose next page is the same page
+REQUESTS = 5_000
+_asked: ContextVar[Counter[str] | None] = ContextVar("asked", default=None)  # None where nothing is bounded
 
 
 @contextmanager
@@ -31,37 +34,43 @@ def bounded() -> Iterator[None]:
             "response": [*hooks["response"], _limit],
         }
     before, client.timeout = client.timeout, SILENCE
-    mark = _bounded.set(True)
+    mark = _asked.set(Counter())
     try:
         yield
     finally:
-        _bounded.reset(mark)
+        _asked.reset(mark)
         client.timeout = before
 
 
 @contextmanager
 def downloading() -> Iterator[None]:
     """What comes in this block goes to a file, and whoever writes it looks after its length."""
-    mark = _bounded.set(False)
+    mark = _asked.set(None)
     try:
         yield
     finally:
-        _bounded.reset(mark)
+        _asked.reset(mark)
 
 
 def _ask(request: Any) -> None:
-    if _bounded.get() and request.headers.get("Accept-Encoding") != "identity":
-        request.headers["Accept-Encoding"] = "gzip"  # which can be unpacked piece by piece
+    asked = _asked.get()
+    if asked is None:
+        return
+    request.headers["Accept-Encoding"] = "gzip"  # which can be unpacked piece by piece
+    address = str(request.url) if request.method == "GET" else ""
+    asked.update({"": 1} | ({address: 1} if address else {}))
+    if asked[address] > (ROUNDS if address else REQUESTS) or asked[""] > REQUESTS:
+        raise _fault(request, "sends the one who asks in circles")
 
 
 def _limit(response: Any) -> None:
     plain = response.is_success and not response.has_redirect_location
-    if plain and not _bounded.get():
+    if plain and _asked.get() is None:
         return
     most = LONGEST_ANSWER if plain else LONGEST_REFUSAL
     packed = response.headers.get("Content-Encoding", "identity").lower()
     if packed not in ("identity", "", "gzip"):
-        raise _fault(response, f"answers in {packed[:20]!r}, which was not asked for")
+        raise _fault(response.request, f"answers in {packed[:20]!r}, which was not asked for")
     if packed == "gzip":
         del response.headers["Content-Encoding"]  # or it would be unpacked twice
     response.stream = _cut(response, most, packed == "gzip")
@@ -81,10 +90,10 @@ def _cut(response: Any, most: int, packed: bool) -> Any:
                 try:
                     made = unpack.decompress(block, left + 1) if unpack else block
                 except zlib.error as fault:
-                    raise _fault(response, "answers with damaged gzip") from fault
+                    raise _fault(response.request, "answers with damaged gzip") from fault
                 left -= len(made)
                 if left < 0:
-                    raise _fault(response, f"answers with more than {most:,} bytes")
+                    raise _fault(response.request, f"answers with more than {most:,} bytes")
                 yield made
 
         def close(self) -> None:
@@ -93,6 +102,6 @@ def _cut(response: Any, most: int, packed: bool) -> Any:
     return Cut()
 
 
-def _fault(response: Any, fault: str) -> HubError:
-    address = str(response.request.url.copy_with(query=None))
+def _fault(request: Any, fault: str) -> HubError:
+    address = str(request.url.copy_with(query=None))
     return HubError(address, fault, "do not use this repository, or check HF_ENDPOINT and your proxy")

@@ -56,6 +56,8 @@ def explain(where: str, fault: BaseException) -> HubError:
         case errors.OfflineModeIsEnabled() | httpx.ConnectError() | httpx.TimeoutException():
             name = type(fault).__name__
             return HubError(where, f"is out of reach: {name}", "check the network, try again")
+        case httpx.TooManyRedirects() | httpx.DecodingError() | httpx.UnsupportedProtocol():
+            return _strange(where, fault)
         case httpx.HTTPError():
             fault_text = f"the connection was cut: {type(fault).__name__}"
             return HubError(where, fault_text, AGAIN)
@@ -126,8 +128,14 @@ def _plain(where: str, fault: BaseException) -> HubError:
         return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
     if isinstance(fault, OSError):
         return HubError(where, f"did not come whole: {text}", AGAIN)
-    if isinstance(fault, RuntimeError):  # what the transfer library of the hub raises
+    if isinstance(fault, RuntimeError) and not isinstance(
+        fault, RecursionError
+    ):  # what the transfer library of the hub raises
         return HubError(where, f"the transfer failed: {text}", "run it again; HF_HUB_DISABLE_XET=1 may help")
+    return _strange(where, fault)
+
+
+def _strange(where: str, fault: BaseException) -> HubError:
     return HubError(where, f"did not answer as a hub does: {type(fault).__name__}", "check HF_ENDPOINT")
 
 

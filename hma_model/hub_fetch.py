@@ -169,10 +169,12 @@ def _stated(wanted: Wanted, home: str, location: str, headers: Any, length: str 
     size = int(length) if length and length.isdecimal() else wanted.size
     if size is None:
         raise HubError(wanted.where, "came without its size", "check HF_ENDPOINT and your proxy")
-    listed = (wanted.size, wanted.sha256)
-    if wanted.size not in (None, size) or (_SHA256.fullmatch(tag) and wanted.sha256 not in (None, tag)):
-        fault = f"is listed as {listed[0]} bytes of SHA-256 {str(listed[1])[:12]}, and answered as "
-        raise HubError(wanted.where, f"{fault}{size} of {tag[:12]}", "do not use this repository")
+    stated = {"size": size, "sha256": tag if _SHA256.fullmatch(tag) else None}
+    for key, value in stated.items():
+        listed = getattr(wanted, key)
+        if None not in (listed, value) and listed != value:
+            fault = f"is listed with {key} {listed}, and answered with {value}"
+            raise HubError(wanted.where, fault, "do not use this repository")
     # a hub's tag must not lead out of the folder, nor be taken for a name of ours
     mark = digest or (tag if re.fullmatch(r"[0-9a-zA-Z_-]{8,128}", tag) else "")
     unmarked = f"{wanted.commit} {wanted.name} {tag}".encode()

@@ -136,7 +136,7 @@ class HuggingFaceStore:
             files = changes()
             try:
                 with bounded():
-                    self._send(files, message)
+                    self._send(files, message, again=attempt > 0)
                 return self.address
             except HubError:
                 raise
@@ -151,14 +151,14 @@ class HuggingFaceStore:
             time.sleep(seconds * (0.5 + random.random()) if conflict else seconds)
         raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
 
-    def _send(self, files: Mapping[str, Path | bytes | None], message: str) -> None:
+    def _send(self, files: Mapping[str, Path | bytes | None], message: str, again: bool) -> None:
         """Upload what is large, then commit all of it, or nothing."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
         added = [
             CommitOperationAdd(name, str(content) if isinstance(content, Path) else content)
             for name, content in files.items()
-            if content is not None and not self._has(name, content)
+            if content is not None and not (again and self._has(name, content))
         ]
         deleted = [CommitOperationDelete(name) for name, content in files.items() if content is None]
         if not added and not deleted:
