@@ -22,6 +22,8 @@ MOST = 1_000_000  # of anything a configuration counts
 _COUNTS = ("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "history_frames",
            "diffusion_depth", "diffusion_width", "diffusion_train_steps", "diffusion_sample_steps",
            "grid", "factored")  # fmt: skip
+MOST_TENSORS = 20_000  # of a file; the paper's largest has some 2,000
+_FLOATS = ("float16", "bfloat16", "float32", "float64")
 _REMEDY = "pull the checkpoint again; if it stays so, do not use it"
 
 
@@ -33,6 +35,7 @@ def trunk(checkpoint: "Checkpoint") -> State:
     """
     path = checkpoint.trunk()
     state: State = migrate.tensors("trunk", read_tensors(path), checkpoint.format_version, path)
+    _require_values(path, state)
     _require_network(checkpoint.config, state, checkpoint.folder)
     return state
 
@@ -55,7 +58,20 @@ def embodiment(checkpoint: "Checkpoint", name: str, space: "ActionSpace") -> tup
         version = read_metadata(path).get("format_version", str(migrate.FORMAT_VERSION))
         number = int(version) if version.isdecimal() and len(version) < 6 else -1
         states.append(migrate.tensors(part, read_tensors(path), number, path))
+        _require_values(path, states[-1])
     return states[0], states[1]
+
+
+def _require_values(where: object, state: Mapping[str, "Tensor"]) -> None:
+    """Raise where what should be weights are no finite floating point numbers, or are strangely many."""
+    if len(state) > MOST_TENSORS:
+        raise CheckpointError(where, f"has {len(state):,} tensors: no network of ours", _REMEDY)
+    for name, tensor in state.items():
+        kind = str(tensor.dtype).removeprefix("torch.")
+        if kind not in _FLOATS and not name.startswith("normalizer."):
+            raise CheckpointError(where, f"holds {name[:80]} as {kind}, not floating point", _REMEDY)
+        if kind in _FLOATS and not bool(tensor.isfinite().all()):
+            raise CheckpointError(where, f"holds values in {name[:80]} that are not finite", _REMEDY)
 
 
 def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: object) -> None:

@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.files import file_sha256
-from hma_model import checkpoint, hub, migrate
+from hma_model import checkpoint, hub, migrate, weights
 from hma_model.checkpoint import Checkpoint
 from hma_model.files import read_metadata
 from hma_model.hub_list import survey
@@ -32,6 +32,16 @@ def edit(path: Path, change) -> None:
     values = json.loads(path.read_text())
     change(values)
     path.write_text(json.dumps(values))
+
+
+def fit(folder: Path) -> None:
+    """Let cards, config.json and stems name the weights that are there now."""
+    trunk = file_sha256(folder / "trunk.safetensors")
+    edit(folder / "config.json", lambda values: values.update(trunk_sha256=trunk))
+    for home in (folder / "embodiments").iterdir():
+        rewrite(home / "stem.safetensors", lambda name: name, trunk_sha256=trunk)
+        digests = {part.name: file_sha256(part) for part in home.glob("*.safetensors")}
+        edit(home / "card.json", lambda values, d=digests: values.update(trunk_sha256=trunk, files=d))
 
 
 def rewrite(path: Path, rename, **metadata: str) -> None:
@@ -153,6 +163,32 @@ def test_a_hostile_safetensors_header_is_refused(folder, head):
     path.write_bytes(head + bytes(16))
     with pytest.raises(CheckpointError, match="is not whole safetensors"):
         checkpoint.load(folder, ["arm"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.bool(), "as bool, not floating point"),
+        (lambda t: t.to(torch.int64), "as int64, not floating point"),
+        (lambda t: t.to(torch.float8_e4m3fn), "as float8_e4m3fn, not floating point"),
+        (lambda t: t * float("nan"), "that are not finite"),
+        (lambda t: t + float("inf"), "that are not finite"),
+    ],
+)
+@pytest.mark.parametrize("name", ["trunk.safetensors", "embodiments/arm/head.safetensors"])
+def test_weights_that_are_no_numbers_are_refused(folder, name, change, message):
+    values = {key: change(tensor) for key, tensor in load_file(folder / name).items()}
+    save_file(values, folder / name, read_metadata(folder / name))
+    fit(folder)
+    with pytest.raises(CheckpointError, match=message):
+        checkpoint.load(folder, ["arm"])
+
+
+def test_a_file_of_countless_tensors_is_refused_in_a_short_line(folder, monkeypatch):
+    monkeypatch.setattr(weights, "MOST_TENSORS", 3)
+    with pytest.raises(CheckpointError, match="tensors: no network of ours") as found:
+        checkpoint.load(folder, ["arm"])
+    assert len(found.value.fault) < 100
 
 
 @pytest.mark.parametrize(
