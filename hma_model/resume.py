@@ -10,6 +10,7 @@ A run goes on only in the format versions that it was written in: what an optimi
 cannot be brought to others. The weights can: a new run starts from such a checkpoint with `start`.
 """
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
@@ -20,9 +21,11 @@ from typing import TYPE_CHECKING, Any
 from hma_data.errors import CheckpointError, RecipeError
 from hma_data.files import file_sha256
 from hma_model.checkpoint import CONFIG, HEAD, STEM, TRAINING, Checkpoint, inside
+from hma_model.config import HMAConfig
 from hma_model.files import finite, read_json, read_tensors, to_json, write_tensors
 from hma_model.migrate import FORMAT_VERSION
 from hma_model.recipe import Recipe, differences
+from hma_model.start import TRAINED_BY
 from hma_model.state import check_fit, module_key
 
 if TYPE_CHECKING:
@@ -73,6 +76,20 @@ class State:
                 f"was begun with another recipe or other shards: {'; '.join(changed)}",
                 "train into another folder, undo the change, or accept it with --force",
             )
+
+
+def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
+    """Raise RecipeError where a run would go on with another network or tokenizer, which nothing allows."""
+    free = TRAINED_BY | {"objectives"} | ({"frames"} if before.time_position == "rotary" else set())
+    for item in dataclasses.fields(HMAConfig):
+        old, new = getattr(before, item.name), getattr(now, item.name)
+        if item.name not in free and old != new:
+            if item.name == "tokenizer":
+                old, new = (spec.get("name") for spec in (old, new))
+                fault = f"was begun with another tokenizer: {old!r}, now {new!r} or other weights of it"
+            else:
+                fault = f"was begun with another network: {item.name} is {new!r}, there it is {old!r}"
+            raise RecipeError(where, fault, "train into another folder; --force cannot accept this")
 
 
 def seed_for(seed: int, what: str, *index: int) -> int:

@@ -74,7 +74,7 @@ class RunLog:
         self._last: dict[str, Any] = {}
         evaluations = [line for line in kept if line["kind"] == "eval"]
         self._evaluation: dict[str, Any] = evaluations[-1] if evaluations else {}
-        self._spent, self._shown = 0.0, 0.0
+        self._spent, self._shown, self._said = 0.0, 0.0, ""
         self._live: Live | None = None
 
     def __enter__(self) -> "RunLog":
@@ -164,8 +164,10 @@ class RunLog:
         if self._live:
             self._live.update(self._table())
         elif force or time.monotonic() - self._shown >= PLAIN_SECONDS:
-            self._shown = time.monotonic()
-            print(self._text(), file=sys.stderr, flush=True)
+            text, self._shown = self._text(), time.monotonic()
+            if text != self._said:
+                print(text, file=sys.stderr, flush=True)
+            self._said = text
 
     def _pace(self) -> tuple[float, str]:
         """Windows a second and time left, over this session's steps."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 FOLDER = ".start"
 # what may differ from the checkpoint's network, because no weight's meaning depends on it
-_TRAINED_BY = {
+TRAINED_BY = {
     *("dropout", "action_loss_weight", "label_smoothing", "corrupt_max", "history_probability"),
     *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
 }
@@ -85,7 +85,7 @@ class Start:
         config = self.checkpoint.config
         changes: dict[str, Any] = {"objectives": recipe.objectives}
         for key, value in recipe.model.items():
-            if key in _TRAINED_BY:
+            if key in TRAINED_BY:
                 changes[key] = value
             elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
                 raise RecipeError(

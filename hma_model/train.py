@@ -86,6 +86,8 @@ def train(
     if out is None and recipe.out is None:
         raise UsageError("out", "is not given", "name the run's folder with --out or out=DIR")
     named = str(recipe.out if out is None else out)
+    if not named.strip() or "\0" in named:
+        raise UsageError("out", f"is {named!r}, no name of a folder", "name the run's folder with --out DIR")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", named):
         raise UsageError("out", f"is {named!r}, no folder of this machine", "train here, then hma hub push")
     folder = Path(named)
@@ -147,7 +149,7 @@ def _loop(
         if last or stopped or _due(run.step, recipe.checkpoint_every):
             log.sync()
             run.save()
-    if run.world.rank == 0:
+    if run.world.main and any(row["samples"] for row in run.feed.realised()):
         log.note(f"drawn: {_shares(run)}")
     if stopped:
         log.note(f"stopped by a signal and saved at step {run.step}; the same command goes on")

@@ -37,10 +37,11 @@ from hma_model.resume import (
     data_digests,
     read_kept,
     read_state,
+    require_network,
     require_version,
     seed_for,
     write_state,
-)  # fmt: skip
+)
 from hma_model.runtime import ENVIRONMENT, RECIPE, environment, require_memory
 from hma_model.self_forward import forwarded, share_at
 from hma_model.start import Start
@@ -111,7 +112,11 @@ class Run:
         require_memory(config, self.device, spread, bool(self.start and self.start.frozen))
         model = HMA(config)
         for name, shards in self.sets.items():
-            model.add_embodiment(ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name)))
+            try:
+                space = ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name))
+            except RecipeError as fault:
+                raise RecipeError(shards.folder, f"{name}: {fault.fault}", fault.remedy) from fault
+            model.add_embodiment(space)
         return model
 
     @property
@@ -320,7 +325,7 @@ class Run:
                 cards={name: self._card(name, s) for name, s in self.sets.items()},
                 tokenizer=model.config.tokenizer,
                 training=lambda folder: write_state(folder, state, moments, weights),
-                base=self.start.checkpoint if self.start and self.start.frozen else None,
+                base=self.start.checkpoint if self.start and self._carries_others else None,
                 samples=newest_pictures(self.out, self.sets),
             )
             for old in training_checkpoints(self.out)[: -self.recipe.keep_last]:
@@ -368,6 +373,7 @@ class Run:
                 state = read_state(checkpoint)
                 if not force:
                     state.require_same(self.recipe.identity(), self.digests, self.out)
+                require_network(checkpoint.config, self.model.config, self.out)
                 kept = read_kept(checkpoint, state, self.sets)
                 notes += self._adopt(checkpoint)
                 kept.fill(self.model)
@@ -386,7 +392,8 @@ class Run:
 
     def _adopt(self, checkpoint: Checkpoint) -> list[str]:
         """Keep the statistics that stems were trained with, where the shards have others by now."""
-        notes = []
+        left = sorted(set(checkpoint.embodiments) - set(self.sets)) if not self._carries_others else []
+        notes, gone = [], [f"left out of checkpoints from here on: {', '.join(left)}"] if left else []
         for name, shards in self.sets.items():
             if name not in checkpoint.embodiments:
                 notes.append(f"{name} is new here: fresh stem and head")
@@ -401,7 +408,12 @@ class Run:
             self.model.trunk.checkpointing = self.recipe.checkpointing
             if self.start:
                 self.start.fill(self.model)
-        return notes
+        return notes + gone
+
+    @property
+    def _carries_others(self) -> bool:
+        """Whether checkpoints keep robots that are not trained: those of a frozen trunk's source."""
+        return bool(self.start and self.start.frozen)
 
     def _describe(self) -> None:
         write_atomic(self.out / RECIPE, to_json(self.recipe.values()))

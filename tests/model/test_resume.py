@@ -6,9 +6,11 @@ import shutil
 import pytest
 import torch
 
-from hma_data.errors import CheckpointError
+from hma_data.errors import CheckpointError, RecipeError, UsageError
+from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.recipe import make_recipe
 from hma_model.train import train
+from tests.model.robots import SPEC
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards
 
@@ -68,3 +70,54 @@ def test_a_checkpoint_of_before_hashes_and_versions_goes_on(recipe, tmp_path, wh
     old = {k: v for k, v in json.loads(path.read_text()).items() if k not in ("version", "files", "sha256")}
     path.write_text(json.dumps(old))
     assert same(train(recipe(), out=run, show=False).checkpoint, whole / "checkpoints/step-00000006")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model": {**TINY["model"], "width": 32}}, "another network: width is 32, there it is 16"),
+        (
+            {"model": {**TINY["model"], "qk_norm": True}},
+            "another network: qk_norm is True, there it is False",
+        ),
+    ],
+)
+def test_not_even_force_goes_on_with_another_network(recipe, whole, changes, message):
+    with pytest.raises(RecipeError, match=message):
+        train(recipe(**changes, steps=8), out=whole, show=False, force=True)
+
+
+def test_not_even_force_goes_on_with_another_tokenizer(recipe, whole, tmp_path):
+    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "other"})
+    shards = make_shards(tmp_path / "arm", "arm", spec=spec)
+    with pytest.raises(RecipeError, match="another tokenizer: 'raw', now 'other'"):
+        train(recipe(data=[str(shards)], steps=8), out=whole, show=False, force=True)
+
+
+def test_robots_that_force_leaves_behind_are_named(recipe, whole, tmp_path, capsys):
+    run, hand = shutil.copytree(whole, tmp_path / "run"), make_shards(tmp_path / "hand", "hand", dims=3)
+    train(recipe(data=[str(hand)], steps=7), out=run, force=True)
+    assert "left out of checkpoints from here on: arm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("out", ["", " ", "a\0b"])
+def test_what_cannot_be_a_folder_is_wrong_usage(recipe, out):
+    with pytest.raises(UsageError, match="no name of a folder"):
+        train(recipe(), out=out, show=False)
+
+
+def test_every_line_of_progress_is_said_once(recipe, tmp_path, capsys):
+    train(recipe(), out=tmp_path / "run")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == len(set(lines)) and lines[-1].startswith("drawn: ")
+
+
+def test_a_line_of_metrics_that_is_damaged_is_left_out(recipe, whole, tmp_path):
+    run = shutil.copytree(whole, tmp_path / "run")
+    lines = (run / "metrics.jsonl").read_bytes().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_bytes(
+        b"".join([*lines[:2], b"\xff\n", b"[1]\n", b'{"step": "x"}\n', *lines[2:]])
+    )
+    assert train(recipe(), out=run, show=False).losses == [
+        (line["step"], line["loss"]) for line in map(json.loads, lines) if line["kind"] == "train"
+    ]
