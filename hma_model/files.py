@@ -130,6 +130,14 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[st
 
     plain = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
     save_file(plain, path, metadata)
+    with path.open("r+b") as file:  # it writes metadata in an order of its own, another one each time
+        length = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(length))
+        values = {"__metadata__": dict(sorted(header.pop("__metadata__").items())), **header}
+        content = json.dumps(values, ensure_ascii=False, separators=(",", ":")).encode().ljust(length)
+        if len(content) == length:
+            file.seek(8)
+            file.write(content)
 
 
 def finite(values: Any) -> Any:

@@ -8,6 +8,7 @@ import torch
 
 from hma_data.errors import CheckpointError, RecipeError, UsageError
 from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.files import read_metadata, read_tensors, write_tensors
 from hma_model.recipe import make_recipe
 from hma_model.train import train
 from tests.model.robots import SPEC
@@ -121,3 +122,16 @@ def test_a_line_of_metrics_that_is_damaged_is_left_out(recipe, whole, tmp_path):
     assert train(recipe(), out=run, show=False).losses == [
         (line["step"], line["loss"]) for line in map(json.loads, lines) if line["kind"] == "train"
     ]
+
+
+def test_the_same_tensors_give_the_same_bytes(tmp_path):
+    metadata = {f"key{i}": f'val"ue {i}' for i in range(8)}
+    tensors = {"b": torch.arange(3.0), "a.é": torch.ones(2, 2, dtype=torch.bfloat16)}
+    contents = set()
+    for i in range(8):
+        write_tensors(tmp_path / f"{i}.safetensors", tensors, metadata)
+        contents.add((tmp_path / f"{i}.safetensors").read_bytes())
+    assert len(contents) == 1 and read_metadata(tmp_path / "0.safetensors") == metadata
+    assert all(
+        torch.equal(value, tensors[n]) for n, value in read_tensors(tmp_path / "0.safetensors").items()
+    )
