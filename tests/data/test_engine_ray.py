@@ -1,14 +1,21 @@
 """The Ray engine on a cluster of two nodes: the same bytes, whether nodes and actors are lost or not."""
 
 import os
+import random
+import signal
+import subprocess
+import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from hma_data.convert import convert
 from hma_data.engines.base import Limits, Retry
-from hma_data.errors import MissingDependencyError, TokenizerError
+from hma_data.errors import HMAError, MissingDependencyError, TokenizerError
+from hma_data.plan import Settings
 from tests.data.test_engines import PLAIN, MakeWork, Unit
 
 try:
@@ -19,13 +26,14 @@ except ImportError:
 
 needs_ray = pytest.mark.skipif(ray is None, reason="Ray is not installed: pip install 'hma-toolkit[ray]'")
 LIMITS = Limits(quiet_s=5, kills=4)
+SETTINGS = Settings(val_fraction=0.2, shard_frames=60)
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
 def cluster():
     """Two nodes; the second may be killed, and comes back."""
-    root = str(Path(__file__).parents[2])
-    os.environ["PYTHONPATH"] = f"{root}:{os.environ.get('PYTHONPATH', '')}"
+    os.environ["PYTHONPATH"] = f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     made.add_node(num_cpus=2)
     ray.init(address=made.address, log_to_driver=False, logging_level="error")
@@ -50,10 +58,48 @@ def test_every_unit_is_done_once_and_its_events_arrive(cluster, tmp_path: Path) 
 
 
 @needs_ray
-def test_an_actor_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
+def test_a_process_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
     results, events = do([Unit("bad", ("a", "b", "c"), "b", "SIGKILL", times=1), *PLAIN], tmp_path)
     assert results["bad"] == ["a", "b", "c"]
-    assert sum(isinstance(event, Retry) for _, event in events) == 1
+    assert [event.reason for _, event in events if isinstance(event, Retry)] == ["ended by SIGKILL at b"]
+
+
+@needs_ray
+def test_an_actor_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
+    def lose() -> None:
+        until = time.monotonic() + 60
+        while not list(tmp_path.glob("long-*")) and time.monotonic() < until:
+            time.sleep(0.05)
+        for pid in actors_of(os.getpid()):
+            if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::Worker"):
+                os.kill(pid, signal.SIGKILL)
+
+    thread = threading.Thread(target=lose, daemon=True)
+    thread.start()
+    results, events = do([Unit("long", ("a",), "a", "nap"), PLAIN[0]], tmp_path)
+    thread.join(60)
+    assert results == {"long": ["a"], "u0": ["a", "b"]}
+    reasons = [event.reason for _, event in events if isinstance(event, Retry)]
+    assert any(reason.startswith("was lost: ") for reason in reasons)
+
+
+@needs_ray
+def test_workers_that_cannot_be_made_are_one_error(cluster, tmp_path: Path) -> None:
+    from hma_data.engines.ray import run
+
+    with pytest.raises(HMAError, match=r"the Ray cluster: .*installed on every node"):
+        list(run(PLAIN, Unreadable(), 1, lambda number, event: None, LIMITS))
+
+
+class Unreadable:
+    """Stands for work whose module a node does not have."""
+
+    def __reduce__(self):
+        return _not_there, ()
+
+
+def _not_there() -> None:
+    raise ModuleNotFoundError("No module named 'hma_data'")
 
 
 @needs_ray
@@ -86,21 +132,95 @@ def test_a_node_that_is_lost_takes_no_unit_along(cluster, tmp_path: Path) -> Non
     assert results == {unit.name: ["a"] for unit in units}
 
 
-@needs_ray
-def test_the_bytes_are_those_of_the_local_engine(cluster, toy_arm, toy_recording, tmp_path: Path) -> None:
-    from hma_data.convert import convert
-    from hma_data.plan import Settings
+@pytest.fixture
+def whole(toy_arm, toy_recording, tmp_path: Path) -> dict[str, bytes]:
+    """What the local engine makes."""
+    convert(toy_arm, str(toy_recording), "raw", tmp_path / "whole", settings=SETTINGS)
+    return contents(tmp_path / "whole")
 
-    settings = Settings(val_fraction=0.2, shard_frames=60)
-    for name, engine in (("a", "local"), ("b", "ray")):
-        convert(
-            toy_arm, str(toy_recording), "raw", tmp_path / name, settings=settings, workers=2, engine=engine
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+@needs_ray
+def test_the_bytes_are_those_of_the_local_engine(
+    cluster, toy_arm, toy_recording, tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    convert(toy_arm, str(toy_recording), "raw", tmp_path / "out", settings=SETTINGS, workers=2, engine="ray")
+    assert contents(tmp_path / "out") == whole
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+import ray
+import hma_data.convert as conversion
+from hma_data.embodiment import Embodiment
+from hma_data.engines.base import Limits
+from tests.conftest import ARM_YAML
+from tests.data.test_engine_ray import SETTINGS
+from tests.data.test_ray_actor import Slow
+
+make_work = conversion.MakeWork
+conversion.MakeWork = lambda *args: Slow(make_work(*args))
+ray.init(address=sys.argv[1], log_to_driver=False, logging_level="error")
+conversion.convert(
+    Embodiment.from_yaml(ARM_YAML), sys.argv[2], "raw", Path(sys.argv[3]), settings=SETTINGS, workers=3,
+    engine="ray", limits=Limits(quiet_s=60, kills=50),
+)
+"""
+
+
+@needs_ray
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_storm_of_kills_ends_with_the_same_bytes(
+    seed: int, cluster, toy_recording, tmp_path: Path, whole: dict[str, bytes], request
+) -> None:
+    """Of actors, of the processes that work for them, and twice of the driver, which is run again."""
+    draws = random.Random(seed)
+    script, out, killed = tmp_path / "driver.py", tmp_path / "out", 0
+    script.write_text(DRIVER)
+    for kills, shards in ((3, 1), (3, 3), (4, 1_000)):  # the driver is killed once there are so many shards
+        driver = subprocess.Popen(
+            [sys.executable, str(script), cluster.address, str(toy_recording), str(out)],
+            cwd=ROOT,
+            stderr=subprocess.PIPE,
+            text=True,
         )
-    one, other = (
-        {p.relative_to(tmp_path / n): p.read_bytes() for p in (tmp_path / n).rglob("*") if p.is_file()}
-        for n in "ab"
-    )
-    assert one == other
+        request.addfinalizer(driver.kill)
+        until = time.monotonic() + 200
+        while driver.poll() is None and len(list(out.rglob("*.parquet"))) < shards:
+            assert time.monotonic() < until
+            time.sleep(draws.uniform(0.1, 0.6))
+            victims = actors_of(os.getpid())
+            if kills and victims and draws.random() < 0.5:
+                with suppress(ProcessLookupError):
+                    os.kill(draws.choice(victims), signal.SIGKILL)
+                    kills, killed = kills - 1, killed + 1
+        if shards < 1_000:
+            driver.kill()
+        _, errors = driver.communicate(timeout=100)
+    assert driver.returncode == 0, errors
+    assert killed
+    assert contents(out) == whole
+
+
+def actors_of(pid: int) -> list[int]:
+    """Actors that work, and their processes, on nodes that `pid` started."""
+    parents, names = {}, {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            names[int(entry.name)] = (entry / "cmdline").read_bytes()
+    ours, found = {pid}, []
+    for _ in range(6):  # generations
+        ours |= {child for child, parent in parents.items() if parent in ours}
+    for child in ours & names.keys():
+        name = names[child]
+        if name.startswith(b"ray::Worker") or names.get(parents[child], b"").startswith(b"ray::Worker"):
+            found.append(child)
+    return sorted(found)
 
 
 @pytest.mark.skipif(ray is not None, reason="Ray is installed")
