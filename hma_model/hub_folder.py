@@ -1,23 +1,30 @@
 """A hub in a folder, on this machine or behind any fsspec URI.
 
-Files are staged beside their names and renamed one by one: first config and trunk, then an embodiment's
-parts with its card last. Who finds no card finds no embodiment, and a card names the digests of its parts.
+Files are staged beside their names; then, one push at a time, they are renamed one by one: first config and
+trunk, then an embodiment's parts with its card last. Who finds no card finds no embodiment, and a card names
+the digests of its parts. What killed pushes left staged is deleted by the next.
 """
 
 import hashlib
 import os
+import random
 import time
-import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hma_data.errors import HubError
+from hma_data.errors import HMAError, HubError, OutputError, StorageAwayError, StorageError
 from hma_data.files import file_sha256
+from hma_data.remote_lock import PROBE, RemoteLock, living_holder
+from hma_data.store import WHOLE_PUTS, RemotePath, attempt
 from hma_model.checkpoint import CONFIG, README, TRUNK, inside
 from hma_model.files import MAX_JSON_BYTES
+from hma_model.hub_partial import beside, is_abandoned, is_partial, remove_abandoned
 
 ATTEMPTS = 10
+PATIENCE = 240.0  # seconds to wait for another push; one that was killed elsewhere is forgotten after 180
+LOCK = ".hma-push.lock"
 
 
 class FolderStore:
@@ -40,23 +47,25 @@ class FolderStore:
         self.name = text
         try:
             self._fs, self._root = fsspec.core.url_to_fs(text)
-            there = self._fs.isdir(self._root)
-            if write and not there:
-                self._fs.makedirs(self._root, exist_ok=True)
         except (ImportError, ValueError, OSError) as fault:
             raise HubError(text, f"cannot be used: {fault}", "check the address and your access") from fault
-        protocol = self._fs.protocol
-        self._local = "file" in ((protocol,) if isinstance(protocol, str) else protocol)
+        protocols = (self._fs.protocol,) if isinstance(self._fs.protocol, str) else self._fs.protocol
+        self._local = "file" in protocols
+        if not self._local and not self._root.strip("/") and "memory" not in protocols:
+            raise HubError(text, "names no folder", "write the bucket and a folder in it")
+        there = self._ask("used", lambda: self._fs.isdir(self._root))
+        self._flat = bool(WHOLE_PUTS & set(protocols))  # folders are there when something is in them
+        if write and not there and not self._flat:
+            self._ask("made", lambda: self._fs.makedirs(self._root, exist_ok=True))
         if not write and not there:
             raise HubError(text, "no such folder", "for a repository of the hub write ORGANISATION/NAME")
 
     def files(self) -> dict[str, int]:
         """Sizes by name, without what is being written."""
-        sizes = _local_sizes(Path(self._root)) if self._local else self._remote_sizes()
         return {
             name: size
-            for name, size in sizes.items()
-            if ".partial-" not in name and not name.startswith("training/")
+            for name, size in self._sizes().items()
+            if not is_partial(name) and not name.startswith(("training/", LOCK, PROBE))
         }
 
     def warm(self, names: list[str]) -> None:
@@ -66,29 +75,24 @@ class FolderStore:
         """A file of at most 16 MB; links are refused."""
         if self._local:
             inside(Path(self._root), name)
-        try:
+
+        def whole() -> bytes:
             with self._fs.open(self._path(name), "rb") as file:
-                content: bytes = file.read(MAX_JSON_BYTES + 1)
-        except OSError as fault:
-            raise HubError(f"{self.name}/{name}", f"cannot be read: {fault}") from fault
+                return bytes(file.read(MAX_JSON_BYTES + 1))
+
+        content = self._ask("read", whole, f"{self.name}/{name}")
         if len(content) > MAX_JSON_BYTES:
             raise HubError(f"{self.name}/{name}", f"is larger than {MAX_JSON_BYTES:,} bytes")
         return content
 
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
-        """Stage everything, then rename; README.md is renewed until it shows what is there."""
-        for attempt in range(ATTEMPTS):
-            if self._put(dict(changes())):
-                break
-            time.sleep(0.05 * (attempt + 1))
-        else:
-            raise HubError(self.name, "somebody else keeps writing here", "push again later")
-        for _ in range(ATTEMPTS):
-            page = changes().get(README)
-            if not isinstance(page, bytes) or self.read(README) == page:
-                break
-            self._put({README: page})
-        return self.name
+        """Stage everything, then rename; README.md is made last, of what is there then."""
+        self._sweep()
+        for pause in range(ATTEMPTS):
+            if self._put(dict(changes()), lambda: changes().get(README)):
+                return self.name
+            time.sleep((0.05 if self._local else 0.5) * (pause + random.random()))
+        raise HubError(self.name, "somebody else keeps writing here", "push again later")
 
     def digests(self) -> dict[str, str]:
         """SHA-256 of the parquet files, where reading them again is cheap."""
@@ -108,101 +112,179 @@ class FolderStore:
             self._refuse_links(out, target)
             if target.is_file() and self._same(name, target):
                 continue
-            if (
-                name in (CONFIG, TRUNK)
-                and target.is_file()
-                and any((out / "embodiments").glob("*/card.json"))
-            ):
-                raise HubError(
-                    out, f"has another {name} with embodiments of its own", "pull to another folder"
-                )
-            target.parent.mkdir(parents=True, exist_ok=True)
-            beside = _beside(target)
-            try:
-                if self._local:
-                    inside(Path(self._root), name)
-                self._fs.get_file(self._path(name), str(beside))
-                beside.replace(target)
-            except OSError as fault:
-                raise HubError(target, f"cannot be pulled: {fault}", "free space, or pull again") from fault
-            finally:
-                beside.unlink(missing_ok=True)
+            others = (out / "embodiments").glob("*/card.json")
+            if name in (CONFIG, TRUNK) and target.is_file() and any(others):
+                fault = f"has another {name} with embodiments of its own"
+                raise HubError(out, fault, "pull to another folder")
+            self._bring(name, target)
         return out
 
-    def _remote_sizes(self) -> dict[str, int]:
-        self._fs.invalidate_cache()
-        found: dict[str, Any] = self._fs.find(self._root, detail=True)
+    def _bring(self, name: str, target: Path) -> None:
+        new = beside(target)
+        if self._local:
+            inside(Path(self._root), name)
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            remove_abandoned(target)
+            self._ask("pulled", lambda: self._fs.get_file(self._path(name), str(new)), target)
+            new.replace(target)
+        except OSError as fault:
+            raise HubError(target, f"cannot be pulled: {fault}", "free space, or pull again") from fault
+        finally:
+            new.unlink(missing_ok=True)
+
+    def _ask[T](self, doing: str, call: Callable[[], T], where: object = None) -> T:
+        """What a call of the file system returns; a remote one is asked again where that may help."""
+        where = self.name if where is None else where
+        remedy = "free space, check the address and your access, and do it again"
+        try:
+            return call() if self._local else attempt(where, doing, call)
+        except FileNotFoundError as fault:
+            raise HubError(where, f"cannot be {doing}: no such file, folder or bucket", remedy) from fault
+        except OSError as fault:
+            raise HubError(where, f"cannot be {doing}: {fault}", remedy) from fault
+        except HubError:
+            raise
+        except HMAError as fault:
+            raise HubError(where, fault.fault, fault.remedy) from fault
+
+    def _sizes(self) -> dict[str, int]:
+        if self._local:
+            return _local_sizes(Path(self._root))
+
+        def ask() -> dict[str, Any]:
+            self._fs.invalidate_cache()
+            return dict(self._fs.find(self._root, detail=True))
+
+        try:
+            found = attempt(self.name, "listed", ask)
+        except FileNotFoundError:
+            return {}
+        except HMAError as fault:
+            raise HubError(self.name, fault.fault, fault.remedy) from fault
         root = self._root.rstrip("/")
         return {
             path.removeprefix(root).lstrip("/"): int(facts.get("size") or 0) for path, facts in found.items()
         }
 
-    def _put(self, files: Mapping[str, Path | bytes | None]) -> bool:
+    def _sweep(self) -> None:
+        """Delete what is staged of pushes that are no more."""
+        for name in filter(is_partial, self._sizes()):
+            path = self._path(name)
+            if is_abandoned(name, self._modified(path)):
+                self._ask("deleted", lambda: self._fs.rm_file(path) if self._fs.exists(path) else None)  # noqa: B023
+
+    def _modified(self, path: str) -> float | None:
+        try:
+            return float(self._fs.modified(path).timestamp())
+        except (NotImplementedError, OSError, KeyError, AttributeError, TypeError):
+            return None
+
+    def _put(self, files: dict[str, Path | bytes | None], page: Callable[[], Path | bytes | None]) -> bool:
         """False where somebody else has put a config there first."""
         staged: dict[str, str] = {}
+        readme = files.pop(README, None)
         try:
             for name, content in files.items():
                 if content is not None:
                     staged[name] = self._stage(name, content)
-            for name, content in files.items():
-                if content is None:
-                    self._fs.rm_file(self._path(name))
-                elif name == CONFIG and not self._claim(staged[name], self._path(name)):
-                    return False
-                elif name != CONFIG:
-                    self._rename(staged.pop(name), self._path(name))
+            with self._alone():
+                for name, content in files.items():
+                    if content is None:
+                        self._remove(self._path(name))
+                    elif name == CONFIG and not self._claim(staged[name], self._path(name)):
+                        return False
+                    elif name != CONFIG:
+                        self._rename(staged.pop(name), self._path(name))
+                if readme is not None and (now := page()) is not None:
+                    staged[README] = self._stage(README, now)
+                    self._rename(staged.pop(README), self._path(README))
         except OSError as fault:
-            raise HubError(
-                self.name, f"cannot be written: {fault}", "free space, check your access, and push again"
-            ) from fault
+            remedy = "free space, check your access, and push again"
+            raise HubError(self.name, f"cannot be written: {fault}", remedy) from fault
+        except OutputError:  # another was quicker to lock it
+            return False
+        except (StorageError, StorageAwayError) as fault:
+            raise HubError(self.name, fault.fault, fault.remedy) from fault
         finally:
             for left in staged.values():
-                if self._fs.exists(left):
-                    self._fs.rm_file(left)
+                if self._ask("used", lambda: self._fs.exists(left)):  # noqa: B023
+                    self._remove(left)
         return True
 
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """The only one who renames here; of a folder whose file system knows no locks that is only hoped."""
+        with _folder_lock(Path(self._root)) if self._local else self._remote_lock():
+            yield
+
+    def _remote_lock(self) -> RemoteLock:
+        """Taken once it is free; to be given back by `with`."""
+        end = time.monotonic() + PATIENCE
+        place = RemotePath(self.name) / LOCK
+        try:
+            while living_holder(place) and time.monotonic() < end:
+                time.sleep(1.0)
+        except HMAError as fault:
+            raise HubError(self.name, fault.fault, fault.remedy) from fault
+        return RemoteLock(place, "this hub")
+
     def _stage(self, name: str, content: Path | bytes) -> str:
-        beside = str(_beside(Path(self._path(name))))
-        parent = beside.rsplit("/", 1)[0]
+        new = str(beside(Path(self._path(name))))
+        parent = new.rsplit("/", 1)[0]
         if self._local:
             self._refuse_links(Path(self._root), Path(parent))
-        self._fs.makedirs(parent, exist_ok=True)
+        if not self._flat:
+            self._ask("made", lambda: self._fs.makedirs(parent, exist_ok=True))
         if isinstance(content, bytes):
-            self._fs.pipe_file(beside, content)
+            self._ask("written", lambda: self._fs.pipe_file(new, content))
         else:
-            self._fs.put_file(str(content), beside)
+            self._ask("written", lambda: self._fs.put_file(str(content), new))
         if self._local:
-            with Path(beside).open("rb") as file:
+            with Path(new).open("rb") as file:
                 os.fsync(file.fileno())
-        return beside
+        return new
 
-    def _claim(self, beside: str, final: str) -> bool:
-        """Give a file its name unless it is taken; not in one step where the file system is not our own."""
+    def _claim(self, new: str, final: str) -> bool:
+        """Give a file its name unless it is taken."""
         if self._local:
             try:
-                os.link(beside, final)
+                os.link(new, final)
             except FileExistsError:
                 return False
             return True
-        if self._fs.exists(final):
+        if self._ask("used", lambda: self._fs.exists(final)):
             return False
-        self._fs.mv(beside, final)
+        self._ask("written", lambda: self._fs.cp_file(new, final))
         return True
 
-    def _rename(self, beside: str, final: str) -> None:
+    def _rename(self, new: str, final: str) -> None:
         if self._local:
-            Path(beside).replace(final)
-        else:
-            self._fs.mv(beside, final)
+            Path(new).replace(final)
+            return
+        self._ask("written", lambda: self._fs.cp_file(new, final))  # may be asked again, as a move may not
+        self._remove(new)
+
+    def _remove(self, path: str) -> None:
+        try:
+            attempt(self.name, "deleted", lambda: self._fs.rm_file(path))
+        except FileNotFoundError:
+            return
+        except HMAError as fault:
+            raise HubError(self.name, fault.fault, fault.remedy) from fault
 
     def _same(self, name: str, target: Path) -> bool:
-        if int(self._fs.size(self._path(name)) or -1) != target.stat().st_size:
+        def digest() -> str:
+            made = hashlib.sha256()
+            with self._fs.open(self._path(name), "rb") as file:
+                while block := file.read(1 << 20):
+                    made.update(block)
+            return made.hexdigest()
+
+        size = self._ask("read", lambda: self._fs.size(self._path(name)))
+        if size is None or int(size) != target.stat().st_size:
             return False
-        digest = hashlib.sha256()
-        with self._fs.open(self._path(name), "rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-        return digest.hexdigest() == file_sha256(target)
+        return self._ask("read", digest) == file_sha256(target)
 
     def _path(self, name: str) -> str:
         return f"{self._root.rstrip('/')}/{name}"
@@ -215,6 +297,29 @@ class FolderStore:
                 raise HubError(part, "is a link", "only files and folders themselves are written to")
 
 
+@contextmanager
+def _folder_lock(folder: Path) -> Iterator[None]:
+    """A lock on the folder itself, which leaves nothing behind."""
+    import fcntl
+
+    end = time.monotonic() + PATIENCE
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        while True:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as fault:
+                if time.monotonic() > end:
+                    raise HubError(folder, "somebody else keeps writing here", "push again later") from fault
+                time.sleep(0.02)
+            except OSError:
+                break  # its file system knows no locks
+        yield
+    finally:
+        os.close(handle)
+
+
 def _local_sizes(root: Path) -> dict[str, int]:
     """Sizes by name; folders that are links are not entered, since they may lead in circles."""
     sizes = {}
@@ -223,7 +328,3 @@ def _local_sizes(root: Path) -> dict[str, int]:
             if path.is_file():
                 sizes[path.relative_to(root).as_posix()] = path.stat().st_size
     return sizes
-
-
-def _beside(path: Path) -> Path:
-    return path.with_name(f".{path.name}.partial-{uuid.uuid4().hex[:12]}")

@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml as plain_yaml
 
+from hma_data import remote_lock
 from hma_data.errors import CheckpointError, HubError
 from hma_model import checkpoint, hub
 from hma_model.checkpoint import Checkpoint
@@ -31,6 +32,7 @@ def source(tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch) -> Path:
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(remote_lock, "SETTLE_S", 0.01)
     return tmp_path / "cache"
 
 

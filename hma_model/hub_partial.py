@@ -1,0 +1,62 @@
+"""Names of unfinished files: they say whose they are, so that those of the dead can be told."""
+
+import hashlib
+import os
+import re
+import time
+import uuid
+from pathlib import Path
+
+from hma_data.remote_lock import Holder
+
+STALE = 86_400.0  # seconds after which a file of another machine's process is nobody's
+_NAME = re.compile(r"\.partial-(?:([0-9a-f]{8})-(\d{1,10})-)?[0-9a-f]{12}")
+
+
+def beside(path: Path) -> Path:
+    """A name next to a file's, for this process to write to before the file gets its own."""
+    mark = f"{_machine()}-{os.getpid()}-" if _machine() else ""
+    return path.with_name(f".{path.name}.partial-{mark}{uuid.uuid4().hex[:12]}")
+
+
+def is_partial(name: str) -> bool:
+    """Whether a name is one of `beside`, or was of an older release."""
+    return ".partial-" in name
+
+
+def is_abandoned(name: str, modified: float | None) -> bool:
+    """Whether nobody will finish a file: its process has ended, or nothing was heard of it for a day.
+
+    Args:
+        name: with or without its folder.
+        modified: Unix seconds; None where the store does not tell.
+    """
+    found = _NAME.search(name)
+    if not found or found.end() != len(name):
+        return False
+    if found[1] and found[1] == _machine():
+        return not _runs(int(found[2]))
+    return modified is not None and time.time() - modified > STALE
+
+
+def remove_abandoned(path: Path) -> None:
+    """Delete what dead processes left of a file on this machine."""
+    for left in path.parent.glob(f".{path.name}.partial-*"):
+        if not left.is_dir() and is_abandoned(left.name, left.lstat().st_mtime):
+            left.unlink(missing_ok=True)
+
+
+def _machine() -> str:
+    """Of those who can see each other's processes, the same eight digits; empty where it cannot be told."""
+    machine = Holder.me().machine
+    return hashlib.sha256(machine.encode()).hexdigest()[:8] if machine else ""
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
