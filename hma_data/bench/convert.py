@@ -42,7 +42,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         _record(recording, settings)
         rows = settings["episodes"] * settings["frames"]
         alone, alone_cpu = _tokenizer_alone(settings, rows)
-        watch = _Watch()
+        watch = _Watch(settings["workers"])
         with watch:
             began = time.perf_counter()
             summary = convert(
@@ -57,27 +57,27 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
                 on_progress=watch.mark,
             )
             seconds = time.perf_counter() - began
-        starting = watch.first_frame_s - began if watch.first_frame_s else 0.0
-        working = (seconds - starting) * max(settings["workers"], 1)
-        working_cpu = watch.cpu_s - watch.starting_cpu_s
+        after = 1 - watch.starting.frames / rows  # of the frames, what was made since the first were told
+        working_s = (seconds - watch.starting.seconds) * max(settings["workers"], 1)
+        working_cpu_s = watch.worker_cpu_s - watch.starting.worker_cpu_s
         return [
             {
                 "engine": settings["engine"],
                 "workers": settings["workers"],
                 "tokenizer": settings["tokenizer"],
                 "seconds": round(seconds, 2),
-                "start_seconds": round(starting, 2),
-                "frames_per_second": round(rows / (seconds - starting), 1),
+                "start_seconds": round(watch.starting.seconds, 2),
+                "frames_per_second": round(rows * after / (seconds - watch.starting.seconds), 1),
                 "tokenizer_seconds": round(alone, 2),
-                "overhead_share": round(1 - alone / working, 4),
-                "tokenizer_cpu_seconds": round(alone_cpu, 2),
-                "worker_cpu_seconds": round(working_cpu, 2),
-                "overhead_cpu_share": round(1 - alone_cpu / working_cpu, 4) if working_cpu else None,
-                "worker_rss_mib_at_a_tenth": watch.at(0.1),
-                "worker_rss_mib_at_half": watch.at(0.5),
-                "worker_rss_mib_at_the_end": watch.at(1.0),
-                "parent_rss_mib_at_a_tenth": watch.at(0.1, parent=True),
-                "parent_rss_mib_at_the_end": watch.at(1.0, parent=True),
+                "overhead_share": round(1 - alone * after / working_s, 4),
+                "tokenizer_cpu_seconds": round(alone_cpu * after, 2),
+                "worker_cpu_seconds": round(working_cpu_s, 2),
+                "overhead_cpu_share": round(1 - alone_cpu * after / working_cpu_s, 4)
+                if working_cpu_s
+                else None,
+                "parent_cpu_seconds": round(watch.parent_cpu_s - watch.starting.parent_cpu_s, 2),
+                "other_cpu_seconds": round(watch.other_cpu_s - watch.starting.other_cpu_s, 2),
+                **watch.memory(),
                 "episodes": sum(split["episodes"] for split in summary.manifest.splits.values()),
                 "bytes_per_frame": round(summary.manifest.to_json()["totals"]["bytes"] / rows, 1),
             }
@@ -128,24 +128,44 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]
     return (time.perf_counter() - began) * rows / done, (time.process_time() - used) * rows / done
 
 
+@dataclass(frozen=True)
+class _Starting:
+    """What had been used when the first frames were told."""
+
+    seconds: float = 0.0
+    frames: int = 0
+    worker_cpu_s: float = 0.0
+    parent_cpu_s: float = 0.0
+    other_cpu_s: float = 0.0
+
+
 @dataclass
 class _Watch:
-    """Resident memory of this process and of its children, while the conversion goes on."""
+    """Memory and CPU time of this process and of those it started, while the conversion goes on."""
 
-    share: float = 0.0
-    first_frame_s: float = 0.0
-    starting_cpu_s: float = 0.0  # of the workers until their first frame
-    cpu_s: float = 0.0  # of the workers, as last seen
-    samples: list[tuple[float, float, float]] = field(default_factory=list)  # share done, workers, parent
+    workers: int
+    share: float = 0.0  # of the frames that are done
+    starting: _Starting = field(default_factory=_Starting)
+    worker_cpu_s: float = 0.0  # as last seen; Ray's actors count as workers
+    parent_cpu_s: float = 0.0  # less what the watching takes
+    other_cpu_s: float = 0.0  # Ray's own processes
+    samples: list[tuple[float, dict[str, float]]] = field(default_factory=list)  # share, MiB by role
     _stop: threading.Event = field(default_factory=threading.Event)
 
     def mark(self, progress: Any) -> None:
         """Where the conversion stands."""
-        if progress.frames and not self.first_frame_s:
-            self.first_frame_s, self.starting_cpu_s = time.perf_counter(), self.cpu_s
+        if progress.frames and not self.starting.frames:
+            self.starting = _Starting(
+                time.perf_counter() - self._began,
+                progress.frames,
+                self.worker_cpu_s,
+                self.parent_cpu_s,
+                self.other_cpu_s,
+            )
         self.share = progress.frames / max(progress.total_frames, 1)
 
     def __enter__(self) -> "_Watch":
+        self._began = time.perf_counter()
         self._thread = threading.Thread(target=self._look, daemon=True)
         self._thread.start()
         return self
@@ -154,50 +174,80 @@ class _Watch:
         self._stop.set()
         self._thread.join()
 
-    def at(self, share: float, parent: bool = False) -> float | None:
-        """MiB at that share of the work; the largest of the workers."""
-        if not self.samples:
-            return None
-        nearest = min(self.samples, key=lambda sample: abs(sample[0] - share))
-        return round(nearest[2 if parent else 1], 1)
+    def memory(self) -> dict[str, float | None]:
+        """Resident MiB of the largest worker, of the largest of Ray's actors, and of this process."""
+        points = {"a_tenth": 0.1, "half": 0.5, "the_end": 1.0}
+        return {
+            f"{role}_rss_mib_at_{name}": self._at(role, share)
+            for role in ("worker", "actor", "parent")
+            for name, share in points.items()
+            if any(role in found for _, found in self.samples)
+        }
+
+    def _at(self, role: str, share: float) -> float:
+        having = [sample for sample in self.samples if role in sample[1]]
+        return round(min(having, key=lambda sample: abs(sample[0] - share))[1][role], 1)
 
     def _look(self) -> None:
         import os
 
+        pid = os.getpid()
         while not self._stop.wait(0.2):
-            mine = _rss_mib(os.getpid())
-            found = _workers(os.getpid())
-            if found:
-                self.cpu_s = max(self.cpu_s, sum(map(_cpu_s, found)))
-            elif self.samples:
+            roles = _roles(pid)
+            if not roles["worker"] and self.workers == 0:
+                roles["worker"] = [pid]
+            if not roles["worker"] and self.samples and "worker" in self.samples[-1][1]:
                 continue  # the workers are gone, the manifest is being written
-            self.samples.append((self.share, max(map(_rss_mib, found), default=mine), mine))
+            self.worker_cpu_s = max(self.worker_cpu_s, _cpu_s(roles["worker"] + roles["actor"]))
+            self.other_cpu_s = max(self.other_cpu_s, _cpu_s(roles["other"]))
+            self.parent_cpu_s = time.process_time() - time.thread_time()
+            roles["parent"] = [pid]
+            memory = {role: max(map(_rss_mib, pids)) for role, pids in roles.items() if pids}
+            self.samples.append((self.share, memory))
 
 
-def _workers(pid: int) -> list[int]:
-    """Worker processes on this machine: our children, and Ray's actors."""
-    found: list[int] = []
+def _roles(pid: int) -> dict[str, list[int]]:
+    """Processes by what they are for: workers, the actors that watch over them, what else `pid` started."""
+    parents: dict[int, int] = {}
+    commands: dict[int, bytes] = {}
     for entry in Path("/proc").glob("[0-9]*"):
         try:
-            command = (entry / "cmdline").read_bytes()
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            commands[int(entry.name)] = (entry / "cmdline").read_bytes()
         except OSError:
             continue
-        ours = parent == pid and b"spawn_main" in command
-        if ours or command.startswith((b"ray::Worker", b"ray::_Worker")):
-            found.append(int(entry.name))
+    ours = _descendants(pid, parents)
+    actors = {other for other, command in commands.items() if command.startswith(b"ray::Worker")}
+    actors = actors & ours or actors  # those of a cluster that runs already are not descendants
+    workers = {
+        other
+        for other, command in commands.items()
+        if b"spawn_main" in command and parents[other] in {pid, *actors}
+    }
+    return {"worker": [*workers], "actor": [*actors], "other": [*(ours - workers - actors)]}
+
+
+def _descendants(pid: int, parents: dict[int, int]) -> set[int]:
+    found: set[int] = set()
+    newest = {pid}
+    while newest:
+        newest = {child for child, parent in parents.items() if parent in newest} - found
+        found |= newest
     return found
 
 
-def _cpu_s(pid: int) -> float:
-    """CPU seconds of a process, its threads included."""
+def _cpu_s(pids: list[int]) -> float:
+    """CPU seconds of processes, their threads included."""
     import os
 
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    ticks = 0
+    for pid in pids:
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def _rss_mib(pid: int) -> float:

@@ -6,6 +6,7 @@ along: their units are done again elsewhere. `RAY_ADDRESS` names the cluster; wi
 this machine.
 """
 
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -46,7 +47,7 @@ def run(
     ray = _ray()
     ours = not ray.is_initialized()
     if ours:
-        ray.init(log_to_driver=False, logging_level="warning", include_dashboard=False)
+        _join(ray)
     ledger = Ledger(units, limits)
     actors = _Actors(ray, make_work, min(max(workers, 1), max(len(ledger.units), 1)), gpus, ledger, on_event)
     try:
@@ -67,6 +68,19 @@ def _ray() -> Any:
             "--engine ray", "Ray is not installed", "pip install 'hma-toolkit[ray]'"
         ) from fault
     return ray
+
+
+def _join(ray: Any) -> None:
+    try:
+        ray.init(log_to_driver=False, logging_level="warning", include_dashboard=False)
+    except Exception as fault:  # which is the class of some that Ray raises here
+        ray.shutdown()
+        address = os.environ.get("RAY_ADDRESS")
+        raise HMAError(
+            f"the Ray cluster at {address}" if address else "Ray on this machine",
+            f"cannot be {'joined' if address else 'started'}: {_first_line(fault)}",
+            "see `ray status` there" if address else "see its logs in /tmp/ray, or leave out --engine ray",
+        ) from fault
 
 
 @dataclass
@@ -209,4 +223,4 @@ class _Actors:
 
 
 def _first_line(fault: Exception) -> str:
-    return str(fault).strip().splitlines()[0][:200]
+    return (str(fault).strip().splitlines() or [type(fault).__name__])[0][:200]

@@ -223,6 +223,33 @@ def actors_of(pid: int) -> list[int]:
     return sorted(found)
 
 
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("", "Ray on this machine: cannot be started: timed out"),
+        ("10.0.0.9:6379", "the Ray cluster at 10.0.0.9:6379: cannot be joined: timed out"),
+    ],
+)
+def test_a_cluster_that_does_not_answer_is_one_error(
+    address: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from hma_data.engines import ray as engine
+
+    class NoRay:
+        is_initialized = staticmethod(lambda: False)
+        shutdown = staticmethod(lambda: None)
+
+        @staticmethod
+        def init(**settings: object) -> None:
+            raise Exception("timed out\nof many lines")
+
+    monkeypatch.setattr(engine, "_ray", NoRay)
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(HMAError) as caught:
+        do(PLAIN, tmp_path)
+    assert str(caught.value).startswith(said)
+
+
 @pytest.mark.skipif(ray is not None, reason="Ray is installed")
 def test_without_ray_the_error_says_how_to_install_it(tmp_path: Path) -> None:
     with pytest.raises(MissingDependencyError, match=r"pip install 'hma-toolkit\[ray\]'"):

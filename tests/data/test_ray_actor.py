@@ -129,6 +129,16 @@ def test_a_process_that_is_killed_between_units_costs_nothing(opened: Worker) ->
     assert do(opened, PLAIN[1])[1] == Done(("u1", ["a", "b"]))
 
 
+def test_a_process_whose_end_the_cluster_keeps_to_itself_counts_as_killed(opened: Worker) -> None:
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # as Ray does where it reaps every process
+    try:
+        end = do(opened, Unit("bad", ("a", "b"), "b", "SIGKILL"))[1]
+        assert end == Lost("killed", "b", "ended by an unknown cause")
+        assert do(opened, PLAIN[0])[1] == Done(("u0", ["a", "b"]))
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
 def test_an_error_that_is_not_the_datas_is_handed_over_as_it_is(opened: Worker) -> None:
     end = do(opened, Unit("bad", ("a",), "a", "error"))[1]
     assert isinstance(end, Failed) and str(end.fault) == str(TokenizerError("weights", "are wrong"))
