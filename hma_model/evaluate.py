@@ -73,7 +73,7 @@ def windows(
 
 @torch.no_grad()
 def teacher_forced(model: "HMA", batch: Batch) -> tuple[Tensor, Tensor]:
-    """Each frame from the second on, fully masked, given the true past.
+    """Each frame from the second on, fully masked, given as much of the true past as a window holds.
 
     Returns:
         nats (B, T-1) float32 a token, averaged over the frame, and accuracy (B, T-1) of whole tokens.
@@ -82,10 +82,11 @@ def teacher_forced(model: "HMA", batch: Batch) -> tuple[Tensor, Tensor]:
     nats, hits = [], []
     factored, mask = model.config.factored, model.config.vocab_size
     for t in range(1, batch.tokens.shape[1]):
-        seen = batch.tokens[:, : t + 1].clone()
-        seen[:, t] = mask
-        actions, known = batch.actions[:, : t + 1], batch.action_mask[:, : t + 1]
-        logits = model.video_logits(seen, actions, batch.embodiment, known)[:, t]
+        window = slice(max(t + 1 - model.config.frames, 0), t + 1)
+        seen = batch.tokens[:, window].clone()
+        seen[:, -1] = mask
+        actions, known = batch.actions[:, window], batch.action_mask[:, window]
+        logits = model.video_logits(seen, actions, batch.embodiment, known)[:, -1]
         nats.append(token_nats(logits, batch.tokens[:, t], factored).mean(dim=(1, 2)))
         hits.append(token_hits(logits, batch.tokens[:, t], factored).float().mean(dim=(1, 2)))
     return torch.stack(nats, dim=1), torch.stack(hits, dim=1)

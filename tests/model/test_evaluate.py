@@ -90,6 +90,23 @@ def test_the_loss_of_a_frame_looks_at_the_past_alone(model, batch):
     assert torch.equal(nats[:, :2], changed[:, :2]) and not torch.equal(nats[:, 2], changed[:, 2])
 
 
+def test_of_a_window_longer_than_the_models_a_frame_sees_what_the_models_holds(data, model):
+    long = next(windows(data, "val", 10, 3))
+    held, last = model.config.frames, 9
+    assert held < last
+    nats, hits = teacher_forced(model, long)
+    part = slice(last + 1 - held, last + 1)
+    tail = replace(
+        long,
+        tokens=long.tokens[:, part],
+        actions=long.actions[:, part],
+        action_mask=long.action_mask[:, part],
+    )
+    expected = teacher_forced(model, tail)
+    assert nats.shape == (3, 9) and torch.allclose(nats[:, -1], expected[0][:, -1], atol=1e-5)
+    assert torch.equal(hits[:, -1], expected[1][:, -1])
+
+
 def test_a_model_with_equal_scores_has_the_log_of_the_vocabulary(model, batch):
     torch.nn.init.zeros_(model.readout.linear.weight)
     torch.nn.init.zeros_(model.readout.linear.bias)
