@@ -4,6 +4,7 @@ import fcntl
 import os
 import platform
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,13 +17,14 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import torch
 
-from hma_data.errors import OutputError, RecipeError, TrainingError
+from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
 from hma_model.parallel import local_rank
 
 if TYPE_CHECKING:
     from hma_model.config import HMAConfig
 
-RECIPE, ENVIRONMENT, LOCK = "recipe.json", "environment.json", ".lock"
+RECIPE, ENVIRONMENT = "recipe.json", "environment.json"
+LOCK, START = ".lock", ".start"  # START: the checkpoint that the run begins from
 _NO_MEMORY = re.compile("out of memory|can't allocate memory|not enough memory|bad_alloc", re.IGNORECASE)
 
 
@@ -74,7 +76,7 @@ def _git_revision() -> str:
 def own_folder(out: Path) -> Iterator[None]:
     """The run's folder, made if need be, and nobody else's while the block runs.
 
-    A block that leaves nothing in it leaves no folder either, where there was none before.
+    A block that fails before it has left anything in it leaves no folder either, where there was none before.
 
     Raises:
         OutputError: it cannot be made, holds something else, or another run is at work in it.
@@ -93,9 +95,10 @@ def own_folder(out: Path) -> Iterator[None]:
         _hold(lock, out)
         try:
             yield
-        finally:
-            if ours and [path.name for path in out.iterdir()] == [LOCK]:
+        except HMAError:
+            if ours and {path.name for path in out.iterdir()} <= {LOCK, START}:
                 _remove_empty(out, made)
+            raise
 
 
 def _hold(lock: TextIO, out: Path) -> None:
@@ -112,6 +115,7 @@ def _hold(lock: TextIO, out: Path) -> None:
 
 def _remove_empty(out: Path, made: list[Path]) -> None:
     with suppress(OSError):  # somebody has put something there meanwhile
+        shutil.rmtree(out / START, ignore_errors=True)
         (out / LOCK).unlink()
         for path in made:
             path.rmdir()

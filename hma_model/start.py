@@ -11,18 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hma_data.errors import CheckpointError, RecipeError
+from hma_data.errors import CheckpointError, HubError, RecipeError
 from hma_data.shards.reader import ShardSet
 from hma_model import checkpoint as checkpoints
 from hma_model import weights
 from hma_model.checkpoint import Checkpoint, require_tokenizer
 from hma_model.config import HMAConfig
+from hma_model.files import read_json
+from hma_model.runtime import RECIPE, START
 
 if TYPE_CHECKING:
     from hma_model.model import HMA
     from hma_model.recipe import Recipe
 
-FOLDER = ".start"
 # what may differ from the checkpoint's network, because no weight's meaning depends on it
 TRAINED_BY = {
     *("dropout", "action_loss_weight", "label_smoothing", "corrupt_max", "history_probability"),
@@ -55,15 +56,26 @@ class Start:
         from hma_model import hub
 
         assert recipe.start is not None
-        frozen, place, source = recipe.freeze == "trunk", out / FOLDER, recipe.start
+        frozen, place, source = recipe.freeze == "trunk", out / START, recipe.start
+        local = not hub.is_repository(source) and "://" not in source
         if (place / checkpoints.README).is_file():  # written last
+            _require_source(source, local, out)
             return
-        if not hub.is_repository(source) and "://" not in source:
-            found = checkpoints.resolve(Path(source).expanduser())
-            require_tokenizer(Checkpoint.open(found).config, _spec(sets), found)
-            source = str(found)
-        known = [str(row["embodiment"]) for row in hub.list_embodiments(source)]
-        hub.pull(source, [name for name in known if frozen or name in sets], place)
+        if local:
+            found = Checkpoint.open(checkpoints.resolve(Path(source).expanduser()))
+            require_tokenizer(found.config, _spec(sets), found.folder)
+            found.trunk()
+            source = str(found.folder)
+        try:
+            known = [str(row["embodiment"]) for row in hub.list_embodiments(source)]
+            hub.pull(source, [name for name in known if frozen or name in sets], place)
+        except HubError as fault:
+            if local or "://" in source:
+                raise
+            both = f"is no folder here; as a repository of the hub: {fault.fault}"
+            raise HubError(
+                source, both, f"give the path of a checkpoint or run, or: {fault.remedy}"
+            ) from fault
 
     @classmethod
     def open(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> "Start":
@@ -72,7 +84,7 @@ class Start:
         Raises:
             CheckpointError: it is damaged, or the data is of another tokenizer.
         """
-        start = cls(Checkpoint.open(out / FOLDER), recipe.freeze == "trunk", str(recipe.start))
+        start = cls(Checkpoint.open(out / START), recipe.freeze == "trunk", str(recipe.start))
         require_tokenizer(start.checkpoint.config, _spec(sets), start.source)
         return start
 
@@ -141,6 +153,32 @@ class Start:
         if known:
             notes.append(f"going on from its stem and head, with its statistics: {', '.join(known)}")
         return notes
+
+
+def _require_source(source: str, local: bool, out: Path) -> None:
+    """Raise where a run is asked to go on from another checkpoint than the one it was begun from.
+
+    The same one may have moved; a source that is gone, or a run that trained on, is no other one.
+    """
+    from hma_model import hub
+
+    before = _begun_from(out)
+    if before in (None, source):
+        return
+    if local:
+        path = Path(source).expanduser()
+        trunk = Checkpoint.open(checkpoints.resolve(path)).trunk_sha256 if path.exists() else None
+    else:
+        trunk = hub.describe(source)["trunk_sha256"]
+    if trunk not in (None, Checkpoint.open(out / START).trunk_sha256):
+        raise RecipeError(
+            out, f"was begun from {before}, not from {source}", "train into another folder, or name the first"
+        )
+
+
+def _begun_from(out: Path) -> str | None:
+    path = out / RECIPE
+    return read_json(path).get("start") if path.is_file() else None
 
 
 def _spec(sets: Mapping[str, ShardSet]) -> Any:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -194,3 +195,39 @@ def test_the_command_says_what_is_wrong_in_one_line(base, tmp_path):
         check=False,
     )
     assert done.returncode == 1 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
+def test_another_source_is_no_way_to_go_on_and_the_same_one_elsewhere_is(base, leg, tmp_path):
+    tune(base.out, leg, tmp_path / "run")
+    moved = shutil.copytree(base.checkpoint, tmp_path / "moved")
+    assert tune(moved, leg, tmp_path / "run").step == 4
+    other = tune(base.out, leg, tmp_path / "other", freeze=False)
+    with pytest.raises(RecipeError, match=f"was begun from .*moved, not from {other.out}"):
+        tune(other.out, leg, tmp_path / "run", force=True)
+
+
+def test_a_damaged_source_is_named_and_leaves_no_folder(base, leg, tmp_path):
+    damaged = shutil.copytree(base.checkpoint, tmp_path / "damaged")
+    trunk = damaged / "trunk.safetensors"
+    trunk.write_bytes(trunk.read_bytes()[:-5])
+    with pytest.raises(CheckpointError, match=rf"{trunk}: is another trunk"):
+        tune(damaged, leg, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("change", ["model.layers=3", "mixture.weights.lag=2", "batch_size=900"])
+def test_a_run_that_cannot_begin_leaves_no_folder(base, leg, tmp_path, change):
+    with pytest.raises(RecipeError):
+        tune(base.out, leg, tmp_path / "new/run", change)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_path_that_looks_like_a_repository_is_told_to_be_neither(leg, tmp_path, monkeypatch):
+    def away(source):
+        raise HubError(f"hf://{source}", "is out of reach, and not in the cache", "go online and pull again")
+
+    monkeypatch.setattr(hub, "list_embodiments", away)
+    with pytest.raises(
+        HubError, match=r"^runs/base: is no folder here; as a repository .* path of"
+    ):
+        tune("runs/base", leg, tmp_path / "run")
