@@ -17,6 +17,7 @@ from typing import Any
 from hma_data.errors import HubError, OutputError, StorageError
 from hma_data.extend import hashes
 from hma_data.files import cache_folder, file_sha256
+from hma_data.hub_chunks import leave_after, leave_if_unknown
 from hma_data.plan import differences
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SHARD_NAME, Manifest
 from hma_data.store import RemotePath, attempt
@@ -132,12 +133,34 @@ class HubOutput:
 
     def _commit(self, operations: list[Any], message: str) -> None:
         def send() -> None:
+            api = _api()
             with _bounded():
-                _api().create_commit(
+                leave_if_unknown(api, self.repo, "dataset")
+                api.preupload_lfs_files(
+                    self.repo,
+                    added,
+                    repo_type="dataset",
+                    revision=self.branch,
+                    free_memory=False,
+                    gitignore_content="",  # one in the repository would silently leave files out
+                )
+                api.create_commit(
                     self.repo, operations, repo_type="dataset", revision=self.branch, commit_message=message
                 )
 
-        self._asked(send)
+        def by_any_way() -> None:
+            try:
+                send()
+            except Exception as fault:
+                if not leave_after(fault):
+                    raise
+                send()
+
+        from huggingface_hub import CommitOperationAdd
+
+        added = [item for item in operations if isinstance(item, CommitOperationAdd)]
+
+        self._asked(by_any_way)
 
     def _there(self) -> dict[str, str]:
         """Name in the repository -> its content's hash: of LFS files their sha256, of others git's."""

@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HubError
-from hma_data.files import file_sha256, write_atomic
+from hma_data.files import file_sha256
+from hma_data.hub_chunks import leave_after, leave_if_unknown
 from hma_model.files import MAX_JSON_BYTES
 from hma_model.hub_bounds import bounded, downloading
 from hma_model.hub_errors import LOG_IN, cuts, explain, explained, raised, waiting, without_token
 from hma_model.hub_fetch import Wanted, cache_of, cached, fetch, fetch_to, forget_damaged
+from hma_model.hub_partial import beside
 
 ATTEMPTS = 8
 TIMEOUT = 30.0  # seconds for a listing
@@ -142,7 +144,7 @@ class HuggingFaceStore:
                 raise
             except raised() as fault:
                 response = getattr(without_token(fault), "response", None)
-                if _by_chunks_alone(fault):
+                if leave_after(fault):
                     continue
                 conflict = response is not None and response.status_code in _CONFLICTS
                 seconds = min(0.2 * 2**attempt, 10.0) if conflict else waiting(fault, attempt)
@@ -155,6 +157,8 @@ class HuggingFaceStore:
         """Upload what is large, then commit all of it, or nothing."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
+        if not again:
+            leave_if_unknown(self._api, self.repo, self._kind)
         added = [
             CommitOperationAdd(name, str(content) if isinstance(content, Path) else content)
             for name, content in files.items()
@@ -252,7 +256,11 @@ class HuggingFaceStore:
         name = self._revision or "main"
         if self._commit and not _COMMIT.fullmatch(name) and ".." not in name:
             with explained(self.name):
-                write_atomic(cache_of(self.repo, self._kind) / "refs" / name, self._commit)
+                ref = cache_of(self.repo, self._kind) / "refs" / name
+                ref.parent.mkdir(parents=True, exist_ok=True)
+                new = beside(ref)
+                new.write_text(self._commit)
+                new.replace(ref)
 
     def _cached_files(self) -> dict[str, int]:
         """What the cache has of the revision."""
@@ -292,21 +300,3 @@ def _unreachable() -> tuple[type[BaseException], ...]:
     from huggingface_hub.errors import OfflineModeIsEnabled
 
     return (OfflineModeIsEnabled, httpx.ConnectError, httpx.TimeoutException)
-
-
-def _by_chunks_alone(fault: BaseException) -> bool:
-    """Whether an upload in chunks failed; the process goes on by plain LFS, which every hub takes.
-
-    The hub's library of that protocol raises plain errors, also where a hub or a firewall has none of it.
-    """
-    import httpx
-    from huggingface_hub import constants
-    from huggingface_hub.utils._runtime import is_xet_available
-
-    of_library = isinstance(fault, ConnectionError | RuntimeError | TimeoutError) or (
-        type(fault).__module__.startswith("hf_xet")
-    )
-    if isinstance(fault, httpx.HTTPError) or not of_library or not is_xet_available():
-        return False
-    constants.HF_HUB_DISABLE_XET = True
-    return True

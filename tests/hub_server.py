@@ -6,89 +6,21 @@ LFS uploads by signed address, downloads of LFS files by redirect to another hos
 """
 
 import base64
-import hashlib
+import fnmatch
 import json
 import re
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
-LFS_BYTES = 10_000_000  # larger files, and those of binary kinds, go by LFS
-LFS_KINDS = (".safetensors", ".png", ".parquet", ".bin")
+from tests.hub_state import Asked, Commit, Fault, Habits, Repository, oid, sha256
 
-
-@dataclass
-class Commit:
-    """A state of a repository: path -> content."""
-
-    id: str
-    files: dict[str, bytes]
-    message: str
-
-
-@dataclass
-class Repository:
-    """Commits, oldest first, and tags and branches besides main."""
-
-    name: str
-    private: bool = False
-    commits: list[Commit] = field(default_factory=list)
-    refs: dict[str, str] = field(default_factory=dict)
-
-    def commit(self, files: dict[str, bytes | None], message: str = "by hand") -> Commit:
-        """Add a commit; None deletes a file."""
-        before = self.commits[-1].files if self.commits else {}
-        after = {path: content for path, content in {**before, **files}.items() if content is not None}
-        name = hashlib.sha1(f"{self.name} {len(self.commits)} {message}".encode()).hexdigest()
-        self.commits.append(Commit(name, after, message))
-        return self.commits[-1]
-
-    def at(self, revision: str) -> Commit | None:
-        """The commit of a branch, tag or id."""
-        wanted = self.commits[-1].id if revision == "main" else self.refs.get(revision, revision)
-        return next((commit for commit in self.commits if commit.id == wanted), None)
-
-    @property
-    def files(self) -> dict[str, bytes]:
-        """What is there now."""
-        return self.commits[-1].files
-
-
-@dataclass
-class Fault:
-    """What goes wrong: an answer, or a connection cut after some bytes.
-
-    Attributes:
-        request: regular expression over "METHOD path".
-        status: answered instead; None cuts the connection.
-        after: bytes of the body, coming or going, before the cut.
-        times: how often; then all is well.
-        stall: seconds without an answer before.
-    """
-
-    request: str
-    status: int | None = None
-    headers: dict[str, str] = field(default_factory=dict)
-    after: int = 0
-    times: int = 1
-    stall: float = 0.0
-
-
-@dataclass(frozen=True)
-class Asked:
-    """A request and how many bytes of a file were sent for it."""
-
-    method: str
-    path: str
-    range: str | None
-    authorized: bool
-    host: str
-    sent: int
+_PLACE = re.compile(r"^.*?/resolve/[^/]+/|^/cdn/[0-9a-f]+/")
 
 
 class Hub(ThreadingHTTPServer):
@@ -98,6 +30,7 @@ class Hub(ThreadingHTTPServer):
         tokens: token -> "read" or "write".
         repositories: "models/org/name" or "datasets/org/name" -> Repository.
         before_commit: functions called, one each, before a commit is looked at.
+        habits: what it does where the interface leaves it open.
         waits: seconds that clients slept; see `connect`.
     """
 
@@ -111,7 +44,7 @@ class Hub(ThreadingHTTPServer):
         self.faults: list[Fault] = []
         self.log: list[Asked] = []
         self.before_commit: list[Any] = []
-        self.page = 1000
+        self.habits = Habits()
         self.waits: list[float] = []
         self.stalled = threading.Event()
         self.lock = threading.RLock()
@@ -127,6 +60,16 @@ class Hub(ThreadingHTTPServer):
         self.repositories[f"{kind}/{name}"] = made
         return made
 
+    def add_folder(self, name: str, branch: str, folder: Path) -> str:
+        """A dataset's branch with a folder's files; the commit's id."""
+        kept = self.repositories.setdefault(f"datasets/{name}", Repository(name))
+        return kept.commit_folder(folder, branch).id
+
+    def served(self) -> list[str]:
+        """Names of the files that were sent, in their order."""
+        sent = [asked.path for asked in self.log if asked.method == "GET" and asked.sent]
+        return [re.sub(_PLACE, "", path) for path in sent]
+
     def model(self, name: str) -> Repository:
         return self.repositories[f"models/{name}"]
 
@@ -139,7 +82,7 @@ class Hub(ThreadingHTTPServer):
         totals: dict[str, int] = {}
         for asked in self.log:
             if asked.method == "GET" and asked.sent and re.search(pattern, asked.path):
-                path = re.sub(r"^.*?/resolve/[^/]+/|^/cdn/[0-9a-f]+/", "", asked.path)
+                path = re.sub(_PLACE, "", asked.path)
                 totals[path] = totals.get(path, 0) + asked.sent
         return totals
 
@@ -175,7 +118,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.server.stalled.wait(self.fault.stall)
             if self.fault and self.fault.status:
                 self._body()
-                self._answer(self.fault.status, {"error": "made up"}, self.fault.headers)
+                self._answer(self.fault.status, self.fault.body, self.fault.headers)
             elif self.fault and self.command in ("POST", "PUT"):
                 self.rfile.read(min(self.fault.after, int(self.headers.get("Content-Length", 0))))
                 self._cut()
@@ -279,6 +222,8 @@ class _Handler(BaseHTTPRequestHandler):
                 return self._answer(403 if self.right else 401, {"error": "Forbidden: write rights needed"})
             actions = {"preupload": self._preupload, "commit": self._commit}
             return actions.get(verb, self._batch)(repository)
+        if verb not in ("resolve", "tree", "paths-info", "revision", ""):
+            return self._answer(404, {"error": "Not Found"})
         revision, _, path = place.partition("/")
         commit = repository.at(revision or "main")
         if commit is None:
@@ -289,13 +234,14 @@ class _Handler(BaseHTTPRequestHandler):
             return self._tree(commit, path)
         if verb == "paths-info":
             return self._paths(commit)
-        siblings = []
+        siblings: list[dict[str, Any]] = []
         for path, content in commit.files.items():
-            siblings.append({"rfilename": path, "size": len(content), "blobId": _oid(content)})
-            if _by_lfs(path, len(content)):
-                lfs = {"sha256": _sha256(content), "size": len(content), "pointerSize": 134}
+            siblings.append({"rfilename": path, "size": len(content), "blobId": oid(content)})
+            if self.server.habits.by_lfs(path, len(content)):
+                lfs = {"sha256": sha256(content), "size": len(content), "pointerSize": 134}
                 siblings[-1]["lfs"] = lfs
-        facts = {"id": name, "sha": commit.id, "private": repository.private, "siblings": siblings}
+        facts = {"id": name, "sha": commit.id, "private": repository.private}
+        facts |= {"siblings": siblings} if self.server.habits.siblings else {}
         return self._answer(200, {**facts, "tags": [], "downloads": 0, "likes": 0})
 
     # -- reading
@@ -304,31 +250,38 @@ class _Handler(BaseHTTPRequestHandler):
         entries = []
         for path in parse_qs(self.content.decode()).get("paths", []):
             if path in commit.files:
-                entries.append(_entry(path, commit.files[path]))
+                entries.append(self.server.habits.entry(path, commit.files[path]))
             elif any(name.startswith(f"{path}/") for name in commit.files):
-                entries.append({"type": "directory", "path": path, "oid": _oid(path.encode())})
+                entries.append({"type": "directory", "path": path, "oid": oid(path.encode())})
         self._answer(200, entries)
 
     def _tree(self, commit: Commit, below: str) -> None:
         begin = f"{below}/" if below else ""
         files = sorted(commit.files.items())
-        entries = [_entry(path, content) for path, content in files if path.startswith(begin)]
+        entries = [
+            self.server.habits.entry(path, content) for path, content in files if path.startswith(begin)
+        ]
         start = int(self.query.get("cursor", ["0"])[0])
         headers = {}
-        if start + self.server.page < len(entries):
-            following = f"{self.server.url}{self.route}?recursive=true&cursor={start + self.server.page}"
+        if start + self.server.habits.page < len(entries):
+            following = (
+                f"{self.server.url}{self.route}?recursive=true&cursor={start + self.server.habits.page}"
+            )
             headers["Link"] = f'<{following}>; rel="next"'
-        self._answer(200, entries[start : start + self.server.page], headers)
+        self._answer(200, entries[start : start + self.server.habits.page], headers)
 
     def _resolve(self, commit: Commit, path: str) -> None:
         headers = {"X-Repo-Commit": commit.id}
         content = commit.files.get(path)
         if content is None:
             return self._answer(404, {"error": "no such entry"}, {**headers, "X-Error-Code": "EntryNotFound"})
-        if not _by_lfs(path, len(content)):
-            return self._send_file(content, {**headers, "ETag": f'"{_oid(content)}"'})
-        name = _sha256(content)
+        if not self.server.habits.by_lfs(path, len(content)):
+            weak = "W/" if self.server.habits.weak else ""
+            return self._send_file(content, {**headers, "ETag": f'{weak}"{oid(content)}"'})
+        name = sha256(content)
         self.server.objects.setdefault(name, content)
+        if not self.server.habits.redirects:
+            return self._send_file(self.server.objects[name], {**headers, "ETag": f'"{name}"'})
         place = f"http://localhost:{self.server.server_address[1]}/cdn/{name}/{path}?signature=x"
         headers |= {"X-Linked-ETag": f'"{name}"', "X-Linked-Size": str(len(content)), "Location": place}
         return self._answer(302, None, headers)
@@ -336,7 +289,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _send_file(self, content: bytes, headers: dict[str, str]) -> None:
         status, part = 200, content
         asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range") or "")
-        if asked:
+        if asked and self.server.habits.ranges:
             first, last = int(asked[1]), int(asked[2] or len(content) - 1)
             if first >= len(content):
                 return self._answer(416, None, {"Content-Range": f"bytes */{len(content)}"})
@@ -362,10 +315,11 @@ class _Handler(BaseHTTPRequestHandler):
         answers = []
         for file in json.loads(self.content)["files"]:
             path, there = file["path"], repository.files.get(file["path"])
-            lfs = _by_lfs(path, file["size"])
-            answer = {"path": path, "uploadMode": "lfs" if lfs else "regular", "shouldIgnore": False}
-            if there is not None:
-                answer["oid"] = _sha256(there) if lfs else _oid(there)
+            lfs = self.server.habits.by_lfs(path, file["size"])
+            ignored = any(fnmatch.fnmatch(path, name) for name in self.server.habits.ignored)
+            answer = {"path": path, "uploadMode": "lfs" if lfs else "regular", "shouldIgnore": ignored}
+            if there is not None and self.server.habits.tells_oids:
+                answer["oid"] = sha256(there) if lfs else oid(there)
             answers.append(answer)
         self._answer(200, {"files": answers})
 
@@ -383,7 +337,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _lfs_object(self) -> None:
         _, _, verb, name = self.route.split("/")
         if verb == "upload":
-            if _sha256(self.content) != name:
+            if sha256(self.content) != name:
                 return self._answer(400, {"error": "sha256 mismatch"})
             self.server.objects[name] = self.content
             return self._answer(200, None)
@@ -402,7 +356,10 @@ class _Handler(BaseHTTPRequestHandler):
         lines = [json.loads(line) for line in self.content.splitlines()]
         header = lines[0]["value"]
         if header.get("parentCommit") not in (None, repository.commits[-1].id):
-            return self._answer(412, {"error": "A commit has happened since. Please refresh and try again."})
+            conflict = self.server.habits.conflict
+            return self._answer(
+                conflict, {"error": "A commit has happened since. Please refresh and try again."}
+            )
         files: dict[str, bytes | None] = {}
         for line in lines[1:]:
             value = line["value"]
@@ -419,7 +376,8 @@ class _Handler(BaseHTTPRequestHandler):
         return self._answer(200, {"success": True, "commitOid": made.id, "commitUrl": address})
 
     def _answer(self, status: int, value: Any, headers: dict[str, str] | None = None) -> None:
-        body = b"" if value is None or self.command == "HEAD" else json.dumps(value).encode()
+        packed = value if isinstance(value, bytes) else json.dumps(value).encode()
+        body = b"" if value is None or self.command == "HEAD" else packed
         self.send_response(status)
         for name, text in {"Content-Type": "application/json", **(headers or {})}.items():
             self.send_header(name, text)
@@ -433,25 +391,6 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
 
-def _entry(path: str, content: bytes) -> dict[str, Any]:
-    entry: dict[str, Any] = {"type": "file", "path": path, "size": len(content), "oid": _oid(content)}
-    if _by_lfs(path, len(content)):
-        entry["lfs"] = {"oid": _sha256(content), "size": len(content), "pointerSize": 134}
-    return entry
-
-
-def _by_lfs(path: str, size: int) -> bool:
-    return size > LFS_BYTES or path.endswith(LFS_KINDS)
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
-def _oid(content: bytes) -> str:
-    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
-
-
 @contextmanager
 def serve() -> Iterator[Hub]:
     """A hub that runs until the block ends."""
@@ -463,7 +402,7 @@ def serve() -> Iterator[Hub]:
     finally:
         hub.shutdown()
         hub.server_close()
-        thread.join()
+        thread.join(10)
 
 
 def connect(monkeypatch: Any, hub: Hub, cache: Any, token: str | None) -> None:

@@ -221,7 +221,7 @@ def test_a_revision_is_the_one_named(published, source, tmp_path):
 
 
 def test_a_listing_in_pages_is_read_whole(published):
-    published.page = 3
+    published.habits.page = 3
     assert set(HMA.from_pretrained(REPO).embodiments) == set(ROBOTS)
     assert published.count("GET .*/tree/") > 1
 

@@ -1,0 +1,141 @@
+"""What the hub of the tests holds, what goes wrong with it, and what the interface leaves open to it."""
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+LFS_BYTES = 10_000_000  # larger files, and those of binary kinds, go by LFS
+LFS_KINDS = (".safetensors", ".png", ".parquet", ".bin")
+
+
+@dataclass
+class Habits:
+    """What hubs do differently.
+
+    Attributes:
+        page: entries of a listing's page.
+        lfs: which files go by LFS: "kinds" and large ones, "all" or "none".
+        redirects: send files of LFS by another host; otherwise they come directly.
+        conflict: status where somebody else has committed.
+        tells_oids: say before an upload what is there already.
+        weak: mark ETags as weak.
+        ranges: send parts of files.
+        ignored: names that a .gitignore there leaves out.
+        siblings: list the files in a repository's facts.
+    """
+
+    page: int = 1000
+    lfs: str = "kinds"
+    redirects: bool = True
+    conflict: int = 412
+    tells_oids: bool = True
+    weak: bool = False
+    ranges: bool = True
+    ignored: tuple[str, ...] = ()
+    siblings: bool = True
+
+    def by_lfs(self, path: str, size: int) -> bool:
+        """Whether a file goes by LFS."""
+        if self.lfs != "kinds":
+            return self.lfs == "all"
+        return size > LFS_BYTES or path.endswith(LFS_KINDS)
+
+    def entry(self, path: str, content: bytes) -> dict[str, Any]:
+        """A file in a listing."""
+        entry: dict[str, Any] = {"type": "file", "path": path, "size": len(content), "oid": oid(content)}
+        if self.by_lfs(path, len(content)):
+            entry["lfs"] = {"oid": sha256(content), "size": len(content), "pointerSize": 134}
+        return entry
+
+
+@dataclass
+class Commit:
+    """A state of a repository: path -> content."""
+
+    id: str
+    files: dict[str, bytes]
+    message: str
+
+
+@dataclass
+class Repository:
+    """Commits, oldest first, and tags and branches besides main."""
+
+    name: str
+    private: bool = False
+    commits: list[Commit] = field(default_factory=list)
+    refs: dict[str, str] = field(default_factory=dict)
+
+    def commit(self, files: dict[str, bytes | None], message: str = "by hand") -> Commit:
+        """Add a commit; None deletes a file."""
+        before = self.commits[-1].files if self.commits else {}
+        after = {path: content for path, content in {**before, **files}.items() if content is not None}
+        name = hashlib.sha1(f"{self.name} {len(self.commits)} {message}".encode()).hexdigest()
+        self.commits.append(Commit(name, after, message))
+        return self.commits[-1]
+
+    def commit_folder(self, folder: Path, branch: str = "main") -> Commit:
+        """Add a commit that has what a folder has and nothing else; below all others where not for main."""
+        before = self.commits[-1].files if self.commits and branch == "main" else {}
+        there = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+        made = self.commit({**dict.fromkeys(before), **there}, f"{branch} of {folder.name}")
+        if branch != "main":
+            made.files = there
+            self.commits.insert(0, self.commits.pop())
+            self.refs[branch] = made.id
+        return made
+
+    def at(self, revision: str) -> Commit | None:
+        """The commit of a branch, tag or id."""
+        wanted = self.commits[-1].id if revision == "main" else self.refs.get(revision, revision)
+        return next((commit for commit in self.commits if commit.id == wanted), None)
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """What is there now."""
+        return self.commits[-1].files
+
+
+@dataclass
+class Fault:
+    """What goes wrong: an answer, or a connection cut after some bytes.
+
+    Attributes:
+        request: regular expression over "METHOD path".
+        status: answered instead; None cuts the connection.
+        after: bytes of the body, coming or going, before the cut.
+        times: how often; then all is well.
+        stall: seconds without an answer before.
+        body: of the answer.
+    """
+
+    request: str
+    status: int | None = None
+    headers: dict[str, str] = field(default_factory=dict)
+    after: int = 0
+    times: int = 1
+    stall: float = 0.0
+    body: bytes = b'{"error": "made up"}'
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request and how many bytes of a file were sent for it."""
+
+    method: str
+    path: str
+    range: str | None
+    authorized: bool
+    host: str
+    sent: int
+
+
+def sha256(content: bytes) -> str:
+    """Of a content, as LFS names it."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def oid(content: bytes) -> str:
+    """Of a content, as git names it."""
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
