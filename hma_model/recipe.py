@@ -31,7 +31,7 @@ MAX_NAME = 200  # characters of a name that are shown
 # what may differ when a run goes on: where and how often, but nothing that changes the weights
 _FREE = {
     *("data", "out", "start", "device", "workers", "parallel", "compile", "checkpointing"),
-    *("eval_every", "eval_windows", "pictures", "checkpoint_every", "keep_last"),
+    *("eval_every", "eval_windows", "pictures", "pictures_share", "checkpoint_every", "keep_last"),
     *("report", "track", "project"),
 }
 
@@ -130,6 +130,9 @@ class Recipe(_Settings):
     eval_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
     eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
     pictures: Count = Field(1, ge=0, description="windows rolled out for a picture at evaluations, a robot")
+    pictures_share: Number = Field(
+        0.05, ge=0, description="of the steps' time, for pictures before the last evaluation's"
+    )
     checkpoint_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
     keep_last: Count = Field(3, ge=1)
     report: bool = Field(True, description="write report.html")

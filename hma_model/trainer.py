@@ -96,6 +96,7 @@ class Run:
         self._baseline: Means | None = None
         self._twin: HMA | None = None
         self._unseen, self._complained = "", False
+        self._painted, self._painting = 0.0, 0.0  # seconds for pictures so far, and for the last ones
 
     def _fetch(self, recipe: Recipe) -> Start | None:
         if recipe.start is None:
@@ -289,9 +290,18 @@ class Run:
 
         with self._autocast(), torch.compiler.set_stance("force_eager"):
             facts = validate(model, held_out, baseline, recipe.seed, self.step)
-            if recipe.pictures:
+            if self._picture_due():
+                begun = time.monotonic()
                 self._unseen = sample_pictures(model, self.held_out, self.out, self.step, recipe)
+                self._painting = time.monotonic() - begun
+                self._painted += self._painting
         return facts
+
+    def _picture_due(self) -> bool:
+        """Whether this evaluation leaves pictures: the last one does, others as far as time allows."""
+        last = self.step == self.recipe.steps
+        spare = self.recipe.pictures_share * self.seconds - self._painted - self._painting
+        return bool(self.recipe.pictures) and (last or spare > 0)
 
     def complaint(self) -> str:
         """Why there are no pictures, once; nothing where there are."""

@@ -1,5 +1,6 @@
 """Ranks, forked here as torchrun starts them: one process's curve, and any number of ranks goes on."""
 
+import errno
 import json
 import multiprocessing
 import multiprocessing.connection
@@ -161,6 +162,16 @@ def test_torchrun_starts_the_command(recipe, data, alone, tmp_path):
 def test_ranks_that_cannot_share_a_step_are_told(recipe, tmp_path):
     told = spread(recipe(batch_size=3, accumulate=1), tmp_path / "run")
     assert "RecipeError" in told and "3 windows a step cannot be shared evenly by 2 ranks" in told
+
+
+def test_a_full_disk_on_the_first_rank_ends_all(recipe, tmp_path, monkeypatch):
+    def write(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("hma_model.trainer.write_atomic", write)
+    told = spread(recipe(), tmp_path / "run")
+    faults = [line for line in told.splitlines() if line.startswith("hma_data.errors.OutputError: ")]
+    assert len(faults) == 2 and all("No space left on device" in line for line in faults)
 
 
 def test_one_process_is_a_world_of_one():

@@ -154,6 +154,14 @@ def test_evaluations_leave_pictures_and_the_card_shows_the_last(run):
     assert "embodiments/arm/sample.png" in (folder / "README.md").read_text()
 
 
+@pytest.mark.parametrize(("share", "steps"), [(0.0, [6]), (1e9, [1, 2, 3, 4, 5, 6])])
+def test_pictures_before_the_last_take_their_share_of_time(data, painter, tmp_path, share, steps):
+    given = {"data": data[:1], "pictures": 1, "pictures_share": share, "eval_every": 1}
+    train(make_recipe({**TINY, **given}), out=tmp_path / "run", show=False)
+    names = sorted(path.name for path in (tmp_path / "run/pictures").iterdir())
+    assert names == [f"step-{step:08d}-arm.png" for step in steps]
+
+
 def test_without_the_tokenizer_there_is_a_word_and_no_picture(data, tmp_path, capsys):
     train(make_recipe({**TINY, "data": data, "pictures": 1}), out=tmp_path / "run")
     assert "no pictures: " in capsys.readouterr().err and not (tmp_path / "run/pictures").exists()
