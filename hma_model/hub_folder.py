@@ -18,9 +18,10 @@ from hma_data.errors import HMAError, HubError, OutputError, StorageAwayError, S
 from hma_data.files import file_sha256
 from hma_data.remote_lock import PROBE, RemoteLock, living_holder
 from hma_data.store import WHOLE_PUTS, RemotePath, attempt
-from hma_model.checkpoint import CONFIG, README, TRUNK, inside
+from hma_model.checkpoint import CARD, CONFIG, README, TRUNK, inside
 from hma_model.files import MAX_JSON_BYTES
 from hma_model.hub_partial import beside, is_abandoned, is_partial, remove_abandoned
+from hma_model.hub_swap import remove_abandoned_folders, swap_in
 
 ATTEMPTS = 10
 PATIENCE = 240.0  # seconds to wait for another push; one that was killed elsewhere is forgotten after 180
@@ -169,6 +170,8 @@ class FolderStore:
 
     def _sweep(self) -> None:
         """Delete what is staged of pushes that are no more."""
+        if self._local:
+            remove_abandoned_folders(Path(self._root))
         for name in filter(is_partial, self._sizes()):
             path = self._path(name)
             if is_abandoned(name, self._modified(path)):
@@ -189,12 +192,13 @@ class FolderStore:
                 if content is not None:
                     staged[name] = self._stage(name, content)
             with self._alone():
+                self._replace_whole(files, staged)
                 for name, content in files.items():
                     if content is None:
                         self._remove(self._path(name))
                     elif name == CONFIG and not self._claim(staged[name], self._path(name)):
                         return False
-                    elif name != CONFIG:
+                    elif name in staged and name != CONFIG:
                         self._rename(staged.pop(name), self._path(name))
                 if readme is not None and (now := page()) is not None:
                     staged[README] = self._stage(README, now)
@@ -211,6 +215,17 @@ class FolderStore:
                 if self._ask("used", lambda: self._fs.exists(left)):  # noqa: B023
                     self._remove(left)
         return True
+
+    def _replace_whole(self, files: Mapping[str, Path | bytes | None], staged: dict[str, str]) -> None:
+        """Put embodiments that are there already in place of their older selves, each in one step."""
+        homes = (
+            {name.rpartition("/")[0] for name in files if name.endswith(f"/{CARD}")} if self._local else set()
+        )
+        for home in sorted(homes):
+            if (Path(self._root) / home / CARD).is_file() and CONFIG not in files:
+                names = [name for name in staged if name.rpartition("/")[0] == home]
+                parts = {name.rpartition("/")[2]: Path(staged.pop(name)) for name in names}
+                swap_in(Path(self._root), Path(self._root) / home, parts)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
@@ -230,12 +245,15 @@ class FolderStore:
         return RemoteLock(place, "this hub")
 
     def _stage(self, name: str, content: Path | bytes) -> str:
-        new = str(beside(Path(self._path(name))))
-        parent = new.rsplit("/", 1)[0]
+        """Write a file under a name of its own: here at the top, as folders below may change places."""
+        final = Path(self._path(name))
         if self._local:
-            self._refuse_links(Path(self._root), Path(parent))
-        if not self._flat:
-            self._ask("made", lambda: self._fs.makedirs(parent, exist_ok=True))
+            self._refuse_links(Path(self._root), final.parent)
+            new = str(beside(Path(self._root) / name.replace("/", "--")))
+        else:
+            new = str(beside(final))
+            if not self._flat:
+                self._ask("made", lambda: self._fs.makedirs(str(final.parent), exist_ok=True))
         if isinstance(content, bytes):
             self._ask("written", lambda: self._fs.pipe_file(new, content))
         else:
@@ -260,6 +278,7 @@ class FolderStore:
 
     def _rename(self, new: str, final: str) -> None:
         if self._local:
+            Path(final).parent.mkdir(parents=True, exist_ok=True)
             Path(new).replace(final)
             return
         self._ask("written", lambda: self._fs.cp_file(new, final))  # may be asked again, as a move may not

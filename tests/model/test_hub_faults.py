@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from huggingface_hub import constants
 
 from hma_data import remote_lock
 from hma_data.errors import HubError
-from hma_model import checkpoint, hub, hub_bounds, hub_fetch, hub_hf, hub_partial
+from hma_model import checkpoint, hub, hub_bounds, hub_fetch, hub_hf, hub_partial, hub_swap
 from hma_model.checkpoint import PARTS
 from hma_model.hub_fetch import Wanted
 from tests.hub_server import Hub, connect, serve
@@ -321,13 +322,54 @@ def test_pushes_of_one_embodiment_at_once_leave_the_whole_of_one(folder, source,
         model.add_embodiment(make_model({"arm": 2}, seed).embodiments["arm"])
         save(tmp_path / f"other{seed}", {"arm": 2}, model=model)
         others.append(tmp_path / f"other{seed}")
-    threads = [threading.Thread(target=hub.push, args=(o, folder), daemon=True) for o in others]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    assert not any(thread.is_alive() for thread in threads)
+    with ThreadPoolExecutor(3) as pool:
+        pushed = [pool.submit(hub.push, other, folder) for other in others]
+        assert [future.result(60) for future in pushed] == [str(folder)] * 3
     assert list(checkpoint.load(folder).embodiments) == ["arm"]
+
+
+@pytest.mark.parametrize("step", ["link", "exchange", "rmtree"])
+def test_an_update_cut_at_any_step_leaves_the_old_or_the_new_embodiment(
+    folder, source, tmp_path, monkeypatch, step
+):
+    (folder / "embodiments/arm/sample.png").write_bytes(b"a picture")
+    model = checkpoint.load(source, [])
+    model.add_embodiment(make_model({"arm": 2}, 7).embodiments["arm"])
+    save(tmp_path / "newer", {"arm": 2}, model=model)
+    before = (folder / "embodiments/arm/stem.safetensors").read_bytes()
+
+    class Killed(BaseException):
+        pass
+
+    def cut(*arguments: object, **options: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        if step != "exchange":
+            patched.setattr(hub_swap.os if step == "link" else hub_swap.shutil, step, cut)
+        else:
+            patched.setattr(hub_swap, step, cut)
+        with pytest.raises(Killed):
+            hub.push(tmp_path / "newer", folder)
+    kept = (folder / "embodiments/arm/stem.safetensors").read_bytes() == before
+    assert kept == (step != "rmtree") and list(checkpoint.load(folder).embodiments) == ["arm"]
+    hub.push(tmp_path / "newer", folder)
+    assert (folder / "embodiments/arm/stem.safetensors").read_bytes() != before
+    assert (folder / "embodiments/arm/sample.png").read_bytes() == b"a picture"
+
+
+def test_an_update_keeps_what_else_is_in_an_embodiments_folder(folder, source):
+    (folder / "embodiments/arm/notes").mkdir()
+    (folder / "embodiments/arm/notes/mine.txt").write_text("kept")
+    hub.push(source, folder)
+    assert (folder / "embodiments/arm/notes/mine.txt").read_text() == "kept"
+
+
+def test_where_folders_cannot_change_places_files_do(folder, source, monkeypatch):
+    monkeypatch.setattr(hub_swap, "exchange", lambda first, second: False)
+    hub.push(source, folder)
+    assert sorted(checkpoint.load(folder).embodiments) == ["arm", "hand"]
+    assert not [path for path in folder.rglob("*") if ".partial-" in path.name]
 
 
 @pytest.mark.parametrize("address", ["s3://", "s3://bucket/hub", "nowhere://a/b"])
