@@ -21,7 +21,7 @@ ANSWER_S = 1.0  # how long an actor gathers before it answers
 ANSWERS_A_S = 100.0  # that the driver takes in at most
 SILENT_S = 60.0  # beyond the time a unit may be quiet: an actor answers whatever its unit does
 NO_ROOM_S = 900.0  # without any actor that could be placed
-LOST_STARTS = 10  # actors in a row that end before they are ready
+LOST_STARTS = 5, 3  # and so many for each worker: actors in a row that end before they are ready
 INSTALLED = "hma-toolkit and what it needs must be installed on every node; see Ray's logs"
 
 
@@ -190,8 +190,8 @@ class _Actors:
             self._lost(slot.unit, "", "killed", how)
         elif not slot.ready:
             self._lost_starts += 1
-            if self._lost_starts >= LOST_STARTS:
-                fault = f"lost {LOST_STARTS} workers in a row at their start; the last {how}"
+            if self._lost_starts >= LOST_STARTS[0] + LOST_STARTS[1] * self._count:
+                fault = f"lost {self._lost_starts} workers in a row at their start; the last {how}"
                 raise HMAError("the Ray cluster", fault, INSTALLED)
 
     def _lost(self, number: int, step: str, cause: Cause, how: str) -> None:
