@@ -198,12 +198,16 @@ class RunLog:
         ignoring = self._evaluation.get("baseline_by_embodiment", {})
         for name, loss in self._smooth().items():
             known = [_number(values.get(name)) for values in (held, ignoring)]
-            table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.0f}" if self._nats else "-", *known)
+            table.add_row(name, f"{loss:.3f}", _rounded(perplexity(loss)) if self._nats else "-", *known)
         last = self._last
         head = f"step {last['step']:,}/{self._steps:,}   {rate:.1f} windows/s   {left} left"
         rest = f"lr {last['lr']:.2e}   {last.get('memory_mib', 0):,.0f} MiB"
         skipped = f"   {last['skipped']} steps left out" if last.get("skipped") else ""
         return Group(f"{head}   {rest}{skipped}", table)
+
+
+def _rounded(value: float) -> str:
+    return f"{value:,.1f}" if value < 100 else f"{value:,.0f}"
 
 
 def _number(value: float | None) -> str:
