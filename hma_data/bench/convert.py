@@ -42,7 +42,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         _record(recording, settings)
         rows = settings["episodes"] * settings["frames"]
         alone, alone_cpu = _tokenizer_alone(settings, rows)
-        watch = _Watch(settings["workers"])
+        watch = _Watch(settings["workers"], settings["engine"])
         with watch:
             began = time.perf_counter()
             summary = convert(
@@ -144,6 +144,7 @@ class _Watch:
     """Memory and CPU time of this process and of those it started, while the conversion goes on."""
 
     workers: int
+    engine: str
     share: float = 0.0  # of the frames that are done
     starting: _Starting = field(default_factory=_Starting)
     worker_cpu_s: float = 0.0  # as last seen; Ray's actors count as workers
@@ -193,7 +194,7 @@ class _Watch:
 
         pid = os.getpid()
         while not self._stop.wait(0.2):
-            roles = _roles(pid)
+            roles = _roles(pid, self.engine)
             if not roles["worker"] and self.workers == 0:
                 roles["worker"] = [pid]
             if not roles["worker"] and self.samples and "worker" in self.samples[-1][1]:
@@ -206,7 +207,7 @@ class _Watch:
             self.samples.append((self.share, memory))
 
 
-def _roles(pid: int) -> dict[str, list[int]]:
+def _roles(pid: int, engine: str) -> dict[str, list[int]]:
     """Processes by what they are for: workers, the actors that watch over them, what else `pid` started."""
     parents: dict[int, int] = {}
     commands: dict[int, bytes] = {}
@@ -218,7 +219,8 @@ def _roles(pid: int) -> dict[str, list[int]]:
             continue
     ours = _descendants(pid, parents)
     actors = {other for other, command in commands.items() if command.startswith(b"ray::Worker")}
-    actors = actors & ours or actors  # those of a cluster that runs already are not descendants
+    if engine != "ray" or actors & ours:  # those of a cluster that runs already are not descendants
+        actors &= ours
     workers = {
         other
         for other, command in commands.items()
