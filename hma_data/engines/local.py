@@ -105,7 +105,7 @@ class _Pool:
     def _start(self) -> _Worker:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(
-            target=_main, args=(theirs, self._make_work, self._count), daemon=True, name="hma-worker"
+            target=serve, args=(theirs, self._make_work, self._count), daemon=True, name="hma-worker"
         )
         process.start()
         theirs.close()
@@ -150,7 +150,7 @@ class _Pool:
         self._workers.remove(worker)
         worker.pipe.close()
         code = worker.process.exitcode or 0
-        name = _signal_name(-code) if code < 0 else f"exit code {code}"
+        name = signal_name(-code) if code < 0 else f"exit code {code}"
         if not worker.ready:
             self._start_failures += 1 if code < 0 and name not in CRASHES else KILLS_A_FAILURE
             if self._start_failures >= START_FAILURES:
@@ -192,7 +192,7 @@ class _Pool:
             worker.pipe.close()
 
 
-def _signal_name(number: int) -> str:
+def signal_name(number: int) -> str:
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -202,7 +202,7 @@ def _signal_name(number: int) -> str:
 # -- in the worker
 
 
-def _main(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> None:
+def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
     sending = threading.Lock()  # a unit reports from more than one thread

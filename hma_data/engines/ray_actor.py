@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from hma_data.engines.base import Attempt, Cause, Step, Work
-from hma_data.engines.local import CRASHES, KILLS_A_FAILURE, START_FAILURES, _main, _signal_name
+from hma_data.engines.local import CRASHES, KILLS_A_FAILURE, START_FAILURES, serve, signal_name
 from hma_data.errors import HMAError
 
 TICK_S = 0.5
@@ -113,7 +113,7 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=_main, args=(theirs, self._make_work, self._workers), daemon=True, name="hma-worker"
+            target=serve, args=(theirs, self._make_work, self._workers), daemon=True, name="hma-worker"
         )
         self._ready = False
         with _no_script():
@@ -196,7 +196,7 @@ class Worker:
 def _name_of_end(code: int | None) -> str:
     if code is None:
         return "an unknown cause"
-    return _signal_name(-code) if code < 0 else f"exit code {code}"
+    return signal_name(-code) if code < 0 else f"exit code {code}"
 
 
 @contextmanager
