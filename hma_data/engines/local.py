@@ -193,6 +193,7 @@ class _Pool:
 
 
 def signal_name(number: int) -> str:
+    """SIGKILL for 9."""
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -203,6 +204,14 @@ def signal_name(number: int) -> str:
 
 
 def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> None:
+    """What a worker's process runs: does the units that come by the pipe, and tells of them, until it closes.
+
+    Args:
+        pipe: brings (unit, attempt); takes (kind, value), of the kinds ready, event, done, failed and
+            short of memory.
+        make_work: called once.
+        workers: of the whole run.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
     sending = threading.Lock()  # a unit reports from more than one thread
