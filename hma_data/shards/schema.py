@@ -22,6 +22,9 @@ from hma_data.tokenizers.base import TokenizerSpec
 
 SCHEMA_VERSION = 1
 ROW_GROUP = 2048
+GROUP_VALUES = (
+    1 << 24
+)  # of tokens or latents in a row group: Parquet writes small integers from four bytes each
 _FOOTER = b"hma"
 
 

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from hma_data.files import atomic_path, file_sha256
-from hma_data.shards.schema import ROW_GROUP, Footer, encodings, to_arrow, token_column
+from hma_data.shards.schema import GROUP_VALUES, ROW_GROUP, Footer, encodings, to_arrow, token_column
 from hma_data.tokenizers.base import TokenizerSpec
 
 
@@ -48,7 +48,8 @@ class ShardWriter:
 
     def __init__(self, path: Path, schema: pa.Schema, spec: TokenizerSpec) -> None:
         self._atomic = atomic_path(path)
-        self._schema, self._tokens = schema, token_column(spec)[0]
+        self._schema, (self._tokens, values) = schema, token_column(spec)
+        self._group = min(ROW_GROUP, max(GROUP_VALUES // values, 1))  # rows
         self._pending: list[pa.Table] = []
         self._closed = False
         self.rows = self.bytes = 0
@@ -87,15 +88,15 @@ class ShardWriter:
         if episode.states is not None:
             values["state"] = episode.states
         table = pa.table([to_arrow(field, values[field.name]) for field in self._schema], schema=self._schema)
-        if self._pending and sum(map(len, self._pending)) + length > ROW_GROUP:
+        if self._pending and sum(map(len, self._pending)) + length > self._group:
             self._flush()
         self._pending.append(table)
         self.rows += length
 
     def _flush(self) -> None:
         table = pa.concat_tables(self._pending).combine_chunks()
-        for start in range(0, len(table), ROW_GROUP):
-            self._writer.write_table(table.slice(start, ROW_GROUP), row_group_size=ROW_GROUP)
+        for start in range(0, len(table), self._group):
+            self._writer.write_table(table.slice(start, self._group), row_group_size=self._group)
         self._pending = []
 
     def close(self, footer: Footer) -> None:

@@ -259,6 +259,25 @@ def test_random_tokens_of_18_bits_cost_less_than_600_bytes_a_frame(tmp_path: Pat
     assert (path.stat().st_size - 4 * actions.size) / frames < 600
 
 
+def test_row_groups_of_large_frames_hold_fewer_of_them(tmp_path: Path) -> None:
+    spec = TokenizerSpec("pixels", 1, "continuous", 256, (256, 256), channels=3, dtype="uint8")
+    path = tmp_path / "shard.parquet"
+    plan = {"embodiment": "a", "embodiment_hash": "", "tokenizer": spec.to_json(), "hash": "0"}
+    pictures = np.arange(100, dtype=np.uint8)[:, None, None, None] + np.zeros((3, 256, 256), np.uint8)
+    with ShardWriter(path, arrow_schema(spec, 1, 0, 1), spec) as writer:
+        for episode, length in enumerate((30, 50, 10, 100)):
+            actions = np.zeros((length, 1), np.float32)
+            time = np.arange(length) / 10
+            writer.add(EpisodeRows(episode, time, pictures[:length], actions, None, ""))
+        stats = {"action": Stats.of(np.zeros((190, 1), np.float32))}
+        writer.close(Footer(plan, "train/shard-00000.parquet", "train", (), (), stats))
+    file = pq.ParquetFile(path)
+    groups = [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)]
+    assert groups == [80, 10, 85, 15]
+    stored = file.read_row_group(3, ["latents"]).column(0).combine_chunks().flatten().to_numpy()
+    np.testing.assert_array_equal(stored.reshape(15, -1)[:, 0], np.arange(85, 100))
+
+
 def test_the_benchmark_of_shards_runs() -> None:
     from hma_data.bench import shards
 
