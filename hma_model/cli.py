@@ -14,6 +14,7 @@ from hma_data.bench import BENCHES
 from hma_data.cli import mount
 from hma_data.console import print_json, print_table
 from hma_data.errors import HMAError
+from hma_data.priority import take_ordinary_priority
 from hma_model import cli_train
 from hma_model.cli_hub import Json, hub_app
 
@@ -32,6 +33,7 @@ _Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[
 
 def main() -> None:
     """Run a command; errors become one line on stderr and an exit code."""
+    take_ordinary_priority()
     # Threads that spin at a barrier starve each other on a busy machine: steps took ten times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is first imported
     debug = "--debug" in sys.argv or bool(os.environ.get("HMA_DEBUG"))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from hma_data.bench.recordings import ordinary_priority
 from hma_data.embodiment import Embodiment
+from hma_data.priority import ordinary_priority, take_ordinary_priority
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
 # The same examples in every run, so that a red main means the change; HMA_FUZZ=1 draws new ones.
@@ -30,6 +30,7 @@ def pytest_fixture_setup() -> Generator[None, Any, Any]:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Generator[None, Any, Any]:
     """A test that encodes AV1 leaves the others, and the processes that they start, their turns."""
+    take_ordinary_priority()
     with ordinary_priority():
         return (yield)
 

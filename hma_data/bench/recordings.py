@@ -5,9 +5,7 @@ A writer takes (folder, episodes, length, seed) and returns the recording's path
 """
 
 import json
-import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 
 from hma_data.bench.scenes import encoded, scene
 from hma_data.embodiment import Embodiment
+from hma_data.priority import ordinary_priority
 from hma_data.video import Images
 
 A, HZ = 7, 30
@@ -201,20 +200,6 @@ def packets(pictures: Iterator[Images], encoder: str, gop: int = HZ) -> Iterator
         frame.pts = number
         yield from (bytes(packet) for packet in context.encode(frame))
     yield from (bytes(packet) for packet in context.encode(None)) if context else ()
-
-
-@contextmanager
-def ordinary_priority() -> Iterator[None]:
-    """Undoes what SVT-AV1 does to a process of root: real-time priority, which starves all the others."""
-    if not hasattr(os, "sched_getscheduler"):
-        yield
-        return
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    try:
-        yield
-    finally:
-        if os.sched_getscheduler(0) != policy:
-            os.sched_setscheduler(0, policy, parameters)
 
 
 def _video(path: Path, pictures: Iterator[Images], encoder: str, gop: int) -> None:

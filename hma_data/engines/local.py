@@ -17,6 +17,7 @@ from typing import Any
 
 from hma_data.engines.base import FIRST, LIMITS, Cause, Ledger, Limits, OnEvent, Step, Work
 from hma_data.errors import HMAError
+from hma_data.priority import take_ordinary_priority
 
 CRASHES = {"SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGSYS"}  # of a process's own making
 TICK_S = 0.5
@@ -212,6 +213,7 @@ def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> N
         make_work: called once.
         workers: of the whole run.
     """
+    take_ordinary_priority()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
     sending = threading.Lock()  # a unit reports from more than one thread

@@ -1,0 +1,23 @@
+"""Real-time priority that a parent had is not kept."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no schedulers to choose from")
+def test_a_command_begun_under_real_time_priority_takes_the_ordinary_one() -> None:
+    script = (
+        "import os\n"
+        "from hma_data.priority import take_ordinary_priority\n"
+        "try:\n"
+        "    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))\n"
+        "except PermissionError:\n"
+        "    print('not allowed')\n"
+        "take_ordinary_priority()\n"
+        "assert os.sched_getscheduler(0) == os.SCHED_OTHER\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
