@@ -19,7 +19,7 @@ from hma_data.store import AHEAD, RangeFile, RemotePath
 
 LIMIT, DEFAULT_GB = "HMA_CACHE_GB", 20.0
 IN_USE_S = 3600.0
-SPARE = 0.1  # of the disk is left free
+SPARE, SPARE_BYTES = 0.1, 5 * 10**9  # a tenth of the disk is left free, of a large one so much
 
 
 def limit_bytes() -> int:
@@ -99,8 +99,7 @@ def _make_room(folder: Path, size: int) -> bool:
             facts = path.stat()
             found.append((facts.st_mtime, facts.st_size, path))
     taken, limit = sum(item[1] for item in found), limit_bytes()
-    disk = shutil.disk_usage(folder)
-    over = max(taken + size - limit, size - int(disk.free - SPARE * disk.total))
+    over = max(taken + size - limit, size - _usable_bytes(folder))
     old = [item for item in sorted(found) if item[0] < time.time() - IN_USE_S]
     if size > limit or over > sum(item[1] for item in old):
         return False
@@ -110,6 +109,11 @@ def _make_room(folder: Path, size: int) -> bool:
         path.unlink(missing_ok=True)
         over -= length
     return True
+
+
+def _usable_bytes(folder: Path) -> int:
+    disk = shutil.disk_usage(folder)
+    return disk.free - min(int(SPARE * disk.total), SPARE_BYTES)
 
 
 @contextmanager

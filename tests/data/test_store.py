@@ -3,8 +3,10 @@
 import copy
 import hashlib
 import os
+import shutil
 import uuid
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,10 +27,15 @@ from tests.conftest import BlockTokenizer
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
 
 
+def a_disk_with(monkeypatch: pytest.MonkeyPatch, free: int, total: int) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free, total=total))
+
+
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """No waiting between tries, and a cache of its own."""
+    """No waiting between tries, and a cache of its own on a disk with room."""
     monkeypatch.setattr(store, "WAITS_S", (0.0, 0.0, 0.0))
+    a_disk_with(monkeypatch, free=1 << 40, total=1 << 41)
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
 
 
@@ -192,6 +199,24 @@ def test_the_cache_keeps_to_its_bound_and_drops_what_was_not_used_for_longest(
         shards.read(shard.path, [0], ["action"])
     assert (folder / "newer.parquet").exists() and not (folder / "older.parquet").exists()
     assert sum(path.stat().st_size for path in folder.iterdir()) <= total + 1500
+
+
+@pytest.mark.parametrize(
+    ("free", "total", "kept"),
+    [
+        (22 * 10**9, 252 * 10**9, True),  # a large disk, nearly full, has room for a few shards all the same
+        (5 * 10**9, 252 * 10**9, False),
+        (2 * 10**9, 10 * 10**9, True),
+        (10**9, 10 * 10**9, False),
+    ],
+)
+def test_some_of_the_disk_is_left_free(
+    both: tuple[Path, RemotePath], monkeypatch: pytest.MonkeyPatch, free: int, total: int, kept: bool
+) -> None:
+    a_disk_with(monkeypatch, free, total)
+    shards = ShardSet(both[1])
+    shards.read(shards.manifest.shards[0].path, [0], ["action"])
+    assert bool(list((shard_cache.cache_folder() / "shards").glob("*.parquet"))) == kept
 
 
 def test_a_set_larger_than_the_cache_or_with_none_is_read_by_ranges(
