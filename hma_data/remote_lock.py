@@ -2,7 +2,8 @@
 
 Stores have no locks of their own. The holder writes its name every half minute; one not heard of for
 three minutes, by the store's own clock, is gone, and so is one whose process has ended on this machine.
-Of two that come at once, the one whose name is read back after a short wait has it.
+Of two that come at once, the store lets one write where it can (S3, GCS); in any case the one whose name
+is read back after a short wait has it.
 """
 
 import json
@@ -19,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 
 from hma_data.errors import HMAError, OutputError, StorageAwayError
-from hma_data.store import RemotePath, put_bytes
+from hma_data.store import RemotePath, create_bytes, put_bytes
 
 REFRESH_S, STALE_S, SETTLE_S = 30.0, 180.0, 2.0
 PROBE = ".lock-clock-"  # begins the names of objects that only tell the store's time
@@ -75,7 +76,12 @@ class RemoteLock:
         held = living_holder(self._path)
         if held:
             raise held_by(self._path, held, self._what)
-        self._write()
+        if not create_bytes(self._content(), self._path):  # one came in between, or a dead one's is left
+            held = living_holder(self._path)
+            if held and held.job != self._me.job:
+                raise held_by(self._path, held, self._what)
+            self._write()
+        self._written = time.monotonic()
         time.sleep(SETTLE_S)
         read = _read(self._path)
         if read is None or read.job != self._me.job:
@@ -109,8 +115,11 @@ class RemoteLock:
         if self._taken_by:
             raise held_by(self._path, self._taken_by, self._what)
 
+    def _content(self) -> bytes:
+        return json.dumps(asdict(replace(self._me, time=time.time()))).encode()
+
     def _write(self) -> None:
-        put_bytes(json.dumps(asdict(replace(self._me, time=time.time()))).encode(), self._path)
+        put_bytes(self._content(), self._path)
         self._written = time.monotonic()
 
     def _renew(self) -> None:

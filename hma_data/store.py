@@ -14,6 +14,7 @@ import stat
 import time
 from collections.abc import Callable, Generator
 from fnmatch import fnmatchcase
+from inspect import signature
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
@@ -292,6 +293,38 @@ def put_file(local: Path, to: RemotePath) -> None:
 def put_bytes(content: bytes, to: RemotePath) -> None:
     """Upload a small file; see `put_file`."""
     _put(to, lambda key: to.files.pipe_file(key, content), len(content))
+
+
+def create_bytes(content: bytes, to: RemotePath) -> bool:
+    """Upload a small file if there is none of that name, as one step; False where there is one.
+
+    A store that knows no such condition is written to as by `put_bytes`.
+
+    Raises:
+        StorageError: the store refuses it; StorageAwayError: it does not answer.
+    """
+    files = to.files
+    if "mode" not in signature(getattr(files, "_pipe_file", files.pipe_file)).parameters:
+        put_bytes(content, to)
+        return True
+
+    def once() -> bool:
+        try:
+            files.pipe_file(to.key, content, mode="create")
+        except Exception:  # each driver says in its own way that there is one
+            files.invalidate_cache()
+            if files.exists(to.key):
+                return False
+            raise
+        return True
+
+    try:
+        return attempt(to, "written", once)
+    except StorageAwayError:
+        raise
+    except (FileNotFoundError, StorageError):  # refused: the condition, or any writing
+        put_bytes(content, to)
+        return True
 
 
 def _put(to: RemotePath, upload: Callable[[str], Any], size: int) -> None:

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -42,7 +43,8 @@ class Proxy(ThreadingHTTPServer):
     """Hands requests on to the server, and lets some go wrong.
 
     Attributes:
-        trouble: called with (method, path, number); a status, "cut" (half an answer), "drop" (none) or None.
+        trouble: called with (method, path, number); a status, "cut" (half an answer), "drop" (not handed on),
+            "lost" (handed on, not answered) or None.
         log: (method, path, range) of every request.
     """
 
@@ -87,6 +89,9 @@ class _Hand(BaseHTTPRequestHandler):
         answer = asked.getresponse()
         data = answer.read()
         asked.close()
+        if what == "lost":
+            self.close_connection = True
+            return
         self._answer(answer.status, answer.getheaders(), data, cut=what == "cut")
 
     def _answer(self, status: int, headers: list[tuple[str, str]], data: bytes, cut: bool = False) -> None:
@@ -382,7 +387,7 @@ def test_two_jobs_at_once_on_one_output(toy_recording, out, whole, tmp_path) -> 
     codes = sorted(process.returncode for process in jobs)
     assert codes in ([0, 1], [0, 0]), said
     if codes == [0, 1]:
-        assert any("hma_data.errors.OutputError: " in text for text in said), said
+        assert any(f"OutputError: {out}: another job is writing it: process " in text for text in said), said
     assert remote(out) == whole
 
 
@@ -391,6 +396,38 @@ def test_workers_of_their_own_put_shards_too(toy_recording, out, whole, tmp_path
     _, errors = process.communicate(timeout=200)
     assert process.returncode == 0, errors
     assert remote(out) == whole
+
+
+def test_of_two_that_see_no_lock_the_store_lets_one_write(out, monkeypatch) -> None:
+    from hma_data.output import LOCK, locked
+
+    create, theirs = remote_lock.create_bytes, remote_lock.Holder("theirs", "far", 7, "x", time.time(), 0.0)
+
+    def late(content: bytes, to: RemotePath) -> bool:
+        store.put_bytes(json.dumps(asdict(theirs)).encode(), out / LOCK)
+        return create(content, to)
+
+    monkeypatch.setattr(remote_lock, "create_bytes", late)
+    with pytest.raises(OutputError, match="another job is writing it: process 7 on far"), locked(out):
+        pass
+    assert json.loads((out / LOCK).read_bytes())["job"] == "theirs"
+
+
+def test_a_lock_whose_answer_was_lost_is_ones_own(out, proxy) -> None:
+    from hma_data.output import locked
+
+    lost = []
+
+    def lose_first(method: str, path: str, number: int) -> str | None:
+        if method == "PUT" and path.endswith("/.lock") and not lost:
+            lost.append(path)
+            return "lost"
+        return None
+
+    proxy.trouble = lose_first
+    with locked(out):
+        assert json.loads((out / ".lock").read_bytes())["pid"] == os.getpid()
+    assert lost and not out.listing()
 
 
 def test_another_job_is_told(toy_arm, toy_recording, out) -> None:
