@@ -71,6 +71,11 @@ def _fail(text: str, code: int) -> int:
 
 Checkpoint = Annotated[str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo.")]
 Data = Annotated[Path, typer.Argument(help="A shard set.")]
+UnmaskSteps = Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps a frame.")]
+SampleSteps = Annotated[
+    int | None,
+    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; default its own."),
+]
 
 
 @app.command()
@@ -104,7 +109,8 @@ def evaluate(
         int | None, typer.Option("--frames", min=2, help="Of a window; default the model's.")
     ] = None,
     prompt: Annotated[int | None, typer.Option("--prompt", min=1, help="True frames to start from.")] = None,
-    unmask_steps: Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps a frame.")] = 2,
+    unmask_steps: UnmaskSteps = 2,
+    sample_steps: SampleSteps = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the rollouts.")] = 0,
     json: Json = False,
 ) -> None:
@@ -126,6 +132,7 @@ def evaluate(
         frames=frames,
         prompt=prompt,
         unmask_steps=unmask_steps,
+        sample_steps=sample_steps,
         seed=seed,
     )
     if json:
@@ -149,7 +156,8 @@ def generate(
         int | None, typer.Option("--frames", min=1, help="To predict; default to the window's end.")
     ] = None,
     prompt: Annotated[int, typer.Option("--prompt", min=1, help="True frames to start from.")] = 2,
-    unmask_steps: Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps a frame.")] = 2,
+    unmask_steps: UnmaskSteps = 2,
+    sample_steps: SampleSteps = None,
     temperature: Annotated[
         float, typer.Option("--temperature", min=0, help="0 takes the likeliest token.")
     ] = 0.0,
@@ -173,6 +181,7 @@ def generate(
         frames=frames,
         prompt=prompt,
         unmask_steps=unmask_steps,
+        sample_steps=sample_steps,
         temperature=temperature,
         seed=seed,
     )

@@ -26,6 +26,7 @@ _CHOICES = {
     "add_at": ("input", "layers"),
     "norms": ("before", "qk"),
     "action_loss": ("mse", "diffusion"),
+    "diffusion_target": ("noise", "velocity"),
     "action_target": ("normalized", "raw"),
 }
 _AT_LEAST_ONE = (
@@ -98,6 +99,7 @@ class HMAConfig:
     history_frames: int = 4  # the shortest such history
     mask_ratio_min: float = 0.0  # a masked frame's smallest mask probability
 
+    diffusion_target: str = "noise"  # what the head predicts (paper); "velocity": also right at full noise
     diffusion_depth: int = 3
     diffusion_width: int = 1024
     diffusion_train_steps: int = 1000

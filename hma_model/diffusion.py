@@ -1,8 +1,9 @@
 """The diffusion head: patches of latents, or action chunks, from what the trunk says of them.
 
 A small MLP, modulated by the noise level and the condition, predicts the noise (paper section 3, with the
-layers of arXiv 2406.11838). Training draws one of 1000 levels of a cosine schedule; sampling is DDIM with any
-number of steps (arXiv 2010.02502).
+layers of arXiv 2406.11838) or the velocity (arXiv 2202.00512), which says what the sample is where there is
+nothing but noise. Training draws one of 1000 levels of a cosine schedule; sampling is DDIM with any number of
+steps (arXiv 2010.02502).
 
 M rows, C values of a sample, D width of the condition, W width of the head.
 """
@@ -52,6 +53,7 @@ class DiffusionHead(nn.Module):
         super().__init__()
         width = config.diffusion_width
         self.values, self.clip = values, config.diffusion_clip
+        self.velocity = config.diffusion_target == "velocity"
         self.repeats, self.sample_steps = config.diffusion_repeats, config.diffusion_sample_steps
         self.input = nn.Linear(values, width)
         self.condition = nn.Linear(config.width, width)
@@ -74,19 +76,21 @@ class DiffusionHead(nn.Module):
                 nn.init.zeros_(module.weight)
 
     def forward(self, noisy: Tensor, level: Tensor, condition: Tensor) -> Tensor:
-        """Noisy samples (M, C), noise levels (M,) int64, conditions (M, D) -> the noise (M, C) float32."""
-        return self._noise(noisy, self._level(level), self.condition(condition))
+        """Noisy samples (M, C), noise levels (M,) int64, conditions (M, D) -> the target (M, C) float32."""
+        return self._predict(noisy, self._level(level), self.condition(condition))
 
     def loss(self, target: Tensor, condition: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Squared error of the predicted noise, (M,) float32, for samples (M, C) and conditions (M, D)."""
+        """Squared error of what is predicted, (M,) float32, for samples (M, C) and conditions (M, D)."""
         rows = target.shape[0]
         target, condition = (x.repeat(self.repeats, 1) for x in (target.float(), condition))
         draw = uniform((target.shape[0],), generator, target.device)
         level = (draw * len(self.levels)).long().clamp(max=len(self.levels) - 1)
         noise = randn(target.shape, generator, target.device)
         share = self.levels.float()[level].unsqueeze(-1)
-        predicted = self(share.sqrt() * target + (1 - share).sqrt() * noise, level, condition)
-        return F.mse_loss(predicted, noise, reduction="none").mean(-1).view(self.repeats, rows).mean(0)
+        signal, spread = share.sqrt(), (1 - share).sqrt()
+        predicted = self(signal * target + spread * noise, level, condition)
+        wanted = signal * noise - spread * target if self.velocity else noise
+        return F.mse_loss(predicted, wanted, reduction="none").mean(-1).view(self.repeats, rows).mean(0)
 
     @torch.no_grad()
     def sample(
@@ -114,29 +118,31 @@ class DiffusionHead(nn.Module):
         embedded = self.condition(condition)
         x = randn((condition.shape[0], self.values), generator, condition.device)
         for index, level in enumerate(levels):
-            noise = self._noise(x, self._level(torch.tensor([level], device=x.device)), embedded)
-            x = self._step(x, noise, shares[index], shares[index + 1], temperature, generator)
+            predicted = self._predict(x, self._level(torch.tensor([level], device=x.device)), embedded)
+            x = self._step(x, predicted, shares[index], shares[index + 1], temperature, generator)
         return x
 
     def _step(
         self,
         x: Tensor,
-        noise: Tensor,
+        predicted: Tensor,
         share: float,
         after: float,
         eta: float,
         generator: torch.Generator | None,
     ) -> Tensor:
         """One DDIM step from a level whose signal share is `share` to one where it is `after`."""
-        clean = ((x - math.sqrt(1 - share) * noise) / math.sqrt(share)).clamp(-self.clip, self.clip)
+        signal, spread = math.sqrt(share), math.sqrt(1 - share)
+        clean = signal * x - spread * predicted if self.velocity else (x - spread * predicted) / signal
+        clean = clean.clamp(-self.clip, self.clip)
         if after == 1.0:
             return clean
-        noise = (x - math.sqrt(share) * clean) / math.sqrt(1 - share)  # consistent with the clipped estimate
+        noise = (x - signal * clean) / spread  # consistent with the clipped estimate
         fresh = eta * math.sqrt((1 - after) / (1 - share) * (1 - share / after))
         x = math.sqrt(after) * clean + math.sqrt(1 - after - fresh**2) * noise
         return x + fresh * randn(x.shape, generator, x.device) if fresh else x
 
-    def _noise(self, noisy: Tensor, level: Tensor, condition: Tensor) -> Tensor:
+    def _predict(self, noisy: Tensor, level: Tensor, condition: Tensor) -> Tensor:
         condition = F.silu(level + condition)
         x = self.input(noisy.to(self.input.weight.dtype))
         for block in self.blocks:

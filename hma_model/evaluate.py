@@ -192,6 +192,7 @@ def rollout(
     actions: Tensor | None = None,
     unmask_steps: int = 2,
     temperature: float = 0.0,
+    sample_steps: int | None = None,
     seed: int = 0,
 ) -> Pictures:
     """Go on from the first frames of each window with its actions.
@@ -203,7 +204,7 @@ def rollout(
         frames: how many to predict; by default all after the prompt.
         prompt: P true frames to start from; by default a third of the window, at least one.
         actions: (B, T, K) raw instead of the window's own.
-        unmask_steps, temperature: as in `HMA.generate`.
+        unmask_steps, temperature, sample_steps: as in `HMA.generate`.
         seed: of every random draw.
 
     Raises:
@@ -223,6 +224,7 @@ def rollout(
         count,
         unmask_steps=unmask_steps,
         temperature=temperature,
+        sample_steps=sample_steps,
         generator=torch.Generator().manual_seed(seed),
     )
     truth = stored[:, : first + count].cpu()
@@ -272,6 +274,7 @@ def evaluate(
     batch_size: int = 16,
     unmask_steps: int = 2,
     temperature: float = 0.0,
+    sample_steps: int | None = None,
     seed: int = 0,
     real: RealFrames | None = None,
 ) -> dict[str, Any]:
@@ -285,7 +288,7 @@ def evaluate(
         count: windows, evenly spaced; where the split has fewer, all.
         frames: T of a window; by default the model's.
         prompt: true frames a rollout starts from.
-        unmask_steps, temperature, seed: of the rollouts.
+        unmask_steps, temperature, sample_steps, seed: of the rollouts.
         real: gives the recording's own frames of (episode_index, (n,) frame indices) at the tokenizer's size,
             to hold the rollouts against; by default they are held against the decoded true tokens.
 
@@ -309,7 +312,8 @@ def evaluate(
     gathered: dict[str, list[Pictures]] = {"true": [], "shuffled": [], "copy": []}
     for number, batch in enumerate(windows(shards, split, length, count, batch_size)):
         options: dict[str, Any] = {
-            "prompt": first, "unmask_steps": unmask_steps, "temperature": temperature, "seed": seed + number,
+            "prompt": first, "unmask_steps": unmask_steps, "temperature": temperature,
+            "sample_steps": sample_steps, "seed": seed + number,
         }  # fmt: skip
         true = rollout(model, tokenizer, batch, **options)
         other = rollout(model, tokenizer, batch, actions=shuffled_actions(batch, first - 1, seed), **options)

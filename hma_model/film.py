@@ -42,6 +42,7 @@ def rollout_film(
     prompt: int = 2,
     unmask_steps: int = 2,
     temperature: float = 0.0,
+    sample_steps: int | None = None,
     seed: int = 0,
 ) -> Film:
     """Roll out from one window of a shard set, with its own actions and with those of another window.
@@ -51,6 +52,7 @@ def rollout_film(
         window: its number among the windows of this length.
         frames: to predict; None fills the model's window.
         prompt: true frames to start from.
+        unmask_steps, temperature, sample_steps, seed: of the rollouts, as in `HMA.generate`.
 
     Raises:
         CheckpointError: the model is of another tokenizer.
@@ -77,6 +79,7 @@ def rollout_film(
             actions=actions,
             unmask_steps=unmask_steps,
             temperature=temperature,
+            sample_steps=sample_steps,
             seed=seed,
         )
         for actions in (batch.actions, swapped)

@@ -288,6 +288,8 @@ def _not_continuous(config: HMAConfig) -> list[str]:
         faults.append(f"latent_scale {config.latent_scale}")
     if config.diffusion_train_steps != 1000:
         faults.append(f"diffusion_train_steps {config.diffusion_train_steps}")
+    if config.diffusion_target != "noise":
+        faults.append(f"diffusion_target {config.diffusion_target!r}")
     if config.mup and config.width != 256:
         faults.append(f"muP at width {config.width} in a continuous model")
     return faults

@@ -165,6 +165,20 @@ def test_a_rollout_repeats_with_its_seed(model, batch):
     assert (one.predicted == same.predicted).all() and (one.predicted != other.predicted).any()
 
 
+def test_the_ways_of_decoding_reach_the_model(model, batch, monkeypatch):
+    told: list[dict[str, Any]] = []
+    real = model.generate
+
+    def generate(*given: Any, **options: Any) -> torch.Tensor:
+        told.append(options)
+        return real(*given, **options)
+
+    monkeypatch.setattr(model, "generate", generate)
+    ways = {"unmask_steps": 3, "temperature": 0.5, "sample_steps": 7}
+    rollout(model, Blocks(), batch, prompt=2, **ways)
+    assert told[0].items() >= ways.items()
+
+
 def test_a_rollout_longer_than_the_window_is_refused(model, batch):
     with pytest.raises(UsageError, match=r"2 \+ 3 frames do not fit windows of 4"):
         rollout(model, Blocks(), batch, frames=3, prompt=2)

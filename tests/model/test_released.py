@@ -375,6 +375,7 @@ def test_a_folder_that_is_no_checkpoint_is_not_replaced(tmp_path: Path) -> None:
         ({"action_loss": "diffusion"}, "action_loss 'diffusion'"),
         (CONTINUOUS | {"latent_scale": 1.0}, "latent_scale 1.0"),
         (CONTINUOUS | {"mup": True}, "muP at width 32"),
+        (CONTINUOUS | {"diffusion_target": "velocity"}, "diffusion_target 'velocity'"),
     ],
 )
 def test_what_the_release_cannot_express_is_named(change: dict[str, Any], named: str) -> None:
