@@ -4,13 +4,15 @@ A recorder is a module with `record(out, robot, episodes, seed, on_progress)`; i
 Every robot of RECORDERS has its embodiment in the registry under the same id.
 """
 
+import os
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
-from hma_data.errors import OutputError, UsageError
+from hma_data.errors import MissingDependencyError, OutputError, UsageError
 
 Progress = Callable[[int, int], None]
 
@@ -65,3 +67,23 @@ def written_beside(final: Path) -> Iterator[Path]:
             part.rename(final)
     except OSError as fault:
         raise OutputError(final, f"cannot be written: {fault}", "check space and rights") from fault
+
+
+@contextmanager
+def imported(simulator: str, install: str) -> Iterator[None]:
+    """Imports of a third-party simulator, without pygame's greeting and the warnings they make.
+
+    Args:
+        simulator: its name, for the error.
+        install: the command that installs it.
+
+    Raises:
+        MissingDependencyError: something of it cannot be imported.
+    """
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            yield
+    except ImportError as fault:
+        raise MissingDependencyError(simulator, f"cannot be imported: {fault}", install) from fault

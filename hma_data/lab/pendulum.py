@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import MissingDependencyError, UsageError
-from hma_data.lab import Progress, written_beside
+from hma_data.errors import UsageError
+from hma_data.lab import Progress, imported, written_beside
 from hma_data.lab.write_rlds import RldsEpisode, write_rlds
 
 Floats = NDArray[np.float64]
@@ -127,20 +127,10 @@ def _episode(seed: int, episode: int) -> RldsEpisode:
 
 def _simulator() -> tuple[Any, Any, Any]:
     """The environment's class, pygame's Surface and its Clock."""
-    import os
-    import warnings
-
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            from gymnasium.envs.classic_control.pendulum import PendulumEnv
-            from pygame import Surface
-            from pygame.time import Clock
-    except ImportError as fault:
-        raise MissingDependencyError(
-            "gymnasium's Pendulum-v1", f"cannot be imported: {fault}", "pip install gymnasium pygame"
-        ) from fault
+    with imported("gymnasium's Pendulum-v1", "pip install gymnasium pygame"):
+        from gymnasium.envs.classic_control.pendulum import PendulumEnv
+        from pygame import Surface
+        from pygame.time import Clock
     return PendulumEnv, Surface, Clock
 
 

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import MissingDependencyError, UsageError
-from hma_data.lab import Progress, written_beside
+from hma_data.errors import UsageError
+from hma_data.lab import Progress, imported, written_beside
 
 if TYPE_CHECKING:
     import pymunk
@@ -260,12 +260,8 @@ def _draw_link(image: NDArray[np.uint8], here: Floats, there: Floats, color: tup
 
 
 def _pymunk() -> Any:
-    try:
+    with imported("pymunk", "pip install pymunk"):
         import pymunk
-    except ImportError as fault:
-        raise MissingDependencyError(
-            "pymunk", f"cannot be imported: {fault}", "pip install pymunk"
-        ) from fault
     return pymunk
 
 

@@ -12,8 +12,6 @@ wanders at random. Success is the environment's own: the T covers more than 95 %
 An episode ends soon after success, else after a fixed time.
 """
 
-import os
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import MissingDependencyError, UsageError
-from hma_data.lab import Progress, written_beside
+from hma_data.errors import UsageError
+from hma_data.lab import Progress, imported, written_beside
 from hma_data.lab.pusher import Floats, Planned, Policy, Tee, Wandering, rotation
 
 TICK_S = 0.01  # of the physics
@@ -160,16 +158,9 @@ class Arena:
 
 def _environment() -> tuple[Any, Any]:
     """The environment's class and pygame's Color."""
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            from gym_pusht.envs.pusht import PushTEnv
-            from pygame import Color
-    except ImportError as fault:
-        raise MissingDependencyError(
-            "gym-pusht", f"cannot be imported: {fault}", "pip install 'gym-pusht>=0.1.8'"
-        ) from fault
+    with imported("gym-pusht", "pip install 'gym-pusht>=0.1.8'"):
+        from gym_pusht.envs.pusht import PushTEnv
+        from pygame import Color
     return PushTEnv, Color
 
 

@@ -6,7 +6,8 @@ needs (reference picture sets; ITU-T H.265, 7.3.2.2, 7.3.6.1, 7.3.7 and 8.3.2).
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -80,6 +81,15 @@ def _units(data: bytes) -> Iterator[bytes]:
             yield data[start : end - 3]
 
 
+def _all_complete(complete: Callable[[bytes], bool], data: bytes) -> bool:
+    """Whether every unit of a message is; each is looked at. What cannot be read tells nothing."""
+    whole = True
+    for unit in _units(data):
+        with suppress(IndexError):  # the decoder will say what is wrong with it
+            whole &= complete(unit)
+    return whole
+
+
 # -- H.264
 
 
@@ -100,13 +110,7 @@ class Avc:
 
     def complete(self, data: bytes) -> bool:
         """See `Order`."""
-        whole = True
-        for unit in _units(data):
-            try:
-                whole &= self._unit(unit)
-            except IndexError:
-                continue  # the decoder will say what is wrong with it
-        return whole
+        return _all_complete(self._unit, data)
 
     def _unit(self, unit: bytes) -> bool:
         kind, reference = unit[0] & 31, bool(unit[0] >> 5 & 3)
@@ -200,13 +204,7 @@ class Hevc:
 
     def complete(self, data: bytes) -> bool:
         """See `Order`."""
-        whole = True
-        for unit in _units(data):
-            try:
-                whole &= self._unit(unit)
-            except IndexError:
-                continue
-        return whole
+        return _all_complete(self._unit, data)
 
     def _unit(self, unit: bytes) -> bool:
         if len(unit) < 3 or (unit[0] & 1) << 5 | unit[1] >> 3:  # another layer's
