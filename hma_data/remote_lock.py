@@ -148,7 +148,7 @@ def living_holder(path: RemotePath) -> Holder | None:
     holder = _read(path)
     if holder is None:
         return None
-    if holder.machine == _machine() and holder.machine and not _runs(holder.pid):
+    if holder.machine == _machine() and holder.machine and not is_running(holder.pid):
         return None
     age = _age(path, holder)
     return holder if age is not None and age < STALE_S else None
@@ -182,7 +182,8 @@ def _age(path: RemotePath, holder: Holder) -> float | None:
         probe.unlink(missing_ok=True)
 
 
-def _runs(pid: int) -> bool:
+def is_running(pid: int) -> bool:
+    """Whether this machine has a process of that number."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):

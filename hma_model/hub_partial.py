@@ -7,7 +7,7 @@ import time
 import uuid
 from pathlib import Path
 
-from hma_data.remote_lock import Holder
+from hma_data.remote_lock import Holder, is_running
 
 STALE = 86_400.0  # seconds after which a file of another machine's process is nobody's
 _NAME = re.compile(r"\.partial-(?:([0-9a-f]{8})-(\d{1,10})-)?[0-9a-f]{12}")
@@ -35,7 +35,7 @@ def is_abandoned(name: str, modified: float | None) -> bool:
     if not found or found.end() != len(name):
         return False
     if found[1] and found[1] == _machine():
-        return not _runs(int(found[2]))
+        return not is_running(int(found[2]))
     return modified is not None and time.time() - modified > STALE
 
 
@@ -50,13 +50,3 @@ def _machine() -> str:
     """Of those who can see each other's processes, the same eight digits; empty where it cannot be told."""
     machine = Holder.me().machine
     return hashlib.sha256(machine.encode()).hexdigest()[:8] if machine else ""
-
-
-def _runs(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True

@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+REPO = "team/model"
+ROBOTS = {"arm": 2, "hand": 3}  # of the checkpoint in it: id -> action dims
+TOKEN = "hf_TheSecretOfThisTest"
 LFS_BYTES = 10_000_000  # larger files, and those of binary kinds, go by LFS
 LFS_KINDS = (".safetensors", ".png", ".parquet", ".bin")
 

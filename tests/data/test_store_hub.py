@@ -18,26 +18,23 @@ from hma_data.plan import Settings
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from tests.conftest import BlockTokenizer
-from tests.hub_server import Hub, Repository, connect, serve
+from tests.hub_server import Hub, Repository
 
+pytest_plugins = ["tests.hub_fixtures"]
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
 OUT = "hf://datasets/team/arm/sets/one"
 
 
 @pytest.fixture
-def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+def hub(server: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     from huggingface_hub import HfFileSystem
-    from huggingface_hub.utils import close_session
 
     monkeypatch.setattr(store, "WAITS_S", (0.0, 0.0, 0.0))
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma"))
     monkeypatch.setattr(hub_output, "FILES", 2)
+    server.tokens["reader"] = "read"
     HfFileSystem.clear_instance_cache()
-    with serve() as made:
-        made.tokens = {"token": "write", "reader": "read"}
-        connect(monkeypatch, made, tmp_path / "cache", "token")
-        yield made
-        close_session()
+    yield server
     HfFileSystem.clear_instance_cache()
 
 

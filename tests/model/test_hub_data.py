@@ -1,7 +1,6 @@
 """Shard sets on the hub: one commit, resumed, read back the same, and what the viewer is told."""
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +11,11 @@ from hma_data.errors import HubError, ShardError
 from hma_data.shards.reader import ShardSet
 from hma_model import hub_data
 from hma_model.hub_data import pull_data, push_data
-from tests.hub_server import Hub, connect, serve
+from tests.hub_server import Hub
 from tests.model.shards import make_shards
 
+pytest_plugins = ["tests.hub_fixtures"]
 REPO = "team/arm"
-TOKEN = "hf_TheSecretOfThisTest"
-
-
-@pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
-    from huggingface_hub.utils import close_session
-
-    with serve() as made:
-        made.tokens = {TOKEN: "write"}
-        connect(monkeypatch, made, tmp_path / "cache", TOKEN)
-        yield made
-        close_session()
 
 
 @pytest.fixture

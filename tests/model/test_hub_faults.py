@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,38 +17,17 @@ from hma_data.errors import HubError
 from hma_model import checkpoint, hub, hub_bounds, hub_fetch, hub_hf, hub_partial, hub_swap
 from hma_model.checkpoint import PARTS
 from hma_model.hub_fetch import Wanted
-from tests.hub_server import Hub, connect, serve
-from tests.hub_state import sha256
+from tests.hub_server import Hub, serve
+from tests.hub_state import REPO, sha256
 from tests.model.robots import make_model, save
 
-ROBOTS = {"arm": 2, "hand": 3}
-REPO = "team/model"
+pytest_plugins = ["tests.hub_fixtures"]
 TOKEN = "secret-without-a-prefix"
 
 
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("source") / "model"
-    save(folder, ROBOTS)
-    return folder
-
-
 @pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
-    from huggingface_hub.utils import close_session
-
-    with serve() as made:
-        made.tokens = {TOKEN: "write"}
-        connect(monkeypatch, made, tmp_path / "cache", TOKEN)
-        yield made
-        close_session()
-
-
-@pytest.fixture
-def published(server: Hub, source: Path) -> Hub:
-    hub.push(source, REPO)
-    server.log.clear()
-    return server
+def token() -> str:
+    return TOKEN
 
 
 def kinds(server: Hub) -> list[str]:

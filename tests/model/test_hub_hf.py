@@ -7,7 +7,6 @@ import resource
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,38 +18,12 @@ from hma_data.errors import CheckpointError, HubError
 from hma_model import checkpoint, hub, hub_bounds, hub_errors
 from hma_model.checkpoint import PARTS
 from hma_model.model import HMA
-from tests.hub_server import Hub, connect, serve
+from tests.hub_server import Hub
+from tests.hub_state import REPO, ROBOTS, TOKEN
 from tests.model.robots import save
 
-ROBOTS = {"arm": 2, "hand": 3}
-REPO = "team/model"
-TOKEN = "hf_TheSecretOfThisTest"
+pytest_plugins = ["tests.hub_fixtures"]
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("source") / "model"
-    save(folder, ROBOTS)
-    return folder
-
-
-@pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
-    from huggingface_hub.utils import close_session
-
-    with serve() as made:
-        made.tokens = {TOKEN: "write"}
-        connect(monkeypatch, made, tmp_path / "cache", TOKEN)
-        yield made
-        close_session()
-
-
-@pytest.fixture
-def published(server: Hub, source: Path) -> Hub:
-    hub.push(source, REPO)
-    server.log.clear()
-    return server
 
 
 def files_of(folder: Path) -> set[str]:

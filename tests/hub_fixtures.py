@@ -1,0 +1,50 @@
+"""Fixtures of the tests that speak to a hub: `pytest_plugins = ["tests.hub_fixtures"]`.
+
+A module that defines `token` or `source` itself gets the others made from its own.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.hub_server import Hub, connect, serve
+from tests.hub_state import REPO, ROBOTS, TOKEN
+
+
+@pytest.fixture
+def token() -> str:
+    """One that may write."""
+    return TOKEN
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, token: str) -> Iterator[Hub]:
+    """A hub without repositories, which this process's client speaks to."""
+    from huggingface_hub.utils import close_session
+
+    with serve() as made:
+        made.tokens = {token: "write"}
+        connect(monkeypatch, made, tmp_path / "cache", token)
+        yield made
+        close_session()
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of ROBOTS."""
+    from tests.model.robots import save
+
+    folder = tmp_path_factory.mktemp("source") / "model"
+    save(folder, ROBOTS)
+    return folder
+
+
+@pytest.fixture
+def published(server: Hub, source: Path) -> Hub:
+    """The hub with that checkpoint in REPO."""
+    from hma_model import hub
+
+    hub.push(source, REPO)
+    server.log.clear()
+    return server
