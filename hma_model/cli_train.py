@@ -43,7 +43,9 @@ def train(
 
 
 def finetune(
-    source: Annotated[str, typer.Option("--from", help="A checkpoint, a run's folder, or a hub repo.")],
+    source: Annotated[
+        str, typer.Option("--from", help="A checkpoint, a run's folder, a URI, or ORG/NAME[@REVISION].")
+    ],
     data: Annotated[
         list[Path], typer.Option("--data", help="A shard set; more may follow it, or repeat --data.")
     ],

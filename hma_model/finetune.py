@@ -33,7 +33,7 @@ def finetune(
     """Train on a checkpoint's trunk; run it again to resume.
 
     Args:
-        source: a checkpoint, a run's folder, a URI, or a hub repository.
+        source: a checkpoint, a run's folder, a URI, or a hub repository, also `org/name@revision`.
         data: folders of shards, made with the checkpoint's tokenizer.
         out: the run's folder; by default that of the overrides.
         freeze_trunk: train stems and heads alone.

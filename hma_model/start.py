@@ -2,7 +2,8 @@
 
 The run keeps its own copy in `.start/`, so that it goes on whatever becomes of the source. Robots of the data
 that the checkpoint knows go on from their stem and head, with the statistics these were trained with; others
-get fresh ones. With the trunk frozen the run's checkpoints carry the very files of the trunk and of all other
+get fresh ones. Of a hub the trunk and the robots of the data are fetched, nothing else. With the trunk frozen
+the run's checkpoints carry the very files of the trunk and, from a checkpoint on this machine, of all other
 robots; a tuned trunk leaves them behind, because they belong to the trunk as it was.
 """
 
@@ -56,10 +57,11 @@ class Start:
         from hma_model import hub
 
         assert recipe.start is not None
-        frozen, place, source = recipe.freeze == "trunk", out / START, recipe.start
+        frozen, place = recipe.freeze == "trunk", out / START
+        source, revision = _addressed(recipe.start)
         local = not hub.is_repository(source) and "://" not in source
         if (place / checkpoints.README).is_file():  # written last
-            _require_source(source, local, out)
+            _require_source(recipe.start, out)
             return
         if local:
             found = Checkpoint.open(checkpoints.resolve(Path(source).expanduser()))
@@ -67,14 +69,15 @@ class Start:
             found.trunk()
             source = str(found.folder)
         try:
-            known = [str(row["embodiment"]) for row in hub.list_embodiments(source)]
-            hub.pull(source, [name for name in known if frozen or name in sets], place)
+            known = hub.embodiment_ids(hub.open_store(source, revision).files())
+            wanted = [name for name in known if name in sets or (frozen and local)]
+            hub.pull(source, wanted, place, revision)
         except HubError as fault:
             if local or "://" in source:
                 raise
             both = f"is no folder here; as a repository of the hub: {fault.fault}"
             raise HubError(
-                source, both, f"give the path of a checkpoint or run, or: {fault.remedy}"
+                recipe.start, both, f"give the path of a checkpoint or run, or: {fault.remedy}"
             ) from fault
 
     @classmethod
@@ -155,7 +158,17 @@ class Start:
         return notes
 
 
-def _require_source(source: str, local: bool, out: Path) -> None:
+def _addressed(source: str) -> tuple[str, str | None]:
+    """`org/name@revision` as the repository and its branch, tag or commit; anything else has no revision."""
+    from hma_model import hub
+
+    address, _, revision = source.partition("@")
+    if revision and not Path(source).exists() and hub.is_repository(address):
+        return address, revision
+    return source, None
+
+
+def _require_source(source: str, out: Path) -> None:
     """Raise where a run is asked to go on from another checkpoint than the one it was begun from.
 
     The same one may have moved; a source that is gone, or a run that trained on, is no other one.
@@ -165,11 +178,12 @@ def _require_source(source: str, local: bool, out: Path) -> None:
     before = _begun_from(out)
     if before in (None, source):
         return
-    if local:
-        path = Path(source).expanduser()
+    address, revision = _addressed(source)
+    if not hub.is_repository(address) and "://" not in address:
+        path = Path(address).expanduser()
         trunk = Checkpoint.open(checkpoints.resolve(path)).trunk_sha256 if path.exists() else None
     else:
-        trunk = hub.describe(source)["trunk_sha256"]
+        trunk = hub.describe(address, revision)["trunk_sha256"]
     if trunk not in (None, Checkpoint.open(out / START).trunk_sha256):
         raise RecipeError(
             out, f"was begun from {before}, not from {source}", "train into another folder, or name the first"

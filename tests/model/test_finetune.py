@@ -223,9 +223,9 @@ def test_a_run_that_cannot_begin_leaves_no_folder(base, leg, tmp_path, change):
 
 
 def test_a_path_that_looks_like_a_repository_is_told_to_be_neither(leg, tmp_path, monkeypatch):
-    def away(source):
+    def away(source, revision):
         raise HubError(f"hf://{source}", "is out of reach, and not in the cache", "go online and pull again")
 
-    monkeypatch.setattr(hub, "list_embodiments", away)
+    monkeypatch.setattr(hub, "open_store", away)
     with pytest.raises(HubError, match=r"^runs/base: is no folder here; as a repository .* path of"):
         tune("runs/base", leg, tmp_path / "run")
