@@ -51,11 +51,10 @@ def test_a_revision_is_the_one_that_is_fetched(published, leg, tmp_path, form):
     first = published.model(REPO).commits[-1].id
     save(tmp_path / "other", {"arm": 2}, model=make_model({"arm": 2}, seed=5))
     other = checkpoint.Checkpoint.open(tmp_path / "other")
-    published.model(REPO).commit({name: None for name in published.model(REPO).files}, "empty it")
+    published.model(REPO).commit(dict.fromkeys(published.model(REPO).files), "empty it")
     hub.push(tmp_path / "other", REPO)
-    old, new = (
-        tune(name, leg, tmp_path / f"run{i}") for i, name in enumerate([form.format(REPO, first), REPO])
-    )
+    old = tune(form.format(REPO, first), leg, tmp_path / "run0")
+    new = tune(REPO, leg, tmp_path / "run1")
     trunks = [Checkpoint.open(result.checkpoint).trunk_sha256 for result in (old, new)]
     assert trunks[1] == other.trunk_sha256 != trunks[0]
     with pytest.raises(RecipeError, match=f"was begun from {REPO}, not from .*{REPO}@{first}"):
@@ -75,19 +74,14 @@ def test_of_a_folder_hub_by_its_uri_the_trunk_alone_comes_along(leg, tmp_path):
     assert Checkpoint.open(result.checkpoint).embodiments == ("leg",)
 
 
-def test_the_command_finetunes_from_a_repository_and_goes_on_without_it(published, leg, tmp_path):
-    def verb(*also: str) -> subprocess.CompletedProcess[str]:
-        command = ["-m", "hma_model.cli", "finetune", "--from", REPO, "--data", str(leg), "--freeze-trunk"]
-        cache = {"HF_ENDPOINT": published.url, "HF_HUB_CACHE": str(tmp_path / "c"), "HF_HUB_DISABLE_XET": "1"}
-        return subprocess.run(
-            [sys.executable, *command, "--out", str(tmp_path / "run"), *SHORT, *also],
-            env={**os.environ, **cache, "PYTHONPATH": str(ROOT)},
-            capture_output=True, text=True, check=False, timeout=120,
-        )  # fmt: skip
-
-    done = verb()
+def test_the_command_finetunes_from_a_repository_and_the_run_goes_on_without_it(published, leg, tmp_path):
+    command = ["-m", "hma_model.cli", "finetune", "--from", REPO, "--data", str(leg), "--freeze-trunk"]
+    cache = {"HF_ENDPOINT": published.url, "HF_HUB_CACHE": str(tmp_path / "c"), "HF_HUB_DISABLE_XET": "1"}
+    done = subprocess.run(
+        [sys.executable, *command, "--out", str(tmp_path / "run"), *SHORT],
+        env={**os.environ, **cache, "PYTHONPATH": str(ROOT)},
+        capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
     assert done.returncode == 0 and "trunk frozen" in done.stderr, done.stderr
     asked = len(published.log)
-    again = verb()
-    assert again.returncode == 0 and "going on from step 4" in again.stderr
-    assert len(published.log) == asked
+    assert tune(REPO, leg, tmp_path / "run").step == 4 and len(published.log) == asked
