@@ -19,6 +19,7 @@ from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
 from hma_data.errors import HMAError, MissingDependencyError, StorageAwayError, StorageError
+from hma_data.reach import reach
 from hma_data.retry import worth_another_try
 from hma_data.sources.fetching import ABSENT, may_pass, said
 
@@ -65,11 +66,13 @@ def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
 
     Raises:
         FileNotFoundError: there is no such file.
-        StorageAwayError: it failed in such a way every time.
+        StorageAwayError: it failed in such a way every time, or was never reached.
         StorageError: it fails for good.
     """
     for wait_s in (*WAITS_S, None):
         try:
+            if isinstance(where, RemotePath):
+                reach(where.files, where)
             return action()
         except HMAError:
             raise

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from hma_data.errors import HMAError, SourceError, StorageAwayError
+from hma_data.reach import reach
 
 TRIES, FIRST_PAUSE_S = 4, 0.2  # each pause is three times the one before
 BUSY = {408, 425, 429, 500, 502, 503, 504}
@@ -47,6 +48,8 @@ def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
     tries = 1 if is_local(files) else TRIES
     for turn in range(tries):
         try:
+            if tries > 1:
+                reach(files, path)
             return action()
         except HMAError:
             raise
