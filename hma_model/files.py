@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hma_data import json_io
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.files import sync_folder
 
@@ -88,9 +89,9 @@ def read_json(path: Path, error: type[HMAError] = CheckpointError) -> dict[str, 
 
 
 def parse_json(content: bytes, where: object, error: type[HMAError] = CheckpointError) -> dict[str, Any]:
-    """The object in JSON bytes; see `read_json`."""
+    """The object in JSON bytes, which give no key twice; see `read_json`."""
     try:
-        values = json.loads(content)
+        values = json_io.parse_json(content)
     except (ValueError, RecursionError) as fault:
         raise error(where, f"is not valid JSON: {fault}") from fault
     if not isinstance(values, dict):

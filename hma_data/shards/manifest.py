@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
 from hma_data.files import atomic_path, file_sha256, write_atomic
+from hma_data.json_io import parse_json
 from hma_data.shards.schema import SCHEMA_VERSION, EpisodeRow, Footer, Refused, read_footer
 from hma_data.shards.wellformed import check_plan, check_spec, check_splits, check_stats, is_count
 from hma_data.stats import Stats
@@ -58,6 +59,7 @@ _EPISODE_SCHEMA = pa.schema(
         ("trimmed", pa.int64()),
         ("flags", pa.string()),
         ("group", pa.string()),
+        ("content", pa.string()),
     ]
 )
 
@@ -172,7 +174,7 @@ class Manifest:
                 "hma shards restat writes it anew from the shards",
             )
         try:
-            values = json.loads(path.read_bytes())
+            values = parse_json(path.read_bytes())
             if values["schema_version"] != SCHEMA_VERSION:
                 raise ShardError(
                     path,
@@ -251,7 +253,9 @@ class Gathered:
     def episodes(self) -> pa.Table:
         """episodes.parquet, in order of episode_index."""
         tables = self._tables or [_episode_table((), self.source)]
-        return pa.concat_tables(tables).combine_chunks().sort_by("episode_index")
+        table = pa.concat_tables(tables).combine_chunks().sort_by("episode_index")
+        known = pc.any(pc.not_equal(table["content"], "")).as_py()
+        return table if known else table.drop_columns("content")  # as sets were written before there was one
 
     def quarantine(self) -> str:
         """quarantine.jsonl, in order of the ids."""

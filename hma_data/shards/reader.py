@@ -3,7 +3,6 @@
 N rows, S tokens a frame, A values of an action.
 """
 
-import json
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from hma_data.errors import ShardError
+from hma_data.json_io import parse_json
 from hma_data.shard_cache import kept_shard, limit_bytes
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
 from hma_data.shards.schema import mask_columns, to_numpy, token_column
@@ -99,7 +99,7 @@ class ShardSet:
         """
         path = self.folder / QUARANTINE
         try:
-            return [dict(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+            return [dict(parse_json(line)) for line in path.read_text(encoding="utf-8").splitlines()]
         except (OSError, ValueError, TypeError) as fault:
             raise ShardError(
                 path, f"cannot be read: {fault}", f"hma shards restat {self.folder} writes it anew"

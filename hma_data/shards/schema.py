@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
+from hma_data.json_io import parse_json
 from hma_data.shards.wellformed import check_fields, check_numbers, check_plan
 from hma_data.stats import Stats
 from hma_data.store import parquet_input
@@ -46,6 +47,7 @@ class EpisodeRow:
         flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
         group: shared by episodes of one recording, which belong into one split; empty for one of its own.
         source: where it is another than the set's.
+        content: hash over what was read of it, see `hma_data.content`; empty where that was not noted.
     """
 
     episode_index: int
@@ -66,6 +68,7 @@ class EpisodeRow:
     flags: str
     group: str = ""
     source: str = ""
+    content: str = ""
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,7 @@ class Footer:
         if not metadata or _FOOTER not in metadata:
             raise ShardError(where, "is parquet but not a shard: its footer has no 'hma' entry")
         try:
-            values = json.loads(metadata[_FOOTER])
+            values = parse_json(metadata[_FOOTER])
             if values["schema_version"] != SCHEMA_VERSION:
                 raise ShardError(
                     where,

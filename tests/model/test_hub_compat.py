@@ -217,6 +217,26 @@ def test_an_embodiment_that_asks_for_too_much_is_refused(folder, monkeypatch):
         checkpoint.load(folder, ["arm"])
 
 
+@pytest.mark.parametrize(
+    ("name", "key"), [("config.json", "trunk_sha256"), ("embodiments/arm/card.json", "files")]
+)
+def test_a_key_that_is_given_twice_is_refused(folder, tmp_path, name, key):
+    hub.push(folder, tmp_path / "hub")
+    path = tmp_path / "hub" / name
+    path.write_text(path.read_text().replace("{", f'{{"{key}": {{}},', 1))
+    for act in (lambda: checkpoint.load(tmp_path / "hub"), lambda: hub.pull(tmp_path / "hub")):
+        with pytest.raises(HMAError, match=rf"{name}: is not valid JSON: key '{key}' is given twice"):
+            act()
+
+
+def test_a_key_given_twice_is_shown_short_and_plain(folder):
+    key = "k" * 10**6 + "\\u001b"
+    (folder / "config.json").write_text(f'{{"{key}": 1, "{key}": 2}}')
+    with pytest.raises(CheckpointError, match="is given twice") as found:
+        checkpoint.load(folder)
+    assert len(str(found.value)) < 300
+
+
 def test_pickles_under_our_names_are_not_unpickled(folder, tmp_path):
     marker = tmp_path / "ran"
     bomb = f"cos\nsystem\n(S'touch {marker}'\ntR.".encode()

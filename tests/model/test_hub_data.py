@@ -170,6 +170,16 @@ def test_a_manifest_that_names_files_elsewhere_is_refused(server, shards, tmp_pa
     assert not list(tmp_path.rglob("*escaped*"))
 
 
+def test_a_manifest_with_a_key_twice_is_refused(server, shards, tmp_path):
+    push_data(shards, REPO)
+    text = dataset(server).files["manifest.json"].decode()
+    dataset(server).commit({"manifest.json": text.replace("{", '{"shards": [],', 1).encode()})
+    with pytest.raises(ShardError, match=r"manifest\.json: is damaged: key 'shards' is given twice"):
+        pull_data(REPO, tmp_path / "out")
+    with pytest.raises(ShardError, match="is given twice"):
+        ShardSet(f"hf://datasets/{REPO}")
+
+
 def test_another_set_in_the_folder_is_not_overwritten(server, shards, tmp_path):
     push_data(shards, REPO)
     with pytest.raises(HubError, match="holds another shard set"):
