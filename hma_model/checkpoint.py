@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 __all__ = [
     "CARD", "CONFIG", "HEAD", "LIBRARY", "PARTS", "README", "SAMPLE", "STATS", "STEM", "TRAINING",
     "TRUNK", "YAML", "ActionStats", "Checkpoint", "action_stats", "add_embodiment", "check_id",
-    "config_json", "digest", "inside", "load", "parse_config", "remove", "require_tokenizer", "resolve",
-    "save", "training_checkpoints", "update_card", "write_readme",
+    "config_json", "digest", "inside", "load", "parse_config", "read_embodiment", "remove",
+    "require_tokenizer", "resolve", "save", "training_checkpoints", "update_card", "write_readme",
 ]  # fmt: skip
 
 
@@ -148,6 +148,19 @@ def load(
 
 def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> None:
     """Load one embodiment's stem and head beside a trunk that is already loaded."""
+    space, stem, head = read_embodiment(checkpoint, embodiment)
+    model.add_embodiment(space)
+    model.load_embodiment(embodiment, stem, head)
+
+
+def read_embodiment(
+    checkpoint: Checkpoint, embodiment: str
+) -> tuple[ActionSpace, weights.State, weights.State]:
+    """An embodiment's action space and the tensors of its stem and head, all checked.
+
+    Raises:
+        CheckpointError: parts do not belong together, or are damaged.
+    """
     checkpoint.check(embodiment)
     yaml, path = checkpoint.embodiment(embodiment), checkpoint.path(embodiment, STATS)
     if yaml.id != embodiment:
@@ -158,9 +171,7 @@ def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> Non
         raise CheckpointError(
             path, f"does not fit {YAML}: {fault.fault}", "pull the embodiment again"
         ) from fault
-    stem, head = weights.embodiment(checkpoint, embodiment, space)
-    model.add_embodiment(space)
-    model.load_embodiment(embodiment, stem, head)
+    return space, *weights.embodiment(checkpoint, embodiment, space)
 
 
 def update_card(folder: str | Path, embodiment: str, **facts: Any) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from hma_model import checkpoint as checkpoints
 from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
 from hma_model.files import parse_json
+from hma_model.hub_check import require_publishable, require_yaml
 from hma_model.model_card import render
 
 if TYPE_CHECKING:
@@ -111,14 +112,13 @@ def push(
         Where it is now: a path, URI or web address.
 
     Raises:
-        CheckpointError: the checkpoint's parts do not belong together, or it lacks an embodiment.
+        CheckpointError: the checkpoint's parts do not belong together or are damaged, or it lacks an
+            embodiment; nothing is made or sent then.
         HubError: what is there has another trunk or is something else, or it cannot be reached or written.
     """
     source = Checkpoint.open(checkpoint)
     ids = sorted(set(source.embodiments if embodiments is None else embodiments))
-    source.trunk()
-    for name in ids:
-        source.check(name)
+    require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
 
     def changes() -> dict[str, Content]:
@@ -182,6 +182,7 @@ def _pull(
     pulled.trunk()
     for name in wanted:
         pulled.check(name)
+        require_yaml(pulled, name)
     if out:
         checkpoints.write_readme(folder)
     return folder, wanted

@@ -7,12 +7,21 @@ with the same SHA-256 is left out, so that running it again goes on where it sto
 
 import tempfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from hma_data.errors import HubError, ShardError
 from hma_data.files import file_sha256, write_atomic
-from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SHARD_NAME, Manifest
+from hma_data.shards.manifest import (
+    EMBODIMENT,
+    EPISODES,
+    MANIFEST,
+    QUARANTINE,
+    SHARD_NAME,
+    Manifest,
+    seal_problem,
+)
 from hma_model.checkpoint import README
 from hma_model.data_card import render
 from hma_model.hub import REPOSITORY, Content, is_repository
@@ -34,6 +43,10 @@ class DataStore(Protocol):
     def files(self) -> dict[str, int]: ...
 
     def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str: ...
+
+    def check_card(self, page: bytes) -> None:
+        """Raise where the page would not be taken."""
+        ...
 
     def digests(self) -> dict[str, str]:
         """SHA-256 by name, where it is known."""
@@ -60,27 +73,31 @@ def push_data(folder: str | Path, target: str | Path, *, private: bool = False) 
         HubError: another shard set is there, or it cannot be reached or written.
     """
     folder = Path(folder)
-    manifest = Manifest.load(folder)
-    for shard in manifest.shards:
-        path = folder / shard.path
-        if not path.is_file() or path.stat().st_size != shard.bytes or file_sha256(path) != shard.sha256:
-            raise ShardError(path, "is not the shard its manifest names", f"run hma shards verify {folder}")
+    manifest = _whole(folder)
     store = _open(target, write=True, private=private)
+    page = render(manifest, store.repo)
     _refuse_others(store, manifest)
+    store.check_card(page)
     known = store.digests()
     missing = [shard.path for shard in manifest.shards if known.get(shard.path) != shard.sha256]
     name = manifest.embodiment.id
     batches = [missing[start : start + BATCH] for start in range(0, len(missing), BATCH)] or [[]]
+
+    def part(batch: list[str]) -> dict[str, Content | None]:
+        _refuse_others(store, manifest)
+        files: dict[str, Content | None] = {path: folder / path for path in batch}
+        return files | ({MANIFEST: None} if MANIFEST in store.files() else {})  # it would name other shards
+
+    def last() -> dict[str, Content | None]:
+        _refuse_others(store, manifest)
+        small = [name for name in SMALL if (folder / name).is_file()]
+        files: dict[str, Content | None] = {path: folder / path for path in (*batches[-1], *small)}
+        files |= dict.fromkeys(_left_over(store, manifest))
+        return files | {README: page, MANIFEST: folder / MANIFEST}
+
     for number, batch in enumerate(batches[:-1], 1):
-        shards: dict[str, Content | None] = {path: folder / path for path in batch}
-        unfinished = {MANIFEST: None} if MANIFEST in store.files() else {}  # it would name other shards
-        changes: dict[str, Content | None] = {**shards, **unfinished}
-        store.publish(lambda: changes, f"Add shards of {name}, {number} of {len(batches)}")  # noqa: B023
-    last: dict[str, Content | None] = {path: folder / path for path in batches[-1]}
-    last |= {path: folder / path for path in SMALL if (folder / path).is_file()}
-    last |= dict.fromkeys(_left_over(store, manifest))
-    last |= {README: render(manifest, store.repo), MANIFEST: folder / MANIFEST}
-    return store.publish(lambda: last, f"Add {name}")
+        store.publish(partial(part, batch), f"Add shards of {name}, {number} of {len(batches)}")
+    return store.publish(last, f"Add {name}")
 
 
 def pull_data(source: str | Path, out: str | Path, *, revision: str | None = None) -> Path:
@@ -112,11 +129,30 @@ def pull_data(source: str | Path, out: str | Path, *, revision: str | None = Non
     for path in wanted:
         if not _is(out / path, shards[path]):
             raise ShardError(out / path, f"is not the shard that {MANIFEST} names", "pull again")
+    for name in SMALL:
+        if name in manifest.files and not _is(out / name, manifest.files[name]):
+            raise ShardError(out / name, f"is not the file that {MANIFEST} names", "pull again")
     write_atomic(out / MANIFEST, content)
     return out
 
 
 # -- pieces
+
+
+def _whole(folder: Path) -> Manifest:
+    """The manifest of a set whose files are all as it says."""
+    manifest = Manifest.load(folder)
+    if problem := seal_problem((folder / MANIFEST).read_bytes()):
+        raise ShardError(folder / MANIFEST, problem, f"hma shards restat {folder} writes it anew")
+    for shard in manifest.shards:
+        path = folder / shard.path
+        if not path.is_file() or path.stat().st_size != shard.bytes or not _is(path, shard.sha256):
+            raise ShardError(path, "is not the shard its manifest names", f"run hma shards verify {folder}")
+    for name, sha256 in manifest.files.items():
+        if name not in SMALL or not _is(folder / name, sha256):
+            remedy = f"hma shards restat {folder} writes it anew"
+            raise ShardError(folder / name, "is not the file its manifest names", remedy)
+    return manifest
 
 
 def _open(address: str | Path, revision: str | None = None, **settings: bool) -> DataStore:

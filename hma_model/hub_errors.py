@@ -11,6 +11,7 @@ TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
 AGAIN = "run the same command again; it goes on where it stopped"
 LONGEST_WAIT = 300.0  # seconds; the hub counts requests over five minutes
+_LICENCE = 'correct "license" in the card.json of a checkpoint, in the embodiment of a shard set'
 CHAIN = 20  # causes of an error that are looked through
 _SECRET = re.compile(r"(?i)\b(hf_|bearer )\w+")
 
@@ -123,7 +124,7 @@ def _answered(where: str, fault: Any) -> HubError:
 def _plain(where: str, fault: BaseException) -> HubError:
     text = _shown(str(fault))
     if isinstance(fault, ValueError) and "metadata in README" in text:
-        return HubError(where, f"the hub refuses the card: {text}", "correct the licence in embodiment.yaml")
+        return HubError(where, f"the hub refuses the card: {text}", _LICENCE)
     if isinstance(fault, OSError) and fault.errno is not None:
         return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
     if isinstance(fault, OSError):

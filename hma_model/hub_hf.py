@@ -11,12 +11,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HubError
 from hma_data.files import file_sha256
 from hma_data.hub_chunks import leave_after, leave_if_unknown
+from hma_model.checkpoint import README
 from hma_model.files import MAX_JSON_BYTES
 from hma_model.hub_bounds import bounded, downloading
 from hma_model.hub_errors import LOG_IN, cuts, explain, explained, raised, waiting, without_token
@@ -28,6 +30,7 @@ TIMEOUT = 30.0  # seconds for a listing
 AT_ONCE = 4  # downloads
 MOST_FILES = 300_000  # of a listing
 MOST_WARM = 256_000_000  # bytes of cards brought together
+_ABSENT = object()
 _CONFLICTS = (409, 412)
 _COMMIT = re.compile(r"[0-9a-f]{40}|[0-9a-f]{64}")
 
@@ -60,36 +63,44 @@ class HuggingFaceStore:
         self.name, self.repo, self._revision, self._kind = f"hf://{prefix}{repo}", repo, revision, kind
         self._api = HfApi(library_name="hma-toolkit")
         self.address = f"{self._api.endpoint}/{prefix}{repo}"
+        self._write, self._private, self._absent = write, private, False
         self._commit: str | None = None
         self._offline: Path | None = None
         self._sizes: dict[str, int] | None = None
         self._digests: dict[str, str] = {}
         self._blobs: dict[str, str] = {}
-        if write:
-            if get_token() is None:
-                remedy = f"{LOG_IN}; for a folder write ./{repo}"
-                raise HubError(self.name, "needs a token to be written", remedy)
-            self._patiently(
-                lambda: self._api.create_repo(repo, repo_type=kind, exist_ok=True, private=private or None)
-            )
+        if write and get_token() is None:
+            remedy = f"{LOG_IN}; for a folder write ./{repo}"
+            raise HubError(self.name, "needs a token to be written", remedy)
 
     def files(self) -> dict[str, int]:
-        """Sizes by name at the revision's newest commit; out of the hub's reach, of what the cache has."""
+        """Sizes by name at the revision's newest commit; out of the hub's reach, of what the cache has.
+
+        Of a repository that is to be written, and is not there yet, none.
+        """
+        from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
 
         def ask() -> Any:
             try:
                 return self._api.repo_info(
                     self.repo, repo_type=self._kind, revision=self._revision, timeout=TIMEOUT
                 )
+            except RepositoryNotFoundError as fault:
+                if not self._write or isinstance(fault, GatedRepoError):
+                    raise
+                return _ABSENT
             except _unreachable():
+                if self._write:
+                    raise
                 return None
 
         info = self._patiently(ask)
         if info is None:
             with explained(self.name):
                 return self._cached_files()
-        self._commit, self._offline = self._named(info.sha), None
-        entries = self._patiently(self._listing) if info.sha else []
+        self._absent = info is _ABSENT
+        self._commit, self._offline = None if self._absent else self._named(info.sha), None
+        entries = self._patiently(self._listing) if self._commit else []
         self._digests = {item.path: item.lfs.sha256 for item in entries if item.lfs}
         self._blobs = {item.path: str(item.blob_id) for item in entries if not item.lfs}
         self._sizes = {item.path: int(item.size or 0) for item in entries}
@@ -135,7 +146,7 @@ class HuggingFaceStore:
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """One commit, prepared again while others commit first."""
         for attempt in range(ATTEMPTS):
-            files = changes()
+            files = changes() if attempt else self._begun(changes)
             try:
                 with bounded():
                     self._send(files, message, again=attempt > 0)
@@ -152,6 +163,21 @@ class HuggingFaceStore:
                     raise explain(self.name, fault) from fault
             time.sleep(seconds * (0.5 + random.random()) if conflict else seconds)
         raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
+
+    def _begun(self, changes: Callable[[], Mapping[str, Path | bytes | None]]) -> Mapping[str, Any]:
+        """The changes, whose card the hub takes; a repository that is not there is made only then."""
+        files = changes()
+        if isinstance(page := files.get(README), bytes):
+            self.check_card(page)
+        if not self._absent:
+            return files
+        make = partial(self._api.create_repo, repo_type=self._kind, exist_ok=True)
+        self._patiently(lambda: make(self.repo, private=self._private or None))
+        return changes()  # somebody else may have been there meanwhile
+
+    def check_card(self, page: bytes) -> None:
+        """Raise HubError where the hub would not take a card."""
+        self._patiently(lambda: self._api._validate_yaml(page.decode(), repo_type=self._kind))
 
     def _send(self, files: Mapping[str, Path | bytes | None], message: str, again: bool) -> None:
         """Upload what is large, then commit all of it, or nothing."""

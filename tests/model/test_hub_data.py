@@ -12,6 +12,7 @@ from hma_data.shards.reader import ShardSet
 from hma_model import hub_data
 from hma_model.hub_data import pull_data, push_data
 from tests.hub_server import Hub
+from tests.model.robots import yaml as yaml_of
 from tests.model.shards import make_shards
 
 pytest_plugins = ["tests.hub_fixtures"]
@@ -151,6 +152,66 @@ def test_a_damaged_shard_is_not_published(server, shards):
     with pytest.raises(ShardError, match="is not the shard its manifest names"):
         push_data(shards, REPO)
     assert server.log == []
+
+
+@pytest.mark.parametrize("name", ["embodiment.yaml", "episodes.parquet", "quarantine.jsonl", "manifest.json"])
+def test_a_set_with_another_file_than_its_manifest_names_is_not_published(server, shards, name):
+    path = shards / name
+    path.write_bytes(path.read_bytes() + b"\n")
+    with pytest.raises(ShardError, match=rf"{name}.*hma shards restat"):
+        push_data(shards, REPO)
+    assert server.log == []
+
+
+def test_a_licence_that_the_hub_refuses_is_told_before_any_shard_is_sent(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(hub_data, "BATCH", 1)
+    other = "cc-by-2.5"  # which this hub does not know
+    monkeypatch.setattr("tests.model.shards.yaml", lambda *a: yaml_of(*a).replace("apache-2.0", other))
+    with pytest.raises(
+        HubError, match=r"refuses the card: .*must be one of.*in the embodiment of a shard set"
+    ):
+        push_data(make_shards(tmp_path / "shards", "arm"), REPO)
+    assert server.repositories == {} and server.count("POST ") == 1
+
+
+def test_pushes_of_one_set_at_once_both_end_well(server, shards):
+    server.create(REPO, "datasets")
+    server.before_commit = [lambda: push_data(shards, REPO)]
+    push_data(shards, REPO)
+    assert [commit.message for commit in dataset(server).commits] == ["initial commit", "Add arm"]
+
+
+def test_a_push_finds_that_another_robots_set_came_meanwhile(server, shards, tmp_path):
+    hand = make_shards(tmp_path / "hand", "hand")
+    server.create(REPO, "datasets")
+    server.before_commit = [lambda: push_data(hand, REPO)]
+    with pytest.raises(HubError, match="holds the shard set of hand"):
+        push_data(shards, REPO)
+    assert b"hand" in dataset(server).files["manifest.json"]
+
+
+def test_a_commit_whose_answer_was_lost_is_not_made_twice(server, shards):
+    server.create(REPO, "datasets")
+    plain = dataset(server).commit
+
+    def commit(files, message="by hand"):
+        plain(files, message)
+        dataset(server).commit = plain
+        raise ConnectionResetError
+
+    dataset(server).commit = commit
+    push_data(shards, REPO)
+    assert [commit.message for commit in dataset(server).commits] == ["initial commit", "Add arm"]
+
+
+@pytest.mark.parametrize("name", ["episodes.parquet", "embodiment.yaml", "quarantine.jsonl"])
+def test_a_small_file_that_is_not_the_manifests_is_refused_on_pulling(shards, tmp_path, name):
+    push_data(shards, tmp_path / "hub")
+    path = tmp_path / "hub" / name
+    path.write_bytes(path.read_bytes() + b"\n")
+    with pytest.raises(ShardError, match=rf"{name}: is not the file that manifest\.json names"):
+        pull_data(tmp_path / "hub", tmp_path / "out")
+    assert not (tmp_path / "out/manifest.json").exists()
 
 
 def test_a_shard_that_is_not_the_manifests_is_refused_on_pulling(server, shards, tmp_path):
