@@ -18,6 +18,7 @@ from typing import Literal
 
 import pyarrow.parquet as pq
 
+from hma_data.content import content_of
 from hma_data.embodiment import Embodiment
 from hma_data.engines.base import LIMITS, Limits, Retry
 from hma_data.engines.local import run as run_local
@@ -42,7 +43,7 @@ from hma_data.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.shard_work import Job, MakeWork, Tick
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
 from hma_data.shards.schema import flag_counts
-from hma_data.sources.base import open_source
+from hma_data.sources.base import EpisodeRef, open_source
 from hma_data.store import parquet_input, place
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
@@ -255,7 +256,12 @@ class _Conversion:
         base = base_manifest(self._out)
         if base is None or not (extend or "extends" in base.plan):
             return self._whole, None
-        plan = extended(self._out, base, self._whole, self._settings.shard_frames)
+        source = open_source(self._embodiment.source.format)
+
+        def content(ref: EpisodeRef) -> str:
+            return content_of(source, self.uri, ref.id, self._embodiment, self._whole.facts)
+
+        plan = extended(self._out, base, self._whole, self._settings.shard_frames, content)
         if plan.units and not extend:
             raise OutputError(
                 self._out,

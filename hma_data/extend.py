@@ -4,16 +4,18 @@ The extended plan knows the hashes of the plans before it (`extends`), and new s
 """
 
 import json
+import logging
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
-
-from hma_data.errors import OutputError
+from hma_data.errors import EpisodeError, OutputError
 from hma_data.plan import Plan, ShardUnit, differences, digest, pack, shard_size
 from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest
 from hma_data.sources.base import EpisodeRef
-from hma_data.store import parquet_input
+from hma_data.store import parquet_file
+
+log = logging.getLogger(__name__)
 
 _OF_THE_CUT = ("recording", "shards", "hash", "extends")
 
@@ -23,7 +25,13 @@ def hashes(facts: dict[str, Any]) -> set[str]:
     return {facts["hash"], *facts.get("extends", ())}
 
 
-def extended(out: Path, base: Manifest, plan: Plan, shard_frames: int | None) -> Plan:
+def extended(
+    out: Path,
+    base: Manifest,
+    plan: Plan,
+    shard_frames: int | None,
+    content: Callable[[EpisodeRef], str],
+) -> Plan:
     """The plan of `base` with the episodes that are new in `plan`.
 
     Args:
@@ -31,6 +39,8 @@ def extended(out: Path, base: Manifest, plan: Plan, shard_frames: int | None) ->
         base: its manifest.
         plan: of the recordings as they are now, made as for an empty folder.
         shard_frames: about how many frames a shard.
+        content: of an episode as it is recorded now; see `hma_data.content`. It is asked for where the
+            fingerprint is another, as when a file has grown.
 
     Returns:
         a plan whose units are the new shards alone; without any, its facts are those of `base`.
@@ -45,22 +55,52 @@ def extended(out: Path, base: Manifest, plan: Plan, shard_frames: int | None) ->
             f"cannot be extended; different: {differences(plan.facts, base.plan)}",
             "convert with the same settings, or choose another --out",
         )
-    known = pq.read_table(parquet_input(out / EPISODES), columns=["id", "fingerprint", "split"]).to_pydict()
-    fingerprints = dict(zip(known["id"], known["fingerprint"], strict=True))
+    fingerprints, contents = _known(out)
     refused = {json.loads(line)["id"] for line in (out / QUARANTINE).read_text("utf-8").splitlines()}
     placed = ((index, ref, unit.split) for unit in plan.units for index, ref in unit.episodes)
     now = [(ref, split) for _, ref, split in sorted(placed, key=lambda item: item[0])]
-    changed = [ref.id for ref, _ in now if fingerprints.get(ref.id, ref.fingerprint) != ref.fingerprint]
-    if changed:
-        raise OutputError(
-            out,
-            f"cannot be extended: {len(changed):,} of its episodes were recorded anew, first {changed[0]!r}",
-            "--overwrite to start anew, or give the new episodes other names",
-        )
+    other = [ref for ref, _ in now if fingerprints.get(ref.id, ref.fingerprint) != ref.fingerprint]
+    _refuse_changed(out, other, contents, content)
     new = [(ref, split) for ref, split in now if ref.id not in fingerprints and ref.id not in refused]
     if not new:
         return Plan((), base.plan)
     return _with(base, new, len(fingerprints) + len(refused), shard_frames)
+
+
+def _known(out: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Fingerprints and contents of a set's episodes by their ids; sets written before say no contents."""
+    file = parquet_file(out / EPISODES)
+    names = [name for name in ("id", "fingerprint", "content") if name in file.schema_arrow.names]
+    known = file.read(columns=names).to_pydict()
+    fingerprints = dict(zip(known["id"], known["fingerprint"], strict=True))
+    return fingerprints, dict(zip(known["id"], known.get("content", ())))
+
+
+def _refuse_changed(
+    out: Path, refs: Sequence[EpisodeRef], contents: dict[str, str], content: Callable[[EpisodeRef], str]
+) -> None:
+    """Of episodes whose files have other bytes now: all are as they were, or it cannot be extended."""
+
+    def is_changed(ref: EpisodeRef) -> bool:
+        try:
+            return content(ref) != contents[ref.id]
+        except EpisodeError as fault:
+            log.info("%s", fault)
+            return True
+
+    unknown = [ref.id for ref in refs if not contents.get(ref.id)]
+    if refs and not unknown:
+        log.info("%s: a file has changed; %s known episodes are looked at", out, f"{len(refs):,}")
+    changed = unknown or [ref.id for ref in refs if is_changed(ref)]
+    if changed:
+        what = "of its episodes were recorded anew"
+        if unknown:
+            what = "of its episodes lie in files that have changed, and it does not say what they held"
+        raise OutputError(
+            out,
+            f"cannot be extended: {len(changed):,} {what}, first {changed[0]!r}",
+            "--overwrite to start anew, or give the new episodes other names",
+        )
 
 
 def _with(base: Manifest, new: list[tuple[EpisodeRef, str]], first: int, shard_frames: int | None) -> Plan:

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from hma_data.align import to_clip
 from hma_data.batching import Batches
+from hma_data.content import Content, rows_kept
 from hma_data.embodiment import Embodiment
 from hma_data.engines.base import FIRST, Attempt, Report, Step, Work
 from hma_data.engines.local import usable_cores
 from hma_data.episode import Clip
 from hma_data.errors import (
-    EpisodeError,
     HMAError,
     MissingDependencyError,
     OutputError,
@@ -163,6 +163,7 @@ class _Begin:
     index: int
     ref: EpisodeRef
     clip: Clip
+    content: Content  # complete at the _End
 
 
 @dataclass
@@ -181,6 +182,7 @@ class _Whole:
     index: int
     ref: EpisodeRef
     clip: Clip
+    content: str
     tokens: dict[str, NDArray[Any]]
 
 
@@ -224,17 +226,17 @@ def _decoded(
 
 def _episode(job: Job, source: Source, spec: TokenizerSpec, index: int, ref: EpisodeRef) -> Iterator[Decoded]:
     clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
-    stride = job.embodiment.stride if job.facts["frames"] == "strided" else 1
-    if len(clip) < stride:
-        raise EpisodeError(ref.id, f"has {len(clip)} frames, fewer than one stride of {stride}")
-    yield _Begin(index, ref, clip)
+    kept = rows_kept(clip, job.embodiment, job.facts["frames"])
+    content = Content(clip, kept)
+    yield _Begin(index, ref, clip, content)
     for name in job.facts["cameras"]:
         camera = job.embodiment.camera(name)
-        kept = np.arange(0, len(clip) // stride * stride, stride)
         for start in range(0, len(kept), BATCH):
             indices = clip.frame_indices[name][kept[start : start + BATCH]]
             stream = clip.episode.streams[name]
-            yield _Frames(name, prepared(stream, indices, camera, spec.image_size, spec.resize_filter))
+            frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
+            content.add(start, frames)
+            yield _Frames(name, frames)
     yield _End()
 
 
@@ -250,7 +252,8 @@ def _tokenized(items: Iterator[Decoded], tokenizer: Tokenizer, report: Report) -
             if isinstance(first, _Begin):
                 if first is begun or not batches.whole(first.index):
                     return
-                yield _Whole(first.index, first.ref, first.clip, batches.take(first.index))
+                tokens = batches.take(first.index)
+                yield _Whole(first.index, first.ref, first.clip, first.content.text(), tokens)
             else:
                 yield first
             waiting.popleft()
@@ -319,4 +322,5 @@ def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> 
         trimmed=clip.trimmed,
         flags=flags_text(clip.trimmed, clip.flags),
         group=item.ref.group,
+        content=item.content,
     )
