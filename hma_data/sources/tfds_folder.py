@@ -177,6 +177,8 @@ def _find(uri: str) -> Folder:
 
 
 def _file_system(uri: str) -> tuple[Any, str]:
+    if "://" not in uri:  # a path, whatever signs of a chain of file systems stand in it
+        return fsspec.filesystem("file"), str(Path(uri).expanduser().absolute())
     try:
         files, path = fsspec.core.url_to_fs(uri)
     except ImportError as fault:
@@ -201,11 +203,7 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
         return path
     if not files.exists(path) and not is_listless(files):
         raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
-    found = (
-        []
-        if is_listless(files)
-        else files.glob(f"{path}/*/features.json") + files.glob(f"{path}/*/*/features.json")
-    )
+    found = _described(files, path)
     if len(found) == 1:
         return files._parent(found[0])
     if found:
@@ -216,6 +214,16 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
         "cannot be reached, or has no features.json" if is_listless(files) else "has no features.json",
         "records cannot be understood without; copy it from where they are from, or write it with TFDS",
     )
+
+
+def _described(files: Any, path: str) -> list[str]:
+    """Every features.json one or two folders below `path`."""
+    patterns = ("*/features.json", "*/*/features.json")
+    if is_listless(files):
+        return []
+    if is_local(files):  # the signs of patterns may stand in its name
+        return [str(found) for pattern in patterns for found in sorted(Path(path).glob(pattern))]
+    return [str(found) for pattern in patterns for found in files.glob(f"{path}/{pattern}")]
 
 
 @lru_cache(maxsize=64)

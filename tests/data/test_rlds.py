@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment, find
 from hma_data.errors import EpisodeError, HMAError, MissingDependencyError, SourceError
-from hma_data.sources.base import open_source
+from hma_data.sources.base import detect, open_source
 from hma_data.sources.tf_example import Example, varints
 from tests.data import rlds_files
 from tests.data.rlds_files import (
@@ -597,3 +597,12 @@ def test_the_real_bridge_recording_equals_tensorflow_datasets(real_data):
         pictures = ours.streams["primary"].frames(range(len(steps)))
         differences = pictures.astype(int) - np.array([step["image_0"].numpy() for step in steps])
         assert np.abs(differences).mean() < 4  # TensorFlow decodes with the fast inverse DCT by default
+
+
+@pytest.mark.parametrize("name", ["a::b", "[x]*?", "100%20 #1 ü機", "file:x"])
+def test_a_folder_of_any_name_is_read(name, tmp_path):
+    toy(tmp_path / name / "toy" / "1.0.0")
+    for inside in ("", "toy", "toy/1.0.0", "toy/1.0.0/toy-train.tfrecord-00000-of-00001"):
+        uri = str(tmp_path / name / inside)
+        assert len(RLDS.index(uri)) == 3 and detect(uri) == "rlds"
+        assert len(read(uri, "train/000002").actions[0].values) == 5
