@@ -38,8 +38,11 @@ def train(
     """
     from hma_model.recipe import load_recipe
     from hma_model.train import train as run
+    from hma_model.voice import one_voice
 
-    _tell(run(load_recipe(recipe, overrides or []), out=out, force=force), json)
+    with one_voice():
+        result = run(load_recipe(recipe, overrides or []), out=out, force=force)
+    _tell(result, json)
 
 
 def finetune(
@@ -68,19 +71,21 @@ def finetune(
     Example: hma finetune --from team/model --data shards/my_arm --freeze-trunk --out runs/my_arm
     """
     from hma_model.finetune import finetune as run
+    from hma_model.voice import one_voice
 
     given = overrides or []
     folders = [*data, *(Path(text) for text in given if "=" not in text)]
     changes = [text for text in given if "=" in text]
-    result = run(
-        source,
-        folders,
-        out=out,
-        freeze_trunk=freeze_trunk,
-        overrides=changes,
-        recipe=recipe,
-        force=force,
-    )
+    with one_voice():
+        result = run(
+            source,
+            folders,
+            out=out,
+            freeze_trunk=freeze_trunk,
+            overrides=changes,
+            recipe=recipe,
+            force=force,
+        )
     _tell(result, json)
 
 

@@ -20,6 +20,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
+from hma_model.voice import Voice
 
 if TYPE_CHECKING:
     from hma_model.model import HMA
@@ -97,34 +98,58 @@ def join(device: torch.device) -> Iterator[World]:
 
     Raises:
         RecipeError: the ranks cannot find each other.
+        TrainingError: another rank has ended, and why where it has said so.
     """
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1 and not dist.is_initialized():
         yield World()
         return
-    backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
     ours = not dist.is_initialized()
-    if ours:
-        try:
-            dist.init_process_group(backend, timeout=PATIENCE)
-        except (RuntimeError, ValueError) as fault:
-            text = f"cannot find each other: {str(fault).splitlines()[0]}"
-            raise RecipeError("ranks", text, "start them with torchrun") from fault
+    store = _met(device) if ours else None
+    world = World(dist.get_rank(), dist.get_world_size(), local_rank())
+    voice = Voice(store, world.rank, world.size)
     try:
-        yield World(dist.get_rank(), dist.get_world_size(), local_rank())
-    except RuntimeError as fault:
-        if not isinstance(fault, dist.DistError) and "gloo" not in str(fault):
-            raise
-        raise TrainingError(
-            f"rank {dist.get_rank()}",
-            f"has lost the others: {str(fault).splitlines()[0][:200]}",
-            "see what ended another rank; the same command goes on from the last checkpoint",
-        ) from fault
-    finally:
-        if ours and (
-            device.type != "cuda" or sys.exc_info()[0] is None
-        ):  # NCCL waits for a rank that is gone
+        yield world
+    except (HMAError, RuntimeError) as fault:
+        ended = _ended(fault, world, voice)
+        voice.leave(ended)
+        if ours and device.type != "cuda":  # NCCL waits for a rank that is gone
             dist.destroy_process_group()
+        voice.settle(ended)
+        if ended is fault:
+            raise
+        raise ended from fault
+    finally:
+        if ours and dist.is_initialized() and (device.type != "cuda" or sys.exc_info()[0] is None):
+            dist.destroy_process_group()
+
+
+def _met(device: torch.device) -> dist.Store:
+    """Meet the other ranks; returns the store they have met by."""
+    backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
+    try:
+        store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))
+        store.set_timeout(PATIENCE)
+        own = dist.PrefixStore("group", store)
+        dist.init_process_group(backend, store=own, rank=rank, world_size=size, timeout=PATIENCE)
+    except (RuntimeError, ValueError) as fault:
+        text = f"cannot find each other: {str(fault).splitlines()[0]}"
+        raise RecipeError("ranks", text, "start them with torchrun") from fault
+    return dist.PrefixStore("voice", store)
+
+
+def _ended(fault: HMAError | RuntimeError, world: World, voice: Voice) -> HMAError:
+    """What ends this rank, in words: where it has lost the others, what another one has left."""
+    if isinstance(fault, HMAError):
+        return fault
+    if not isinstance(fault, dist.DistError) and "gloo" not in str(fault):
+        said = (str(fault).splitlines() or [""])[0][:200]
+        return TrainingError(f"rank {world.rank}", f"{type(fault).__name__}: {said}", "--debug shows where")
+    return voice.heard() or TrainingError(
+        f"rank {world.rank}",
+        f"has lost the others: {str(fault).splitlines()[0][:200]}",
+        "see what ended another rank; the same command goes on from the last checkpoint",
+    )
 
 
 def local_rank() -> int:

@@ -122,6 +122,21 @@ def _remove_empty(out: Path, made: list[Path]) -> None:
 
 
 @contextmanager
+def writable(out: Path) -> Iterator[None]:
+    """Around what writes into a run's folder.
+
+    Raises:
+        OutputError: something cannot be written.
+    """
+    try:
+        yield
+    except OSError as fault:
+        where, why = fault.filename or out, fault.strerror or str(fault)
+        remedy = "free space or choose another folder; checkpoints that are there are intact"
+        raise OutputError(where, f"cannot be written: {why}", remedy) from fault
+
+
+@contextmanager
 def enough_memory() -> Iterator[None]:
     """Around what may ask for more memory than there is.
 
@@ -182,7 +197,8 @@ def stop_on_signals() -> Iterator[threading.Event]:
         stop.set()
         signal.signal(signal.SIGINT, before[signal.SIGINT])
         if os.environ.get("RANK", "0") == "0":
-            print("saving; a second Ctrl-C stops at once", file=sys.stderr)
+            asked = number == signal.SIGINT
+            print("saving" + "; a second Ctrl-C stops at once" * asked, file=sys.stderr, flush=True)
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGTERM, signal.SIGINT)}
     try:

@@ -17,13 +17,13 @@ from typing import Any
 
 import torch
 
-from hma_data.errors import OutputError, UsageError
+from hma_data.errors import UsageError
 from hma_model import checkpoint as checkpoints
 from hma_model.parallel import World, join
 from hma_model.recipe import Recipe
 from hma_model.report import write_report
 from hma_model.runlog import RunLog, read_metrics
-from hma_model.runtime import choose_device, enough_memory, own_folder, stop_on_signals
+from hma_model.runtime import choose_device, enough_memory, own_folder, stop_on_signals, writable
 from hma_model.trackers import Tracker, open_trackers
 from hma_model.trainer import Run
 
@@ -90,14 +90,7 @@ def train(
         raise UsageError("out", f"is {named!r}, no name of a folder", "name the run's folder with --out DIR")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", named):
         raise UsageError("out", f"is {named!r}, no folder of this machine", "train here, then hma hub push")
-    folder = Path(named)
-    try:
-        with enough_memory():
-            return _trained(recipe, folder, on_progress, show, force)
-    except OSError as fault:
-        where, why = fault.filename or folder, fault.strerror or str(fault)
-        remedy = "free space or choose another folder; checkpoints that are there are intact"
-        raise OutputError(where, f"cannot be written: {why}", remedy) from fault
+    return _trained(recipe, Path(named), on_progress, show, force)
 
 
 def _trained(
@@ -109,7 +102,13 @@ def _trained(
 ) -> TrainResult:
     device = choose_device(recipe.device)
     cuda = [device] if device.type == "cuda" else []
-    with join(device) as world, ExitStack() as stack, torch.random.fork_rng(devices=cuda):
+    with (
+        join(device) as world,
+        writable(folder),
+        enough_memory(),
+        ExitStack() as stack,
+        torch.random.fork_rng(devices=cuda),
+    ):
         world.once(lambda: stack.enter_context(own_folder(folder)))
         run = Run(recipe, folder, device, world)
         kept, noted = run.resume(force)

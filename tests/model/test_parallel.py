@@ -12,12 +12,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.distributed import HashStore
 
-from hma_model import checkpoint
+from hma_data.errors import ShardError, TrainingError
+from hma_model import checkpoint, voice
 from hma_model.parallel import World
 from hma_model.recipe import make_recipe
 from hma_model.runlog import read_metrics
 from hma_model.train import train
+from hma_model.voice import Voice, one_voice
 from tests.model.runs import TINY, weights
 from tests.model.shards import make_shards
 
@@ -49,10 +52,10 @@ def alone(recipe, tmp_path_factory):
     return train(recipe(), out=tmp_path_factory.mktemp("alone") / "run", show=False)
 
 
-def spread(recipe, out: Path, kill_after: int = 0, ranks: int = 2) -> str:
+def spread(recipe, out: Path, kill_after: int = 0, ranks: int = 2, fail: int | None = None) -> str:
     """Train on forked ranks, which spares them torch's import; returns what they said.
 
-    A rank that fails or is killed ends the others, as torchrun does.
+    A rank that fails or is killed ends the others, as torchrun does. Rank `fail` has a fault after two steps.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -60,7 +63,7 @@ def spread(recipe, out: Path, kill_after: int = 0, ranks: int = 2) -> str:
     told = out.with_name("told.txt")
     context = multiprocessing.get_context("fork")
     processes = [
-        context.Process(target=_rank, args=(rank, ranks, port, recipe, out, kill_after, told))
+        context.Process(target=_rank, args=(rank, ranks, port, recipe, out, kill_after, told, fail))
         for rank in range(ranks)
     ]
     for process in processes:
@@ -72,7 +75,7 @@ def spread(recipe, out: Path, kill_after: int = 0, ranks: int = 2) -> str:
     return told.read_text()
 
 
-def _rank(rank, ranks, port, recipe, out, kill_after, told) -> None:
+def _rank(rank, ranks, port, recipe, out, kill_after, told, fail) -> None:
     os.environ.update(
         RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE=str(ranks),
         MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port),
@@ -83,8 +86,11 @@ def _rank(rank, ranks, port, recipe, out, kill_after, told) -> None:
     def kill(facts) -> None:
         if facts["step"] == kill_after:
             os._exit(9)
+        if facts["step"] == 2 and rank == fail:
+            raise ShardError("shards/arm", "lies on a disk that this rank alone has lost", "mount it")
 
-    train(recipe, out=out, on_progress=kill)
+    with one_voice():
+        train(recipe, out=out, on_progress=kill)
 
 
 def curve(out: Path) -> list[float]:
@@ -171,7 +177,59 @@ def test_a_full_disk_on_the_first_rank_ends_all(recipe, tmp_path, monkeypatch):
     monkeypatch.setattr("hma_model.trainer.write_atomic", write)
     told = spread(recipe(), tmp_path / "run")
     faults = [line for line in told.splitlines() if line.startswith("hma_data.errors.OutputError: ")]
-    assert len(faults) == 2 and all("No space left on device" in line for line in faults)
+    assert len(faults) == 1 and "No space left on device" in faults[0]
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_fault_that_one_rank_has_is_said_once(recipe, tmp_path, rank):
+    told = spread(recipe(steps=60), tmp_path / "run", fail=rank)
+    faults = [line for line in told.splitlines() if line.startswith("hma_data.errors.")]
+    assert len(faults) == 1 and "lies on a disk that this rank alone has lost — mount it" in faults[0]
+
+
+def test_a_rank_says_itself_what_the_first_does_not_and_the_first_is_silent_then(monkeypatch):
+    monkeypatch.setattr(voice, "MOMENT", 0.05)
+    store, fault = HashStore(), ShardError("here", "is gone")
+    first, second = Voice(store, 0, 2), Voice(store, 1, 2)
+    assert first.heard() is None
+    second.leave(fault)
+    second.settle(fault)
+    assert not silent(fault, "1", monkeypatch)
+    heard = first.heard()
+    assert str(heard) == "rank 1: here: is gone" and silent(heard, "0", monkeypatch)
+
+
+def test_a_rank_is_silent_where_the_first_has_spoken(monkeypatch):
+    store, fault = HashStore(), ShardError("here", "is gone")
+    first, second = Voice(store, 0, 2), Voice(store, 1, 2)
+    second.leave(fault)
+    heard = first.heard()
+    first.leave(heard)
+    second.settle(fault)
+    assert silent(fault, "1", monkeypatch) and not silent(heard, "0", monkeypatch)
+
+
+def silent(fault, rank: str, monkeypatch) -> bool:
+    """Whether a command on a rank ends without a word, with the fault's exit code."""
+    monkeypatch.setenv("RANK", rank)
+    try:
+        with one_voice():
+            raise fault
+    except (ShardError, TrainingError):
+        return False
+    except SystemExit as ended:
+        return ended.code == fault.exit_code
+
+
+def test_before_ranks_have_met_the_others_give_the_first_a_moment(monkeypatch):
+    waited: list[float] = []
+    monkeypatch.setattr(voice.time, "sleep", waited.append)
+    for rank, moments in (("0", []), ("1", [voice.MOMENT])):
+        monkeypatch.setenv("RANK", rank)
+        waited.clear()
+        with pytest.raises(ShardError), one_voice():
+            raise ShardError("here", "is gone")
+        assert waited == moments
 
 
 def test_one_process_is_a_world_of_one():
