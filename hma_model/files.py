@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MAX_JSON_BYTES = 16_000_000
+_AGAIN = "have it saved or pushed again"
 
 
 @contextmanager
@@ -93,9 +94,9 @@ def parse_json(content: bytes, where: object, error: type[HMAError] = Checkpoint
     try:
         values = json_io.parse_json(content)
     except (ValueError, RecursionError) as fault:
-        raise error(where, f"is not valid JSON: {fault}") from fault
+        raise error(where, f"is not valid JSON: {fault}", _AGAIN) from fault
     if not isinstance(values, dict):
-        raise error(where, f"must hold a JSON object, holds {type(values).__name__}")
+        raise error(where, f"must hold a JSON object, holds {type(values).__name__}", _AGAIN)
     return values
 
 

@@ -294,11 +294,15 @@ def cache_folder() -> Path:
 
 
 def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
+    from hma_data.shards.manifest import MANIFEST
+
     files = store.files()
     present: dict[str, Content] = {}
     if CONFIG in files:
         _require_trunk(source, _config(store, files), store.name)
     else:
+        if MANIFEST in files:
+            raise HubError(store.name, "holds a shard set", "push to a place of its own")
         present[CONFIG] = inside(source.folder, CONFIG)
     if TRUNK not in files:
         present[TRUNK] = source.trunk()

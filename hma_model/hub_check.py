@@ -21,8 +21,8 @@ def require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
     """
     read_metadata(source.trunk())
     for name in embodiments:
-        checkpoints.read_embodiment(source, name)
         require_yaml(source, name)
+        checkpoints.read_embodiment(source, name)
         _require_picture(source, name)
 
 

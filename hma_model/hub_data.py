@@ -184,7 +184,10 @@ def _published(store: DataStore) -> tuple[Manifest, bytes]:
         raise HubError(store.name, f"has no {MANIFEST}", "is it a shard set, and has its push finished?")
     with tempfile.TemporaryDirectory() as folder:
         store.download([MANIFEST], Path(folder))
-        return Manifest.load(Path(folder)), (Path(folder) / MANIFEST).read_bytes()
+        try:
+            return Manifest.load(Path(folder)), (Path(folder) / MANIFEST).read_bytes()
+        except ShardError as fault:
+            raise ShardError(f"{store.name}/{MANIFEST}", fault.fault, "have it pushed again") from fault
 
 
 def _refuse_others(store: DataStore, manifest: Manifest) -> None:

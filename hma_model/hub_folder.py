@@ -10,7 +10,7 @@ import os
 import random
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -132,10 +132,11 @@ class FolderStore:
             remove_abandoned(target)
             self._ask("pulled", lambda: self._fs.get_file(self._path(name), str(new)), target)
             new.replace(target)
-        except OSError as fault:
+        except (OSError, ValueError) as fault:
             raise HubError(target, f"cannot be pulled: {fault}", "free space, or pull again") from fault
         finally:
-            new.unlink(missing_ok=True)
+            with suppress(OSError, ValueError):  # where a folder is none, nothing was written
+                new.unlink(missing_ok=True)
 
     def _ask[T](self, doing: str, call: Callable[[], T], where: object = None) -> T:
         """What a call of the file system returns; a remote one is asked again where that may help."""
@@ -145,7 +146,7 @@ class FolderStore:
             return call() if self._local else attempt(where, doing, call)
         except FileNotFoundError as fault:
             raise HubError(where, f"cannot be {doing}: no such file, folder or bucket", remedy) from fault
-        except OSError as fault:
+        except (OSError, ValueError) as fault:  # such as a name with a zero byte
             raise HubError(where, f"cannot be {doing}: {fault}", remedy) from fault
         except HubError:
             raise
