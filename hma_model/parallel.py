@@ -8,7 +8,9 @@ stay whole, because the ranks of one step may use different ones.
 """
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -111,17 +113,31 @@ def join(device: torch.device) -> Iterator[World]:
     try:
         yield world
     except (HMAError, RuntimeError) as fault:
-        ended = _ended(fault, world, voice)
-        voice.leave(ended)
-        if ours and device.type != "cuda":  # NCCL waits for a rank that is gone
-            dist.destroy_process_group()
-        voice.settle(ended)
+        with _to_its_end(world):
+            ended = _ended(fault, world, voice)
+            voice.leave(ended)
+            if ours and device.type != "cuda":  # NCCL waits for a rank that is gone
+                dist.destroy_process_group()
+            voice.settle(ended)
         if ended is fault:
             raise
         raise ended from fault
     finally:
         if ours and dist.is_initialized() and (device.type != "cuda" or sys.exc_info()[0] is None):
             dist.destroy_process_group()
+
+
+@contextmanager
+def _to_its_end(world: World) -> Iterator[None]:
+    """Let torchrun's signal, which follows the end of any rank, not end rank 0 before it has spoken."""
+    if not world.main or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _met(device: torch.device) -> dist.Store:
