@@ -22,7 +22,7 @@ from hma_data.content import content_of
 from hma_data.embodiment import Embodiment
 from hma_data.engines.base import LIMITS, Limits, Retry
 from hma_data.engines.local import run as run_local
-from hma_data.errors import OutputError, RegistryError, SourceError
+from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
 from hma_data.extend import extended
 from hma_data.files import remove_parts
 from hma_data.hub_output import HubOutput
@@ -43,7 +43,7 @@ from hma_data.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.shard_work import Job, MakeWork, Tick
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
 from hma_data.shards.schema import flag_counts
-from hma_data.sources.base import EpisodeRef, open_source
+from hma_data.sources.base import EpisodeRef, of_another_format, open_source
 from hma_data.store import parquet_input, place
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
@@ -102,12 +102,20 @@ def plan_conversion(
     embodiment: Embodiment, source: str | None, tokenizer: Tokenizer, settings: Settings
 ) -> tuple[Plan, str]:
     """The plan of a conversion and the URI it reads; see `convert`."""
+    if source is not None and not source.strip():
+        raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
     uri = source or embodiment.source.uri
     if not uri:
         raise RegistryError(f"embodiment {embodiment.id}", "names no source.uri", "give --source URI")
     if embodiment.frequency_hz == "unknown":
         _ = embodiment.rate_hz  # raises, and says what to do
-    refs = open_source(embodiment.source.format).index(uri, embodiment)
+    form = embodiment.source.format
+    try:
+        refs = open_source(form).index(uri, embodiment)
+    except StorageAwayError:
+        raise
+    except SourceError as fault:
+        raise of_another_format(uri, form, fault) from fault
     return make_plan(refs, embodiment, tokenizer.spec, settings, uri), uri
 
 

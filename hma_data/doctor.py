@@ -5,7 +5,6 @@ shows once they are read and aligned as this robot's. Of a shard set, its integr
 statistics show.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment, find
 from hma_data.episode import Clip
-from hma_data.errors import HMAError
-from hma_data.sources.base import SAMPLE, Inspection, detect, open_source
+from hma_data.errors import HMAError, SourceError
+from hma_data.sources.base import SAMPLE, Inspection, detect, of_another_format, open_source
 from hma_data.sources.findings import SEVERITIES, Finding, Severity
 from hma_data.sources.survey import sampled
 from hma_data.spec import Camera
@@ -59,6 +58,10 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
     try:
         source = open_source(robot.source.format if robot else detect(uri))
         inspection = source.inspect(uri, sample)
+    except SourceError as fault:
+        stated = robot.source.format if robot else ""
+        yield Finding("readable", "error", str(of_another_format(uri, stated, fault) if stated else fault))
+        return
     except HMAError as fault:
         yield Finding("readable", "error", str(fault))
         return
@@ -103,10 +106,10 @@ def _episodes(uri: str, robot: Embodiment, sample: int, inspection: Inspection) 
     try:
         names = [ref.id for ref in source.index(uri, robot)]
     except HMAError as fault:
-        yield Finding("usable", "error", f"none of its episodes: {fault.fault}")
+        yield Finding("usable", "error", f"none of its episodes: {fault.fault}", fault.remedy)
         return
     chosen = [names[i] for i in sampled(len(names), sample)]
-    refused: Counter[tuple[str, str]] = Counter()
+    refused: dict[tuple[str, str], list[str]] = {}
     clips: list[Clip] = []
     for name in chosen:
         try:
@@ -115,11 +118,11 @@ def _episodes(uri: str, robot: Embodiment, sample: int, inspection: Inspection) 
                 clip.frames_at(camera.name, np.array([len(clip) - 1]))
             clips.append(clip)
         except HMAError as fault:
-            refused[fault.fault, fault.remedy] += 1
-    for (reason, remedy), count in refused.most_common(5):
+            refused.setdefault((fault.fault, fault.remedy), []).append(name)
+    for (reason, remedy), which in sorted(refused.items(), key=lambda item: -len(item[1]))[:5]:
         severity: Severity = "warn" if clips else "error"
-        said = f"{count} of {len(chosen)} episodes looked at: {reason}"
-        numbers = {"refused": count, "looked_at": len(chosen)}
+        said = f"{len(which)} of {len(chosen)} episodes looked at, such as {which[0]}: {reason}"
+        numbers = {"refused": len(which), "looked_at": len(chosen)}
         yield Finding("usable", severity, said, remedy, numbers=numbers)
     if clips:
         told = any(one.check == "gaps" and one.key == robot.primary_camera.key for one in inspection.findings)

@@ -10,7 +10,7 @@ from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment, find
 from hma_data.episode import Clip
 from hma_data.errors import HMAError, SourceError
-from hma_data.sources.base import SAMPLE, Inspection, Source, detect, open_source
+from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
 from hma_data.sources.findings import SEVERITIES, Finding
 from hma_data.sources.survey import CHECKS
 
@@ -30,7 +30,10 @@ def inspect_recording(uri: str, embodiment: str | None = None, episodes: int = S
     """
     robot = find(embodiment) if embodiment else None
     source = open_source(robot.source.format if robot else detect(uri))
-    inspection = source.inspect(uri, episodes)
+    try:
+        inspection = source.inspect(uri, episodes)
+    except SourceError as fault:
+        raise of_another_format(uri, robot.source.format if robot else detect(uri), fault) from fault
     found = list(inspection.findings)
     facts: dict[str, str] = {}
     if robot:

@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,6 +36,7 @@ VIDEO_SUFFIXES = (
     ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".ogv", ".flv", ".gif",
 )  # fmt: skip
 
+ENDINGS = dict.fromkeys((".h5", ".hdf5", ".hdf"), "hdf5") | dict.fromkeys((".bag", ".mcap", ".db3"), "rosbag")
 PACKED = {  # what unpacks a file, by the end of its name
     ".tar": "tar xf", ".tar.gz": "tar xf", ".tgz": "tar xf", ".tar.bz2": "tar xf", ".tar.xz": "tar xf",
     ".tar.zst": "tar xf", ".zip": "unzip", ".7z": "7z x", ".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz",
@@ -201,8 +202,10 @@ def detect(uri: str) -> str:
     Raises:
         SourceError: nothing there, or nothing we know.
     """
+    if not uri:
+        raise SourceError("", "the recording's path is empty", "name a file, a folder or a URI")
     if "://" in uri and not uri.startswith("file://"):
-        return "lerobot" if uri.startswith("hf://") else "rlds"
+        return "lerobot" if uri.startswith("hf://") else ENDINGS.get(PurePosixPath(uri).suffix, "rlds")
     if _names_a_dataset(uri):
         return "lerobot"
     path = local_path(uri)
@@ -215,7 +218,7 @@ def detect(uri: str) -> str:
     for item in files:
         if _is_bag(item):
             return "rosbag"
-        if item.suffix in (".h5", ".hdf5", ".hdf") or first_bytes(item, 8) == b"\x89HDF\r\n\x1a\n":
+        if ENDINGS.get(item.suffix) == "hdf5" or first_bytes(item, 8) == b"\x89HDF\r\n\x1a\n":
             return "hdf5"
     if any(item.suffix.lower() in VIDEO_SUFFIXES for item in files):
         return "hands"
@@ -227,6 +230,23 @@ def detect(uri: str) -> str:
         or "expected RLDS (features.json, *.tfrecord*), HDF5, a ROS bag or MCAP, "
         "a LeRobotDataset (meta/info.json), or videos of hands",
     )
+
+
+def of_another_format(uri: str, name: str, fault: SourceError) -> SourceError:
+    """What is wrong with a recording that could not be read as of that format: maybe it is of another.
+
+    Args:
+        name: the format that was stated.
+        fault: why it could not be read.
+    """
+    try:
+        known = detect(uri) if Path(uri.removeprefix("file://")).expanduser().exists() else name
+    except SourceError:
+        known = name
+    if known == name:
+        return fault
+    remedy = f"it looks like {known}, source.format in the YAML says {name}"
+    return SourceError(fault.where, fault.fault, remedy)
 
 
 def _unpack_first(files: Sequence[Path]) -> str:
@@ -256,9 +276,13 @@ def local_path(uri: str) -> Path:
     """The local path of a plain path or file:// URI.
 
     Raises:
-        SourceError: it does not exist.
+        SourceError: it does not exist, or is of a store.
     """
     path = Path(uri.removeprefix("file://")).expanduser()
+    if not path.exists() and "://" in uri.removeprefix("file://"):
+        raise SourceError(
+            uri, "is not on this machine", "copy it here: only RLDS and LeRobot are read elsewhere"
+        )
     if not path.exists():
         raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
     return path

@@ -223,10 +223,13 @@ class Survey:
     def _readable(self) -> Iterator[Finding]:
         count = len(self._faults)
         severity: Severity = "error" if count and count >= max(self.episodes, len(self.looked)) else "warn"
-        for fault in list(self._faults.values())[:SHOWN]:
-            yield Finding("readable", severity, fault)
-        if count > SHOWN:
-            said = f"{count - SHOWN:,} more of {self.episodes:,} episodes cannot be read"
+        together = Counter(self._faults.values())
+        for fault, episodes in list(together.items())[:SHOWN]:
+            more = f" (and {episodes - 1:,} more episodes)" if episodes > 1 else ""
+            yield Finding("readable", severity, fault + more)
+        rest = sum(list(together.values())[SHOWN:])
+        if rest:
+            said = f"{rest:,} more of {self.episodes:,} episodes cannot be read"
             yield Finding("readable", severity, said, numbers={"episodes": count})
 
     def _keys(self) -> Iterator[Finding]:

@@ -1,0 +1,84 @@
+"""A recording that is not what the YAML or the command says: the error tells what it is, and what to do."""
+
+from pathlib import Path
+
+import pytest
+
+from hma_data.convert import convert
+from hma_data.doctor import examine
+from hma_data.embodiment import Embodiment
+from hma_data.errors import HMAError, SourceError, UsageError
+from hma_data.inspect import inspect_recording
+from hma_data.sources.base import detect, of_another_format, open_source
+from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.data.test_rlds import embodiment as rlds_robot
+from tests.data.test_rlds import toy
+from tests.data.videos import make_v3
+
+
+def converted(robot: Embodiment, source: str, out: Path) -> str:
+    with pytest.raises(HMAError) as refused:
+        convert(robot, source, BlockTokenizer(), out)
+    assert not out.exists() or not list(out.iterdir())
+    return str(refused.value)
+
+
+def test_another_format_than_the_yaml_says_is_named(toy_arm: Embodiment, tmp_path: Path) -> None:
+    toy(tmp_path / "rlds")
+    write_toy(tmp_path / "toy.hdf5", [3])
+    make_v3(tmp_path / "lerobot", (3,))
+    said = "it looks like {}, source.format in the YAML says {}"
+    for robot, name, other in (
+        (toy_arm, "rlds", "rlds"),
+        (toy_arm, "lerobot", "lerobot"),
+        (rlds_robot(), "toy.hdf5", "hdf5"),
+    ):
+        expected = said.format(other, robot.source.format)
+        assert converted(robot, str(tmp_path / name), tmp_path / "out").endswith(expected)
+    (tmp_path / "arm.yaml").write_text(ARM_YAML)
+    (found,) = examine(str(tmp_path / "lerobot"), str(tmp_path / "arm.yaml"))
+    assert found.check == "readable" and said.format("lerobot", "hdf5") in found.message
+    with pytest.raises(SourceError, match=said.format("lerobot", "hdf5")):
+        inspect_recording(str(tmp_path / "lerobot"), str(tmp_path / "arm.yaml"))
+
+
+@pytest.mark.parametrize("uri", ["no/such", "hf://datasets/team/set", "s3://bucket/toy"])
+def test_of_a_place_that_is_not_here_no_format_is_guessed(uri: str) -> None:
+    fault = SourceError(uri, "does not exist", "check it")
+    assert of_another_format(uri, "hdf5", fault) is fault
+
+
+@pytest.mark.parametrize(("uri", "name"), [("s3://bucket/a.hdf5", "hdf5"), ("https://host/b.mcap", "rosbag")])
+def test_what_is_read_from_files_alone_says_so_of_a_store(uri: str, name: str) -> None:
+    assert detect(uri) == name
+    with pytest.raises(SourceError, match=f"^{uri}: is not on this machine — copy it here"):
+        open_source(name).index(uri)
+
+
+def test_an_empty_path_is_told_and_the_yamls_is_not_taken_for_it(toy_arm: Embodiment, tmp_path: Path) -> None:
+    robot = toy_arm.model_copy(update={"source": toy_arm.source.model_copy(update={"uri": "elsewhere"})})
+    with pytest.raises(UsageError, match="--source: is empty"):
+        convert(robot, "", BlockTokenizer(), tmp_path / "out")
+    with pytest.raises(SourceError, match="the recording's path is empty"):
+        detect("")
+
+
+def test_the_same_fault_of_many_episodes_is_told_once(tmp_path: Path) -> None:
+    folder = make_v3(tmp_path / "set", (3, 4, 5))
+    data = next((folder / "data").rglob("*.parquet"))
+    data.write_bytes(b"")
+    found = [one for one in open_source("lerobot").inspect(str(folder)).findings if one.check == "readable"]
+    assert len(found) == 1 and found[0].message.endswith("(and 2 more episodes)")
+    assert str(data) in found[0].message
+
+
+def test_doctor_names_an_episode_it_could_not_use_and_the_keys_there_are(tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [60, 60])
+    (tmp_path / "arm.yaml").write_text(ARM_YAML.replace("key: obs/image", "key: obs/nothing"))
+    (first, *_) = examine(str(tmp_path / "toy.hdf5"), str(tmp_path / "arm.yaml"))
+    assert first.message.startswith("2 of 2 episodes looked at, such as demo_0: has no 'obs/nothing'")
+    toy(tmp_path / "rlds")
+    changed = rlds_robot(cameras=[{"name": "primary", "key": "observation/none"}])
+    (tmp_path / "rlds.yaml").write_text(changed.to_yaml())
+    (first, *_) = examine(str(tmp_path / "rlds"), str(tmp_path / "rlds.yaml"))
+    assert first.check == "usable" and "observation/image" in first.remedy
