@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from hma_data.loader import Batch
@@ -64,12 +65,13 @@ def culprits(batches: Sequence[tuple[Batch, Tensor]], sets: "Mapping[str, ShardS
         episodes, frames = (
             ["?"] * len(batch) if v is None else v.tolist() for v in (batch.episode, batch.frame)
         )
-        for name, episode, frame, loss in zip(batch.embodiment, episodes, frames, losses.tolist()):
-            found.append((loss, name, episode, frame))
+        inside = torch.ones_like(batch.action_mask) if batch.frame_mask is None else batch.frame_mask
+        rows = zip(batch.embodiment, episodes, frames, losses.tolist(), inside.sum(1).tolist(), strict=True)
+        found += [(loss, name, episode, frame, length) for name, episode, frame, loss, length in rows]
     bad = [item for item in found if not math.isfinite(item[0])] or sorted(found, key=lambda item: -item[0])
     return [
-        f"{name} episode {episode}{_named(sets.get(name), episode)} frame {frame}"
-        for _, name, episode, frame in bad
+        f"{name} episode {episode}{_named(sets.get(name), episode)} {_span(sets.get(name), frame, length)}"
+        for _, name, episode, frame, length in bad
     ]
 
 
@@ -77,6 +79,13 @@ def listed(windows: Sequence[str]) -> str:
     """The first few, and how many more."""
     more = len(windows) - NAMED
     return "; ".join(windows[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _span(shards: "ShardSet | None", first: object, length: int) -> str:
+    """The rows of `frame_index` that a window of so many frames goes over."""
+    if shards is None or not isinstance(first, int):
+        return f"frame {first} and on"
+    return f"frames {first} to {first + (length - 1) * shards.row_stride}"
 
 
 def _named(shards: "ShardSet | None", episode: object) -> str:

@@ -5,6 +5,7 @@ terminal there is a live table; elsewhere a plain line every few seconds.
 """
 
 import json
+import math
 import os
 import sys
 import time
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 METRICS, KINDS = "metrics.jsonl", ("train", "eval")
 PLAIN_SECONDS = 10.0
 SMOOTHING = 20  # steps a shown loss is averaged over
+PACING = 50  # steps that the speed and the time left are told from
 
 
 def read_metrics(out: Path) -> list[dict[str, Any]]:
@@ -74,7 +76,9 @@ class RunLog:
         self._last: dict[str, Any] = {}
         evaluations = [line for line in kept if line["kind"] == "eval"]
         self._evaluation: dict[str, Any] = evaluations[-1] if evaluations else {}
+        self._paces: deque[float] = deque(maxlen=PACING)  # seconds of steps of this session
         self._spent, self._shown, self._said = 0.0, 0.0, ""
+        self._opened = time.monotonic()
         self._live: Live | None = None
 
     def __enter__(self) -> "RunLog":
@@ -83,7 +87,8 @@ class RunLog:
             from rich.console import Console
             from rich.live import Live
 
-            self._live = Live(console=Console(stderr=True), refresh_per_second=4)
+            first = f"step {self._begin:,}/{self._steps:,}   the next step is the first of this session"
+            self._live = Live(first, console=Console(stderr=True), refresh_per_second=4)
             self._live.__enter__()
         return self
 
@@ -111,8 +116,13 @@ class RunLog:
         self._track("train", facts, ("loss", "lr", "grad_norm", "step_seconds", "memory_mib", "skipped"))
         self._last = facts
         self._spent += facts["step_seconds"]
+        if facts["step"] == self._begin + 2:  # a session's first step also starts workers and compiles
+            self._paces.clear()
+        self._paces.append(facts["step_seconds"])
         for name, loss in facts["loss_by_embodiment"].items():
-            self._recent.setdefault(name, deque(maxlen=SMOOTHING)).append(loss)
+            recent = self._recent.setdefault(name, deque(maxlen=SMOOTHING))
+            if math.isfinite(loss):  # steps that are left out are counted beside it
+                recent.append(loss)
         self._present()
 
     def evaluation(self, facts: dict[str, Any]) -> None:
@@ -170,14 +180,15 @@ class RunLog:
             self._said = text
 
     def _pace(self) -> tuple[float, str]:
-        """Windows a second and time left, over this session's steps."""
-        done = self._last["step"] - self._begin
-        seconds = max(self._spent, 1e-9)
-        left = (self._steps - self._last["step"]) * seconds / max(done, 1)
-        return self._last["windows"] * done / seconds, human_seconds(left)
+        """Windows a second of the last steps, and the time left by them and by what else this session did."""
+        done = max(self._last["step"] - self._begin, 1)
+        seconds = max(sum(self._paces) / max(len(self._paces), 1), 1e-9)
+        besides = max(time.monotonic() - self._opened - self._spent, 0.0) / done
+        left = (self._steps - self._last["step"]) * (seconds + besides)
+        return self._last["windows"] / seconds, human_seconds(left)
 
     def _smooth(self) -> dict[str, float]:
-        return {name: sum(values) / len(values) for name, values in sorted(self._recent.items())}
+        return {n: sum(v) / len(v) if v else math.nan for n, v in sorted(self._recent.items())}
 
     def _text(self) -> str:
         rate, left = self._pace()

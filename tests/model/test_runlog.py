@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import re
 import struct
 import sys
@@ -15,10 +16,10 @@ import torch
 
 from hma_data.errors import MissingDependencyError
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model import checkpoint
+from hma_model import checkpoint, runlog
 from hma_model.recipe import make_recipe
 from hma_model.report import write_report
-from hma_model.runlog import read_metrics
+from hma_model.runlog import RunLog, read_metrics
 from hma_model.train import train
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
@@ -227,3 +228,50 @@ def test_action_losses_have_no_perplexity(data, tmp_path, terminal):
     train(make_recipe({**TINY, "data": data, "objectives": {"policy": 1}}), out=tmp_path / "run")
     (row,) = [line for line in terminal[0].splitlines() if line.strip().startswith("arm")]
     assert row.split()[2] == "-"
+
+
+def facts(step: int, seconds: float = 0.5, loss: float = 2.0, **given) -> dict:
+    own = {"loss": loss, "loss_by_embodiment": {"arm": loss}, "windows": 8, "lr": 1e-3, "skipped": 0}
+    return {"step": step, "step_seconds": seconds, **own, **given}
+
+
+def test_after_a_resume_speed_and_time_left_are_of_this_sessions_steps(tmp_path, capsys):
+    lines = "".join(json.dumps({"kind": "train", **facts(i, 100.0)}) + "\n" for i in range(1, 1001))
+    (tmp_path / "metrics.jsonl").write_text(lines)
+    with RunLog(tmp_path, 1100, 1000) as log:
+        log.step(facts(1001, 40.0))  # workers start
+        for step in range(1002, 1021):
+            log.step(facts(step))
+    first, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("step 1001/1100") and "0.2 windows/s, 1 h 06 min left" in first
+    assert last.startswith("step 1020/1100") and "16.0 windows/s, 40 s left" in last
+
+
+def test_time_left_counts_what_is_done_between_steps(tmp_path, capsys, monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(runlog.time, "monotonic", lambda: clock[0])
+    with RunLog(tmp_path, 100, 0) as log:
+        for step in range(1, 51):
+            clock[0] += 0.5 + 1.0  # a second for evaluations a step
+            log.step(facts(step))
+    assert "16.0 windows/s, 1 min 15 s left" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_loss_that_is_no_number_leaves_the_shown_mean_one(tmp_path, capsys):
+    with RunLog(tmp_path, 9, 0) as log:
+        log.step(facts(1))
+        log.step(facts(2, loss=math.nan, skipped=1))
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "loss arm 2.000" in last and "1 steps left out" in last
+
+
+def test_a_terminal_shows_where_the_run_stands_before_the_first_step(tmp_path, monkeypatch):
+    from rich import live
+
+    shown = []
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setattr(live.Live, "__enter__", lambda self: shown.append(self.renderable))
+    monkeypatch.setattr(live.Live, "__exit__", lambda *given: None)
+    with RunLog(tmp_path, 2000, 1000):
+        pass
+    assert str(shown[0]).startswith("step 1,000/2,000")

@@ -235,7 +235,8 @@ def test_a_loss_that_is_no_number_stops_and_names_the_window(recipe, tmp_path, p
         train(recipe(checkpoint_every=1), out=tmp_path / "run", show=False)
     batch = poisoned[2]
     number = int(batch.episode[1])
-    place = f"{batch.embodiment[1]} episode {number} (e{number}) frame {batch.frame[1]}"
+    first = int(batch.frame[1])  # of 4 frames, 2 rows apart
+    place = f"{batch.embodiment[1]} episode {number} (e{number}) frames {first} to {first + 6}"
     assert f"windows: {place}" in caught.value.fault and caught.value.where == "step 3"
     last = checkpoint.resolve(tmp_path / "run")
     assert last.name == "step-00000002"

@@ -202,7 +202,9 @@ def spiking(monkeypatch):
 
 def test_a_spike_stops_and_names_the_windows_with_the_largest_loss(recipe, tmp_path, spiking):
     long = recipe(steps=SETTLED + 4, spike=10, eval_every=0, checkpoint_every=0)
-    with pytest.raises(TrainingError, match=r"times its running mean.*episode \d+ \(e\d+\) frame \d+"):
+    with pytest.raises(
+        TrainingError, match=r"times its running mean.*episode \d+ \(e\d+\) frames \d+ to \d+"
+    ):
         train(long, out=tmp_path / "run", show=False)
 
 
