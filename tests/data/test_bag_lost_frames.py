@@ -1,4 +1,7 @@
-"""H.264 and H.265 pictures that were never recorded: none is made from them, none refused for others."""
+"""H.264, H.265 and AV1 pictures that were never recorded: none is made from them, none refused for others.
+
+Of AV1 that holds where the stream is coded to survive losses; elsewhere nothing is refused.
+"""
 
 from pathlib import Path
 
@@ -9,12 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.nal import Bits, order
+from hma_data.sources.bags.bits import Bits
+from hma_data.sources.bags.nal import order
 from hma_data.sources.bags.video import VideoDecoder, is_keyframe
 from hma_data.video import Images
 
 GROUP, FRAMES = 9, 27
 QUIET = "log-level=none:keyint=9:min-keyint=9:scenecut=0"
+AOM = {"usage": "realtime", "cpu-used": "8", "lag-in-frames": "0"}
 STREAMS = {
     "x264": ("h264", "libx264", {"bf": "0"}),
     "x264 zero latency, slices": ("h264", "libx264", {"tune": "zerolatency", "slices": "3"}),
@@ -23,6 +28,7 @@ STREAMS = {
     "x265": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=0"}),
     "x265 one reference": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=0:ref=1:repeat-headers=1"}),
     "x265 scaling lists": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=0:scaling-list=default"}),
+    "aom resilient": ("av1", "libaom-av1", {**AOM, "error-resilience": "default"}),
 }
 REORDERED = {
     "x264 with b-frames": ("h264", "libx264", {"bf": "3", "x264-params": "b-pyramid=normal"}),
@@ -31,12 +37,21 @@ REORDERED = {
     "x265 with b-frames": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=4:b-pyramid=1"}),
     "x265 open groups": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=3:open-gop=1"}),
     "x265 layers in time": ("h265", "libx265", {"x265-params": f"{QUIET}:bframes=3:temporal-layers=1"}),
+    "aom": ("av1", "libaom-av1", AOM),
+    "aom with hidden frames": ("av1", "libaom-av1", {"cpu-used": "8"}),
+    "aom resilient with hidden frames": (
+        "av1",
+        "libaom-av1",
+        {"cpu-used": "8", "error-resilience": "default"},
+    ),
+    "svt": ("av1", "libsvtav1", {"preset": "12", "svtav1-params": "pred-struct=1:lookahead=0"}),
+    "svt with hidden frames": ("av1", "libsvtav1", {"preset": "12"}),
 }
 
 
 def messages(folder: Path, codec: str, encoder: str, options: dict[str, str]) -> list[bytes]:
     """The packets of a moving picture, as a recorder would put them into messages."""
-    path = folder / ("v.h264" if codec == "h264" else "v.hevc")
+    path = folder / {"h264": "v.h264", "h265": "v.hevc"}.get(codec, "v.mkv")
     draw = np.random.default_rng(0)
     ground = draw.integers(0, 255, (12, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     with av.open(str(path), "w") as out:
@@ -90,7 +105,7 @@ def test_nothing_is_missed_where_nothing_is_missing(tmp_path: Path, name: str) -
 
 
 def test_of_other_codecs_nothing_is_looked_into() -> None:
-    assert order("vp9").complete(b"\x00\x00\x01") and order("av1").complete(b"")
+    assert order("vp9").complete(b"\x00\x00\x01") and order("other").complete(b"")
 
 
 @given(st.lists(st.integers(0, 2**16)), st.integers(0, 255))
@@ -107,8 +122,32 @@ def test_numbers_are_read_as_they_are_written(numbers: list[int], tail: int) -> 
     assert [bits.ue() for _ in numbers] == numbers and bits.u(8) == tail
 
 
-@given(st.binary(max_size=200), st.sampled_from(["h264", "h265"]))
+@pytest.fixture(scope="module")
+def resilient(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    return messages(tmp_path_factory.mktemp("av1"), *STREAMS["aom resilient"])
+
+
+def test_what_is_followed_of_av1_is_counted_from_a_key_frame_on(resilient: list[bytes]) -> None:
+    follow = order("av1")
+    assert [follow.complete(packet) for packet in resilient[3:15]] == [True] * 12
+    follow = order("av1")
+    told = [follow.complete(packet) for packet in resilient[:3] + resilient[6:GROUP]]
+    assert told == [True] * 3 + [False] * 3
+
+
+@given(st.data())
+def test_av1_with_flipped_bits_or_cut_off_is_followed_to_its_end(resilient: list[bytes], data) -> None:
+    follow = order("av1")
+    for packet in resilient[:4]:
+        changed = bytearray(packet[: data.draw(st.integers(0, 60))])
+        for at in data.draw(st.lists(st.integers(0, 8 * len(changed) - 1), max_size=4)) if changed else ():
+            changed[at // 8] ^= 1 << at % 8
+        assert follow.complete(bytes(changed)) in (True, False)
+
+
+@given(st.binary(max_size=200), st.sampled_from(["h264", "h265", "av1"]))
 def test_no_bytes_are_too_odd(data: bytes, codec: str) -> None:
     follow = order(codec)
+    assert follow.complete(data) in (True, False)
     for kind in (b"", b"\x67", b"\x68", b"\x41", b"\x42\x01", b"\x44\x01", b"\x02\x01", b"\x2a\x01"):
         assert follow.complete(b"\x00\x00\x01" + kind + data) in (True, False)

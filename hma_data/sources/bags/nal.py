@@ -11,8 +11,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
+from hma_data.sources.bags.av1 import Av1
+from hma_data.sources.bags.bits import HEAD, Bits
+
 UNIT = re.compile(b"\x00\x00\x01")
-HEAD = 96  # bytes of a slice that are looked at: its header's beginning
 _HIGH = {100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135}  # profiles that state a chroma format
 
 
@@ -32,45 +34,9 @@ class Anything:
 
 
 def order(codec: str) -> Order:
-    """For h264 and h265; of other codecs every message is taken for complete."""
-    kinds: dict[str, type[Order]] = {"h264": Avc, "h265": Hevc}
+    """For h264, h265 and av1; of other codecs every message is taken for complete."""
+    kinds: dict[str, type[Order]] = {"h264": Avc, "h265": Hevc, "av1": Av1}
     return kinds.get(codec, Anything)()
-
-
-class Bits:
-    """Reads the syntax elements of a unit's payload.
-
-    Raises:
-        IndexError: it ends before.
-    """
-
-    def __init__(self, unit: bytes) -> None:
-        self._data = unit.replace(b"\x00\x00\x03", b"\x00\x00")  # emulation prevention
-        self._at = 0
-
-    def u(self, bits: int) -> int:
-        """Unsigned, of that many bits."""
-        end = self._at + bits
-        if end > 8 * len(self._data):
-            raise IndexError("the unit ends in its header")
-        first, last = self._at // 8, -(-end // 8)
-        value = int.from_bytes(self._data[first:last], "big") >> (8 * last - end)
-        self._at = end
-        return value & ((1 << bits) - 1)
-
-    def ue(self) -> int:
-        """Unsigned Exp-Golomb."""
-        zeros = 0
-        while not self.u(1):
-            zeros += 1
-            if zeros > 32:
-                raise IndexError("no number has so many zeros")
-        return (1 << zeros) - 1 + self.u(zeros)
-
-    def se(self) -> int:
-        """Signed Exp-Golomb."""
-        code = self.ue()
-        return (code + 1) // 2 if code % 2 else -(code // 2)
 
 
 def _units(data: bytes) -> Iterator[bytes]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError
+from hma_data.sources.bags.av1 import SEQUENCE, units
 from hma_data.sources.bags.nal import order
 from hma_data.sources.video_file import is_spoilt
 from hma_data.video import MAX_PIXELS, Images
@@ -40,22 +41,7 @@ def _vp9_begins(data: bytes) -> bool:
 
 def _av1_begins(data: bytes) -> bool:
     """Whether a sequence header is in it, as with every key frame: AV1 specification, section 5.3."""
-    at = 0
-    while at < len(data):
-        kind, extended, sized = data[at] >> 3 & 15, data[at] & 4, data[at] & 2
-        if kind == 1:
-            return True
-        at += 2 if extended else 1
-        size, shift = 0, 0
-        while sized and at < len(data):
-            size |= (data[at] & 0x7F) << shift
-            at, shift = at + 1, shift + 7
-            if not data[at - 1] & 0x80:
-                break
-        if not sized:
-            return False
-        at += size
-    return False
+    return any(kind == SEQUENCE for kind, _ in units(data))
 
 
 class VideoDecoder:
