@@ -194,6 +194,7 @@ def rollout(
     temperature: float = 0.0,
     sample_steps: int | None = None,
     seed: int = 0,
+    truth: NDArray[np.uint8] | None = None,
 ) -> Pictures:
     """Go on from the first frames of each window with its actions.
 
@@ -206,6 +207,7 @@ def rollout(
         actions: (B, T, K) raw instead of the window's own.
         unmask_steps, temperature, sample_steps: as in `HMA.generate`.
         seed: of every random draw.
+        truth: the decoded frames of another rollout of the same windows, to spare decoding them again.
 
     Raises:
         UsageError: more frames than the windows have.
@@ -227,9 +229,10 @@ def rollout(
         sample_steps=sample_steps,
         generator=torch.Generator().manual_seed(seed),
     )
-    truth = stored[:, : first + count].cpu()
-    whole = torch.cat([truth[:, :first], predicted.cpu()], dim=1)
-    return Pictures(first, decode(tokenizer, whole), decode(tokenizer, truth))
+    if truth is None:
+        truth = decode(tokenizer, stored[:, : first + count])
+    made = decode(tokenizer, predicted)
+    return Pictures(first, np.concatenate([truth[:, :first], made], axis=1), truth)
 
 
 def default_prompt(length: int) -> int:
@@ -316,7 +319,8 @@ def evaluate(
             "sample_steps": sample_steps, "seed": seed + number,
         }  # fmt: skip
         true = rollout(model, tokenizer, batch, **options)
-        other = rollout(model, tokenizer, batch, actions=shuffled_actions(batch, first - 1, seed), **options)
+        shuffled = shuffled_actions(batch, first - 1, seed)
+        other = rollout(model, tokenizer, batch, actions=shuffled, truth=true.truth, **options)
         if real is not None:
             truth = _real(real, batch, shards)
             true, other = replace(true, truth=truth), replace(other, truth=truth)

@@ -55,16 +55,21 @@ def ssim(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0)
         raise UsageError(
             "ssim", f"pictures of {truth.shape[1]}x{truth.shape[2]} are smaller than its 7x7 window"
         )
+    return np.array([_similarity(x, y, data_range) for x, y in zip(truth, pictures, strict=True)])
+
+
+def _similarity(truth: NDArray[np.float64], picture: NDArray[np.float64], data_range: float) -> float:
+    """Of two pictures (H, W, C); one at a time, because what is in hand then fits a processor's cache."""
     count = SSIM_WINDOW**2
-    mean_x, mean_y = _box(truth), _box(pictures)
+    mean_x, mean_y = _box(truth), _box(picture)
     unbias = count / (count - 1)
     var_x = unbias * (_box(truth * truth) - mean_x * mean_x)
-    var_y = unbias * (_box(pictures * pictures) - mean_y * mean_y)
-    covariance = unbias * (_box(truth * pictures) - mean_x * mean_y)
+    var_y = unbias * (_box(picture * picture) - mean_y * mean_y)
+    covariance = unbias * (_box(truth * picture) - mean_x * mean_y)
     c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
     above = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     below = (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
-    return (above / below).mean(axis=(1, 2, 3))
+    return float((above / below).mean())
 
 
 def _pair(truth: NDArray[Any], pictures: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -77,13 +82,14 @@ def _pair(truth: NDArray[Any], pictures: NDArray[Any]) -> tuple[NDArray[np.float
 
 
 def _box(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Means over every 7x7 window inside (N, H, W, C), separable by running sums."""
-    for axis in (1, 2):
-        sums = np.cumsum(values, axis=axis)
-        sums = np.insert(sums, 0, 0.0, axis=axis)
-        length = sums.shape[axis]
-        above = np.take(sums, range(SSIM_WINDOW, length), axis=axis)
-        values = (above - np.take(sums, range(length - SSIM_WINDOW), axis=axis)) / SSIM_WINDOW
+    """Means over every 7x7 window inside (H, W, C), separable by running sums."""
+    for axis in (0, 1):
+        sums = np.zeros([n + (k == axis) for k, n in enumerate(values.shape)])
+        behind, ahead = [slice(None)] * 3, [slice(None)] * 3
+        ahead[axis] = slice(1, None)
+        np.cumsum(values, axis=axis, out=sums[tuple(ahead)])
+        behind[axis], ahead[axis] = slice(None, -SSIM_WINDOW), slice(SSIM_WINDOW, None)
+        values = (sums[tuple(ahead)] - sums[tuple(behind)]) / SSIM_WINDOW
     return values
 
 

@@ -179,6 +179,26 @@ def test_the_ways_of_decoding_reach_the_model(model, batch, monkeypatch):
     assert told[0].items() >= ways.items()
 
 
+def test_each_picture_is_decoded_once(data, model):
+    class Counting(Blocks):
+        decoded = 0
+
+        def decode(self, tokens: np.ndarray) -> np.ndarray:
+            self.decoded += len(tokens)
+            return super().decode(tokens)
+
+    tokenizer = Counting()
+    found = evaluate(model, tokenizer, data, count=5, prompt=1, batch_size=2)
+    truth, predicted = found["windows"] * 4, found["windows"] * 3
+    assert tokenizer.decoded == truth + 2 * predicted  # with the true actions and with others
+
+
+def test_a_rollout_over_a_truth_that_is_known_is_the_same(model, batch):
+    one = rollout(model, Blocks(), batch, prompt=2)
+    other = rollout(model, Blocks(), batch, prompt=2, truth=one.truth)
+    assert (one.predicted == other.predicted).all() and other.truth is one.truth
+
+
 def test_a_rollout_longer_than_the_window_is_refused(model, batch):
     with pytest.raises(UsageError, match=r"2 \+ 3 frames do not fit windows of 4"):
         rollout(model, Blocks(), batch, frames=3, prompt=2)

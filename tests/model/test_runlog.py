@@ -244,7 +244,7 @@ def test_after_a_resume_speed_and_time_left_are_of_this_sessions_steps(tmp_path,
             log.step(facts(step))
     first, last = capsys.readouterr().err.splitlines()
     assert first.startswith("step 1001/1100") and "0.2 windows/s, 1 h 06 min left" in first
-    assert last.startswith("step 1020/1100") and "16.0 windows/s, 40 s left" in last
+    assert last.startswith("step 1020/1100") and "16.0 windows/s, 40.0 s left" in last
 
 
 def test_time_left_counts_what_is_done_between_steps(tmp_path, capsys, monkeypatch):
