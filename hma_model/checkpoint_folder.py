@@ -36,6 +36,8 @@ STEM, HEAD, YAML, STATS, CARD = (
 )  # fmt: skip
 PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card last: it says that the others are there
 SAMPLE = "sample.png"  # optional, shown in the model card
+_APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
+_CUT_SHORT = "a push or pull was cut short: do it again"
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,8 @@ class Checkpoint:
             _same(where, facts, "trunk_sha256", self.trunk_sha256, "belongs to another trunk")
             _same(where, facts, "tokenizer", self.tokenizer, "was trained on another tokenizer")
             stats = file_sha256(self.path(embodiment, STATS))
-            _same(where, facts, "stats_sha256", stats, f"was trained with other statistics than {STATS}")
+            other = f"was trained with other statistics than {STATS}"
+            _same(where, facts, "stats_sha256", stats, other, _CUT_SHORT)
         files = self.card(embodiment).get("files")
         for part in (STEM, HEAD):
             recorded = files.get(part) if isinstance(files, dict) else None
@@ -158,7 +161,7 @@ class Checkpoint:
                 raise CheckpointError(
                     self.path(embodiment, part),
                     f"is not the file that {CARD} names",
-                    "a push or pull was cut short: do it again",
+                    _CUT_SHORT,
                 )
 
 
@@ -267,11 +270,13 @@ def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
         raise CheckpointError(where, "lacks action.mean or action.std as lists of numbers") from fault
 
 
-def _same(where: Path, facts: Mapping[str, Any], key: str, expected: str, fault: str) -> None:
+def _same(
+    where: Path, facts: Mapping[str, Any], key: str, expected: str, fault: str, remedy: str = _APART
+) -> None:
     found = facts.get(key)
     if found != expected:
         raise CheckpointError(
             where,
             f"{fault}: its {key} is {str(found)[:16]}, here it is {expected[:16]}",
-            "pull the embodiment and its trunk together, or finetune it on this trunk",
+            remedy,
         )

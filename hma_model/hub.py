@@ -20,6 +20,7 @@ from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
 from hma_model.files import parse_json
 from hma_model.hub_check import require_publishable, require_yaml
+from hma_model.hub_partial import remove_dead_parts
 from hma_model.model_card import render
 
 if TYPE_CHECKING:
@@ -184,6 +185,7 @@ def _pull(
         pulled.check(name)
         require_yaml(pulled, name)
     if out:
+        remove_dead_parts(folder / README)
         checkpoints.write_readme(folder)
     return folder, wanted
 

@@ -29,6 +29,7 @@ from hma_model.hub import REPOSITORY, Content, is_repository
 BATCH = 1000  # shards of a commit
 SMALL = (EMBODIMENT, EPISODES, QUARANTINE)
 _OURS = {*SMALL, MANIFEST, README, ".gitattributes"}
+_AGAIN = "pull again; if it stays so, have it pushed again"
 _DATASETS = "hf://datasets/"
 
 
@@ -128,10 +129,10 @@ def pull_data(source: str | Path, out: str | Path, *, revision: str | None = Non
     store.download([*wanted, *(name for name in SMALL if name in files)], out)
     for path in wanted:
         if not _is(out / path, shards[path]):
-            raise ShardError(out / path, f"is not the shard that {MANIFEST} names", "pull again")
+            raise ShardError(out / path, f"is not the shard that {MANIFEST} names", _AGAIN)
     for name in SMALL:
         if name in manifest.files and not _is(out / name, manifest.files[name]):
-            raise ShardError(out / name, f"is not the file that {MANIFEST} names", "pull again")
+            raise ShardError(out / name, f"is not the file that {MANIFEST} names", _AGAIN)
     write_atomic(out / MANIFEST, content)
     return out
 
@@ -173,7 +174,7 @@ def _open(address: str | Path, revision: str | None = None, **settings: bool) ->
     return FolderStore(address, settings.get("write", False))
 
 
-def _published(store: DataStore) -> tuple[Manifest, bytes]:
+def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[Manifest, bytes]:
     """The manifest that is there, and its bytes.
 
     Raises:
@@ -187,7 +188,7 @@ def _published(store: DataStore) -> tuple[Manifest, bytes]:
         try:
             return Manifest.load(Path(folder)), (Path(folder) / MANIFEST).read_bytes()
         except ShardError as fault:
-            raise ShardError(f"{store.name}/{MANIFEST}", fault.fault, "have it pushed again") from fault
+            raise ShardError(f"{store.name}/{MANIFEST}", fault.fault, remedy) from fault
 
 
 def _refuse_others(store: DataStore, manifest: Manifest) -> None:
@@ -198,7 +199,7 @@ def _refuse_others(store: DataStore, manifest: Manifest) -> None:
         raise HubError(store.name, f"holds something else: {strange[0]}", "push to a place of its own")
     if MANIFEST not in files:
         return
-    there = _published(store)[0]
+    there = _published(store, f"delete {MANIFEST} there if the set is yours, and push again")[0]
     ours = (manifest.embodiment.id, manifest.tokenizer.name, manifest.tokenizer.weights_sha256)
     theirs = (there.embodiment.id, there.tokenizer.name, there.tokenizer.weights_sha256)
     if ours != theirs:

@@ -66,7 +66,7 @@ class FolderStore:
         return {
             name: size
             for name, size in self._sizes().items()
-            if not is_partial(name) and not name.startswith(("training/", LOCK, PROBE))
+            if not is_partial(name) and not name.startswith(("training/", LOCK, f".{LOCK}.", PROBE))
         }
 
     def warm(self, names: list[str]) -> None:
@@ -277,7 +277,7 @@ class FolderStore:
             return True
         if self._ask("used", lambda: self._fs.exists(final)):
             return False
-        self._ask("written", lambda: self._fs.cp_file(new, final))
+        self._settle(new, final)
         return True
 
     def _rename(self, new: str, final: str) -> None:
@@ -285,8 +285,23 @@ class FolderStore:
             Path(final).parent.mkdir(parents=True, exist_ok=True)
             Path(new).replace(final)
             return
-        self._ask("written", lambda: self._fs.cp_file(new, final))  # may be asked again, as a move may not
-        self._remove(new)
+        self._settle(new, final)
+
+    def _settle(self, new: str, final: str) -> None:
+        """Give a file of a store its name: copied where files appear as a whole only, moved where not."""
+
+        def move() -> None:
+            try:
+                self._fs.mv(new, final)
+            except FileNotFoundError:  # an earlier try whose answer was lost may have done it
+                if self._fs.exists(new) or not self._fs.exists(final):
+                    raise
+
+        if self._flat:
+            self._ask("written", lambda: self._fs.cp_file(new, final))
+            self._remove(new)
+        else:
+            self._ask("written", move)
 
     def _remove(self, path: str) -> None:
         try:

@@ -7,6 +7,7 @@ import time
 import uuid
 from pathlib import Path
 
+from hma_data.files import PART
 from hma_data.remote_lock import Holder, is_running
 
 STALE = 86_400.0  # seconds after which a file of another machine's process is nobody's
@@ -43,6 +44,14 @@ def remove_abandoned(path: Path) -> None:
     """Delete what dead processes left of a file on this machine."""
     for left in path.parent.glob(f".{path.name}.partial-*"):
         if not left.is_dir() and is_abandoned(left.name, left.lstat().st_mtime):
+            left.unlink(missing_ok=True)
+
+
+def remove_dead_parts(path: Path) -> None:
+    """Delete what dead processes of this machine left where they wrote a file by `write_atomic`."""
+    for left in path.parent.glob(f".{path.name}.*{PART}"):
+        pid = left.name.removesuffix(PART).rpartition(".")[2]
+        if pid.isdecimal() and not is_running(int(pid)):
             left.unlink(missing_ok=True)
 
 
