@@ -8,9 +8,10 @@ import torch
 from hma_data.errors import RecipeError
 from hma_data.loader import Batch
 from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.embed import to_digits
 from hma_model.parallel import World
 from hma_model.recipe import make_recipe
-from hma_model.self_forward import Forwarded, forwarded, share_at
+from hma_model.self_forward import SAMPLE_STEPS, Forwarded, forwarded, share_at
 from hma_model.train import train
 from hma_model.trainer import Run
 from tests.model.robots import CONFIG, make_model
@@ -162,3 +163,76 @@ def test_a_run_pads_short_episodes_when_asked(tmp_path):
     data = [str(make_shards(tmp_path / "arm", "arm", spec=spec, length=6, episodes=8))]
     recipe = make_recipe({**TINY, "data": data, "short": "pad", "eval_every": 0, "steps": 2})
     assert train(recipe, out=tmp_path / "run", show=False).step == 2
+
+
+CONTINUOUS = {
+    "kind": "continuous", "grid": (4, 4), "channels": 2, "patch": 2, "diffusion_width": 16,
+    "diffusion_depth": 1, "latent_scale": 0.5,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["discrete", "noise", "velocity"])
+@pytest.mark.parametrize("alignment", ["previous", "current"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_past_of_its_own_is_what_generation_makes_of_the_same_prompt_and_actions(
+    kind, alignment, seed, monkeypatch
+):
+    continuous = kind != "discrete"
+    own = {**CONTINUOUS, "diffusion_target": kind} if continuous else {}
+    config = CONFIG.replace(frames=FRAMES, action_alignment=alignment, **own)
+    model = make_model(ROBOTS, seed=seed, config=config).train()
+    torch.manual_seed(seed)
+    with torch.no_grad():  # fresh gates, modulations and outputs are zero, so that actions would not matter
+        for parameter in model.parameters():
+            parameter.add_(0.2 * torch.randn_like(parameter))
+    monkeypatch.setattr("hma_model.diffusion.randn", lambda shape, *_: torch.full(tuple(shape), 0.3))
+    true, depth = batch(4, continuous), 1 + seed
+    stored = true.latents if continuous else true.tokens
+    given = forwarded(model, true, 1.0, depth, torch.Generator().manual_seed(seed))
+    model.eval()
+    for i, row in enumerate(changed(given, stored)):
+        at = int(row.nonzero()[0])
+        made, other = (
+            model.generate(
+                stored[i : i + 1, :at], actions[i : i + 1], true.embodiment[i], depth,
+                unmask_steps=1, sample_steps=SAMPLE_STEPS if continuous else None,
+            )[0]
+            for actions in (true.actions, -true.actions)
+        )  # fmt: skip
+        assert torch.allclose(given.context[i, at : at + depth].float(), made.float(), atol=1e-4)
+        assert not torch.allclose(made.float(), other.float(), atol=1e-4)
+        assert torch.equal(given.context[i, :at], stored[i, :at])
+        assert torch.equal(given.context[i, at + depth :], stored[i, at + depth :])
+
+
+@pytest.mark.parametrize("target", ["noise", "velocity"])
+def test_targets_of_a_continuous_model_are_the_true_latents_whatever_it_sees(target, monkeypatch):
+    config = CONFIG.replace(frames=FRAMES, **CONTINUOUS, diffusion_target=target)
+    model, targets = make_model(ROBOTS, config=config).train(), []
+    diffusion = model.latent_readout.diffusion
+    plain = diffusion.loss
+    monkeypatch.setattr(
+        diffusion, "loss", lambda target, *more: (targets.append(target), plain(target, *more))[1]
+    )
+    true = batch(4, continuous=True)
+    given = forwarded(model, true, 1.0, 2, torch.Generator().manual_seed(3))
+    assert not torch.equal(given.context, true.latents)
+    for seen in (given, true):
+        model(seen, "forward", torch.Generator().manual_seed(5))
+    assert torch.equal(targets[0], targets[1])
+
+
+def test_one_that_knows_the_frames_already_gives_the_very_batch(model, monkeypatch):
+    true = batch()
+    exact = to_digits(true.tokens, model.config.factored)
+    scores = torch.nn.functional.one_hot(exact, 8).float()
+    monkeypatch.setattr(model, "video_logits", lambda *given: scores)
+    given = forwarded(model, true, 1.0, 3, torch.Generator().manual_seed(3))
+    assert torch.equal(given.context, true.tokens)
+
+
+def test_no_gradient_flows_through_the_past_and_the_draws_of_training_stay_as_they_were(model):
+    state = torch.get_rng_state()
+    given = forwarded(model, batch(), 1.0, 2, torch.Generator().manual_seed(3))
+    assert not given.context.requires_grad and torch.equal(torch.get_rng_state(), state)
+    assert all(parameter.grad is None for parameter in model.parameters())
