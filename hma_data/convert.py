@@ -41,7 +41,7 @@ from hma_data.output import (
 )
 from hma_data.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.shard_work import Job, MakeWork, Tick
-from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
+from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish
 from hma_data.shards.schema import flag_counts
 from hma_data.sources.base import EpisodeRef, of_another_format, open_source
 from hma_data.store import parquet_input, place
@@ -325,8 +325,10 @@ class _Conversion:
         """The manifest and what else is derived from footers; nothing where nothing changed."""
         out = self._out
         remove_parts(out)  # of workers that died
-        if not changed and (out / MANIFEST).is_file() and (out / EPISODES).is_file():
-            return Manifest.load(out)
+        if not changed and (out / MANIFEST).is_file():
+            manifest = Manifest.load(out)
+            if not damaged_files(out, manifest):
+                return manifest
         kept = base.shards if base else ()
         names = [*(shard.path for shard in kept), *(unit.name for unit in plan.units)]
         manifest = finish(

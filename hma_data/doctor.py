@@ -20,7 +20,7 @@ from hma_data.sources.base import SAMPLE, Inspection, detect, of_another_format,
 from hma_data.sources.findings import SEVERITIES, Finding, Severity
 from hma_data.sources.survey import sampled
 from hma_data.spec import Camera
-from hma_data.store import place
+from hma_data.store import is_remote, place
 
 WINDOW = 12  # frames of the model's window, by default
 LOOKS = ("blank", "still", "colour", "size")  # checks of pictures, which matter for cameras that are used
@@ -46,7 +46,10 @@ def examine(target: str, embodiment: str | None = None, sample: int = SAMPLE) ->
 
 def _is_shard_set(target: str) -> bool:
     try:
-        return (place(target) / "manifest.json").is_file()
+        folder = place(target)
+        if (folder / "manifest.json").is_file():
+            return True
+        return not is_remote(folder) and any(folder.glob("train/shard-*.parquet"))  # one that is not finished
     except HMAError:
         return False  # a source's own schemes
 

@@ -11,9 +11,9 @@ from typing import Any
 
 from hma_data.errors import EpisodeError, OutputError
 from hma_data.plan import Plan, ShardUnit, differences, digest, pack, shard_size
-from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest
+from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest, damaged_files
 from hma_data.sources.base import EpisodeRef
-from hma_data.store import parquet_file
+from hma_data.store import RemotePath, parquet_file
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +46,9 @@ def extended(
         a plan whose units are the new shards alone; without any, its facts are those of `base`.
 
     Raises:
-        OutputError: the set was made in another way, or an episode of it has changed since.
+        OutputError: the set was made in another way, lacks something, or an episode of it has changed since.
     """
+    _refuse_damaged(out, base)
     here, there = ways(plan.facts), ways(base.plan)
     if here != there:
         raise OutputError(
@@ -65,6 +66,29 @@ def extended(
     if not new:
         return Plan((), base.plan)
     return _with(base, new, len(fingerprints) + len(refused), shard_frames)
+
+
+def _refuse_damaged(out: Path, base: Manifest) -> None:
+    """What is kept must be there: shards by their size, the files derived from them by their bytes."""
+    sizes = out.listing() if isinstance(out, RemotePath) else None
+    for shard in base.shards:
+        path = out / shard.path
+        size = _size(path) if sizes is None else sizes.get(shard.path, -1)
+        if size != shard.bytes:
+            fault = "is missing" if size < 0 else f"has {size:,} bytes, the manifest says {shard.bytes:,}"
+            remedy = "without --extend it is made again, if it is deleted and the recordings are as they were"
+            if "extends" in base.plan:
+                remedy = "put back a copy of it, or --overwrite to start anew"
+            raise OutputError(path, fault, remedy)
+    damaged = damaged_files(out, base)
+    if damaged:
+        remedy = f"hma shards restat {out} writes it anew from the shards"
+        raise OutputError(damaged[0], "is missing, or changed since the manifest was written", remedy)
+
+
+def _size(path: Path) -> int:
+    """Bytes of a local file, -1 where there is none."""
+    return path.stat().st_size if path.is_file() else -1
 
 
 def _known(out: Path) -> tuple[dict[str, str], dict[str, str]]:

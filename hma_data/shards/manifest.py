@@ -201,6 +201,15 @@ class Manifest:
             ) from fault
 
 
+def damaged_files(folder: Path, manifest: Manifest) -> list[Path]:
+    """Files derived from the shards that are missing, or not what the manifest says of them."""
+
+    def is_whole(path: Path) -> bool:
+        return path.is_file() and file_sha256(path) == manifest.files.get(path.name)
+
+    return [path for name in (EPISODES, QUARANTINE, EMBODIMENT) if not is_whole(path := folder / name)]
+
+
 def stored_embodiment(folder: Path) -> Embodiment:
     """The embodiment.yaml of a shard set.
 

@@ -11,6 +11,7 @@ import pytest
 
 from hma_data.content import Content, content_of
 from hma_data.convert import Summary, convert
+from hma_data.doctor import examine
 from hma_data.embodiment import Embodiment
 from hma_data.errors import OutputError
 from hma_data.plan import Settings
@@ -148,6 +149,57 @@ def test_a_set_written_before_contents_were_noted_is_as_it_was(
     grow(recording, [23], 3)
     with pytest.raises(OutputError, match="3 of its episodes lie in files that have changed, .* 'demo_0'"):
         run(toy_arm, recording, out, extend=True)
+
+
+# -- what is kept must be there
+
+
+@pytest.mark.parametrize("name", ["episodes.parquet", "quarantine.jsonl", "embodiment.yaml"])
+@pytest.mark.parametrize("damage", ["gone", "blank", "other"])
+def test_what_follows_from_the_shards_is_written_anew_or_told_before_it_is_extended(
+    name: str, damage: str, toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(toy_arm, recording, out)
+    before, shards_before = (out / name).read_bytes(), shards(out)
+    (out / name).unlink()
+    if damage != "gone":
+        (out / name).write_bytes(b"\n" if damage == "blank" else b'{"id": 3}\n' + before)
+    with pytest.raises(OutputError, match=rf"{name}: is missing, or changed .* hma shards restat {out} "):
+        run(toy_arm, recording, out, extend=True)
+    assert run(toy_arm, recording, out).made_shards == 0
+    assert (out / name).read_bytes() == before and shards(out) == shards_before and verify(out) == []
+
+
+def test_a_shard_that_is_missing_is_told_before_the_set_is_extended(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(toy_arm, recording, out)
+    whole = shards(out)
+    first = out / sorted(whole)[0]
+    first.write_bytes(b"PAR1")
+    with pytest.raises(OutputError, match=r"has 4 bytes, the manifest says [\d,]+ — without --extend"):
+        run(toy_arm, recording, out, extend=True)
+    first.unlink()
+    with pytest.raises(OutputError, match="shard-00000.parquet: is missing — without --extend it is made"):
+        run(toy_arm, recording, out, extend=True)
+    assert run(toy_arm, recording, out).made_shards == 1 and shards(out) == whole
+    grow(recording, [23], 3)
+    run(toy_arm, recording, out, extend=True)
+    first.unlink()
+    for extend in (False, True):
+        with pytest.raises(OutputError, match="is missing — put back a copy of it"):
+            run(toy_arm, recording, out, extend=extend)
+
+
+def test_doctor_tells_a_set_that_is_not_finished_from_a_recording(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    run(toy_arm, recording, tmp_path / "out")
+    (tmp_path / "out" / "manifest.json").unlink()
+    (found,) = examine(str(tmp_path / "out"))
+    assert found.check == "integrity" and "its conversion has not finished" in found.message
 
 
 def test_what_a_worker_notes_is_what_is_found_later(
