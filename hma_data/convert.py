@@ -41,7 +41,7 @@ from hma_data.output import (
 )
 from hma_data.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.shard_work import Job, MakeWork, Tick
-from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish
+from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, damaged_files, finish
 from hma_data.shards.schema import flag_counts
 from hma_data.sources.base import EpisodeRef, of_another_format, open_source
 from hma_data.store import parquet_input, place
@@ -68,7 +68,7 @@ class Summary:
     """What a conversion did.
 
     Attributes:
-        reasons: error type and message (without the episode's id) -> episodes refused for it.
+        reasons: error type and message (without the ids where there are several) -> episodes refused for it.
         flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
         too_many: more than `max_quarantine` was refused; the command ends with exit code 1.
     """
@@ -345,14 +345,15 @@ class _Conversion:
 
 
 def _reasons(out: Path) -> dict[str, int]:
-    reasons: dict[str, int] = {}
-    for line in (out / "quarantine.jsonl").read_text(encoding="utf-8").splitlines():
+    """Reason -> episodes refused for it; reasons that differ in the episode's id alone are one."""
+    told: dict[str, list[str]] = {}
+    for line in (out / QUARANTINE).read_text(encoding="utf-8").splitlines():
         item = json.loads(line)
-        text = f"{item['type']}: {item['message']}"
+        text = plain = f"{item['type']}: {item['message']}"
         if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
             text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
-        reasons[text] = reasons.get(text, 0) + 1
-    return reasons
+        told.setdefault(text, []).append(plain)
+    return {text if len(plain) > 1 else plain[0]: len(plain) for text, plain in told.items()}
 
 
 def _flags(out: Path) -> dict[str, int]:

@@ -266,8 +266,8 @@ def _names_a_dataset(uri: str) -> bool:
 
 
 def _is_bag(path: Path) -> bool:
-    magic = first_bytes(path, 16)
-    known = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3")
+    magic = first_bytes(path, 28)
+    known = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3", b"rosbag2_bagfile_information:")
     endings = (".bag", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
     return path.name.endswith(endings) or magic.startswith(known)
 

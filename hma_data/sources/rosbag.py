@@ -80,10 +80,13 @@ class RosbagSource:
 
 
 def _bags(uri: str) -> dict[str, Path]:
-    bags = find_bags(local_path(uri))
+    path = local_path(uri)
+    if path.is_file() and path.name == "metadata.yaml":
+        raise SourceError(uri, "only describes a bag", f"give the bag's folder, {path.parent}")
+    bags = find_bags(path)
     if not bags:
         remedy = "expected .bag, .mcap, .db3, or folders with a metadata.yaml"
-        raise nothing_there(uri, local_path(uri), "holds no bags", remedy)
+        raise nothing_there(uri, path, "holds no bags", remedy)
     return bags
 
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import pytest
 
 from hma_data.convert import convert
@@ -11,6 +12,7 @@ from hma_data.errors import HMAError, SourceError, UsageError
 from hma_data.inspect import inspect_recording
 from hma_data.sources.base import detect, of_another_format, open_source
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.data.bag_files import make_recording, write_ros2
 from tests.data.test_rlds import embodiment as rlds_robot
 from tests.data.test_rlds import toy
 from tests.data.videos import make_v3
@@ -82,3 +84,25 @@ def test_doctor_names_an_episode_it_could_not_use_and_the_keys_there_are(tmp_pat
     (tmp_path / "rlds.yaml").write_text(changed.to_yaml())
     (first, *_) = examine(str(tmp_path / "rlds"), str(tmp_path / "rlds.yaml"))
     assert first.check == "usable" and "observation/image" in first.remedy
+
+
+def test_a_bag_folder_without_its_files_is_known_as_one(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "run", make_recording(), "SQLITE3")
+    assert detect(str(folder / "metadata.yaml")) == "rosbag"
+    with pytest.raises(SourceError, match=f"only describes a bag — give the bag's folder, {folder}$"):
+        inspect_recording(str(folder / "metadata.yaml"))
+    next(folder.glob("*.db3")).unlink()
+    with pytest.raises(SourceError, match="metadata.yaml: names run.db3, which is not in the folder"):
+        inspect_recording(str(folder))
+
+
+def test_a_reason_of_one_episode_alone_names_it(toy_arm: Embodiment, tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [5, 6, 7, 8])
+    with h5py.File(tmp_path / "toy.hdf5", "a") as file:
+        del file["data/demo_1/obs"]
+        for i in (2, 3):
+            del file[f"data/demo_{i}/actions"]
+    summary = convert(toy_arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "out")
+    (one, count), (many, counts) = sorted(summary.reasons.items(), key=lambda item: item[1])
+    assert (count, counts) == (1, 2)
+    assert "data/demo_1: has no 'obs/image'" in one and "data/<episode>: has no 'actions'" in many
