@@ -6,7 +6,7 @@ What the run does then is the recipe's: stop and name the windows, or leave the 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -53,8 +53,10 @@ class Pulse:
         self.count += 1
 
 
-def culprits(batches: Sequence[tuple[Batch, Tensor]], sets: "Mapping[str, ShardSet]") -> list[str]:
-    """The windows whose losses are not numbers; where each is one, all, the largest losses first.
+def suspects(
+    batches: Sequence[tuple[Batch, Tensor]], sets: "Mapping[str, ShardSet]"
+) -> list[tuple[float, str]]:
+    """The windows of this rank's part of a step that may be at fault, each with its loss.
 
     Args:
         batches: with the loss (B,) of each window.
@@ -68,11 +70,22 @@ def culprits(batches: Sequence[tuple[Batch, Tensor]], sets: "Mapping[str, ShardS
         inside = torch.ones_like(batch.action_mask) if batch.frame_mask is None else batch.frame_mask
         rows = zip(batch.embodiment, episodes, frames, losses.tolist(), inside.sum(1).tolist(), strict=True)
         found += [(loss, name, episode, frame, length) for name, episode, frame, loss, length in rows]
-    bad = [item for item in found if not math.isfinite(item[0])] or sorted(found, key=lambda item: -item[0])
-    return [
-        f"{name} episode {episode}{_named(sets.get(name), episode)} {_span(sets.get(name), frame, length)}"
-        for _, name, episode, frame, length in bad
-    ]
+    told = []
+    for loss, name, episode, frame, length in _worst(found):
+        shards = sets.get(name)
+        place = f"{name} episode {episode}{_named(shards, episode)} {_span(shards, frame, length)}"
+        told.append((loss, place))
+    return told
+
+
+def culprits(suspected: Sequence[tuple[float, str]]) -> list[str]:
+    """Of the suspects of all ranks those whose losses are not numbers; else all, the largest losses first."""
+    return [text for _, text in _worst(suspected)]
+
+
+def _worst[Item: tuple[Any, ...]](found: Sequence[Item]) -> list[Item]:
+    bad = [item for item in found if not math.isfinite(item[0])]
+    return bad or sorted(found, key=lambda item: -item[0])
 
 
 def listed(windows: Sequence[str]) -> str:

@@ -24,7 +24,7 @@ from hma_model.ema import Average
 from hma_model.evaluate import Means, digit_frequencies, unconditional_baseline, windows
 from hma_model.feed import Feed
 from hma_model.files import remove_partial, to_json
-from hma_model.health import Pulse, culprits, listed
+from hma_model.health import Pulse, culprits, listed, suspects
 from hma_model.model import HMA
 from hma_model.optim import load_optimizer_state, lr_scale, make_optimizer, optimizer_state, set_lr
 from hma_model.parallel import Spread, World, gathered
@@ -252,10 +252,10 @@ class Run:
         if self.recipe.nonfinite == "skip":
             self.skipped += 1
             return
-        named = [text for part in self.world.gather(culprits(seen, self.sets)) for text in part]
+        suspected = [item for part in self.world.gather(suspects(seen, self.sets)) for item in part]
         raise TrainingError(
             f"step {self.step}",
-            f"{fault}; windows: {listed(named)}",
+            f"{fault}; windows: {listed(culprits(suspected))}",
             "look at these with hma shards preview, lower lr, or go on without such steps by nonfinite=skip",
         )
 
