@@ -6,9 +6,10 @@ and a run may go on with another number of ranks.
 """
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from hma_data.errors import RecipeError, UsageError
+from hma_data.errors import RecipeError, TrainingError, UsageError
 from hma_data.loader import Batch, MixtureDataset
 from hma_data.mixture import Mixture
 from hma_data.shards.reader import ShardSet
@@ -36,6 +37,26 @@ def share(recipe: "Recipe", ranks: int) -> tuple[int, int]:
             f"choose batch_size × accumulate as a multiple of {ranks}, such as {-(-total // ranks) * ranks}",
         )
     return passes, total // passes
+
+
+@contextmanager
+def _workers_alive() -> Iterator[None]:
+    """Around the wait for what other processes decode.
+
+    Raises:
+        TrainingError: one of them has ended.
+    """
+    try:
+        yield
+    except (RuntimeError, ConnectionError, EOFError) as fault:
+        said = (str(fault).splitlines() or [""])[0][:200]
+        if isinstance(fault, RuntimeError) and "DataLoader worker" not in said:
+            raise
+        raise TrainingError(
+            "workers",
+            f"a process that decodes batches has ended: {said or type(fault).__name__}",
+            "where memory is short choose fewer; the same command goes on from the last checkpoint",
+        ) from fault
 
 
 class Feed:
@@ -103,11 +124,18 @@ class Feed:
         return self._data[0].mixture
 
     def step(self) -> Iterator[tuple[int, Batch]]:
-        """This rank's batches of the next step, each with the number of its pass."""
+        """This rank's batches of the next step, each with the number of its pass.
+
+        Raises:
+            ShardError: a shard is missing or damaged.
+            TrainingError: a worker has ended.
+        """
         if not self._batches:
             self._batches = [data.batches(self._workers) for data in self._data]
         for number, batches in zip(self.own, self._batches):
-            yield number, next(batches)
+            with _workers_alive():
+                batch = next(batches)
+            yield number, batch
 
     def realised(self) -> list[dict[str, Any]]:
         """What this rank has drawn of each embodiment, beside what was intended: `Mixture.table`."""

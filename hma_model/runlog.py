@@ -116,9 +116,10 @@ class RunLog:
         self._track("train", facts, ("loss", "lr", "grad_norm", "step_seconds", "memory_mib", "skipped"))
         self._last = facts
         self._spent += facts["step_seconds"]
-        if facts["step"] == self._begin + 2:  # a session's first step also starts workers and compiles
+        first = facts["step"] == self._begin + 1  # it also waits for workers to start, and compiles
+        if facts["step"] == self._begin + 2:
             self._paces.clear()
-        self._paces.append(facts["step_seconds"])
+        self._paces.append(facts["step_seconds"] - first * facts.get("data_seconds", 0.0))
         for name, loss in facts["loss_by_embodiment"].items():
             recent = self._recent.setdefault(name, deque(maxlen=SMOOTHING))
             if math.isfinite(loss):  # steps that are left out are counted beside it

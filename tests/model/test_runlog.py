@@ -239,11 +239,11 @@ def test_after_a_resume_speed_and_time_left_are_of_this_sessions_steps(tmp_path,
     lines = "".join(json.dumps({"kind": "train", **facts(i, 100.0)}) + "\n" for i in range(1, 1001))
     (tmp_path / "metrics.jsonl").write_text(lines)
     with RunLog(tmp_path, 1100, 1000) as log:
-        log.step(facts(1001, 40.0))  # workers start
+        log.step(facts(1001, 41.0, data_seconds=40.0))  # workers start
         for step in range(1002, 1021):
             log.step(facts(step))
     first, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("step 1001/1100") and "0.2 windows/s, 1 h 06 min left" in first
+    assert first.startswith("step 1001/1100") and "8.0 windows/s, 1 min 39 s left" in first
     assert last.startswith("step 1020/1100") and "16.0 windows/s, 40.0 s left" in last
 
 

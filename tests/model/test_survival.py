@@ -2,6 +2,7 @@
 
 import errno
 import json
+import multiprocessing
 import os
 import random
 import signal
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError
+from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, TrainingError
 from hma_model import checkpoint
 from hma_model.recipe import make_recipe
 from hma_model.runlog import read_metrics
@@ -202,6 +203,22 @@ def test_a_run_may_go_on_with_other_workers(recipe, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(recipe(), out=tmp_path / "cut", show=False, on_progress=kill)
     again = train(recipe(workers=2), out=tmp_path / "cut", show=False)
+    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
+
+
+def test_a_worker_that_is_killed_is_said_and_the_run_goes_on_from_its_last_checkpoint(recipe, tmp_path):
+    long = {"steps": 30, "eval_every": 0, "checkpoint_every": 2}
+    whole = train(recipe(**long), out=tmp_path / "whole", show=False)
+
+    def kill(facts):
+        if facts["step"] == 3:
+            for process in multiprocessing.active_children():
+                process.kill()
+                process.join(10)
+
+    with pytest.raises(TrainingError, match="workers: a process that decodes batches has ended"):
+        train(recipe(workers=1, **long), out=tmp_path / "cut", show=False, on_progress=kill)
+    again = train(recipe(**long), out=tmp_path / "cut", show=False)
     assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
 
 
