@@ -7,24 +7,30 @@ same content is left out, so the same command also goes on with an upload that w
 """
 
 import hashlib
+import random
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
-from hma_data.errors import HubError, OutputError, StorageError
+from hma_data.errors import HMAError, HubError, OutputError, StorageAwayError, StorageError
 from hma_data.extend import hashes
 from hma_data.files import cache_folder, file_sha256
+from hma_data.hub_bounds import bounded
 from hma_data.hub_chunks import leave_after, leave_if_unknown
+from hma_data.hub_errors import AGAIN, LOG_IN, raised, waiting, without_token
 from hma_data.plan import differences
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SHARD_NAME, Manifest
 from hma_data.store import RemotePath, attempt
 
 FILES, BYTES = 50, 5 * 10**9  # of a commit
-SILENCE_S = 300.0  # without an answer; a commit of many files takes the hub minutes
-LOG_IN = "log in with hf auth login, or set HF_TOKEN"
+TURNS = 3  # to ask a hub that says when to ask again
+BUSY = 429
+MOST_MOVES = 20  # of the branch, by others, while this uploads
+_CONFLICTS = (409, 412)
 _URI = re.compile(r"hf://datasets/([^/@]+/[^/@]+)(?:@([^/]+))?(?:/(.+))?")
 
 
@@ -81,6 +87,21 @@ class HubOutput:
             self._asked(
                 lambda: api.create_branch(self.repo, repo_type="dataset", branch=branch, exist_ok=True)
             )
+        self._asked(self._require_right)
+
+    def _require_right(self) -> None:
+        """Ask how a manifest would be uploaded, which only those are told who may."""
+        from huggingface_hub import get_session
+        from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
+
+        branch = quote(self.branch or "main", safe="")
+        asked = {"files": [{"path": self._name(MANIFEST), "size": 1, "sample": "ew=="}]}
+        answer = get_session().post(
+            f"{_api().endpoint}/api/datasets/{self.repo}/preupload/{branch}",
+            json=asked,
+            headers=build_hf_headers(library_name="hma-toolkit"),
+        )
+        hf_raise_for_status(answer)
 
     def refuse_other(self, facts: dict[str, Any]) -> None:
         """Before anything is made.
@@ -90,7 +111,7 @@ class HubOutput:
         """
         if self._name(MANIFEST) not in self._there():
             return
-        theirs = self._manifest().plan
+        theirs = Manifest.load(RemotePath(self.uri)).plan
         if theirs["hash"] not in hashes(facts):
             words = differences(facts, theirs)
             raise OutputError(
@@ -103,71 +124,114 @@ class HubOutput:
         """Upload the staging folder's shard set; how many commits it took.
 
         Raises:
+            OutputError: another job writes something else there meanwhile.
             StorageError: the hub refuses it; StorageAwayError: it does not answer.
         """
-        from huggingface_hub import CommitOperationDelete
+        manifest, made, conflicts = Manifest.load(self.staging), 0, 0
+        head, there = self._state()
+        begun, planned = there, self._pending(manifest, there)
+        while planned:
+            names, gone = planned[0]
+            said = f"Shard set of {manifest.embodiment.id}"
+            if len(planned) > 1:
+                said = f"Shards of {manifest.embodiment.id}, {made + 1} of {made + len(planned)}"
+            try:
+                head = self._commit(names, gone, said, head)
+            except _MovedError as fault:  # by somebody else, or by a commit of ours whose answer was lost
+                conflicts += 1
+                if conflicts > MOST_MOVES:
+                    raise StorageAwayError(self.uri, "others keep committing there", AGAIN) from fault
+                time.sleep(random.random() * min(10.0, 0.2 * 2**conflicts))
+                head, there = self._state()
+                self._refuse_foreign(manifest, there, begun)
+                planned = self._pending(manifest, there)
+                continue
+            made += 1
+            planned = planned[1:]
+        return made
 
-        folder, there = self.staging, self._there()
-        manifest = Manifest.load(folder)
-        missing = [s.path for s in manifest.shards if there.get(self._name(s.path)) != f"sha256:{s.sha256}"]
+    def _pending(self, manifest: Manifest, there: dict[str, str]) -> list[tuple[list[str], list[str]]]:
+        """What each commit adds and deletes; the manifest is in the last."""
+        missing = [s.path for s in manifest.shards if not self._same(s.path, there, s.sha256)]
         others = [
             name for name in (EPISODES, QUARANTINE, EMBODIMENT, MANIFEST) if not self._same(name, there)
         ]
         kept = {self._name(shard.path) for shard in manifest.shards}
         stale = [name for name in there if self._is_shard(name) and name not in kept]
-        *first, last = _batches(folder, missing)
-        unfinished = [MANIFEST] if MANIFEST in others and self._name(MANIFEST) in there and first else []
-        for number, batch in enumerate(first, 1):
-            gone = [CommitOperationDelete(self._name(name)) for name in unfinished if number == 1]
-            said = f"Shards of {manifest.embodiment.id}, {number} of {len(first) + 1}"
-            self._commit([*self._added(batch), *gone], said)
-        operations = [*self._added([*last, *others]), *(CommitOperationDelete(name) for name in stale)]
-        if operations:
-            self._commit(operations, f"Shard set of {manifest.embodiment.id}")
-        return len(first) + bool(operations)
+        *first, last = _batches(self.staging, missing)
+        commits: list[tuple[list[str], list[str]]] = [(batch, []) for batch in first]
+        if first and MANIFEST in others and self._name(MANIFEST) in there:
+            commits[0][1].append(self._name(MANIFEST))  # it would name other shards
+        last += others
+        return [*commits, (last, stale)] if last or stale else commits
 
-    def _added(self, names: Sequence[str]) -> list[Any]:
-        from huggingface_hub import CommitOperationAdd
+    def _refuse_foreign(self, manifest: Manifest, there: dict[str, str], begun: dict[str, str]) -> None:
+        """Raise where what is there is neither ours nor what was there when we began."""
+        ours: dict[str, str | None] = {shard.path: shard.sha256 for shard in manifest.shards}
+        for name, sha256 in (ours | {MANIFEST: None}).items():
+            mark = there.get(self._name(name))
+            if mark not in (None, begun.get(self._name(name))) and not self._same(name, there, sha256):
+                remedy = "choose another --out for one of the two"
+                raise OutputError(self.uri, "another conversion is writing there", remedy)
 
-        return [CommitOperationAdd(self._name(name), str(self.staging / name)) for name in names]
+    def _commit(
+        self, names: Sequence[str], gone: Sequence[str], message: str, head: str | None
+    ) -> str | None:
+        """One commit on top of `head`; the new head.
 
-    def _commit(self, operations: list[Any], message: str) -> None:
-        def send() -> None:
+        Raises:
+            _MovedError: the branch has another head.
+        """
+        from huggingface_hub import CommitOperationAdd, CommitOperationDelete
+
+        added = [CommitOperationAdd(self._name(name), str(self.staging / name)) for name in names]
+        deleted = [CommitOperationDelete(name) for name in gone]
+
+        def send() -> str | None:
             api = _api()
-            with _bounded():
-                leave_if_unknown(api, self.repo, "dataset")
-                api.preupload_lfs_files(
-                    self.repo,
-                    added,
-                    repo_type="dataset",
-                    revision=self.branch,
-                    free_memory=False,
-                    gitignore_content="",  # one in the repository would silently leave files out
-                )
-                api.create_commit(
-                    self.repo, operations, repo_type="dataset", revision=self.branch, commit_message=message
-                )
+            leave_if_unknown(api, self.repo, "dataset")
+            api.preupload_lfs_files(
+                self.repo,
+                added,
+                repo_type="dataset",
+                revision=self.branch,
+                free_memory=False,
+                gitignore_content="",  # one in the repository would silently leave files out
+            )
+            made = api.create_commit(
+                self.repo,
+                [*added, *deleted],
+                repo_type="dataset",
+                revision=self.branch,
+                commit_message=message,
+                parent_commit=head,
+            )
+            return str(made.oid)
 
-        def by_any_way() -> None:
+        def by_any_way() -> str | None:
             try:
-                send()
+                return send()
             except Exception as fault:
+                if getattr(getattr(fault, "response", None), "status_code", None) in _CONFLICTS:
+                    raise _MovedError(self.uri, "has another commit") from fault
                 if not leave_after(fault):
                     raise
-                send()
+                return send()
 
-        from huggingface_hub import CommitOperationAdd
+        return self._asked(by_any_way)
 
-        added = [item for item in operations if isinstance(item, CommitOperationAdd)]
+    def _state(self) -> tuple[str | None, dict[str, str]]:
+        """The branch's newest commit, and what is in it."""
+        api = _api()
+        info = self._asked(lambda: api.repo_info(self.repo, repo_type="dataset", revision=self.branch))
+        return info.sha, self._there(info.sha) if info.sha else {}
 
-        self._asked(by_any_way)
-
-    def _there(self) -> dict[str, str]:
+    def _there(self, revision: str | None = None) -> dict[str, str]:
         """Name in the repository -> its content's hash: of LFS files their sha256, of others git's."""
 
         def ask() -> dict[str, str]:
             entries = _api().list_repo_tree(
-                self.repo, repo_type="dataset", revision=self.branch, recursive=True
+                self.repo, repo_type="dataset", revision=revision or self.branch, recursive=True
             )
             files = [entry for entry in entries if hasattr(entry, "blob_id")]
             return {
@@ -178,23 +242,16 @@ class HubOutput:
         found: dict[str, str] = self._asked(ask)
         return found
 
-    def _same(self, name: str, there: dict[str, str]) -> bool:
+    def _same(self, name: str, there: dict[str, str], sha256: str | None = None) -> bool:
+        """Whether a file of the staging folder, of this digest where it is known, is there."""
         path, mark = self.staging / name, there.get(self._name(name), "")
         if mark.startswith("sha256:"):
-            return mark == f"sha256:{file_sha256(path)}"
+            return mark == f"sha256:{sha256 or file_sha256(path)}"
+        if not mark:
+            return False
         content = path.read_bytes()
         blob = hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False)
         return mark == f"git:{blob.hexdigest()}"
-
-    def _manifest(self) -> Manifest:
-        from huggingface_hub import hf_hub_download
-
-        path = self._asked(
-            lambda: hf_hub_download(
-                self.repo, self._name(MANIFEST), repo_type="dataset", revision=self.branch
-            )
-        )
-        return Manifest.load(Path(path).parent)
 
     def _name(self, name: str) -> str:
         return f"{self.folder}/{name}" if self.folder else name
@@ -203,9 +260,24 @@ class HubOutput:
         begin = f"{self.folder}/" if self.folder else ""
         return name.startswith(begin) and SHARD_NAME.fullmatch(name[len(begin) :]) is not None
 
-    def _asked(self, action: Any) -> Any:
+    def _asked[T](self, action: Callable[[], T]) -> T:
+        """What the hub answers, asked again where that may help, and after the time that it names."""
+
+        def patiently() -> T:
+            for turn in range(TURNS):
+                try:
+                    with bounded():
+                        return action()
+                except raised() as fault:
+                    without_token(fault)
+                    busy = getattr(getattr(fault, "response", None), "status_code", None) == BUSY
+                    if not busy or turn == TURNS - 1 or (seconds := waiting(fault, turn)) is None:
+                        raise
+                time.sleep(seconds)
+            raise AssertionError("the last turn returns or raises")
+
         try:
-            return attempt(self.uri, "uploaded", action)
+            return attempt(self.uri, "uploaded", patiently)
         except StorageError as fault:
             if any(word in fault.fault for word in ("401", "403")):
                 raise StorageError(self.uri, fault.fault, f"{LOG_IN}, with a token that may write") from fault
@@ -214,23 +286,14 @@ class HubOutput:
             raise StorageError(self.uri, "is not there", "check the name of repository and branch") from fault
 
 
+class _MovedError(HMAError):
+    """A branch has another newest commit than a commit was made for."""
+
+
 def _api() -> Any:
     from huggingface_hub import HfApi
 
     return HfApi(library_name="hma-toolkit")
-
-
-@contextmanager
-def _bounded() -> Iterator[None]:
-    """Let no request in this block wait for ever, which is the client's default."""
-    from huggingface_hub import get_session
-
-    client = get_session()
-    before, client.timeout = client.timeout, SILENCE_S
-    try:
-        yield
-    finally:
-        client.timeout = before
 
 
 def _batches(folder: Path, names: Sequence[str]) -> list[list[str]]:

@@ -21,7 +21,7 @@ from urllib.parse import urljoin, urlsplit
 
 from hma_data.errors import HubError
 from hma_data.files import PART, file_sha256
-from hma_model.hub_errors import CutShortError, waiting
+from hma_data.hub_errors import CutShortError, waiting
 
 ATTEMPTS = 5  # without a new byte
 LARGE = 100_000  # bytes; from here on a bar shows the progress

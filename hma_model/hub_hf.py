@@ -17,11 +17,11 @@ from typing import Any
 
 from hma_data.errors import HubError
 from hma_data.files import file_sha256
+from hma_data.hub_bounds import bounded, downloading
 from hma_data.hub_chunks import leave_after, leave_if_unknown
+from hma_data.hub_errors import LOG_IN, cuts, explain, explained, raised, waiting, without_token
 from hma_model.checkpoint import README
 from hma_model.files import MAX_JSON_BYTES
-from hma_model.hub_bounds import bounded, downloading
-from hma_model.hub_errors import LOG_IN, cuts, explain, explained, raised, waiting, without_token
 from hma_model.hub_fetch import Wanted, cache_of, cached, fetch, fetch_to, forget_damaged
 from hma_model.hub_partial import beside
 

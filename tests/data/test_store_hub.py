@@ -13,12 +13,15 @@ from hma_data.convert import convert, convert_share
 from hma_data.embodiment import Embodiment
 from hma_data.errors import HubError, OutputError, ShardError, StorageAwayError, StorageError
 from hma_data.files import cache_folder
+from hma_data.hub_output import HubOutput
 from hma_data.output import Share
 from hma_data.plan import Settings
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
+from hma_data.store import place
 from tests.conftest import BlockTokenizer
-from tests.hub_server import Hub, Repository
+from tests.hub_server import Hub, Repository, _Handler
+from tests.hub_state import Fault
 
 pytest_plugins = ["tests.hub_fixtures"]
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
@@ -138,6 +141,122 @@ def test_no_token_and_no_rights_are_clear_errors(toy_arm, toy_recording, hub, mo
     monkeypatch.setenv("HF_TOKEN", "reader")
     with pytest.raises(StorageError, match="403.*with a token that may write"):
         run(toy_arm, toy_recording)
+
+
+def test_a_lack_of_rights_is_known_before_anything_is_made(toy_arm, toy_recording, hub, monkeypatch) -> None:
+    hub.create("team/arm", "datasets")
+    for token, said in (("reader", "403.*with a token that may write"), ("wrong", "401.*hf auth login")):
+        monkeypatch.setenv("HF_TOKEN", token)
+        with pytest.raises(StorageError, match=said):
+            run(toy_arm, toy_recording)
+    assert not list(cache_folder().rglob("shard-*"))
+
+
+@pytest.mark.parametrize(
+    "fault", [{"status": 503}, {"status": 429, "headers": {"Retry-After": "7"}}, {"after": 10}],
+    ids=["503", "429", "cut"],
+)  # fmt: skip
+def test_passing_faults_stop_no_upload_and_cost_no_commit(toy_arm, toy_recording, hub, whole, fault) -> None:
+    hub.create("team/arm", "datasets")
+    for request in (
+        "repos/create",
+        "preupload",
+        "objects/batch",
+        "lfs/upload",
+        "/commit/",
+        "/tree/",
+        "/arm$",
+    ):
+        hub.fail(request, **fault)
+    run(toy_arm, toy_recording)
+    assert published(hub) == whole and all(fault.times == 0 for fault in hub.faults)
+    assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in whole) + 1) // 2
+    assert fault.get("status") != 429 or max(hub.waits) >= 7
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_a_commit_whose_answer_was_lost_is_not_made_twice(toy_arm, toy_recording, hub, whole, number) -> None:
+    plain, lost = hub.create("team/arm", "datasets").commit, []
+
+    def commit(files, message="by hand"):
+        made = plain(files, message)
+        lost.append(message)
+        if len(lost) == number:
+            raise ConnectionResetError
+        return made
+
+    dataset(hub).commit = commit
+    run(toy_arm, toy_recording)
+    assert published(hub) == whole and len(lost) == len(set(lost))
+    assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in whole) + 1) // 2
+
+
+def gone(handler: _Handler, after: int) -> Fault | None:
+    """A hub that answers nothing after so many requests."""
+    return Fault("") if len(handler.server.log) >= after else None
+
+
+def test_an_upload_cut_at_any_request_is_ended_by_the_same_command(
+    toy_arm, toy_recording, hub, whole, monkeypatch
+) -> None:
+    run(toy_arm, toy_recording)
+    output, commits = HubOutput.of(place(OUT)), len(dataset(hub).commits)
+    monkeypatch.setattr(hub_output, "TURNS", 1)
+    for at in range(200):
+        hub.repositories.clear()
+        hub.objects.clear()
+        begun = len(hub.log)
+        monkeypatch.setattr(_Handler, "_fault", lambda self, n=begun + at: gone(self, n))
+        try:
+            output.prepare()
+            output.upload()
+            break
+        except (StorageAwayError, StorageError) as fault:
+            assert OUT in str(fault) and fault.remedy
+        monkeypatch.setattr(_Handler, "_fault", lambda self: None)
+        output.prepare()
+        output.upload()
+        assert published(hub) == whole
+        assert len(dataset(hub).commits) == commits
+    assert 20 < at < 199
+
+
+def other_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Let staging folders lie elsewhere from here on."""
+    monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma of another"))
+
+
+def test_two_jobs_of_one_conversion_at_once_make_it_together(
+    toy_arm, toy_recording, hub, whole, monkeypatch, tmp_path
+) -> None:
+    def other() -> None:
+        other_machine(monkeypatch, tmp_path)
+        run(toy_arm, toy_recording)
+        monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma"))
+
+    hub.before_commit = [lambda: None, other]
+    run(toy_arm, toy_recording)
+    assert published(hub) == whole
+    assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in whole) + 1) // 2
+
+
+def test_of_two_conversions_at_once_one_is_whole_and_the_other_is_told(
+    toy_arm, toy_recording, hub, whole, monkeypatch, tmp_path
+) -> None:
+    def other() -> None:
+        other_machine(monkeypatch, tmp_path)
+        with pytest.raises(OutputError, match=f"{OUT}: another conversion is writing there"):
+            run(toy_arm, toy_recording, replace(SMALL, seed=3))
+        monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma"))
+
+    def first() -> None:
+        hub.before_commit = [lambda: dataset(hub).commit({f"sets/one/{name}": whole[name]})]
+        other()
+
+    name = next(name for name in sorted(whole, reverse=True) if "shard-" in name)
+    hub.before_commit = [lambda: None, first]
+    run(toy_arm, toy_recording)
+    assert published(hub) == whole
 
 
 def test_what_a_hub_cannot_take_is_told(toy_arm, toy_recording, hub) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from huggingface_hub import constants
 
-from hma_data import remote_lock
+from hma_data import hub_bounds, remote_lock
 from hma_data.errors import HubError
-from hma_model import checkpoint, hub, hub_bounds, hub_fetch, hub_hf, hub_partial, hub_swap
+from hma_model import checkpoint, hub, hub_fetch, hub_hf, hub_partial, hub_swap
 from hma_model.checkpoint import PARTS
 from hma_model.hub_fetch import Wanted
 from tests.hub_server import Hub, serve

@@ -15,8 +15,9 @@ import torch
 import yaml as plain_yaml
 from huggingface_hub import constants
 
+from hma_data import hub_bounds, hub_errors
 from hma_data.errors import CheckpointError, HubError
-from hma_model import checkpoint, hub, hub_bounds, hub_errors
+from hma_model import checkpoint, hub
 from hma_model.checkpoint import PARTS
 from hma_model.model import HMA
 from tests.hub_server import Hub
