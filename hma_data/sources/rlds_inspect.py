@@ -100,8 +100,10 @@ def _pictures(steps: Steps, key: str, survey: Survey, pairs: int) -> None:
 
 
 def _why(survey: Survey, folder: Folder) -> str:
-    said = [str(one) for one in survey.findings(())]
-    return said[-1] if said else f"{folder.uri} is empty"
+    found = survey.findings(())
+    of_files = [str(one) for one in found if one.check == "files"]
+    said = of_files[-1:] or [str(one) for one in found[:1]]
+    return said[0] if said else f"{folder.uri} is empty"
 
 
 def facts(folder: Folder) -> dict[str, str]:

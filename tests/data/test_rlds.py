@@ -606,3 +606,10 @@ def test_a_folder_of_any_name_is_read(name, tmp_path):
         uri = str(tmp_path / name / inside)
         assert len(RLDS.index(uri)) == 3 and detect(uri) == "rlds"
         assert len(read(uri, "train/000002").actions[0].values) == 5
+
+
+def test_of_many_episodes_that_cannot_be_read_the_first_is_told(tmp_path):
+    toy(tmp_path / "toy", (2,) * 7)
+    (tmp_path / "toy" / "features.json").write_text("{}")
+    with pytest.raises(SourceError, match="no readable episode: train/000000: holds none of the features"):
+        RLDS.inspect(str(tmp_path / "toy"))
