@@ -213,24 +213,17 @@ def test_what_a_worker_notes_is_what_is_found_later(
     assert found == {row["id"]: row["content"] for row in rows} and len(set(found.values())) == 3
 
 
-def test_episodes_appended_to_the_videos_of_a_lerobot_dataset(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("make", "robot"), [(make_v3, lerobot_robot), (toy, rlds_robot)])
+def test_episodes_added_to_a_lerobot_datasets_videos_or_a_split_of_rlds(
+    make: Callable[..., Path], robot: Callable[[], Embodiment], tmp_path: Path
+) -> None:
     folder, out = tmp_path / "set", tmp_path / "out"
-    make_v3(folder, (12, 9, 15))
-    run(lerobot_robot(), folder, out)
+    make(folder, (12, 9, 15))
+    run(robot(), folder, out)
     before = shards(out)
     shutil.rmtree(folder)
-    make_v3(folder, (12, 9, 15, 11))
-    check_extended(lerobot_robot(), folder, out, before, 4)
-
-
-def test_records_added_to_a_split_of_rlds(tmp_path: Path) -> None:
-    folder, out = tmp_path / "set", tmp_path / "out"
-    toy(folder, (4, 3, 5))
-    run(rlds_robot(), folder, out)
-    before = shards(out)
-    shutil.rmtree(folder)
-    toy(folder, (4, 3, 5, 6))
-    check_extended(rlds_robot(), folder, out, before, 4)
+    make(folder, (12, 9, 15, 11))
+    check_extended(robot(), folder, out, before, 4)
 
 
 def test_records_in_another_order_are_refused(tmp_path: Path) -> None:
