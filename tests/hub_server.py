@@ -32,6 +32,7 @@ class Hub(ThreadingHTTPServer):
         before_commit: functions called, one each, before a commit is looked at.
         habits: what it does where the interface leaves it open.
         waits: seconds that clients slept; see `connect`.
+        gone_after: how many requests it answers before it answers none; None for all.
     """
 
     daemon_threads = True
@@ -46,6 +47,7 @@ class Hub(ThreadingHTTPServer):
         self.before_commit: list[Any] = []
         self.habits = Habits()
         self.waits: list[float] = []
+        self.gone_after: int | None = None
         self.stalled = threading.Event()
         self.lock = threading.RLock()
 
@@ -138,6 +140,8 @@ class _Handler(BaseHTTPRequestHandler):
             )
 
     def _fault(self) -> Fault | None:
+        if self.server.gone_after is not None and len(self.server.log) >= self.server.gone_after:
+            return Fault("")
         for fault in self.server.faults:
             if fault.times > 0 and re.search(fault.request, f"{self.command} {self.route}"):
                 fault.times -= 1
@@ -217,11 +221,13 @@ class _Handler(BaseHTTPRequestHandler):
             status = 404 if self.right else 401
             return self._answer(status, {"error": "Repository not found"}, {"X-Error-Code": "RepoNotFound"})
         verb, _, place = rest.partition("/")
-        if verb in ("preupload", "commit") or rest.endswith("objects/batch"):
+        if verb in ("preupload", "commit", "branch") or rest.endswith("objects/batch"):
             if self.right != "write":
                 return self._answer(403 if self.right else 401, {"error": "Forbidden: write rights needed"})
-            actions = {"preupload": self._preupload, "commit": self._commit}
-            return actions.get(verb, self._batch)(repository)
+            if verb not in ("preupload", "commit", "branch"):
+                return self._batch(repository)
+            actions = {"preupload": self._preupload, "commit": self._commit, "branch": self._branch}
+            return actions[verb](repository, place)
         if verb not in ("resolve", "tree", "paths-info", "revision", ""):
             return self._answer(404, {"error": "Not Found"})
         revision, _, path = place.partition("/")
@@ -311,17 +317,26 @@ class _Handler(BaseHTTPRequestHandler):
 
     # -- writing
 
-    def _preupload(self, repository: Repository) -> None:
+    def _branch(self, repository: Repository, name: str) -> None:
+        if name == "main" or name in repository.refs:
+            return self._answer(409, {"error": "Reference already exists"})
+        repository.refs[name] = repository.commits[-1].id
+        return self._answer(201, {})
+
+    def _preupload(self, repository: Repository, revision: str) -> None:
+        commit = repository.at(revision)
+        if commit is None:
+            return self._answer(404, {"error": "Invalid rev id"}, {"X-Error-Code": "RevisionNotFound"})
         answers = []
         for file in json.loads(self.content)["files"]:
-            path, there = file["path"], repository.files.get(file["path"])
+            path, there = file["path"], commit.files.get(file["path"])
             lfs = self.server.habits.by_lfs(path, file["size"])
             ignored = any(fnmatch.fnmatch(path, name) for name in self.server.habits.ignored)
             answer = {"path": path, "uploadMode": "lfs" if lfs else "regular", "shouldIgnore": ignored}
             if there is not None and self.server.habits.tells_oids:
                 answer["oid"] = sha256(there) if lfs else oid(there)
             answers.append(answer)
-        self._answer(200, {"files": answers})
+        return self._answer(200, {"files": answers})
 
     def _batch(self, repository: Repository) -> None:
         objects = []
@@ -345,17 +360,20 @@ class _Handler(BaseHTTPRequestHandler):
         whole = there is not None and len(there) == json.loads(self.content)["size"]
         return self._answer(200 if whole else 404, {})
 
-    def _commit(self, repository: Repository) -> None:
+    def _commit(self, repository: Repository, branch: str) -> None:
         for act in self.server.before_commit[:1]:
             self.server.before_commit.pop(0)
             act()
         with self.server.lock:
-            self._commit_now(repository)
+            self._commit_now(repository, branch)
 
-    def _commit_now(self, repository: Repository) -> None:
+    def _commit_now(self, repository: Repository, branch: str) -> None:
         lines = [json.loads(line) for line in self.content.splitlines()]
         header = lines[0]["value"]
-        if header.get("parentCommit") not in (None, repository.commits[-1].id):
+        head = repository.at(branch)
+        if head is None:
+            return self._answer(404, {"error": "Invalid rev id"}, {"X-Error-Code": "RevisionNotFound"})
+        if header.get("parentCommit") not in (None, head.id):
             conflict = self.server.habits.conflict
             return self._answer(
                 conflict, {"error": "A commit has happened since. Please refresh and try again."}
@@ -371,7 +389,10 @@ class _Handler(BaseHTTPRequestHandler):
                 files[value["path"]] = self.server.objects[value["oid"]]
             else:
                 files[value["path"]] = None
-        made = repository.commit(files, header["summary"])
+        if branch == "main":
+            made = repository.commit(files, header["summary"])
+        else:
+            made = repository.commit_to(branch, files, header["summary"])
         address = f"{self.server.url}/{repository.name}/commit/{made.id}"
         return self._answer(200, {"success": True, "commitOid": made.id, "commitUrl": address})
 

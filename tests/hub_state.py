@@ -89,6 +89,18 @@ class Repository:
             self.refs[branch] = made.id
         return made
 
+    def commit_to(self, branch: str, files: dict[str, bytes | None], message: str) -> Commit:
+        """Add a commit to a branch other than main, below all others."""
+        head = self.at(branch)
+        assert head is not None
+        newest = self.commits[-1]
+        made = self.commit(files, f"{branch}: {message}")
+        made.files = {path: data for path, data in {**head.files, **files}.items() if data is not None}
+        self.commits = [made, *(one for one in self.commits if one is not made)]
+        assert self.commits[-1] is newest
+        self.refs[branch] = made.id
+        return made
+
     def at(self, revision: str) -> Commit | None:
         """The commit of a branch, tag or id."""
         wanted = self.commits[-1].id if revision == "main" else self.refs.get(revision, revision)

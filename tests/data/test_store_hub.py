@@ -20,8 +20,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.store import place
 from tests.conftest import BlockTokenizer
-from tests.hub_server import Hub, Repository, _Handler
-from tests.hub_state import Fault
+from tests.hub_server import Hub, Repository
 
 pytest_plugins = ["tests.hub_fixtures"]
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
@@ -134,6 +133,19 @@ def test_another_conversion_is_refused_before_anything_is_made_and_overwrite_rep
     assert dataset(hub).files["README.md"] == b"# mine"
 
 
+def test_a_branch_gets_the_set_and_main_none_of_it(toy_arm, toy_recording, hub, whole) -> None:
+    out = "hf://datasets/team/arm@dev/sets/one"
+    run(toy_arm, toy_recording, out=out)
+    there = dataset(hub).at("dev").files
+    assert {name: there[f"sets/one/{name}"] for name in whole} == whole
+    assert set(dataset(hub).files) == {".gitattributes"}
+    before = len(dataset(hub).commits)
+    run(toy_arm, toy_recording, out=out)
+    assert len(dataset(hub).commits) == before
+    with pytest.raises(OutputError, match=r"@dev/sets/one: belongs to another conversion"):
+        HubOutput.of(place(out)).refuse_other({**ShardSet(out).manifest.plan, "hash": "0" * 16})
+
+
 def test_no_token_and_no_rights_are_clear_errors(toy_arm, toy_recording, hub, monkeypatch) -> None:
     monkeypatch.delenv("HF_TOKEN")
     with pytest.raises(HubError, match=f"{OUT}: needs a token to be written — log in with hf auth login"):
@@ -191,11 +203,6 @@ def test_a_commit_whose_answer_was_lost_is_not_made_twice(toy_arm, toy_recording
     assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in whole) + 1) // 2
 
 
-def gone(handler: _Handler, after: int) -> Fault | None:
-    """A hub that answers nothing after so many requests."""
-    return Fault("") if len(handler.server.log) >= after else None
-
-
 def test_an_upload_cut_at_any_request_is_ended_by_the_same_command(
     toy_arm, toy_recording, hub, whole, monkeypatch
 ) -> None:
@@ -205,15 +212,14 @@ def test_an_upload_cut_at_any_request_is_ended_by_the_same_command(
     for at in range(200):
         hub.repositories.clear()
         hub.objects.clear()
-        begun = len(hub.log)
-        monkeypatch.setattr(_Handler, "_fault", lambda self, n=begun + at: gone(self, n))
+        hub.gone_after = len(hub.log) + at
         try:
             output.prepare()
             output.upload()
             break
         except (StorageAwayError, StorageError) as fault:
             assert OUT in str(fault) and fault.remedy
-        monkeypatch.setattr(_Handler, "_fault", lambda self: None)
+        hub.gone_after = None
         output.prepare()
         output.upload()
         assert published(hub) == whole

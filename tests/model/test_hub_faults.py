@@ -119,7 +119,46 @@ def test_what_a_hub_says_is_shown_but_never_the_token(server, source):
     assert len(chain) > 1 and not any(TOKEN in text for text in chain)
 
 
+def test_a_push_cut_at_any_request_is_ended_by_the_same_command(server, source):
+    for at in range(200):
+        server.repositories.clear()
+        server.objects.clear()
+        hub.push(source, REPO, ["arm"])
+        before = dict(server.model(REPO).files)
+        server.gone_after = len(server.log) + at
+        try:
+            hub.push(source, REPO, ["hand"])
+            break
+        except HubError as fault:
+            assert fault.remedy
+        finally:
+            server.gone_after = None
+        after = server.model(REPO).files
+        assert after == before or kinds(server) == ["Add arm", "Add hand"]
+        hub.push(source, REPO, ["hand"])
+        assert kinds(server) == ["Add arm", "Add hand"]
+        assert server.model(REPO).files["embodiments/hand/card.json"]
+    assert 5 < at < 199
+
+
 # -- downloads
+
+
+def test_a_pull_cut_at_any_request_is_ended_by_the_same_command(published, source, tmp_path, monkeypatch):
+    for at in range(200):
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / f"cache{at}"))
+        published.gone_after = len(published.log) + at
+        try:
+            hub.pull(REPO, ["arm"], tmp_path / f"out{at}")
+            break
+        except HubError as fault:
+            assert fault.remedy
+        finally:
+            published.gone_after = None
+        out = hub.pull(REPO, ["arm"], tmp_path / f"out{at}")
+        for name in ("trunk.safetensors", *(f"embodiments/arm/{part}" for part in PARTS)):
+            assert (out / name).read_bytes() == (source / name).read_bytes()
+    assert 10 < at < 199
 
 
 def test_an_address_that_is_no_longer_good_is_asked_for_again(published):
