@@ -24,7 +24,8 @@ from hma_data.loader import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import token_column
 from hma_model.checkpoint import require_tokenizer
-from hma_model.metrics import perplexity, psnr, ssim, token_hits, token_nats
+from hma_model.metrics import perplexity, psnr, ssim
+from hma_model.teacher import teacher_forced
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -69,27 +70,6 @@ def windows(
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(np.int64))
     for start in range(0, len(chosen) if len(dataset) else 0, batch_size):
         yield dataset.batch(chosen[start : start + batch_size])
-
-
-@torch.no_grad()
-def teacher_forced(model: "HMA", batch: Batch) -> tuple[Tensor, Tensor]:
-    """Each frame from the second on, fully masked, given as much of the true past as a window holds.
-
-    Returns:
-        nats (B, T-1) float32 a token, averaged over the frame, and accuracy (B, T-1) of whole tokens.
-    """
-    assert batch.tokens is not None
-    nats, hits = [], []
-    factored, mask = model.config.factored, model.config.vocab_size
-    for t in range(1, batch.tokens.shape[1]):
-        window = slice(max(t + 1 - model.config.frames, 0), t + 1)
-        seen = batch.tokens[:, window].clone()
-        seen[:, -1] = mask
-        actions, known = batch.actions[:, window], batch.action_mask[:, window]
-        logits = model.video_logits(seen, actions, batch.embodiment, known)[:, -1]
-        nats.append(token_nats(logits, batch.tokens[:, t], factored).mean(dim=(1, 2)))
-        hits.append(token_hits(logits, batch.tokens[:, t], factored).float().mean(dim=(1, 2)))
-    return torch.stack(nats, dim=1), torch.stack(hits, dim=1)
 
 
 @torch.no_grad()

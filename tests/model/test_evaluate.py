@@ -18,12 +18,13 @@ from hma_model.evaluate import (
     masked_val_loss,
     rollout,
     shuffled_actions,
-    teacher_forced,
     unconditional_baseline,
     validation_losses,
     windows,
 )
+from hma_model.metrics import token_hits, token_nats
 from hma_model.model import HMA
+from hma_model.teacher import teacher_forced
 from tests.model.robots import CONFIG, SPEC, make_model
 from tests.model.shards import make_shards
 
@@ -88,6 +89,36 @@ def test_the_loss_of_a_frame_looks_at_the_past_alone(model, batch):
     later.tokens[:, 3], later.actions[:, 3] = 1, 9.0
     changed, _ = teacher_forced(model, later)
     assert torch.equal(nats[:, :2], changed[:, :2]) and not torch.equal(nats[:, 2], changed[:, 2])
+
+
+@pytest.mark.parametrize("time", ["rotary", "learned"])
+@pytest.mark.parametrize("alignment", ["previous", "current"])
+@pytest.mark.parametrize(
+    "conditioning", ["modulation", "concat", "add", "cross_attention", "concat+modulation"]
+)
+@pytest.mark.parametrize("absent", ["embedding", "tokens", "skip"])
+def test_all_frames_at_once_are_what_each_is_after_its_own_prefix(time, alignment, conditioning, absent):
+    config = CONFIG.replace(
+        frames=6, layers=2, time_position=time, action_alignment=alignment, conditioning=conditioning,
+        absent_action=absent,
+    )  # fmt: skip
+    model = make_model({"arm": 2, "hand": 3}, config=config)
+    torch.manual_seed(4)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    known = torch.rand(4, 6) < 0.7
+    mixed = Batch(["arm", "hand"] * 2, torch.randn(4, 6, 6), known, tokens=torch.randint(64, (4, 6, 2, 3)))
+    nats, hits = teacher_forced(model, mixed)
+    for t in range(1, 6):
+        seen = mixed.tokens[:, : t + 1].clone()
+        seen[:, t] = 64
+        part = slice(t + 1)
+        logits = model.video_logits(seen, mixed.actions[:, part], mixed.embodiment, known[:, part])[:, t]
+        expected = token_nats(logits, mixed.tokens[:, t], (8, 8)).mean(dim=(1, 2))
+        assert torch.allclose(nats[:, t - 1], expected, atol=1e-4)
+        right = token_hits(logits, mixed.tokens[:, t], (8, 8)).float().mean(dim=(1, 2))
+        assert torch.equal(hits[:, t - 1], right)
 
 
 def test_of_a_window_longer_than_the_models_a_frame_sees_what_the_models_holds(data, model):
