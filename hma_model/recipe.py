@@ -49,7 +49,8 @@ def _listed(value: Any) -> Any:
 def _named(value: str) -> str:
     if not value.strip():
         raise ValueError("must name a folder or URI")
-    return value
+    # in YAML and in key=value no shell has done it; a URI must not go through Path
+    return str(Path(value).expanduser()) if value.startswith("~") else value
 
 
 Count = Annotated[int, BeforeValidator(_no_bool)]

@@ -35,6 +35,13 @@ def test_one_folder_of_data_needs_no_list():
     assert load_recipe("discrete_tiny", ["data=shards/arm"]).data == ("shards/arm",)
 
 
+def test_a_home_folder_is_meant_by_its_tilde(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/ada")
+    recipe = make_recipe({"data": ["~/shards", "s3://bucket/~"], "out": "~/runs", "start": "~/base"})
+    assert recipe.data == ("/home/ada/shards", "s3://bucket/~")
+    assert (recipe.out, recipe.start) == ("/home/ada/runs", "/home/ada/base")
+
+
 def test_a_later_override_wins():
     assert load_recipe("discrete_tiny", ["steps=5", "steps=7"]).steps == 7
 
