@@ -23,6 +23,7 @@ def require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
     for name in embodiments:
         require_yaml(source, name)
         checkpoints.read_embodiment(source, name)
+        _require_card(source, name)
         _require_picture(source, name)
 
 
@@ -34,6 +35,17 @@ def require_yaml(source: Checkpoint, name: str) -> None:
     if recorded not in (None, file_sha256(path)):
         remedy = "put the one back that it was trained with; facts for readers can be changed in the card"
         raise CheckpointError(path, f"is not the file that {CARD} names", remedy)
+
+
+def _require_card(source: Checkpoint, name: str) -> None:
+    card, path = source.card(name), source.path(name, CARD)
+    if card.get("id", name) != name:
+        raise CheckpointError(path, f"is the card of {str(card['id'])[:60]!r}", "save the checkpoint again")
+    wanted = {"data": (dict, "an object"), "metrics": (dict, "an object"), "license": (str, "text")}
+    for key, (kind, words) in wanted.items():
+        if not isinstance(card.get(key), (kind, type(None))):
+            fault = f"has a {key} that is {type(card[key]).__name__}, not {words}"
+            raise CheckpointError(path, fault, "correct it, or save the checkpoint again")
 
 
 def _require_picture(source: Checkpoint, name: str) -> None:

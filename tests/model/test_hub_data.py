@@ -79,6 +79,27 @@ def test_a_push_that_was_cut_goes_on_with_what_is_missing(server, shards, monkey
     assert "manifest.json" in dataset(server).files
 
 
+def test_a_push_cut_at_any_request_is_ended_by_the_same_command(server, shards, monkeypatch):
+    monkeypatch.setattr(hub_data, "BATCH", 1)
+    for at in range(200):
+        server.repositories.clear()
+        server.objects.clear()
+        server.gone_after = len(server.log) + at
+        try:
+            push_data(shards, REPO)
+            break
+        except HubError as fault:
+            assert fault.remedy
+        finally:
+            server.gone_after = None
+        push_data(shards, REPO)
+        said = [commit.message for commit in dataset(server).commits[1:]]
+        assert len(said) == len(set(said)) <= 2 and said[-1] == "Add arm"
+        whole = contents(shards)
+        assert {name: dataset(server).files[name] for name in whole} == whole
+    assert 10 < at < 199
+
+
 def test_an_unfinished_push_is_no_shard_set(server, shards, tmp_path, monkeypatch):
     monkeypatch.setattr(hub_data, "BATCH", 1)
     server.create(REPO, "datasets")
