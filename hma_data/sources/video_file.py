@@ -320,4 +320,6 @@ def _explained(path: str) -> Iterator[None]:
     try:
         yield
     except (FFmpegError, MemoryError, OverflowError, UnicodeDecodeError) as fault:
-        raise EpisodeError(path, f"cannot be decoded as video: {fault}") from fault
+        said = getattr(fault, "strerror", None) or fault
+        remedy = "the file may be cut off or damaged"
+        raise EpisodeError(path, f"cannot be decoded as video: {said}", remedy) from fault

@@ -190,3 +190,10 @@ def test_encoding_av1_leaves_the_process_its_turn_among_others(tmp_path: Path) -
     with ordinary_priority():
         make(tmp_path / "v.mp4", *AV1, gop=2)
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+def test_a_file_that_is_no_video_is_told_in_words(tmp_path: Path) -> None:
+    (tmp_path / "v.mp4").write_bytes(b"\0" * 5000)
+    said = "v.mp4: cannot be decoded as video: Invalid data found when processing input — the file may be"
+    with pytest.raises(EpisodeError, match=said):
+        VideoFile(tmp_path / "v.mp4")
