@@ -220,7 +220,10 @@ def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> N
 
     def send(kind: str, value: Any = None) -> None:
         with sending:
-            pipe.send((kind, value))
+            try:
+                pipe.send((kind, value))
+            except (BrokenPipeError, ConnectionResetError):
+                os._exit(1)  # the job is over, and none of its units at fault
 
     try:
         work = make_work(workers)

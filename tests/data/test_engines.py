@@ -5,16 +5,19 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import Pipe, get_context
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hma_data.engines.base import Attempt, Ledger, Limits, Report, Retry, Step
-from hma_data.engines.local import run
+from hma_data.engines.local import run, serve
 from hma_data.errors import HMAError, TokenizerError
 
 FAST = Limits(quiet_s=1.5, kills=3)
@@ -29,6 +32,37 @@ class Unit:
     at: str = ""
     trouble: str = ""
     times: int = 10**6
+
+
+class Telling:
+    """Makes work that tells of itself until nobody listens, and takes a fault of the pipe for a file's."""
+
+    def __call__(self, workers: int) -> Callable[[Any, Report, Attempt], None]:
+        def work(unit: Any, report: Report, attempt: Attempt) -> None:
+            try:
+                while True:
+                    report("here")
+                    time.sleep(0.01)
+            except OSError as fault:
+                raise HMAError("a shard", f"cannot be written: {fault}") from fault
+
+        return work
+
+
+@contextmanager
+def quiet() -> Iterator[list[str]]:
+    """What processes started within write to stderr, at the end."""
+    said: list[str] = []
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield said
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        file.seek(0)
+        said.append(file.read().decode())
 
 
 @dataclass(frozen=True)
@@ -158,6 +192,21 @@ def _runs(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def test_a_worker_that_nobody_hears_any_more_ends_without_a_word() -> None:
+    here, there = Pipe()
+    process = get_context("spawn").Process(target=serve, args=(there, Telling(), 1))
+    with quiet() as said:
+        process.start()
+        there.close()
+        assert here.poll(60) and here.recv() == ("ready", None)
+        here.send(("unit", Attempt()))
+        assert here.poll(60) and here.recv()[0] == "event"
+        here.close()
+        process.join(60)
+        process.kill()  # where it did not end
+    assert process.exitcode == 1 and said == [""]
 
 
 def test_the_ledger_leaves_a_unit_that_was_killed_twice_for_when_nothing_else_runs() -> None:
