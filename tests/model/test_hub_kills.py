@@ -11,6 +11,7 @@ from typing import Any
 import fsspec
 import pytest
 from fsspec.implementations.local import LocalFileSystem
+from fsspec.implementations.memory import MemoryFileSystem
 
 from hma_data import remote_lock
 from hma_data.errors import CheckpointError, HubError, ShardError
@@ -177,4 +178,56 @@ def test_a_pull_killed_anywhere_is_ended_by_the_same_command(versions, tmp_path)
         assert not [path for path in out.rglob("*") if ".part" in path.name]
         if not cut:
             break
+    assert 10 < at < MOST - 1
+
+
+class Killed(BaseException):
+    """Nothing comes after it."""
+
+
+def cut_in_memory(act: Callable[[], object], monkeypatch: pytest.MonkeyPatch, at: int) -> bool:
+    """Run an act whose store does nothing from its change number `at` on; whether it got there."""
+    done = 0
+    with monkeypatch.context() as patched:
+        for name in ("pipe_file", "put_file", "cp_file", "rm_file"):
+            plain = getattr(MemoryFileSystem, name)
+
+            def change(self: Any, *given: Any, plain: Any = plain, **options: Any) -> Any:
+                nonlocal done
+                done += 1
+                if done > at:
+                    raise Killed
+                return plain(self, *given, **options)
+
+            patched.setattr(MemoryFileSystem, name, change)
+        try:
+            act()
+        except Killed:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_push_to_an_object_store_killed_anywhere_is_ended_by_the_same_command(
+    versions, tmp_path, monkeypatch, begun
+):
+    old, new = versions
+    target, objects = "memory://hub/kills", fsspec.filesystem("memory").store
+    for at in range(MOST):
+        objects.clear()
+        if begun:
+            hub.push(old, target)
+        cut = cut_in_memory(lambda: hub.push(new, target), monkeypatch, at)
+        got = tmp_path / f"got{at}"
+        if begun:
+            assert parts(hub.pull(target, ["hand"], got), "hand") == parts(old, "hand")
+        try:
+            assert parts(hub.pull(target, ["arm"], got), "arm") in (parts(old, "arm"), parts(new, "arm"))
+        except (HubError, CheckpointError) as fault:
+            assert not begun or "again" in str(fault.remedy)
+        hub.push(new, target)
+        assert parts(hub.pull(target, ["arm"], tmp_path / f"new{at}"), "arm") == parts(new, "arm")
+        if not cut:
+            break
+    objects.clear()
     assert 10 < at < MOST - 1
