@@ -4,7 +4,10 @@ The client uploads in chunks whenever the library for it is installed, also to a
 and through a firewall that lets none of it pass. Every hub takes files by LFS.
 """
 
+from collections.abc import Sequence
 from typing import Any
+
+from hma_data.errors import HubError
 
 TIMEOUT_S = 30.0
 
@@ -31,6 +34,18 @@ def leave_if_unknown(api: Any, repo: str, kind: str) -> None:
     knows = "x-xet-access-token" in answer.headers or b"accessToken" in answer.content
     if answer.status_code in (200, 400, 404, 405, 501) and not knows:
         constants.HF_HUB_DISABLE_XET = True
+
+
+def refuse_ignored(added: Sequence[Any], where: object) -> None:
+    """Raise HubError where a repository's .gitignore would silently leave out what is to be committed.
+
+    Args:
+        added: the client's CommitOperationAdds, after their preupload.
+    """
+    ignored = [item.path_in_repo for item in added if getattr(item, "_should_ignore", False)]
+    if ignored:
+        fault = f"leaves out {ignored[0]}, by its .gitignore"
+        raise HubError(where, fault, "delete that line there, and push again")
 
 
 def leave_after(fault: BaseException) -> bool:

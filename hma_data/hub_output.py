@@ -20,7 +20,7 @@ from hma_data.errors import HMAError, HubError, OutputError, StorageAwayError, S
 from hma_data.extend import hashes
 from hma_data.files import cache_folder, file_sha256
 from hma_data.hub_bounds import bounded
-from hma_data.hub_chunks import leave_after, leave_if_unknown
+from hma_data.hub_chunks import leave_after, leave_if_unknown, refuse_ignored
 from hma_data.hub_errors import AGAIN, LOG_IN, raised, waiting, without_token
 from hma_data.plan import differences
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SHARD_NAME, Manifest
@@ -196,8 +196,9 @@ class HubOutput:
                 repo_type="dataset",
                 revision=self.branch,
                 free_memory=False,
-                gitignore_content="",  # one in the repository would silently leave files out
+                gitignore_content="",
             )
+            refuse_ignored(added, self.uri)
             made = api.create_commit(
                 self.repo,
                 [*added, *deleted],
@@ -269,10 +270,10 @@ class HubOutput:
                     with bounded():
                         return action()
                 except raised() as fault:
-                    without_token(fault)
-                    busy = getattr(getattr(fault, "response", None), "status_code", None) == BUSY
-                    if not busy or turn == TURNS - 1 or (seconds := waiting(fault, turn)) is None:
-                        raise
+                    cause = _cause(without_token(fault))
+                    busy = getattr(getattr(cause, "response", None), "status_code", None) == BUSY
+                    if not busy or turn == TURNS - 1 or (seconds := waiting(cause, turn)) is None:
+                        raise cause from None if cause is fault else fault
                 time.sleep(seconds)
             raise AssertionError("the last turn returns or raises")
 
@@ -288,6 +289,17 @@ class HubOutput:
 
 class _MovedError(HMAError):
     """A branch has another newest commit than a commit was made for."""
+
+
+def _cause(fault: BaseException) -> BaseException:
+    """What happened, where the client only says which file it was uploading."""
+    from huggingface_hub.errors import HfHubHTTPError
+    from httpx import HTTPError
+
+    cause = fault.__cause__
+    return (
+        cause if isinstance(fault, RuntimeError) and isinstance(cause, HTTPError | HfHubHTTPError) else fault
+    )
 
 
 def _api() -> Any:

@@ -18,7 +18,7 @@ from typing import Any
 from hma_data.errors import HubError
 from hma_data.files import file_sha256
 from hma_data.hub_bounds import bounded, downloading
-from hma_data.hub_chunks import leave_after, leave_if_unknown
+from hma_data.hub_chunks import leave_after, leave_if_unknown, refuse_ignored
 from hma_data.hub_errors import LOG_IN, cuts, explain, explained, raised, waiting, without_token
 from hma_model.checkpoint import README
 from hma_model.files import MAX_JSON_BYTES
@@ -195,11 +195,8 @@ class HuggingFaceStore:
             return
         self._api.preupload_lfs_files(
             self.repo, added, repo_type=self._kind, free_memory=False, gitignore_content=""
-        )  # a .gitignore of the repository would silently leave files out
-        ignored = [item.path_in_repo for item in added if getattr(item, "_should_ignore", False)]
-        if ignored:
-            fault = f"leaves out {ignored[0]}, by its .gitignore"
-            raise HubError(self.name, fault, "delete that line there, and push again")
+        )
+        refuse_ignored(added, self.name)
         self._api.create_commit(
             self.repo,
             [*added, *deleted],
