@@ -273,7 +273,7 @@ class HubOutput:
                     cause = _cause(without_token(fault))
                     busy = getattr(getattr(cause, "response", None), "status_code", None) == BUSY
                     if not busy or turn == TURNS - 1 or (seconds := waiting(cause, turn)) is None:
-                        raise cause from None if cause is fault else fault
+                        raise cause from None
                 time.sleep(seconds)
             raise AssertionError("the last turn returns or raises")
 
@@ -293,13 +293,10 @@ class _MovedError(HMAError):
 
 def _cause(fault: BaseException) -> BaseException:
     """What happened, where the client only says which file it was uploading."""
-    from huggingface_hub.errors import HfHubHTTPError
     from httpx import HTTPError
 
     cause = fault.__cause__
-    return (
-        cause if isinstance(fault, RuntimeError) and isinstance(cause, HTTPError | HfHubHTTPError) else fault
-    )
+    return cause if isinstance(fault, RuntimeError) and isinstance(cause, HTTPError) else fault
 
 
 def _api() -> Any:
