@@ -91,9 +91,11 @@ def convert(
 
     Example: hma convert -e my_arm.yaml --source ./demo.hdf5 --out shards/my_arm
     """
-    from hma_data.convert_recipe import ConversionJob, load_jobs
+    from hma_data.convert_recipe import job_of_options, load_jobs
     from hma_data.output import Share
 
+    if extend and overwrite:
+        raise UsageError("hma convert", "--extend keeps what --overwrite throws away", "give one of them")
     if recipe:
         if embodiment or out or source:
             raise UsageError("--recipe", "states embodiment, source and out itself", "leave the options out")
@@ -104,7 +106,7 @@ def convert(
                 "hma convert", "needs --embodiment and --out, or --recipe", "see hma convert --help"
             )
         jobs = [
-            ConversionJob(
+            job_of_options(
                 embodiment=embodiment,
                 out=out,
                 source=source,

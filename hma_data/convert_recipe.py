@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from hma_data.errors import RecipeError
+from hma_data.errors import RecipeError, UsageError
 from hma_data.plan import Settings
 from hma_data.yaml_io import read_yaml
 
@@ -35,7 +35,7 @@ class ConversionJob(BaseModel):
     engine: Literal["local", "ray"] = "local"
     limit: int | None = Field(None, ge=1)
     frames: Literal["all", "strided"] = "all"
-    frequency_hz: float | None = Field(None, gt=0)
+    frequency_hz: float | None = Field(None, gt=0, allow_inf_nan=False)
     cameras: tuple[str, ...] = ()
     shard_frames: int | None = Field(None, ge=1)
     val_fraction: float = Field(0.05, ge=0, lt=1)
@@ -49,6 +49,20 @@ class ConversionJob(BaseModel):
         return Settings(
             self.frames, self.cameras, self.val_fraction, self.seed, self.limit, self.shard_frames
         )
+
+
+def job_of_options(**values: Any) -> ConversionJob:
+    """The conversion that the command's options state.
+
+    Raises:
+        UsageError: one has a value that is not allowed.
+    """
+    try:
+        return ConversionJob(**values)
+    except ValidationError as fault:
+        first = fault.errors()[0]
+        name = "--" + "-".join(map(str, first["loc"])).replace("_", "-")
+        raise UsageError(name, f"is {first['input']!r}: {first['msg'].lower()}") from fault
 
 
 def load_jobs(path: str | Path) -> list[ConversionJob]:

@@ -103,9 +103,10 @@ def _locks(out: RemotePath) -> list[RemotePath]:
 
 @contextmanager
 def _locked_here(out: Path, share: Share | None) -> Iterator[None]:
-    made = not out.exists()
+    made = False
     with ExitStack() as held:
         try:
+            made = not out.exists()
             out.mkdir(parents=True, exist_ok=True)
             held.enter_context(_lock(out / LOCK, fcntl.LOCK_SH if share else fcntl.LOCK_EX))
             if share:

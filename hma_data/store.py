@@ -38,12 +38,15 @@ def place(where: str | Path) -> Path:
     Also takes what became of a URI in `Path("s3://bucket/set")`, which is `s3:/bucket/set`.
 
     Raises:
-        StorageError: no store is known by that scheme.
+        StorageError: no store is known by that scheme, or it names nothing in it.
         MissingDependencyError: its package is not installed.
     """
     if isinstance(where, RemotePath):
         return where
     found = _SCHEME.fullmatch(str(where))
+    bare = str(where).rstrip("/")
+    if bare.endswith(":") and bare[:-1] in {*DRIVERS, "hf"}:
+        raise StorageError(f"{bare}//", "names no bucket or repository", f"as in {bare}//bucket/folder")
     if not found:
         return Path(where)
     if found[1] in ("file", "local"):

@@ -4,13 +4,15 @@ from pathlib import Path
 
 import h5py
 import pytest
+from typer.testing import CliRunner
 
 from hma_data.convert import convert
 from hma_data.doctor import examine
 from hma_data.embodiment import Embodiment
-from hma_data.errors import HMAError, SourceError, UsageError
+from hma_data.errors import HMAError, OutputError, SourceError, StorageError, UsageError
 from hma_data.inspect import inspect_recording
 from hma_data.sources.base import detect, of_another_format, open_source
+from hma_model.cli import app
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 from tests.data.bag_files import make_recording, write_ros2
 from tests.data.test_rlds import embodiment as rlds_robot
@@ -106,3 +108,34 @@ def test_a_reason_of_one_episode_alone_names_it(toy_arm: Embodiment, tmp_path: P
     (one, count), (many, counts) = sorted(summary.reasons.items(), key=lambda item: item[1])
     assert (count, counts) == (1, 2)
     assert "data/demo_1: has no 'obs/image'" in one and "data/<episode>: has no 'actions'" in many
+
+
+@pytest.mark.parametrize("out", ["s3://", "s3:", "hf://", "gs:///"])
+def test_a_store_without_a_bucket_is_no_folder_of_this_machine(
+    out: str, toy_arm: Embodiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_toy(tmp_path / "toy.hdf5", [5])
+    with pytest.raises(StorageError, match="names no bucket"):
+        convert(toy_arm, "toy.hdf5", BlockTokenizer(), Path(out))
+    assert [item.name for item in tmp_path.iterdir()] == ["toy.hdf5"]
+
+
+def test_an_out_that_cannot_be_named_is_one_clear_error(toy_arm: Embodiment, tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [5])
+    with pytest.raises(OutputError, match="cannot be written: File name too long — choose another --out"):
+        convert(toy_arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / ("n" * 300))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--frequency-hz", "0"], "--frequency-hz: is 0.0: input should be greater than 0"),
+        (["--frequency-hz", "nan"], "--frequency-hz: is nan"),
+        (["--frequency-hz", "inf"], "--frequency-hz: is inf"),
+        (["--extend", "--overwrite"], "give one of them"),
+    ],
+)
+def test_options_that_cannot_be_meant_are_wrong_usage(options: list[str], said: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["convert", "-e", "x", "--out", str(tmp_path / "out"), *options])
+    assert isinstance(result.exception, UsageError) and said in str(result.exception)
