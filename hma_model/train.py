@@ -90,20 +90,22 @@ def train(
         raise UsageError("out", f"is {named!r}, no name of a folder", "name the run's folder with --out DIR")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", named):
         raise UsageError("out", f"is {named!r}, no folder of this machine", "train here, then hma hub push")
-    return _trained(recipe, Path(named), on_progress, show, force)
+    device = choose_device(recipe.device)
+    with join(device) as world:
+        return _trained(recipe, Path(named), device, world, on_progress, show, force)
 
 
 def _trained(
     recipe: Recipe,
     folder: Path,
+    device: torch.device,
+    world: World,
     on_progress: Callable[[dict[str, Any]], None] | None,
     show: bool,
     force: bool,
 ) -> TrainResult:
-    device = choose_device(recipe.device)
     cuda = [device] if device.type == "cuda" else []
     with (
-        join(device) as world,
         writable(folder),
         enough_memory(),
         ExitStack() as stack,

@@ -5,14 +5,13 @@ import json
 import multiprocessing
 import multiprocessing.connection
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
-from torch.distributed import HashStore
+from torch.distributed import HashStore, TCPStore
 
 from hma_data.errors import ShardError, TrainingError
 from hma_model import checkpoint, voice
@@ -57,20 +56,20 @@ def spread(recipe, out: Path, kill_after: int = 0, ranks: int = 2, fail: int | N
 
     A rank that fails or is killed ends the others, as torchrun does. Rank `fail` has a fault after two steps.
     """
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    store = TCPStore(
+        "127.0.0.1", 0, is_master=True, wait_for_workers=False
+    )  # torchrun's, which outlives ranks
     told = out.with_name("told.txt")
     context = multiprocessing.get_context("fork")
     processes = [
-        context.Process(target=_rank, args=(rank, ranks, port, recipe, out, kill_after, told, fail))
+        context.Process(target=_rank, args=(rank, ranks, store.port, recipe, out, kill_after, told, fail))
         for rank in range(ranks)
     ]
     for process in processes:
         process.start()
     multiprocessing.connection.wait([p.sentinel for p in processes])
     for process in processes:
-        process.join(60 if all(p.exitcode in (0, None) for p in processes) else 2)
+        process.join(60 if all(p.exitcode in (0, None) for p in processes) else 10)
         process.kill()
     return told.read_text()
 
@@ -78,7 +77,7 @@ def spread(recipe, out: Path, kill_after: int = 0, ranks: int = 2, fail: int | N
 def _rank(rank, ranks, port, recipe, out, kill_after, told, fail) -> None:
     os.environ.update(
         RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE=str(ranks),
-        MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port),
+        MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), TORCHELASTIC_USE_AGENT_STORE="True",
     )  # fmt: skip
     os.dup2(os.open(told, os.O_CREAT | os.O_WRONLY | os.O_APPEND), 2)
     sys.stderr = os.fdopen(2, "w")
