@@ -69,7 +69,9 @@ def _fail(text: str, code: int) -> int:
     return code
 
 
-Checkpoint = Annotated[str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo.")]
+Checkpoint = Annotated[
+    str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
+]
 Data = Annotated[Path, typer.Argument(help="A shard set.")]
 UnmaskSteps = Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps a frame.")]
 SampleSteps = Annotated[

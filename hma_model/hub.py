@@ -70,9 +70,14 @@ def open_store(
 ) -> Store:
     """The hub behind an address; `private` is of a repository that is made now.
 
+    Args:
+        address: see `addressed`, to write without a revision.
+
     Raises:
         HubError: it is not there, or cannot be reached.
     """
+    if not write:
+        address, revision = addressed(address, revision)
     if is_repository(address):
         from hma_model.hub_hf import HuggingFaceStore
 
@@ -82,6 +87,16 @@ def open_store(
     if revision is not None:
         raise HubError(address, f"is a folder, and has no revision {revision!r}", "leave the revision out")
     return FolderStore(address, write)
+
+
+def addressed[Address: str | Path](
+    address: Address, revision: str | None = None
+) -> tuple[Address | str, str | None]:
+    """`org/name@revision` as the repository and its branch, tag or commit; anything else stays as it is."""
+    repository, _, named = str(address).partition("@")
+    if revision is None and named and not Path(address).exists() and is_repository(repository):
+        return repository, named
+    return address, revision
 
 
 def is_repository(address: str | Path) -> bool:
@@ -157,6 +172,7 @@ def _pull(
     source: str | Path, embodiments: Iterable[str] | None, out: Path | None, revision: str | None
 ) -> tuple[Path, list[str]]:
     """The checkpoint's folder, and the ids that were asked for; the folder may hold others from before."""
+    source, revision = addressed(source, revision)
     store = open_store(source, revision)
     files = store.files()
     values = _config(store, files)
@@ -224,6 +240,7 @@ def from_pretrained(
     device: "str | torch.device" = "cpu",
 ) -> "HMA":
     """See `HMA.from_pretrained`; the source may also be a training run's folder."""
+    source, revision = addressed(source, revision)
     if not is_repository(source) and "://" not in str(source):
         source = checkpoints.resolve(Path(source).expanduser())
     folder, ids = _pull(source, embodiments, None, revision)

@@ -98,8 +98,9 @@ def _files(source: str | Path, revision: str | None) -> tuple[Path, Path]:
 
 
 def _fetched(source: str | Path, revision: str | None) -> tuple[Path, Path]:
-    from hma_model.hub import is_repository, open_store
+    from hma_model.hub import addressed, is_repository, open_store
 
+    source, revision = addressed(source, revision)
     if not is_repository(source) and "://" not in str(source):
         raise CheckpointError(source, "no such file or folder", "give a folder, or ORGANISATION/NAME")
     store = open_store(source, revision)

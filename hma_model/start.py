@@ -58,7 +58,7 @@ class Start:
 
         assert recipe.start is not None
         frozen, place = recipe.freeze == "trunk", out / START
-        source, revision = _addressed(recipe.start)
+        source, revision = hub.addressed(recipe.start)
         local = not hub.is_repository(source) and "://" not in source
         if (place / checkpoints.README).is_file():  # written last
             _require_source(recipe.start, out)
@@ -158,16 +158,6 @@ class Start:
         return notes
 
 
-def _addressed(source: str) -> tuple[str, str | None]:
-    """`org/name@revision` as the repository and its branch, tag or commit; anything else has no revision."""
-    from hma_model import hub
-
-    address, _, revision = source.partition("@")
-    if revision and not Path(source).exists() and hub.is_repository(address):
-        return address, revision
-    return source, None
-
-
 def _require_source(source: str, out: Path) -> None:
     """Raise where a run is asked to go on from another checkpoint than the one it was begun from.
 
@@ -178,7 +168,7 @@ def _require_source(source: str, out: Path) -> None:
     before = _begun_from(out)
     if before in (None, source):
         return
-    address, revision = _addressed(source)
+    address, revision = hub.addressed(source)
     if not hub.is_repository(address) and "://" not in address:
         path = Path(address).expanduser()
         trunk = Checkpoint.open(checkpoints.resolve(path)).trunk_sha256 if path.exists() else None

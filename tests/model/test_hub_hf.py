@@ -204,10 +204,17 @@ def test_a_revision_is_the_one_named(published, source, tmp_path):
     repository.commit(
         {name: (tmp_path / "other" / name).read_bytes() for name in files_of(tmp_path / "other")}
     )
-    for revision in ("v1", repository.refs["v1"]):
-        model = HMA.from_pretrained(REPO, embodiments=["arm"], revision=revision)
-        theirs = checkpoint.load(source, ["arm"]).state_dict()
+    theirs = checkpoint.load(source, ["arm"]).state_dict()
+    commit = repository.refs["v1"]
+    for address, revision in (
+        *((REPO, named) for named in ("v1", commit)),
+        *((f"{REPO}@{named}", None) for named in ("v1", commit)),
+        (f"hf://{REPO}@v1", None),
+    ):
+        model = HMA.from_pretrained(address, embodiments=["arm"], revision=revision)
         assert all(torch.equal(value, theirs[name]) for name, value in model.state_dict().items())
+        assert len(hub.list_embodiments(address, revision)) == len(ROBOTS)
+    assert len(hub.list_embodiments(REPO)) == len(ROBOTS) + 1
 
 
 def test_a_listing_in_pages_is_read_whole(published):
