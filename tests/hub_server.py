@@ -112,32 +112,22 @@ class _Handler(BaseHTTPRequestHandler):
     def _handle(self) -> None:
         split = urlsplit(self.path)
         self.route, self.query = unquote(split.path), parse_qs(split.query)
-        self.bytes_sent = 0
+        host, authorized = self.headers.get("Host", ""), "authorization" in self.headers
+        self.asked = Asked(self.command, self.route, self.headers.get("Range"), authorized, host)
         with self.server.lock:
             self.fault = self._fault()
-        try:
-            if self.fault and self.fault.stall:
-                self.server.stalled.wait(self.fault.stall)
-            if self.fault and self.fault.status:
-                self._body()
-                self._answer(self.fault.status, self.fault.body, self.fault.headers)
-            elif self.fault and self.command in ("POST", "PUT"):
-                self.rfile.read(min(self.fault.after, int(self.headers.get("Content-Length", 0))))
-                self._cut()
-            else:
-                self.content = self._body()
-                self._route()
-        finally:
-            self.server.log.append(
-                Asked(
-                    self.command,
-                    self.route,
-                    self.headers.get("Range"),
-                    "authorization" in self.headers,
-                    self.headers.get("Host", ""),
-                    self.bytes_sent,
-                )
-            )
+            self.server.log.append(self.asked)  # before the answer, after which it is looked at
+        if self.fault and self.fault.stall:
+            self.server.stalled.wait(self.fault.stall)
+        if self.fault and self.fault.status:
+            self._body()
+            self._answer(self.fault.status, self.fault.body, self.fault.headers)
+        elif self.fault and self.command in ("POST", "PUT"):
+            self.rfile.read(min(self.fault.after, int(self.headers.get("Content-Length", 0))))
+            self._cut()
+        else:
+            self.content = self._body()
+            self._route()
 
     def _fault(self) -> Fault | None:
         if self.server.gone_after is not None and len(self.server.log) >= self.server.gone_after:
@@ -308,7 +298,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command == "GET":
             cut = self.fault is not None
             part = part[: self.fault.after] if self.fault else part
-            self.bytes_sent = len(part)
+            self.asked.sent = len(part)
             self.wfile.write(part)
             self.wfile.flush()
             if cut:

@@ -134,7 +134,7 @@ class Fault:
     body: bytes = b'{"error": "made up"}'
 
 
-@dataclass(frozen=True)
+@dataclass
 class Asked:
     """A request and how many bytes of a file were sent for it."""
 
@@ -143,7 +143,7 @@ class Asked:
     range: str | None
     authorized: bool
     host: str
-    sent: int
+    sent: int = 0
 
 
 def sha256(content: bytes) -> str:
