@@ -36,10 +36,10 @@ def test_one_folder_of_data_needs_no_list():
 
 
 def test_a_home_folder_is_meant_by_its_tilde(monkeypatch):
-    monkeypatch.setenv("HOME", "/home/ada")
+    monkeypatch.setenv("HOME", "/ada")
     recipe = make_recipe({"data": ["~/shards", "s3://bucket/~"], "out": "~/runs", "start": "~/base"})
-    assert recipe.data == ("/home/ada/shards", "s3://bucket/~")
-    assert (recipe.out, recipe.start) == ("/home/ada/runs", "/home/ada/base")
+    assert recipe.data == ("/ada/shards", "s3://bucket/~")
+    assert (recipe.out, recipe.start) == ("/ada/runs", "/ada/base")
 
 
 def test_a_later_override_wins():
