@@ -39,6 +39,7 @@ from hma_data.output import (
     remove_journals,
     shard_names,
 )
+from hma_data.paths import StrPath, as_text
 from hma_data.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.shard_work import Job, MakeWork, Tick
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, damaged_files, finish
@@ -99,12 +100,12 @@ class Shared:
 
 
 def plan_conversion(
-    embodiment: Embodiment, source: str | None, tokenizer: Tokenizer, settings: Settings
+    embodiment: Embodiment, source: StrPath | None, tokenizer: Tokenizer, settings: Settings
 ) -> tuple[Plan, str]:
     """The plan of a conversion and the URI it reads; see `convert`."""
-    if source is not None and not source.strip():
+    uri = embodiment.source.uri if source is None else as_text(source)
+    if source is not None and not (uri or "").strip():
         raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
-    uri = source or embodiment.source.uri
     if not uri:
         raise RegistryError(f"embodiment {embodiment.id}", "names no source.uri", "give --source URI")
     if embodiment.frequency_hz == "unknown":
@@ -121,14 +122,14 @@ def plan_conversion(
 
 def convert(
     embodiment: Embodiment,
-    source: str | None,
+    source: StrPath | None,
     tokenizer: str | Tokenizer,
-    out: Path,
+    out: StrPath,
     *,
     settings: Settings | None = None,
     workers: int = 0,
     engine: Literal["local", "ray"] = "local",
-    weights: str | None = None,
+    weights: StrPath | None = None,
     device: str = "cpu",
     limits: Limits = LIMITS,
     max_quarantine: float = 0.01,
@@ -140,11 +141,12 @@ def convert(
 
     Args:
         embodiment: the robot.
-        source: URI of the recording; None takes the one in the embodiment's YAML.
+        source: str or path of the recording, or its URI; None takes the one in the embodiment's YAML.
         tokenizer: name, see `get_tokenizer`; or one that is open already, for work in this process.
         workers: processes, which may crash or hang without ending the job; 0 works in this one.
+        out: str or path of the folder, or its URI.
         engine: what runs the workers: this machine, or a Ray cluster.
-        weights, device: of the tokenizer.
+        weights, device: of the tokenizer; the weights as str or path.
         limits: when a worker counts as hanging, and how often it may be lost.
         max_quarantine: fraction of episodes that may be refused.
         overwrite: throw away what `out` holds, if it is a shard set.
@@ -197,14 +199,14 @@ def convert(
 
 def convert_share(
     embodiment: Embodiment,
-    source: str | None,
+    source: StrPath | None,
     tokenizer: str | Tokenizer,
-    out: Path,
+    out: StrPath,
     share: Share,
     *,
     settings: Settings | None = None,
     workers: int = 0,
-    weights: str | None = None,
+    weights: StrPath | None = None,
     device: str = "cpu",
     limits: Limits = LIMITS,
     extend: bool = False,
@@ -237,13 +239,13 @@ class _Conversion:
     def __init__(
         self,
         embodiment: Embodiment,
-        source: str | None,
+        source: StrPath | None,
         tokenizer: str | Tokenizer,
         out: Path,
         settings: Settings,
         workers: int,
         engine: str,
-        weights: str | None,
+        weights: StrPath | None,
         device: str,
         limits: Limits,
     ) -> None:
@@ -251,7 +253,7 @@ class _Conversion:
         self._named = isinstance(tokenizer, str)
         alone = not self._named or str(out).startswith("memory:")  # which no other process would see
         self._workers, self._engine, self._limits = 0 if alone else workers, engine, limits
-        self._weights, self._device = weights, device
+        self._weights, self._device = None if weights is None else as_text(weights), device
         self._tokenizer = (
             get_tokenizer(tokenizer, weights=weights, device=device)
             if isinstance(tokenizer, str)

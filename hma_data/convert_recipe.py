@@ -16,6 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hma_data.errors import RecipeError, UsageError
+from hma_data.paths import StrPath, as_path
 from hma_data.plan import Settings
 from hma_data.yaml_io import read_yaml
 
@@ -65,13 +66,17 @@ def job_of_options(**values: Any) -> ConversionJob:
         raise UsageError(name, f"is {first['input']!r}: {first['msg'].lower()}") from fault
 
 
-def load_jobs(path: str | Path) -> list[ConversionJob]:
+def load_jobs(path: StrPath) -> list[ConversionJob]:
     """The conversions of a recipe, in its order.
+
+    Args:
+        path: str or path of the YAML.
 
     Raises:
         RecipeError: an unknown key, a value of another type, two jobs with one `out`.
     """
-    values = read_yaml(Path(path), RecipeError)
+    path = as_path(path)
+    values = read_yaml(path, RecipeError)
     if not isinstance(values, dict) or not isinstance(values.get("jobs"), list) or not values["jobs"]:
         raise RecipeError(path, "holds no jobs", "expected `jobs:` with a list, see recipes/convert")
     unknown = sorted(set(values) - {"defaults", "jobs", "description"})
@@ -103,7 +108,7 @@ def _job(defaults: dict[str, Any], item: Any, where: str) -> ConversionJob:
         raise RecipeError(where, f"{key} is {first['input']!r}: {first['msg'].lower()}") from fault
 
 
-def _refuse_repeated(outs: Sequence[Path], path: str | Path) -> None:
+def _refuse_repeated(outs: Sequence[Path], path: Path) -> None:
     seen: set[Path] = set()
     for out in outs:
         if out.absolute() in seen:

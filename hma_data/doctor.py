@@ -16,6 +16,7 @@ from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment, find
 from hma_data.episode import Clip
 from hma_data.errors import HMAError, SourceError
+from hma_data.paths import StrPath, as_text
 from hma_data.sources.base import SAMPLE, Inspection, detect, of_another_format, open_source
 from hma_data.sources.findings import SEVERITIES, Finding, Severity
 from hma_data.sources.survey import sampled
@@ -26,17 +27,19 @@ WINDOW = 12  # frames of the model's window, by default
 LOOKS = ("blank", "still", "colour", "size")  # checks of pictures, which matter for cameras that are used
 
 
-def examine(target: str, embodiment: str | None = None, sample: int = SAMPLE) -> list[Finding]:
+def examine(target: StrPath, embodiment: StrPath | None = None, sample: int = SAMPLE) -> list[Finding]:
     """Everything the checks find, worst first.
 
     Args:
-        target: a recording, or the folder of a shard set.
-        embodiment: id or YAML; with it a recording's episodes are read and aligned as this robot's.
+        target: str or path (or URI) of a recording, or of the folder of a shard set.
+        embodiment: id, or str or path of a YAML; with it a recording's episodes are read and aligned as this
+            robot's.
         sample: how many episodes are looked into, evenly spaced.
 
     Raises:
         RegistryError: no such embodiment.
     """
+    target = as_text(target)
     if _is_shard_set(target):
         found = list(_shard_set(place(target)))
     else:

@@ -13,12 +13,12 @@ import os
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from hma_data.errors import RegistryError
+from hma_data.paths import StrPath, as_path, as_text
 from hma_data.registry import file_id, registry_files, registry_folders
 from hma_data.spec import (
     Action,
@@ -215,13 +215,17 @@ class Embodiment(SpecModel):
         return cls.from_values(parse_yaml(text, where), where)
 
     @classmethod
-    def load(cls, path: str | Path) -> "Embodiment":
+    def load(cls, path: StrPath) -> "Embodiment":
         """The embodiment of a YAML file.
+
+        Args:
+            path: str or path of the YAML.
 
         Raises:
             RegistryError: all the file's problems, each with YAML path, value and what is allowed.
         """
-        return cls.from_values(read_yaml(Path(path)), str(path))
+        file = as_path(path)
+        return cls.from_values(read_yaml(file), str(file))
 
     @classmethod
     def from_values(cls, values: Any, where: str) -> "Embodiment":
@@ -354,12 +358,17 @@ def schema() -> dict[str, Any]:
 # -- where embodiments are found
 
 
-def find(name_or_path: str, beside: Path | None = None) -> Embodiment:
+def find(name_or_path: StrPath, beside: StrPath | None = None) -> Embodiment:
     """The embodiment of that id, or of that YAML file.
+
+    Args:
+        name_or_path: id, or str or path of a YAML.
+        beside: str or path of a checkpoint whose embodiments are searched too.
 
     Raises:
         RegistryError: there is none, with the nearest ids; or its YAML is not valid.
     """
+    name_or_path = as_text(name_or_path)
     if name_or_path.endswith((".yaml", ".yml")) or os.sep in name_or_path:
         return Embodiment.load(name_or_path)
     folders = registry_folders(beside)

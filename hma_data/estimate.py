@@ -9,6 +9,7 @@ import numpy as np
 from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment
 from hma_data.errors import HMAError
+from hma_data.paths import StrPath
 from hma_data.plan import Plan
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
@@ -34,7 +35,9 @@ class Estimate:
     fault: str = ""
 
 
-def estimate(plan: Plan, uri: str, embodiment: Embodiment, tokenizer: Tokenizer, workers: int) -> Estimate:
+def estimate(
+    plan: Plan, uri: StrPath, embodiment: Embodiment, tokenizer: Tokenizer, workers: int
+) -> Estimate:
     """Read and tokenize a little of the first readable episode, and multiply."""
     stride = plan.facts["frame_stride"]
     cameras = plan.facts["cameras"]

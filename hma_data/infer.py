@@ -17,6 +17,7 @@ from hma_data.infer_choices import Choice, actions, camera_names, cameras, instr
 from hma_data.infer_space import names_of, space_of
 from hma_data.infer_text import yaml_text
 from hma_data.infer_words import dims, is_gripper, shown, vectors
+from hma_data.paths import StrPath
 from hma_data.sources.base import Inspection, KeyInfo, detect, open_source
 from hma_data.spec import Space
 
@@ -24,8 +25,12 @@ HIGHEST_HZ = 100_000  # of a rate in a YAML
 MEASURED_TO = 5e-4  # of a rate; what time stamps leave open comes on top
 
 
-def infer(uri: str, embodiment_id: str) -> str:
+def infer(uri: StrPath, embodiment_id: str) -> str:
     """The YAML of an embodiment that reads `uri`.
+
+    Args:
+        uri: str or path of the recording, or its URI.
+        embodiment_id: of the new embodiment.
 
     Raises:
         UsageError: not an id.

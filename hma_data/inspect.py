@@ -10,6 +10,7 @@ from hma_data.align import to_clip
 from hma_data.embodiment import Embodiment, find
 from hma_data.episode import Clip
 from hma_data.errors import HMAError, SourceError
+from hma_data.paths import StrPath, as_text
 from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
 from hma_data.sources.findings import SEVERITIES, Finding
 from hma_data.sources.survey import CHECKS
@@ -17,18 +18,20 @@ from hma_data.sources.survey import CHECKS
 TRIED = 20  # episodes looked at for one that can be read
 
 
-def inspect_recording(uri: str, embodiment: str | None = None, episodes: int = SAMPLE) -> dict[str, Any]:
+def inspect_recording(
+    uri: StrPath, embodiment: StrPath | None = None, episodes: int = SAMPLE
+) -> dict[str, Any]:
     """Everything `hma inspect` says, as plain values.
 
     Args:
-        uri: of the recording.
-        embodiment: id or YAML; with it the first readable episode is aligned and checked.
+        uri: str or path of the recording, or its URI.
+        embodiment: id, or str or path of a YAML; with it the first readable episode is aligned and checked.
         episodes: how many are looked into, spread evenly over all.
 
     Raises:
         SourceError: the recording cannot be read at all.
     """
-    robot = find(embodiment) if embodiment else None
+    uri, robot = as_text(uri), find(embodiment) if embodiment else None
     source = open_source(robot.source.format if robot else detect(uri))
     try:
         inspection = source.inspect(uri, episodes)

@@ -14,7 +14,6 @@ B batch, T frames, h·w grid, c·H·W latents, A action dims, K = stride·A.
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 from hma_data.batch import Batch, as_batch, assemble
 from hma_data.errors import HMAError, ShardError, UsageError
 from hma_data.mixture import TEMPERATURES, Draw, Mixture
+from hma_data.paths import StrPath
 from hma_data.pools import Deal, Stream, pool_size
 from hma_data.row_groups import MIB, Decoder
 from hma_data.shards.reader import ShardSet
@@ -31,8 +31,11 @@ from hma_data.windows import Ints, Short
 __all__ = ["Batch", "MixtureDataset", "WindowDataset", "as_batch", "open_sets"]
 
 
-def open_sets(data: Sequence[str | Path | ShardSet]) -> dict[str, ShardSet]:
+def open_sets(data: Sequence[StrPath | ShardSet]) -> dict[str, ShardSet]:
     """Shard sets by embodiment id.
+
+    Args:
+        data: of each set the str or path of its folder, its URI, or the set itself.
 
     Raises:
         ShardError: none given, two of one embodiment, or sets of different tokenizers.
@@ -68,7 +71,7 @@ class WindowDataset(Dataset[Batch]):
     A torch DataLoader takes it with `collate_fn=as_batch`.
 
     Args:
-        data: the shard set.
+        data: str or path of the shard set, its URI, or the set itself.
         split: train or val.
         frames: T.
         stride: rows between frames; None takes the embodiment's.
@@ -81,7 +84,7 @@ class WindowDataset(Dataset[Batch]):
 
     def __init__(
         self,
-        data: str | Path | ShardSet,
+        data: StrPath | ShardSet,
         split: str,
         frames: int = 12,
         stride: int | None = None,
@@ -166,7 +169,7 @@ class MixtureDataset(IterableDataset[Batch]):
 
     def __init__(
         self,
-        data: Sequence[str | Path | ShardSet],
+        data: Sequence[StrPath | ShardSet],
         batch_size: int,
         frames: int = 12,
         *,

@@ -1,25 +1,26 @@
 """Plots of the data side: axes with units, readable in light and dark and without colour vision."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hma_data.files import atomic_path
 from hma_data.mixture import Mixture
+from hma_data.paths import StrPath, as_path
 
 BLUE, ORANGE, GREY = "#0072b2", "#e69f00", "#666666"
 LONGEST_NAME = 34
 
 
-def plot_mixture(mixture: Mixture, temperature: float, path: Path) -> None:
+def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:
     """Bars of the probabilities beside what proportional sampling would give; the largest set on top.
 
     Args:
-        path: its suffix decides the format: .png, .svg, .pdf.
+        path: str or path of the file to write; its suffix decides the format: .png, .svg, .pdf.
     """
     from matplotlib.figure import Figure
 
+    path = as_path(path)
     order = np.argsort(-np.array(mixture.counts), kind="stable")
     counts, p = np.array(mixture.counts)[order], mixture.p[order]
     proportional = counts / max(1, counts.sum())

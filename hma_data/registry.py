@@ -8,7 +8,7 @@ them, never by a time stamp: it cannot be stale.
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any
 
 from hma_data.errors import HMAError, RegistryError
 from hma_data.files import cache_folder, write_atomic
+from hma_data.paths import StrPath, as_path
 from hma_data.shipped import shipped
 from hma_data.yaml_io import decode_yaml, parse_yaml, read_bytes
 
@@ -23,19 +24,23 @@ MAX_KEPT = 100_000  # judgements kept in the cache
 _JUDGES = ("embodiment.py", "spec.py", "yaml_io.py", "registry.py")
 
 
-def registry_folders(beside: Path | None = None) -> list[Path]:
-    """Folders searched for an id, first wins: ./registry, $HMA_REGISTRY, beside a checkpoint, shipped."""
+def registry_folders(beside: StrPath | None = None) -> list[Path]:
+    """Folders searched for an id, first wins: ./registry, $HMA_REGISTRY, beside a checkpoint, shipped.
+
+    Args:
+        beside: str or path of the checkpoint.
+    """
     folders = [Path("registry")]
     folders += [Path(entry) for entry in os.environ.get("HMA_REGISTRY", "").split(os.pathsep) if entry]
     if beside:
-        folders.append(beside / "embodiments")
+        folders.append(as_path(beside) / "embodiments")
     folders.append(shipped("registry"))
     return list(dict.fromkeys(folder.resolve() for folder in folders if folder.is_dir()))
 
 
-def registry_files(folders: list[Path] | None = None) -> Iterator[Path]:
-    """Every YAML of the registry, in search order."""
-    for folder in registry_folders() if folders is None else folders:
+def registry_files(folders: Iterable[StrPath] | None = None) -> Iterator[Path]:
+    """Every YAML of the registry (or of those folders, each a str or path), in search order."""
+    for folder in registry_folders() if folders is None else map(as_path, folders):
         found = [
             f"{root}/{name}"
             for root, _, names in os.walk(folder)
@@ -67,15 +72,15 @@ class Entry:
     name: str | None
 
 
-def entries(files: list[Path] | None = None) -> list[Entry]:
-    """Every YAML of the registry (or of those files), judged, in search order.
+def entries(files: Iterable[StrPath] | None = None) -> list[Entry]:
+    """Every YAML of the registry (or of those files, each a str or path), judged, in search order.
 
     Problems between files are added: an id that two files of one folder tree claim, and in a registry
     folder a file that its own id does not find.
     """
     judged = _Cache()
     if files is not None:
-        found = [_entry(path, judged) for path in files]
+        found = [_entry(as_path(path), judged) for path in files]
         judged.save()
         return _doubles(found)
     found = []

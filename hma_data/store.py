@@ -19,6 +19,7 @@ from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
 from hma_data.errors import HMAError, MissingDependencyError, StorageAwayError, StorageError
+from hma_data.paths import StrPath, as_text
 from hma_data.reach import reach
 from hma_data.retry import worth_another_try
 from hma_data.sources.fetching import ABSENT, may_pass, said
@@ -32,10 +33,11 @@ _SCHEME = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
 log = logging.getLogger(__name__)
 
 
-def place(where: str | Path) -> Path:
+def place(where: StrPath) -> Path:
     """The path a user named: of this machine, or a RemotePath where it begins with a store's scheme.
 
-    Also takes what became of a URI in `Path("s3://bucket/set")`, which is `s3:/bucket/set`.
+    Args:
+        where: str or path; also what became of a URI in `Path("s3://bucket/set")`, `s3:/bucket/set`.
 
     Raises:
         StorageError: no store is known by that scheme, or it names nothing in it.
@@ -43,15 +45,15 @@ def place(where: str | Path) -> Path:
     """
     if isinstance(where, RemotePath):
         return where
-    found = _SCHEME.fullmatch(str(where))
-    bare = str(where).rstrip("/")
+    text = as_text(where)
+    found, bare = _SCHEME.fullmatch(text), text.rstrip("/")
     if bare.endswith(":") and bare[:-1] in {*DRIVERS, "hf"}:
         raise StorageError(f"{bare}//", "names no bucket or repository", f"as in {bare}//bucket/folder")
     if not found:
-        return Path(where)
+        return Path(text)
     if found[1] in ("file", "local"):
         return Path("/" + found[2])
-    path = RemotePath(str(where))
+    path = RemotePath(text)
     _ = path.files  # whether there is a driver
     return path
 

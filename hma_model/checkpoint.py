@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from hma_data.embodiment import Embodiment
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.files import file_sha256, write_atomic
+from hma_data.paths import StrPath, as_path
 from hma_model import weights
 from hma_model.checkpoint_folder import (
     CARD,
@@ -54,7 +55,7 @@ __all__ = [
 
 def save(
     model: "HMA",
-    folder: str | Path,
+    folder: StrPath,
     *,
     embodiment_yaml: Mapping[str, str],
     stats: Mapping[str, dict[str, Any]],
@@ -68,7 +69,7 @@ def save(
 
     Args:
         model: with every embodiment of `embodiment_yaml`.
-        folder: its name; an error leaves an older checkpoint there as it was.
+        folder: str or path of its folder; an error leaves an older checkpoint there as it was.
         embodiment_yaml: id -> registry YAML.
         stats: id -> {"action": {"mean", "std", ...}, ...}.
         cards: id -> what is known of its data and metrics; ids without one get an empty one.
@@ -116,7 +117,7 @@ def save(
 
 
 def load(
-    folder: str | Path,
+    folder: StrPath,
     embodiments: Iterable[str] | None = None,
     device: str = "cpu",
     tokenizer: "TokenizerSpec | None" = None,
@@ -124,7 +125,7 @@ def load(
     """The model of a checkpoint with the trunk and the embodiments asked for, and nothing else read.
 
     Args:
-        folder: of a checkpoint, or of a training run.
+        folder: str or path of a checkpoint, or of a training run.
         embodiments: ids; None for all that are there.
         device: where the model goes.
         tokenizer: refuse a model that was trained on another.
@@ -174,7 +175,7 @@ def read_embodiment(
     return space, *weights.embodiment(checkpoint, embodiment, space)
 
 
-def update_card(folder: str | Path, embodiment: str, **facts: Any) -> dict[str, Any]:
+def update_card(folder: StrPath, embodiment: str, **facts: Any) -> dict[str, Any]:
     """Add to an embodiment's card (`metrics` merges, all else replaces) and renew README.md."""
     checkpoint = Checkpoint.open(folder)
     card = dict(checkpoint.card(embodiment))
@@ -185,10 +186,11 @@ def update_card(folder: str | Path, embodiment: str, **facts: Any) -> dict[str, 
     return card
 
 
-def write_readme(folder: Path) -> None:
+def write_readme(folder: StrPath) -> None:
     """Make README.md from the cards in a checkpoint's folder."""
     from hma_model.model_card import render
 
+    folder = as_path(folder)
     checkpoint = Checkpoint.open(folder)
     cards = {name: checkpoint.card(name) for name in checkpoint.embodiments}
     samples = {name for name in cards if (folder / "embodiments" / name / SAMPLE).is_file()}
@@ -196,8 +198,9 @@ def write_readme(folder: Path) -> None:
     write_atomic(folder / README, text)
 
 
-def remove(folder: Path) -> None:
+def remove(folder: StrPath) -> None:
     """Delete a checkpoint so that a cut deletion leaves no half of one under its name."""
+    folder = as_path(folder)
     doomed = folder.with_name(f".{folder.name}.partial-removed")
     shutil.rmtree(doomed, ignore_errors=True)
     folder.rename(doomed)

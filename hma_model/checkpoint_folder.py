@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from hma_data.embodiment import ID_PATTERN, Embodiment
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.files import file_sha256
+from hma_data.paths import StrPath, as_path
 from hma_model import migrate
 from hma_model.config import HMAConfig
 from hma_model.files import read_json, read_metadata
@@ -74,13 +75,16 @@ class Checkpoint:
     _cards: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def open(cls, folder: str | Path) -> "Checkpoint":
+    def open(cls, folder: StrPath) -> "Checkpoint":
         """The checkpoint in a folder, or the newest one of a training run's folder.
+
+        Args:
+            folder: str or path of it.
 
         Raises:
             CheckpointError: there is none, it is damaged, or of a format this release does not read.
         """
-        folder = resolve(Path(folder))
+        folder = resolve(folder)
         values = read_json(inside(folder, CONFIG))
         config = parse_config(values, folder / CONFIG)
         home = folder / "embodiments"
@@ -187,12 +191,16 @@ def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
         raise CheckpointError(where, f"does not describe a model: {fault}", "update or save again") from fault
 
 
-def resolve(folder: Path) -> Path:
+def resolve(folder: StrPath) -> Path:
     """The checkpoint meant by a path: itself, or the newest below a training run's `checkpoints/`.
+
+    Args:
+        folder: str or path of it.
 
     Raises:
         CheckpointError: there is none.
     """
+    folder = as_path(folder)
     if (folder / CONFIG).is_file():
         return folder
     steps = training_checkpoints(folder)
@@ -202,9 +210,9 @@ def resolve(folder: Path) -> Path:
     raise CheckpointError(folder, fault, "give a checkpoint, or the folder of a training run")
 
 
-def training_checkpoints(run: Path) -> list[Path]:
-    """Checkpoints of a training run, oldest first."""
-    return sorted(path for path in (run / "checkpoints").glob("step-*") if (path / CONFIG).is_file())
+def training_checkpoints(run: StrPath) -> list[Path]:
+    """Checkpoints of a training run (str or path of its folder), oldest first."""
+    return sorted(path for path in (as_path(run) / "checkpoints").glob("step-*") if (path / CONFIG).is_file())
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -25,6 +25,7 @@ from hma_data.errors import OutputError, ShardError
 from hma_data.files import write_atomic
 from hma_data.loader import open_sets
 from hma_data.mixture import Mixture
+from hma_data.paths import StrPath, as_path
 from hma_data.plan import Settings
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
@@ -80,10 +81,11 @@ class Demo:
         write_atomic(path, json.dumps(known))
 
 
-def demo(out: Path, *, episodes: int = 24, steps: int | None = None, seed: int = 0) -> Path:
+def demo(out: StrPath, *, episodes: int = 24, steps: int | None = None, seed: int = 0) -> Path:
     """Run the main job into `out`.
 
     Args:
+        out: str or path of a folder.
         episodes: recorded for each robot.
         steps: of training; None takes the recipe's.
         seed: of recording and training.
@@ -95,6 +97,7 @@ def demo(out: Path, *, episodes: int = 24, steps: int | None = None, seed: int =
         OutputError: the folder holds something else.
         MissingDependencyError: gym-pusht is not installed.
     """
+    out = as_path(out)
     _refuse_foreign(out)
     made = Demo(out)
     with made.stage(1, "record"):

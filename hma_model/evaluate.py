@@ -11,7 +11,6 @@ B batch, T frames, P frames of the prompt, h,w grid, F digits, V values a digit,
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from hma_data.errors import UsageError
 from hma_data.loader import Batch, WindowDataset
+from hma_data.paths import StrPath
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import token_column
 from hma_model.checkpoint import require_tokenizer
@@ -63,7 +63,7 @@ class Means:
 
 
 def windows(
-    data: str | Path | ShardSet, split: str, frames: int, count: int, batch_size: int = 8
+    data: StrPath | ShardSet, split: str, frames: int, count: int, batch_size: int = 8
 ) -> Iterator[Batch]:
     """Up to `count` windows of a split, evenly spaced and always the same, in batches."""
     dataset = WindowDataset(data, split, frames)
@@ -125,12 +125,12 @@ def digit_frequencies(
 
 
 def unconditional_baseline(
-    train: Mapping[str, ShardSet] | Sequence[str | Path | ShardSet], batches: Iterable[Batch]
+    train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet], batches: Iterable[Batch]
 ) -> Means:
     """What looking at nothing reaches: cross-entropy of each embodiment's training frequencies.
 
     Args:
-        train: shard sets, whose train frames are counted, digit by digit.
+        train: shard sets (or the str or path of each), whose train frames are counted, digit by digit.
         batches: validation windows of discrete tokens.
 
     Returns:
@@ -248,7 +248,7 @@ def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0) -> Tensor:
 def evaluate(
     model: "HMA",
     tokenizer: "Tokenizer",
-    data: str | Path | ShardSet,
+    data: StrPath | ShardSet,
     *,
     split: str = "val",
     count: int = 32,
@@ -266,7 +266,7 @@ def evaluate(
     Args:
         model: with the shard set's embodiment.
         tokenizer: the shard set's.
-        data: the shard set.
+        data: str or path of the shard set, its URI, or the set itself.
         split: train or val.
         count: windows, evenly spaced; where the split has fewer, all.
         frames: T of a window; by default the model's.
@@ -372,5 +372,5 @@ def _real(real: RealFrames, batch: Batch, shards: ShardSet) -> NDArray[np.uint8]
     return np.stack([real(int(e), frames) for e, frames in zip(batch.episode, recorded)])
 
 
-def _opened(item: str | Path | ShardSet) -> ShardSet:
+def _opened(item: StrPath | ShardSet) -> ShardSet:
     return item if isinstance(item, ShardSet) else ShardSet(item)

@@ -1,7 +1,6 @@
 """A rollout as a film: truth, prediction with its actions, prediction with other actions, side by side."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from hma_data.errors import UsageError
 from hma_data.files import atomic_path
 from hma_data.loader import WindowDataset
+from hma_data.paths import StrPath, as_path
 from hma_data.shards.reader import ShardSet
 from hma_data.sheets import webp_bytes, with_actions, write_mp4, write_text
 from hma_model.checkpoint import require_tokenizer
@@ -109,12 +109,13 @@ def _side_by_side(panels: dict[str, NDArray[np.uint8]], prompt: int) -> NDArray[
     return film
 
 
-def write_film(path: Path, film: Film) -> None:
-    """An .mp4 or an animated .webp, whole or absent.
+def write_film(path: StrPath, film: Film) -> None:
+    """An .mp4 or an animated .webp at a str or path, whole or absent.
 
     Raises:
         UsageError: another suffix.
     """
+    path = as_path(path)
     if path.suffix == ".mp4":
         write_mp4(path, film.frames, film.fps)
     elif path.suffix == ".webp":

@@ -6,12 +6,12 @@ With the trunk frozen the result can be pushed to the hub that the trunk came fr
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from hma_data.errors import UsageError
+from hma_data.paths import StrPath, as_text
 from hma_model.recipe import load_recipe
 
 if TYPE_CHECKING:
@@ -21,24 +21,25 @@ RECIPE = "finetune"
 
 
 def finetune(
-    source: str | Path,
-    data: Sequence[str | Path],
+    source: StrPath,
+    data: Sequence[StrPath],
     *,
-    out: str | Path | None = None,
+    out: StrPath | None = None,
     freeze_trunk: bool = False,
     overrides: Sequence[str] = (),
-    recipe: str | Path = RECIPE,
+    recipe: StrPath = RECIPE,
     **options: Any,
 ) -> "TrainResult":
     """Train on a checkpoint's trunk; run it again to resume.
 
     Args:
-        source: a checkpoint, a run's folder, a URI, or a hub repository, also `org/name@revision`.
-        data: folders of shards, made with the checkpoint's tokenizer.
-        out: the run's folder; by default that of the overrides.
+        source: str or path of a checkpoint or a run's folder, a URI, or a hub repository, also
+            `org/name@revision`.
+        data: str or path of folders of shards, made with the checkpoint's tokenizer.
+        out: str or path of the run's folder; by default that of the overrides.
         freeze_trunk: train stems and heads alone.
         overrides: `key=value` over the recipe.
-        recipe: name or path.
+        recipe: name, or str or path of a YAML.
         options: `show`, `force`, `on_progress` of `hma_model.train.train`.
 
     Raises:
@@ -51,8 +52,8 @@ def finetune(
     if not data:
         raise UsageError("--data", "names no shards", "give the folder of hma convert")
     given = {
-        "start": str(source),
-        "data": [str(folder) for folder in data],
+        "start": as_text(source),
+        "data": [as_text(folder) for folder in data],
         "freeze": "trunk" if freeze_trunk else "nothing",
     }
     ours = [f"{key}={yaml.safe_dump(value, default_flow_style=True)}" for key, value in given.items()]

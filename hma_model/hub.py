@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from hma_data.embodiment import ID_PATTERN
 from hma_data.errors import CheckpointError, HMAError, HubError
+from hma_data.paths import StrPath, as_address, as_path
 from hma_model import checkpoint as checkpoints
 from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
@@ -66,27 +67,28 @@ class Store(Protocol):
 
 
 def open_store(
-    address: str | Path, revision: str | None = None, write: bool = False, private: bool | None = None
+    address: StrPath, revision: str | None = None, write: bool = False, private: bool | None = None
 ) -> Store:
     """The hub behind an address; `private` is of a repository that is made now.
 
     Args:
-        address: see `addressed`, to write without a revision.
+        address: str or path, see `addressed`; to write without a revision.
 
     Raises:
         HubError: it is not there, or cannot be reached.
     """
+    place = as_address(address)
     if not write:
-        address, revision = addressed(address, revision)
-    if is_repository(address):
+        place, revision = addressed(place, revision)
+    if is_repository(place):
         from hma_model.hub_hf import HuggingFaceStore
 
-        return HuggingFaceStore(str(address).removeprefix("hf://"), revision, write, private=private)
+        return HuggingFaceStore(str(place).removeprefix("hf://"), revision, write, private=private)
     from hma_model.hub_folder import FolderStore
 
     if revision is not None:
-        raise HubError(address, f"is a folder, and has no revision {revision!r}", "leave the revision out")
-    return FolderStore(address, write)
+        raise HubError(place, f"is a folder, and has no revision {revision!r}", "leave the revision out")
+    return FolderStore(place, write)
 
 
 def addressed[Address: str | Path](
@@ -99,28 +101,29 @@ def addressed[Address: str | Path](
     return address, revision
 
 
-def is_repository(address: str | Path) -> bool:
+def is_repository(address: StrPath) -> bool:
     """Whether an address means a repository of the hub: hf://org/name, or org/name that is no folder here."""
-    if isinstance(address, Path):
+    place = as_address(address)
+    if isinstance(place, Path):
         return False
-    if address.startswith("hf://"):
-        if not REPOSITORY.fullmatch(address.removeprefix("hf://")):
-            raise HubError(address, "is not hf://ORGANISATION/NAME", "name a model repository")
+    if place.startswith("hf://"):
+        if not REPOSITORY.fullmatch(place.removeprefix("hf://")):
+            raise HubError(place, "is not hf://ORGANISATION/NAME", "name a model repository")
         return True
-    return REPOSITORY.fullmatch(address) is not None and not Path(address).is_dir()
+    return REPOSITORY.fullmatch(place) is not None and not Path(place).is_dir()
 
 
 def push(
-    checkpoint: str | Path,
-    target: str | Path,
+    checkpoint: StrPath,
+    target: StrPath,
     embodiments: Iterable[str] | None = None,
     private: bool | None = None,
 ) -> str:
     """Publish embodiments of a checkpoint, with the trunk where there is none yet.
 
     Args:
-        checkpoint: its folder, or that of a training run.
-        target: a folder, a URI, or a repository; made where it is not there.
+        checkpoint: str or path of its folder, or of that of a training run.
+        target: str or path of a folder, a URI, or a repository; made where it is not there.
         embodiments: ids; None for all.
         private: make a new repository a private one.
 
@@ -144,18 +147,18 @@ def push(
 
 
 def pull(
-    source: str | Path,
+    source: StrPath,
     embodiments: Iterable[str] | None = None,
-    out: str | Path | None = None,
+    out: StrPath | None = None,
     revision: str | None = None,
 ) -> Path:
     """Bring the trunk and the embodiments asked for, and nothing else.
 
     Args:
-        source: a folder, a URI, or a repository.
+        source: str or path of a folder, a URI, or a repository.
         embodiments: ids; None for all.
-        out: a folder; what it has already is not transferred again. By default a local folder stays where it
-            is, and all else goes to the cache.
+        out: str or path of a folder; what it has already is not transferred again. By default a local folder
+            stays where it is, and all else goes to the cache.
         revision: branch, tag or commit of a repository.
 
     Returns:
@@ -165,7 +168,7 @@ def pull(
         HubError: not there, not reachable, no such embodiment or revision.
         CheckpointError: what came does not belong together.
     """
-    return _pull(source, embodiments, Path(out) if out else None, revision)[0]
+    return _pull(as_address(source), embodiments, as_path(out) if out else None, revision)[0]
 
 
 def _pull(
@@ -206,14 +209,14 @@ def _pull(
     return folder, wanted
 
 
-def list_embodiments(source: str | Path, revision: str | None = None) -> list[dict[str, Any]]:
+def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
     """What is published there, a row an embodiment: ids, action, rate, figures, licence, bytes."""
     from hma_model.hub_list import listed
 
     return listed(describe(source, revision))
 
 
-def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
+def describe(source: StrPath, revision: str | None = None) -> dict[str, Any]:
     """What is published: the trunk's hash and bytes, tokenizer and model, and of each id `card`, `bytes`."""
     store = open_store(source, revision)
     files = store.files()
@@ -234,22 +237,22 @@ def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
 
 
 def from_pretrained(
-    source: str | Path,
+    source: StrPath,
     embodiments: Iterable[str] | None = None,
     revision: str | None = None,
     device: "str | torch.device" = "cpu",
 ) -> "HMA":
     """See `HMA.from_pretrained`; the source may also be a training run's folder."""
-    source, revision = addressed(source, revision)
-    if not is_repository(source) and "://" not in str(source):
-        source = checkpoints.resolve(Path(source).expanduser())
-    folder, ids = _pull(source, embodiments, None, revision)
+    address, revision = addressed(as_address(source), revision)
+    if not is_repository(address) and "://" not in str(address):
+        address = checkpoints.resolve(Path(address).expanduser())
+    folder, ids = _pull(address, embodiments, None, revision)
     return checkpoints.load(folder, ids, str(device))
 
 
 def import_released(
-    source: str | Path,
-    out: str | Path,
+    source: StrPath,
+    out: StrPath,
     *,
     embodiments: Iterable[str] | None = None,
     grid: tuple[int, int] | None = None,
@@ -264,16 +267,14 @@ def import_released(
     )
 
 
-def export_released(
-    checkpoint: str | Path, out: str | Path, *, embodiments: Iterable[str] | None = None
-) -> Path:
+def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[str] | None = None) -> Path:
     """Write a checkpoint in the paper's released layout; see `hma_model.released_export`."""
     from hma_model import released_export
 
     return released_export.export_released(checkpoint, out, embodiments=embodiments)
 
 
-def push_model(model: "HMA", target: str | Path, embodiments: Iterable[str] | None = None) -> str:
+def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None = None) -> str:
     """See `HMA.push_to_hub`: YAML, statistics and cards are those the model was loaded with.
 
     Raises:

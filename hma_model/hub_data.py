@@ -13,6 +13,7 @@ from typing import Protocol
 
 from hma_data.errors import HubError, ShardError
 from hma_data.files import file_sha256, write_atomic
+from hma_data.paths import StrPath, as_address, as_path
 from hma_data.shards.manifest import (
     EMBODIMENT,
     EPISODES,
@@ -58,11 +59,11 @@ class DataStore(Protocol):
         ...
 
 
-def push_data(folder: str | Path, target: str | Path, *, private: bool = False) -> str:
+def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str:
     """Publish a shard set.
 
     Args:
-        folder: what `hma convert` wrote.
+        folder: str or path of what `hma convert` wrote.
         target: organisation/name of a dataset, `hf://datasets/organisation/name`, a folder or a URI.
         private: make a new repository a private one.
 
@@ -73,9 +74,9 @@ def push_data(folder: str | Path, target: str | Path, *, private: bool = False) 
         ShardError: the set is not finished, or a shard is not the one its manifest names.
         HubError: another shard set is there, or it cannot be reached or written.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     manifest = _whole(folder)
-    store = _open(target, write=True, private=private)
+    store = _open(as_address(target), write=True, private=private)
     page = render(manifest, store.repo)
     _refuse_others(store, manifest)
     store.check_card(page)
@@ -101,12 +102,12 @@ def push_data(folder: str | Path, target: str | Path, *, private: bool = False) 
     return store.publish(last, f"Add {name}")
 
 
-def pull_data(source: str | Path, out: str | Path, *, revision: str | None = None) -> Path:
+def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> Path:
     """Fetch a published shard set; what is in `out` already is not transferred again.
 
     Args:
         source: as `push_data`'s target.
-        out: a new folder, or one that an interrupted pull has left.
+        out: str or path of a new folder, or of one that an interrupted pull has left.
         revision: branch, tag or commit of a repository.
 
     Returns:
@@ -116,7 +117,7 @@ def pull_data(source: str | Path, out: str | Path, *, revision: str | None = Non
         HubError: no such dataset, no shard set, or out of reach.
         ShardError: what came is not what the manifest names.
     """
-    out, store = Path(out), _open(source, revision)
+    out, store = as_path(out), _open(as_address(source), revision)
     files = store.files()
     manifest, content = _published(store)
     if (out / MANIFEST).is_file() and (out / MANIFEST).read_bytes() != content:

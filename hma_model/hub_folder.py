@@ -16,6 +16,7 @@ from typing import Any
 
 from hma_data.errors import HMAError, HubError, OutputError, StorageAwayError, StorageError
 from hma_data.files import file_sha256
+from hma_data.paths import StrPath, as_text
 from hma_data.remote_lock import PROBE, RemoteLock, living_holder
 from hma_data.store import WHOLE_PUTS, RemotePath, attempt
 from hma_model.checkpoint import CARD, CONFIG, README, TRUNK, inside
@@ -41,10 +42,11 @@ class FolderStore:
 
     repo: str | None = None
 
-    def __init__(self, address: str | Path, write: bool = False) -> None:
+    def __init__(self, address: StrPath, write: bool = False) -> None:
         import fsspec
 
-        text = str(Path(address).expanduser()) if "://" not in str(address) else str(address)
+        text = as_text(address)
+        text = text if "://" in text else str(Path(text).expanduser())
         self.name = text
         try:
             self._fs, self._root = fsspec.core.url_to_fs(text)

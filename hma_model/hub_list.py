@@ -4,10 +4,10 @@ A folder may hold one checkpoint or many, in folders of their own. Nothing but J
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HMAError, HubError
+from hma_data.paths import StrPath
 from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
 from hma_model.files import parse_json
@@ -18,11 +18,11 @@ FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
 MOST = 200  # checkpoints shown of a folder
 
 
-def survey(source: str | Path, revision: str | None = None) -> list[dict[str, Any]]:
+def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
     """Every checkpoint there.
 
     Args:
-        source: a folder, a URI, or a repository.
+        source: str or path of a folder, a URI, or a repository.
         revision: branch, tag or commit of a repository.
 
     Returns:

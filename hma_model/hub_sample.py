@@ -8,6 +8,7 @@ import numpy as np
 
 from hma_data.errors import CheckpointError, UsageError
 from hma_data.files import write_atomic
+from hma_data.paths import StrPath
 from hma_model import checkpoint as checkpoints
 from hma_model.checkpoint import SAMPLE, Checkpoint
 
@@ -21,12 +22,12 @@ if TYPE_CHECKING:
 COLUMNS, SIDE = 6, 128  # pictures of a row, and pixels a side
 
 
-def add_samples(checkpoint: str | Path, data: Iterable[str | Path]) -> list[Path]:
+def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
     """Put a sample.png beside each embodiment that has one of the shard sets, and renew the card.
 
     Args:
-        checkpoint: its folder, or that of a training run.
-        data: shard sets, one an embodiment.
+        checkpoint: str or path of its folder, or of that of a training run.
+        data: str or path of shard sets, one an embodiment.
 
     Returns:
         The pictures' paths.
@@ -51,11 +52,11 @@ def add_samples(checkpoint: str | Path, data: Iterable[str | Path]) -> list[Path
     return made
 
 
-def sample(checkpoint: Path, shards: "ShardSet", tokenizer: "Tokenizer | None" = None) -> bytes:
+def sample(checkpoint: StrPath, shards: "ShardSet", tokenizer: "Tokenizer | None" = None) -> bytes:
     """A PNG of one window of `shards`: truth, prediction and prediction with other actions, over time.
 
     Args:
-        checkpoint: its folder.
+        checkpoint: str or path of its folder.
         shards: of one of its embodiments; validation episodes are preferred.
         tokenizer: the one that made the shards; None finds it.
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError, HMAError
+from hma_data.paths import StrPath
 from hma_model.conditioning import Groups, align, condition, unknown
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.embed import LatentEmbedding, TokenEmbedding, patchify
@@ -145,18 +146,25 @@ class HMA(nn.Module):
     @classmethod
     def from_pretrained(
         cls,
-        source: str,
+        source: StrPath,
         embodiments: Sequence[str] | None = None,
         revision: str | None = None,
         device: str | torch.device = "cpu",
     ) -> "HMA":
-        """The trunk and the embodiments asked for, all by default, from a folder or a hub repository."""
+        """The trunk and the embodiments asked for, all by default.
+
+        Args:
+            source: str or path of a checkpoint or training run, a URI, or a hub repository.
+            embodiments: ids.
+            revision: branch, tag or commit of a repository.
+            device: where the model goes.
+        """
         from hma_model import hub  # needs the network's client, which most uses do not
 
         return hub.from_pretrained(source, embodiments=embodiments, revision=revision, device=device)
 
-    def push_to_hub(self, repo: str, embodiments: Sequence[str] | None = None) -> str:
-        """Publish the model, or only some of its embodiments, to a repository or folder."""
+    def push_to_hub(self, repo: StrPath, embodiments: Sequence[str] | None = None) -> str:
+        """Publish the model, or only some of its embodiments, to a repository or folder (str or path)."""
         from hma_model import hub
 
         return hub.push_model(self, repo, embodiments=embodiments)

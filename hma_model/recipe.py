@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hma_data.errors import RecipeError, UsageError
+from hma_data.paths import StrPath, as_text
 from hma_data.shipped import shipped
 from hma_data.yaml_io import parse_yaml, read_yaml
 from hma_model.config import HMAConfig
@@ -174,11 +175,11 @@ class Recipe(_Settings):
             raise RecipeError("recipe: model", f"a value is of the wrong type: {fault}") from fault
 
 
-def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
+def load_recipe(name_or_path: StrPath, overrides: Sequence[str] = ()) -> Recipe:
     """The recipe of a YAML file, with overrides.
 
     Args:
-        name_or_path: a file, or the name of a recipe that comes with the package.
+        name_or_path: str or path of a file, or the name of a recipe that comes with the package.
         overrides: `key=value` with dots for keys inside keys, values as YAML: `model.layers=4`.
 
     Raises:
@@ -206,7 +207,7 @@ def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
     return recipe
 
 
-def find_recipe(name_or_path: str | Path, where: object = None) -> Path:
+def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
     """The file of a recipe: a path, or a name below the shipped `recipes/` or `recipes/train/`.
 
     Args:
@@ -216,13 +217,14 @@ def find_recipe(name_or_path: str | Path, where: object = None) -> Path:
     Raises:
         RecipeError: there is none.
     """
+    name_or_path = as_text(name_or_path)
     given, folder = Path(name_or_path), shipped("recipes")
-    said = str(name_or_path) if len(str(name_or_path)) <= MAX_NAME else f"{str(name_or_path)[:MAX_NAME]}…"
+    said = name_or_path if len(name_or_path) <= MAX_NAME else f"{name_or_path[:MAX_NAME]}…"
     for candidate in (given, folder / "train" / f"{given}.yaml", folder / f"{given}.yaml", folder / given):
         if _is_file(candidate) and (candidate == given or not given.is_absolute()):
             return candidate
     fault = f"extends {said!r}: no such recipe" if where else "no such recipe"
-    if str(name_or_path) and os.path.lexists(given) and len(said) <= MAX_NAME:
+    if name_or_path and os.path.lexists(given) and len(said) <= MAX_NAME:
         fault = f"extends {said!r}, which is no file" if where else "is no file of YAML"
     known = sorted(path.stem for path in (folder / "train").glob("*.yaml"))
     near = get_close_matches(given.stem.lower(), known, n=1)

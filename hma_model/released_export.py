@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError
+from hma_data.paths import StrPath, as_path
 from hma_model.checkpoint import Checkpoint, load
 from hma_model.files import new_folder, to_json, write_tensors
 from hma_model.released import config_to_released
@@ -23,14 +24,12 @@ if TYPE_CHECKING:
     from hma_model.model import HMA
 
 
-def export_released(
-    checkpoint: str | Path, out: str | Path, *, embodiments: Iterable[str] | None = None
-) -> Path:
+def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[str] | None = None) -> Path:
     """Write config.json and model.safetensors as the released code's `from_pretrained` reads them.
 
     Args:
-        checkpoint: its folder, or that of a training run.
-        out: a folder that is not there yet or is empty.
+        checkpoint: str or path of its folder, or of that of a training run.
+        out: str or path of a folder that is not there yet or is empty.
         embodiments: ids; all by default.
 
     Returns:
@@ -41,7 +40,7 @@ def export_released(
     """
     from safetensors import SafetensorError
 
-    out = Path(out)
+    out = as_path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise CheckpointError(out, "is there already", "choose another folder")
     opened = Checkpoint.open(checkpoint)

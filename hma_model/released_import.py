@@ -18,6 +18,7 @@ from torch import Tensor
 
 from hma_data.embodiment import Embodiment, find
 from hma_data.errors import CheckpointError, HMAError, HubError
+from hma_data.paths import StrPath, as_address
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import CATALOG
 from hma_model.checkpoint import LIBRARY, Checkpoint, save
@@ -33,8 +34,8 @@ _SHOWN = 3  # names an error lists
 
 
 def import_released(
-    source: str | Path,
-    out: str | Path,
+    source: StrPath,
+    out: StrPath,
     *,
     embodiments: Iterable[str] | None = None,
     grid: tuple[int, int] | None = None,
@@ -44,8 +45,9 @@ def import_released(
     """Bring a released checkpoint into our layout.
 
     Args:
-        source: a folder with config.json and weights, the weights' file in it, or a hub repository.
-        out: folder of the new checkpoint.
+        source: str or path of a folder with config.json and weights or of the weights' file in it, or a hub
+            repository.
+        out: str or path of the folder of the new checkpoint.
         embodiments: domains to take, by their released names or our ids; all by default.
         grid: the tokenizer's (h, w), where a frame is not square.
         tokenizer: name of the one the model was trained on; by default the paper's, where the sizes are its.
@@ -55,7 +57,8 @@ def import_released(
         CheckpointError: not a released checkpoint, damaged, or of an architecture the release does not have.
         HubError: the repository is not there or out of reach.
     """
-    folder, weights = _files(source, revision)
+    address = as_address(source)
+    folder, weights = _files(address, revision)
     values = _config_values(folder / CONFIG)
     state = _read_state(weights)
     config = _explained(folder, lambda: config_from_released(values, {"grid": grid} if grid else None))
@@ -74,7 +77,7 @@ def import_released(
         out,
         embodiment_yaml={name: _yaml(domain, spaces[name]) for domain, name in names.items()},
         stats={name: _stats(space) for name, space in spaces.items()},
-        cards={name: _card(domain, source) for domain, name in names.items()},
+        cards={name: _card(domain, address) for domain, name in names.items()},
         tokenizer=config.tokenizer,
     )
 

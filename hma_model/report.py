@@ -10,6 +10,7 @@ from typing import Any
 
 from hma_data.console import human_seconds
 from hma_data.files import write_atomic
+from hma_data.paths import StrPath, as_path
 from hma_model.page import Page
 from hma_model.pictures import FOLDER
 from hma_model.runlog import read_metrics
@@ -19,12 +20,13 @@ REPORT = "report.html"
 RECENT = 50  # steps that closing figures are averaged over
 
 
-def write_report(out: Path) -> None:
-    """Write `report.html` into a run's folder.
+def write_report(out: StrPath) -> None:
+    """Write `report.html` into a run's folder, a str or path.
 
     Raises:
         OSError: it cannot be written.
     """
+    out = as_path(out)
     lines = read_metrics(out)
     steps = [line for line in lines if line["kind"] == "train"]
     evaluations = [line for line in lines if line["kind"] == "eval"]

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from hma_data.console import human_seconds
 from hma_data.errors import OutputError
 from hma_data.files import write_atomic
+from hma_data.paths import StrPath, as_path
 from hma_model.files import finite
 from hma_model.metrics import perplexity
 from hma_model.pictures import FOLDER as PICTURES
@@ -33,9 +34,9 @@ SMOOTHING = 20  # steps a shown loss is averaged over
 PACING = 50  # steps that the speed and the time left are told from
 
 
-def read_metrics(out: Path) -> list[dict[str, Any]]:
-    """Every whole line of a run's metrics.jsonl; none where there is no such file."""
-    path = out / METRICS
+def read_metrics(out: StrPath) -> list[dict[str, Any]]:
+    """Every whole line of metrics.jsonl in a run's folder (str or path); none where there is no such file."""
+    path = as_path(out) / METRICS
     if not path.is_file():
         return []
     found: list[dict[str, Any]] = []

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 from hma_data.errors import UsageError
+from hma_data.paths import StrPath, as_text
 from hma_model import checkpoint as checkpoints
 from hma_model.parallel import World, join
 from hma_model.recipe import Recipe
@@ -61,7 +62,7 @@ class TrainResult:
 def train(
     recipe: Recipe,
     *,
-    out: str | Path | None = None,
+    out: StrPath | None = None,
     on_progress: Callable[[dict[str, Any]], None] | None = None,
     show: bool = True,
     force: bool = False,
@@ -70,7 +71,7 @@ def train(
 
     Args:
         recipe: see `hma_model.recipe`.
-        out: the run's folder; by default the recipe's.
+        out: str or path of the run's folder; by default the recipe's.
         on_progress: called after every step with its line of metrics.jsonl.
         show: progress on standard error.
         force: go on although the recipe or the shards have changed.
@@ -83,9 +84,10 @@ def train(
         TrainingError: a loss is not a number, and it names the windows; memory is short; a rank is lost.
         CheckpointError: a checkpoint cannot be written or none of them can be read.
     """
-    if out is None and recipe.out is None:
+    chosen = recipe.out if out is None else out
+    if chosen is None:
         raise UsageError("out", "is not given", "name the run's folder with --out or out=DIR")
-    named = str(recipe.out if out is None else out)
+    named = as_text(chosen)
     if not named.strip() or "\0" in named:
         raise UsageError("out", f"is {named!r}, no name of a folder", "name the run's folder with --out DIR")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", named):

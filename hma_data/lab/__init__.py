@@ -13,6 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
+from hma_data.paths import StrPath, as_path
 
 Progress = Callable[[int, int], None]
 
@@ -24,12 +25,14 @@ RECORDERS = {
 }
 
 
-def record(robot: str, out: Path, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
+def record(
+    robot: str, out: StrPath, episodes: int, seed: int = 0, on_progress: Progress | None = None
+) -> Path:
     """Record a laboratory robot.
 
     Args:
         robot: a key of RECORDERS.
-        out: folder to put the recording in; made when absent.
+        out: str or path of the folder to put the recording in; made when absent.
         episodes: how many, at least one.
         seed: the same seed gives the same recording.
         on_progress: called after each episode with (episodes done, episodes in all).
@@ -46,7 +49,7 @@ def record(robot: str, out: Path, episodes: int, seed: int = 0, on_progress: Pro
         raise UsageError(robot, "is not a laboratory robot", f"known: {', '.join(RECORDERS)}")
     if episodes < 1:
         raise UsageError("episodes", f"{episodes} asked for", "ask for at least one")
-    recording: Path = import_module(RECORDERS[robot]).record(Path(out), robot, episodes, seed, on_progress)
+    recording: Path = import_module(RECORDERS[robot]).record(as_path(out), robot, episodes, seed, on_progress)
     return recording
 
 

@@ -1,11 +1,11 @@
 """What a shard set holds, in figures: of its manifest and episodes.parquet, without opening a shard."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
 
+from hma_data.paths import StrPath
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_counts
 from hma_data.windows import WindowIndex
@@ -13,8 +13,11 @@ from hma_data.windows import WindowIndex
 WINDOW = 12  # frames, the model's
 
 
-def describe(folder: Path) -> dict[str, Any]:
+def describe(folder: StrPath) -> dict[str, Any]:
     """Plain values for `hma shards info --json`.
+
+    Args:
+        folder: str or path of the set, or its URI.
 
     Raises:
         ShardError: the manifest or episodes.parquet is missing or damaged.

@@ -20,6 +20,7 @@ from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
 from hma_data.files import atomic_path, file_sha256, write_atomic
 from hma_data.json_io import parse_json
+from hma_data.paths import StrPath
 from hma_data.shards.schema import SCHEMA_VERSION, EpisodeRow, Footer, Refused, read_footer
 from hma_data.shards.wellformed import check_plan, check_spec, check_splits, check_stats, is_count
 from hma_data.stats import Stats
@@ -158,8 +159,11 @@ class Manifest:
         return text.replace(_UNSEALED, hashlib.sha256(text.encode()).hexdigest(), 1)
 
     @classmethod
-    def load(cls, folder: Path) -> "Manifest":
+    def load(cls, folder: StrPath) -> "Manifest":
         """The manifest of a shard set.
+
+        Args:
+            folder: str or path of the set, or its URI.
 
         Raises:
             ShardError: there is none, or it is damaged.

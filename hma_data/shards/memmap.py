@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import OutputError, UsageError
 from hma_data.files import sync_folder, write_atomic
+from hma_data.paths import StrPath, as_path
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import token_column
 from hma_data.tokenizers.base import TokenizerSpec
@@ -39,8 +40,8 @@ def quiet(done: int, total: int) -> None:
 
 
 def export(
-    folder: Path,
-    out: Path,
+    folder: StrPath,
+    out: StrPath,
     *,
     split: str | None = None,
     camera: str | None = None,
@@ -49,6 +50,8 @@ def export(
     """Write the splits of a shard set as flat files; each folder appears when it is whole.
 
     Args:
+        folder: str or path of the set, or its URI.
+        out: str or path of a new folder.
         split: only this one, into `out` itself; None writes each split that has episodes into a folder below.
         camera: which, where the set has several; None takes the first.
 
@@ -59,13 +62,15 @@ def export(
         UsageError: no such split or camera.
         OutputError: a folder is there already, or cannot be written.
     """
-    shards = ShardSet(folder)
+    shards, out = ShardSet(folder), as_path(out)
     cameras = shards.manifest.cameras
     if camera is not None and camera not in cameras:
-        raise UsageError("--camera", f"{camera!r} is not in {folder}", f"its cameras: {', '.join(cameras)}")
+        raise UsageError(
+            "--camera", f"{camera!r} is not in {shards.folder}", f"its cameras: {', '.join(cameras)}"
+        )
     have = [name for name, counts in shards.manifest.splits.items() if counts["episodes"]]
     if split is not None and split not in have:
-        raise UsageError("--split", f"{folder} has no {split!r}", f"its splits: {', '.join(have)}")
+        raise UsageError("--split", f"{shards.folder} has no {split!r}", f"its splits: {', '.join(have)}")
     places = {split: out} if split else {name: out / name for name in have}
     for place in places.values():
         if place.exists() and (not place.is_dir() or any(place.iterdir())):

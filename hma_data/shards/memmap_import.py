@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError, UsageError
+from hma_data.paths import StrPath, as_path
 from hma_data.plan import Settings
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.memmap import (
@@ -50,8 +51,8 @@ class Mapped:
 
 
 def import_memmap(
-    folder: Path,
-    out: Path,
+    folder: StrPath,
+    out: StrPath,
     *,
     embodiment: Embodiment | None = None,
     tokenizer: TokenizerSpec | None = None,
@@ -63,7 +64,8 @@ def import_memmap(
     """A shard set from flat files: of `export`, or of the paper's code.
 
     Args:
-        folder: one such folder, or a folder with `train` and `val` of them.
+        folder: str or path of one such folder, or of a folder with `train` and `val` of them.
+        out: str or path of the new set, or its URI.
         embodiment, tokenizer: needed where the folder does not say.
         val_fraction, seed: divide episodes that came without a split.
 
@@ -71,6 +73,7 @@ def import_memmap(
         ShardError: the files do not fit together.
         UsageError: the embodiment or tokenizer is neither given nor stated.
     """
+    folder = as_path(folder)
     parts = _parts(folder)
     first = _read_metadata(next(iter(parts.values())))
     robot = embodiment or _stated_embodiment(next(iter(parts.values())))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import ShardError, TokenizerError, UsageError
+from hma_data.paths import StrPath, as_path
 from hma_data.shards.curves import Curves
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns, token_column
@@ -29,8 +30,11 @@ class Preview:
     episodes: tuple[str, ...]
 
 
-def tokenizer_of(shards: ShardSet, weights: str | None = None, device: str = "cpu") -> Tokenizer:
+def tokenizer_of(shards: ShardSet, weights: StrPath | None = None, device: str = "cpu") -> Tokenizer:
     """The tokenizer that made a shard set.
+
+    Args:
+        weights: str or path, as `get_tokenizer` takes them.
 
     Raises:
         TokenizerError: the one here would give other tokens.
@@ -47,12 +51,12 @@ def tokenizer_of(shards: ShardSet, weights: str | None = None, device: str = "cp
 
 
 def preview(
-    folder: Path,
-    out: Path,
+    folder: StrPath,
+    out: StrPath,
     *,
     episodes: int = 4,
     columns: int = 8,
-    weights: str | None = None,
+    weights: StrPath | None = None,
     camera: str | None = None,
     frames: int = 300,
     tokenizer: Tokenizer | None = None,
@@ -60,6 +64,9 @@ def preview(
     """Write `sheet.png` and `preview.mp4` for episodes from all over a shard set.
 
     Args:
+        folder: str or path of the set, or its URI.
+        out: str or path of the folder to write to.
+        weights: str or path, as `get_tokenizer` takes them.
         episodes: how many, evenly spaced from the first to the last.
         columns: pictures of each in the sheet.
         camera: which; None takes the first.
@@ -70,12 +77,12 @@ def preview(
         ShardError: it holds no episodes.
         UsageError: no such camera.
     """
-    shards = ShardSet(folder)
+    shards, out = ShardSet(folder), as_path(out)
     if camera is not None and camera not in shards.manifest.cameras:
         known = ", ".join(shards.manifest.cameras)
-        raise UsageError("--camera", f"{camera!r} is not in {folder}", f"its cameras: {known}")
+        raise UsageError("--camera", f"{camera!r} is not in {shards.folder}", f"its cameras: {known}")
     if not len(shards.episodes):
-        raise ShardError(folder, "holds no episodes", "its quarantine.jsonl says why")
+        raise ShardError(shards.folder, "holds no episodes", "its quarantine.jsonl says why")
     opened = tokenizer or tokenizer_of(shards, weights)
     picks = np.unique(np.linspace(0, len(shards.episodes) - 1, episodes).round().astype(int))
     rows = shards.episodes.take(picks).to_pylist()

@@ -7,7 +7,6 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import ShardError
 from hma_data.json_io import parse_json
+from hma_data.paths import StrPath
 from hma_data.shard_cache import kept_shard, limit_bytes
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
 from hma_data.shards.schema import mask_columns, to_numpy, token_column
@@ -57,7 +57,7 @@ class ShardSet:
         StorageError: the store refuses to read it.
     """
 
-    def __init__(self, folder: str | Path, cache: bool = True) -> None:
+    def __init__(self, folder: StrPath, cache: bool = True) -> None:
         self.folder = place(folder)
         if not (self.folder / MANIFEST).is_file() and not self.folder.is_dir():
             raise ShardError(self.folder, "is not a folder", "give the --out of an hma convert")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError, UsageError
 from hma_data.output import finished_shards, locked
+from hma_data.paths import StrPath
 from hma_data.plan import Plan, Settings, ShardUnit, digest, make_plan
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
 from hma_data.shards.reader import EpisodeReader, ShardSet
@@ -86,11 +87,12 @@ class Job:
 
 
 def remake(
-    job: Job, out: Path, workers: int = 1, on_progress: OnProgress = lambda done, total: None
+    job: Job, out: StrPath, workers: int = 1, on_progress: OnProgress = lambda done, total: None
 ) -> Manifest:
     """Write the set; shards that are there already are kept.
 
     Args:
+        out: str or path of the new set, or its URI.
         workers: threads, each at a shard of its own.
         on_progress: called with (frames written, frames in all) after each shard.
 
@@ -197,14 +199,18 @@ def _stats(columns: dict[str, NDArray[Any]], name: str, length: int, width: int)
 
 
 def merge(
-    folders: Sequence[Path],
-    out: Path,
+    folders: Sequence[StrPath],
+    out: StrPath,
     workers: int = 1,
     on_progress: OnProgress = lambda done, total: None,
 ) -> Manifest:
     """One set of several of the same embodiment and tokenizer; every episode keeps its split.
 
     An id that stands in several sets is given the number of its set in front, `2/demo_0`.
+
+    Args:
+        folders: str or path of each set, or its URI.
+        out: of the new one.
 
     Raises:
         ShardError: the sets do not go together.
@@ -240,8 +246,8 @@ def merge(
 
 
 def split(
-    folder: Path,
-    out: Path,
+    folder: StrPath,
+    out: StrPath,
     *,
     val_fraction: float = 0.05,
     seed: int = 0,
@@ -252,6 +258,8 @@ def split(
     """The set with its episodes divided anew into train and val, as a conversion divides them.
 
     Args:
+        folder: str or path of the set, or its URI.
+        out: of the new one.
         by: what stays together: episode (and its recording), instruction or source.
 
     Raises:
@@ -300,7 +308,7 @@ def _together(rows: Sequence[EpisodeRow], by: str) -> list[str]:
     return ["/".join(find(("id", row.id))) for row in rows]
 
 
-def _check_out(out: Path, folders: Sequence[Path]) -> None:
+def _check_out(out: StrPath, folders: Sequence[StrPath]) -> None:
     for folder in folders:
         mine, theirs = place(out).resolve(), place(folder).resolve()
         if mine == theirs or mine in theirs.parents or theirs in mine.parents:

@@ -13,6 +13,7 @@ from hma_data.embodiment import Embodiment
 from hma_data.errors import HMAError, ShardError
 from hma_data.files import file_sha256
 from hma_data.output import locked
+from hma_data.paths import StrPath
 from hma_data.plan import digest
 from hma_data.shards.check import REMAKE
 from hma_data.shards.manifest import (
@@ -37,7 +38,7 @@ AGAIN = "run the same hma convert again"
 
 
 def restat(
-    folder: Path,
+    folder: StrPath,
     *,
     workers: int | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
@@ -46,6 +47,9 @@ def restat(
 
     A manifest that is whole says which shards belong and what they hash to; without one, the shards
     themselves must show that none is missing.
+
+    Args:
+        folder: str or path of the set, or its URI.
 
     Raises:
         ShardError: a shard is missing or damaged, or nothing tells whether all are there; nothing is written.

@@ -17,6 +17,7 @@ from hma_data.engines.local import usable_cores
 from hma_data.errors import HMAError
 from hma_data.files import PART, file_sha256
 from hma_data.output import JOURNAL, LOCK
+from hma_data.paths import StrPath
 from hma_data.shards.check import Checked, check_shard, plan_problem, same_stats
 from hma_data.shards.manifest import (
     EMBODIMENT,
@@ -38,7 +39,7 @@ OnProgress = Callable[[int, int], None]
 
 
 def verify(
-    folder: Path,
+    folder: StrPath,
     *,
     workers: int | None = None,
     quick: bool = False,
@@ -47,6 +48,7 @@ def verify(
     """Everything wrong with a shard set, a line each; empty when it is sound.
 
     Args:
+        folder: str or path of the set, or its URI.
         workers: threads; None takes the cores.
         quick: sizes and footers only: seconds for any set, but a flipped bit in a shard stays unseen.
         on_progress: called with (bytes checked, bytes in all) after each shard.

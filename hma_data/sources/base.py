@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.paths import StrPath, as_text
 from hma_data.sources.findings import Finding
 from hma_data.sources.links import nothing_there
 from hma_data.spec import Vector
@@ -165,21 +166,21 @@ class Inspection:
 
 
 class Source(Protocol):
-    """One recording format."""
+    """One recording format; `uri` is a str or path of a recording, or its URI."""
 
-    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """What is in the recording; values and pictures of so many episodes are looked at."""
         ...
 
-    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """The episodes, in a stable order, without decoding any."""
         ...
 
-    def episode_ids(self, uri: str) -> list[str]:
+    def episode_ids(self, uri: StrPath) -> list[str]:
         """Their ids alone."""
         ...
 
-    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """One episode, lazily."""
         ...
 
@@ -196,12 +197,16 @@ def open_source(name: str) -> Source:
     return source
 
 
-def detect(uri: str) -> str:
+def detect(uri: StrPath) -> str:
     """The format of the recording at `uri`, by its files' names and first bytes.
+
+    Args:
+        uri: str or path of the recording, or its URI.
 
     Raises:
         SourceError: nothing there, or nothing we know.
     """
+    uri = as_text(uri)
     if not uri:
         raise SourceError("", "the recording's path is empty", "name a file, a folder or a URI")
     if "://" in uri and not uri.startswith("file://"):

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Signal
 from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.paths import StrPath, as_text
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hands_inspect import inspect_videos
 from hma_data.sources.hands_labels import LabelSet, open_labels
@@ -69,22 +70,23 @@ class HandsSource:
         self._labels: dict[tuple[str, HandsLayout], LabelSet] = {}
         self._detector: tuple[int, HandsLayout, Any, HandModels] | None = None
 
-    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """The videos, and the hands in a small sample of frames where there are models."""
-        return inspect_videos(uri, episodes)
+        return inspect_videos(as_text(uri), episodes)
 
-    def episode_ids(self, uri: str) -> list[str]:
+    def episode_ids(self, uri: StrPath) -> list[str]:
         """The videos' names; each is the longest run of its video."""
-        return list(self._find(uri, again=True))
+        return list(self._find(as_text(uri), again=True))
 
-    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """Videos, or runs of them where there are annotations; no picture is decoded.
 
         Raises:
             SourceError: no videos, no models or labels, none that fit, or no run that is long enough.
             RegistryError: the YAML's layout is wrong.
         """
-        videos, layout = self._find(uri, again=True), layout_of(embodiment)
+        uri, layout = as_text(uri), layout_of(embodiment)
+        videos = self._find(uri, again=True)
         needed = _needed(embodiment) if embodiment else ("left/center", "right/center")
         if layout.labels == "detector":
             digest = self._models(layout)[1].digest if embodiment else ""
@@ -96,7 +98,7 @@ class HandsSource:
             raise SourceError(uri, *_nothing(videos, labels, layout))
         return found
 
-    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """One run of a video; its pictures are decoded when asked for.
 
         Raises:
@@ -104,7 +106,7 @@ class HandsSource:
             SourceError: no such episode, or a key that is none of hand videos.
             RegistryError: the YAML's layout is wrong.
         """
-        layout = layout_of(embodiment)
+        uri, layout = as_text(uri), layout_of(embodiment)
         video, number = self._place(uri, episode_id)
         file, runs = self.runs(uri, video.name, embodiment)
         if not runs.spans:
@@ -115,9 +117,9 @@ class HandsSource:
             raise EpisodeError(video.path, f"has {len(runs.spans)} runs, no run {number}")
         return _episode(episode_id, file, runs, number, embodiment, alone)
 
-    def runs(self, uri: str, name: str, embodiment: Embodiment) -> tuple[VideoFile, Runs]:
+    def runs(self, uri: StrPath, name: str, embodiment: Embodiment) -> tuple[VideoFile, Runs]:
         """A video and all its runs; see read."""
-        layout, needed = layout_of(embodiment), _needed(embodiment)
+        uri, layout, needed = as_text(uri), layout_of(embodiment), _needed(embodiment)
         video = self._place(uri, name)[0]
         if layout.labels == "detector":
             self._models(layout)  # what is missing is said before the video is opened

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import MissingDependencyError, SourceError
+from hma_data.paths import StrPath, as_text
 
 ENVIRONMENT = "HMA_HAND_MODELS"
 PALM_SIDE, HAND_SIDE = 192, 224  # pixels of what each model looks at
@@ -50,11 +51,11 @@ class HandModels:
         return hashlib.sha256(hashlib.sha256(self.palm).digest() + self.hand).hexdigest()[:16]
 
 
-def load_models(place: str | Path | None = None) -> HandModels:
+def load_models(place: StrPath | None = None) -> HandModels:
     """The models in a folder or a bundle; full before lite.
 
     Args:
-        place: folder or .task file; None takes $HMA_HAND_MODELS.
+        place: str or path of a folder or .task file; None takes $HMA_HAND_MODELS.
 
     Raises:
         SourceError: none given, none there, or files that are no such models.
@@ -62,7 +63,7 @@ def load_models(place: str | Path | None = None) -> HandModels:
     place = place or os.environ.get(ENVIRONMENT)
     if not place:
         raise SourceError("hand models", "are not given", _REMEDY)
-    path = Path(str(place).removeprefix("file://")).expanduser()
+    path = Path(as_text(place).removeprefix("file://")).expanduser()
     if path.is_dir():
         bundles = sorted(path.glob("*.task"))
         here = {item.name for item in path.iterdir()}

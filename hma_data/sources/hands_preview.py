@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hma_data.embodiment import Embodiment, find
 from hma_data.errors import EpisodeError
+from hma_data.paths import StrPath, as_path
 from hma_data.sheets import write_mp4
 from hma_data.sources.hands import HandsSource
 from hma_data.sources.hands_runs import SIDES, Runs
@@ -26,8 +27,8 @@ _PALM = [5, 9, 13, 17]
 
 
 def preview(
-    uri: str,
-    out: str | Path,
+    uri: StrPath,
+    out: StrPath,
     embodiment: Embodiment | None = None,
     video: str | None = None,
     first: int = 0,
@@ -36,8 +37,8 @@ def preview(
     """Draw the hands of a video into an MP4.
 
     Args:
-        uri: a video or a folder of videos.
-        out: file to write.
+        uri: str or path of a video or a folder of videos.
+        out: str or path of the file to write.
         embodiment: says where labels are from; None takes `hand_video`, the detector.
         video: its name in the folder; the first by default.
         first, limit: frames shown.
@@ -56,7 +57,7 @@ def preview(
     if not len(chosen):
         raise EpisodeError(file.path, f"has {len(file)} frames, none from {first} on")
     pictures = (annotated(file.frames([index])[0], runs, int(index)) for index in chosen)
-    final = Path(out)
+    final = as_path(out)
     write_mp4(final, pictures, file.table.hz or 30.0)
     return final
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import OutputError, SourceError
 from hma_data.files import atomic_path, cache_folder
+from hma_data.paths import StrPath, as_path, as_text
 from hma_data.sources.base import file_fingerprint
 from hma_data.sources.hands_detect import VERSION, Detector, Hand, MediaPipeHands
 from hma_data.sources.hands_layout import HandsLayout, videos_of
@@ -79,13 +80,13 @@ def scan(video: VideoFile, detector: Detector, frames: Iterable[int] | None = No
     )
 
 
-def detect(folder: str | Path, out: str | Path, models: str | None = None, mirrored: bool = False) -> int:
+def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrored: bool = False) -> int:
     """Find the hands in all videos of a folder and write them as a table; see hands_table.
 
     Args:
-        folder: of videos, or one video.
-        out: file to write, .parquet.
-        models: folder or bundle; None takes $HMA_HAND_MODELS.
+        folder: str or path of a folder of videos, or of one video.
+        out: str or path of the file to write, .parquet.
+        models: str or path of a folder or bundle; None takes $HMA_HAND_MODELS.
         mirrored: the pictures are mirrored.
 
     Returns:
@@ -95,11 +96,13 @@ def detect(folder: str | Path, out: str | Path, models: str | None = None, mirro
         SourceError: no videos, no models.
         EpisodeError: a video is damaged.
     """
-    final = Path(out)
+    final = as_path(out)
     if final.suffix != ".parquet":
         raise OutputError(final, "is no name of a parquet file", "let it end in .parquet")
     detector = MediaPipeHands(load_models(models), mirrored=mirrored)
-    found = {name: scan(VideoFile(video.path), detector) for name, video in videos_of(str(folder)).items()}
+    found = {
+        name: scan(VideoFile(video.path), detector) for name, video in videos_of(as_text(folder)).items()
+    }
     _write(final, found)
     return sum(len(each.frames) for each in found.values())
 

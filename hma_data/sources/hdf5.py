@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Signal, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.paths import StrPath, as_text
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hdf5_file import (
     MAX_NUMBERS,
@@ -57,23 +58,23 @@ class Hdf5Source:
         self._files = OpenFiles()
         self._places = Places(self._files)
 
-    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
         from hma_data.sources.hdf5_inspect import inspect
 
-        return inspect(uri, self._places, self._files, episodes)
+        return inspect(as_text(uri), self._places, self._files, episodes)
 
-    def episode_ids(self, uri: str) -> list[str]:
+    def episode_ids(self, uri: StrPath) -> list[str]:
         """Their ids, files by name and `demo_2` before `demo_10`."""
-        return list(self._places.all(uri))
+        return list(self._places.all(as_text(uri)))
 
-    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """The episodes. A damaged file among others is one that `read` will refuse.
 
         Raises:
             SourceError: nothing there, a single file that is damaged, or no mask of the name `source.split`.
         """
-        chosen = embodiment.source.split if embodiment else None
+        uri, chosen = as_text(uri), embodiment.source.split if embodiment else None
         refs: list[EpisodeRef] = []
         known: set[str] = set()
         for file, places in self._places.by_file(uri, layout_of(embodiment).episodes):
@@ -93,7 +94,7 @@ class Hdf5Source:
             raise SourceError(uri, f"has no mask {chosen!r}", f"its masks: {said}")
         return refs
 
-    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """One episode; its pictures are read when asked for.
 
         Raises:
@@ -101,7 +102,7 @@ class Hdf5Source:
             SourceError: no such episode, or no rate and no times.
         """
         layout = layout_of(embodiment)
-        place = self._places.find(uri, episode_id, layout.episodes)
+        place = self._places.find(as_text(uri), episode_id, layout.episodes)
         where = str(place)
         with explained(where):
             group = self._places.group(place)

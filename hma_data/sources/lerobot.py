@@ -19,6 +19,7 @@ from hma_data.align import nearest
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Signal, Stream, rate_times
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.paths import StrPath, as_text
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.lerobot_meta import Folder, Metadata, Span, episode_name
 from hma_data.sources.lerobot_rows import Rows, StillPictures, rows_of
@@ -37,22 +38,23 @@ class LeRobotSource:
     def __init__(self) -> None:
         self._opened: dict[str, Metadata] = {}
 
-    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """What is in the dataset: its metadata, checked against the files that are there."""
         from hma_data.sources.lerobot_inspect import inspect
 
-        return inspect(uri, self._open(uri, again=True), episodes)
+        return inspect(as_text(uri), self._open(as_text(uri), again=True), episodes)
 
-    def episode_ids(self, uri: str) -> list[str]:
+    def episode_ids(self, uri: StrPath) -> list[str]:
         """Their ids, `episode_000000` and on."""
-        return [episode_name(index) for index in self._open(uri, again=True).episodes]
+        return [episode_name(index) for index in self._open(as_text(uri), again=True).episodes]
 
-    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """The episodes by metadata; a missing video is found when the episode is read.
 
         Raises:
             SourceError: damaged metadata, another rate than the embodiment's, or no such split.
         """
+        uri = as_text(uri)
         meta = self._open(uri, again=True)
         if embodiment:
             _check_rate(meta, embodiment)
@@ -73,13 +75,14 @@ class LeRobotSource:
             if not chosen or index in meta.splits[chosen]
         ]
 
-    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """One episode; its pictures are decoded when asked for.
 
         Raises:
             EpisodeError: a video is missing or has another number of frames, rows are damaged.
             SourceError: no such episode, a key that is no feature, another rate than the embodiment's.
         """
+        uri = as_text(uri)
         meta = self._open(uri)
         _check_rate(meta, embodiment)
         index = _number(episode_id)

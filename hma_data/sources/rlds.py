@@ -15,6 +15,7 @@ import math
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Pictures, Signal, rate_times
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.paths import StrPath, as_text
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
 from hma_data.sources.fetching import info, mark
 from hma_data.sources.rlds_steps import (
@@ -45,11 +46,11 @@ def open() -> "RldsSource":
 class RldsSource:
     """Reads TFDS folders in the RLDS form."""
 
-    def episode_ids(self, uri: str) -> list[str]:
+    def episode_ids(self, uri: StrPath) -> list[str]:
         """See Source."""
         return [ref.id for ref in self.index(uri)]
 
-    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """See Source. Frames are estimated from the records' bytes.
 
         With `source.split` only that split is indexed and refs carry no split; so they do where the
@@ -58,6 +59,7 @@ class RldsSource:
         Raises:
             SourceError: nothing readable there, no such split, or the embodiment's keys are not there.
         """
+        uri = as_text(uri)
         folder = open_folder(uri)
         wanted = embodiment.source.split if embodiment else None
         if embodiment:
@@ -79,14 +81,14 @@ class RldsSource:
             )
         return refs
 
-    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """See Source.
 
         Raises:
             SourceError: the dataset cannot be read, or the embodiment's keys are not there.
             EpisodeError: this episode is damaged, or not as features.json says.
         """
-        folder = open_folder(uri)
+        folder = open_folder(as_text(uri))
         check_keys(folder, embodiment)
         example, path = folder.example(episode_id)
         steps = Steps(folder, example, episode_id)
@@ -105,7 +107,7 @@ class RldsSource:
             metadata=metadata(folder, example),
         )
 
-    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source.
 
         Raises:
@@ -113,7 +115,7 @@ class RldsSource:
         """
         from hma_data.sources.rlds_inspect import inspect
 
-        return inspect(uri, self.index(uri), episodes)
+        return inspect(as_text(uri), self.index(uri), episodes)
 
 
 def _refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.paths import StrPath, as_text
 from hma_data.sources.bags.bag import Bag, find_bags
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.opened import parted
@@ -35,15 +36,17 @@ def open() -> "RosbagSource":
 class RosbagSource:
     """See sources.base.Source."""
 
-    def inspect(self, uri: str, episodes: int = SAMPLE) -> Inspection:
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
+        uri = as_text(uri)
         return report(uri, local_path(uri), _bags(uri), episodes)
 
-    def index(self, uri: str, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """See Source. A bag that cannot be read has no frames here; `read` says why.
 
         With an embodiment that parts bags, an episode of the bag `run` is `run/0000`, `run/0001` …
         """
+        uri = as_text(uri)
         root = local_path(uri)
         found: list[EpisodeRef] = []
         for name, path in _bags(uri).items():
@@ -53,17 +56,18 @@ class RosbagSource:
                 found.append(_ref(name, path, root, embodiment))
         return found
 
-    def episode_ids(self, uri: str) -> list[str]:
+    def episode_ids(self, uri: StrPath) -> list[str]:
         """See Source: whole bags, whatever an embodiment may part them into."""
-        return list(_bags(uri))
+        return list(_bags(as_text(uri)))
 
-    def read(self, uri: str, episode_id: str, embodiment: Embodiment) -> Episode:
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """See Source. A bag's own id reads the whole of it, also where the embodiment parts bags.
 
         Raises:
             SourceError: no such bag, or no such episode in it.
             EpisodeError: the bag is damaged, holds no episode, or lacks what the embodiment names.
         """
+        uri = as_text(uri)
         bags, root, segments = _bags(uri), local_path(uri), embodiment.source.segments
         if episode_id in bags:
             path = bags[episode_id]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import TokenizerError
+from hma_data.paths import StrPath, as_text
 from hma_data.tokenizers.catalog import CATALOG
 
 # name -> (module, keyword arguments of its `load`)
@@ -86,23 +87,23 @@ class Tokenizer(Protocol):
         ...
 
 
-def get_tokenizer(name_or_path: str, *, weights: str | None = None, device: str = "cpu") -> Tokenizer:
+def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, device: str = "cpu") -> Tokenizer:
     """The tokenizer of that name, ready to use.
 
     Args:
         name_or_path: a name of `TOKENIZERS`.
-        weights: a file to take the weights from instead of the usual place.
+        weights: str or path of a file (or folder) to take the weights from instead of the usual place, or
+            `hf://[datasets/]ORGANISATION/NAME[@REVISION]/FILE`.
         device: where a network runs: cpu, cuda, mps.
 
     Raises:
         TokenizerError: no such tokenizer, or its weights cannot be used.
     """
-    if name_or_path not in TOKENIZERS:
-        raise TokenizerError(name_or_path, "is not a tokenizer", f"known: {', '.join(sorted(TOKENIZERS))}")
-    module, arguments = TOKENIZERS[name_or_path]
-    tokenizer: Tokenizer = import_module(module).load(
-        name_or_path, weights=weights, device=device, **arguments
-    )
+    name, given = as_text(name_or_path), None if weights is None else as_text(weights)
+    if name not in TOKENIZERS:
+        raise TokenizerError(name, "is not a tokenizer", f"known: {', '.join(sorted(TOKENIZERS))}")
+    module, arguments = TOKENIZERS[name]
+    tokenizer: Tokenizer = import_module(module).load(name, weights=given, device=device, **arguments)
     return tokenizer
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError, TokenizerError
+from hma_data.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.corpus import VIDEOS, read_pictures
 from hma_data.video import Filter, prepare, resize
@@ -29,7 +30,7 @@ def _ignore(text: str) -> None:
 
 
 def read_frames(
-    path: Path,
+    path: StrPath,
     size: int,
     *,
     frames: int = 64,
@@ -39,12 +40,14 @@ def read_frames(
     """Frames of a picture, a video, or every picture and video below a folder.
 
     Args:
+        path: str or path of it.
         frames: taken from each video, evenly.
         on_skip: told of a file in a folder that cannot be decoded.
 
     Raises:
         TokenizerError: there is nothing, no picture and no video, or none that can be decoded.
     """
+    path = as_path(path)
     if not path.exists():
         raise TokenizerError(path, "no such file or folder")
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
@@ -86,7 +89,7 @@ def _pictures(file: Path, frames: int) -> Iterator[Frame]:
 
 def recording_frames(
     embodiment: "Embodiment",
-    uri: str,
+    uri: StrPath,
     spec: TokenizerSpec,
     *,
     frames: int = 64,
@@ -95,6 +98,7 @@ def recording_frames(
     """Frames of a recording as a conversion would tokenize them: every camera, by the robot's YAML.
 
     Args:
+        uri: str or path of the recording, or its URI.
         frames: taken from each of up to 16 episodes, evenly.
         on_skip: told of an episode that cannot be read; another takes its place.
 
@@ -118,7 +122,7 @@ def recording_frames(
             fault = str(problem)
             on_skip(fault)
     if not read:
-        raise SourceError(uri, f"gave no frame: {fault}")
+        raise SourceError(as_text(uri), f"gave no frame: {fault}")
 
 
 def _episode_frames(
@@ -132,7 +136,7 @@ def _episode_frames(
 
 
 def frames_of(
-    data: str | Path,
+    data: StrPath,
     spec: TokenizerSpec,
     *,
     embodiment: "Embodiment | None" = None,
@@ -142,13 +146,16 @@ def frames_of(
     """Frames of whatever lies there: with an embodiment a recording (a path or URI), else a shard set's
     source, pictures or videos.
 
+    Args:
+        data: str or path of it, or the URI of a recording.
+
     Raises:
         TokenizerError: nothing there can be measured.
         SourceError: the recording cannot be read.
     """
     from hma_data.shards.manifest import MANIFEST, Manifest
 
-    path, uri = Path(data), str(data)
+    path, uri = as_path(data), as_text(data)
     if embodiment is None and (path / MANIFEST).is_file():
         manifest = Manifest.load(path)
         embodiment, uri = manifest.embodiment, manifest.source

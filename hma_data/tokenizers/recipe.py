@@ -5,13 +5,13 @@ Every value is checked before anything is read or trained; unknown keys are refu
 
 import hashlib
 import json
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hma_data.errors import RecipeError
+from hma_data.paths import StrPath, as_path
 from hma_data.tokenizers.corpus import DrawnSource, FileSource, PushtSource
 from hma_data.tokenizers.fsq_network import STRIDE, FsqConfig
 from hma_data.tokenizers.vae_network import VaeConfig
@@ -148,12 +148,16 @@ def _digest(values: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
-def load_recipe(path: Path, overrides: dict[str, Any] | None = None) -> TokenizerRecipe:
+def load_recipe(path: StrPath, overrides: dict[str, Any] | None = None) -> TokenizerRecipe:
     """The recipe of a YAML file; `overrides` replace values by dotted key (`training.steps`).
+
+    Args:
+        path: str or path of the YAML.
 
     Raises:
         RecipeError: the file or an override is not valid.
     """
+    path = as_path(path)
     values = read_yaml(path, RecipeError)
     for key, value in (overrides or {}).items():
         *parents, last = key.split(".")

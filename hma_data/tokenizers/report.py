@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.files import write_atomic
+from hma_data.paths import StrPath, as_path
 from hma_data.sheets import grid, write_png
 
 Results = dict[str, dict[str, Any]]
@@ -45,13 +46,15 @@ def to_markdown(results: Results) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_report(folder: Path, title: str, results: Results, notes: list[str]) -> list[Path]:
+def write_report(folder: StrPath, title: str, results: Results, notes: list[str]) -> list[Path]:
     """Write `eval.md`, `eval.json` and, where results hold worst frames, `worst.png` to a folder.
 
     Args:
+        folder: str or path of the folder.
         results: as for `to_markdown`; their `worst_frames` go into the picture.
         notes: lines below the table.
     """
+    folder = as_path(folder)
     plain = {name: without_frames(result) for name, result in results.items()}
     text = f"# {title}\n\n{to_markdown(plain)}"
     text += "".join(f"\n{note}\n" for note in notes)

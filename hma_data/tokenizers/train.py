@@ -30,6 +30,7 @@ from torch.nn import functional
 
 from hma_data.errors import RecipeError
 from hma_data.files import write_atomic
+from hma_data.paths import StrPath, as_path
 from hma_data.tokenizers.corpus import Pool, draw_batch, load_pools
 from hma_data.tokenizers.embedded import save_weights
 from hma_data.tokenizers.eval import ssim_map
@@ -236,8 +237,8 @@ def _latent_penalty(latents: Tensor) -> Tensor:
 
 
 def train(
-    recipe_path: Path,
-    out: Path,
+    recipe_path: StrPath,
+    out: StrPath,
     overrides: dict[str, Any] | None = None,
     *,
     device: str = "cpu",
@@ -248,8 +249,9 @@ def train(
     """Train as the recipe says and write the weights; a run that was stopped goes on.
 
     Args:
-        recipe_path: YAML, see `hma_data.tokenizers.recipe.TokenizerRecipe`.
-        out: the weights' file, rewritten at every report; `<out>.state` holds the run until it ends.
+        recipe_path: str or path of a YAML, see `hma_data.tokenizers.recipe.TokenizerRecipe`.
+        out: str or path of the weights' file, rewritten at every report; `<out>.state` holds the run until
+            it ends.
         overrides: values to replace in the recipe, by dotted key.
         device: where the network is trained: cpu, cuda, mps.
         workers: threads that draw crops ahead; 0 draws them in turn. The crops are the same.
@@ -265,7 +267,7 @@ def train(
             is another training's.
         TokenizerError: there is no such device.
     """
-    place = open_device("tokenizer train", device)
+    place, out = open_device("tokenizer train", device), as_path(out)
     recipe = load_recipe(recipe_path, overrides)
     torch.set_num_threads(recipe.training.threads)
     pools, corpus_sha256 = load_pools(list(recipe.sources), Path(recipe.corpus).expanduser(), recipe.seed)
