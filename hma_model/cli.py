@@ -5,6 +5,7 @@ Every verb imports what it needs when it runs, so that --help answers at once.
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,37 +32,46 @@ _Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[
 ]  # ClickException, wherever typer keeps its click
 
 
-def main() -> None:
-    """Run a command; errors become one line on stderr and an exit code."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; errors become one line on stderr.
+
+    Args:
+        argv: the words after `hma`; None takes the process's own.
+
+    Returns:
+        The exit code: 0 well, 1 failed or problems found, 2 wrong usage, 130 interrupted.
+    """
     take_ordinary_priority()
     # Threads that spin at a barrier starve each other on a busy machine: steps took ten times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is first imported
-    debug = "--debug" in sys.argv or bool(os.environ.get("HMA_DEBUG"))
-    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words or bool(os.environ.get("HMA_DEBUG"))
     try:
-        code = app(arguments, standalone_mode=False)
+        code = app([word for word in words if word != "--debug"], standalone_mode=False)
+    except SystemExit as ended:  # a rank whose error another rank has reported
+        return ended.code if isinstance(ended.code, int) else 1
     except HMAError as fault:
         if debug:
             raise
-        sys.exit(_fail(str(fault), fault.exit_code))
+        return _fail(str(fault), fault.exit_code)
     except _Wrong as fault:
         context = getattr(fault, "ctx", None)
         if not fault.format_message().strip() or type(fault).__name__ == "NoArgsIsHelpError":
-            sys.exit(2)  # the help has been shown
+            return 2  # the help has been shown
         hint = f" — see {context.command_path} --help" if context else ""
         said = fault.format_message().replace("Value error, ", "")  # of the enum options
-        sys.exit(_fail(said + hint, 2))
+        return _fail(said + hint, 2)
     except (KeyboardInterrupt, typer.Abort):
-        sys.exit(_fail("interrupted; run the same command again to continue", 130))
+        return _fail("interrupted; run the same command again to continue", 130)
     except BrokenPipeError:
         sys.stderr.close()
-        sys.exit(1)
+        return 1
     except Exception as fault:
         if debug:
             raise
         text = f"{type(fault).__name__}: {fault}".splitlines()[0]
-        sys.exit(_fail(f"{text} — this should have been a clearer error; --debug shows where it happened", 1))
-    sys.exit(code if isinstance(code, int) else 0)
+        return _fail(f"{text} — this should have been a clearer error; --debug shows where it happened", 1)
+    return code if isinstance(code, int) else 0
 
 
 def _fail(text: str, code: int) -> int:
@@ -206,4 +216,4 @@ app.add_typer(hub_app, name="hub")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

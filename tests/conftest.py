@@ -35,6 +35,53 @@ def pytest_runtest_call() -> Generator[None, Any, Any]:
         return (yield)
 
 
+# Why a test may be skipped, by the words of its reason; any other skip fails a run of CI.
+SKIPS = {
+    "root": "root may",
+    "no GPU": "needs a GPU",
+    "no real recordings": "no real recordings",
+    "no paper's code": "the paper's released code",
+    "another platform": "this platform",
+}
+_skipped: list[str] = []
+
+
+def _note_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
+    if report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        _skipped.append(reason.removeprefix("Skipped: "))
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Note why a test is skipped."""
+    _note_skip(report)
+
+
+def pytest_collectreport(report: pytest.CollectReport) -> None:
+    """Note why a module is skipped."""
+    _note_skip(report)
+
+
+def _unexplained() -> list[str]:
+    """Return the reasons that none of SKIPS allows, such as a package that is missing."""
+    return sorted({r for r in _skipped if not any(words in r for words in SKIPS.values())})
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Count the skipped tests by reason, and name what must not be skipped in CI."""
+    for kind, words in SKIPS.items():
+        if count := sum(words in reason for reason in _skipped):
+            terminalreporter.write_line(f"skipped, {kind}: {count}")
+    for reason in _unexplained():
+        terminalreporter.write_line(f"skipped without leave, an error in CI: {reason}", red=True)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail a run of CI in which a test was skipped for want of a package."""
+    if os.environ.get("CI") and _unexplained() and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real recordings, beside the checkout or named by HMA_REAL_DATA."""

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.command import hma
 from tests.data.bag_files import make_recording, write_ros2
 from tests.data.videos import make_v3
-from tests.test_cli import hma
 
 TINY = ["frames=3", "batch_size=2", "steps=2", "warmup=1"]
 TINY += ["model.layers=1", "model.width=32", "model.heads=2"]

@@ -1,7 +1,6 @@
 """The command line: exit codes, one-line errors, JSON, and that light verbs stay light."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,31 +9,8 @@ import h5py
 import pytest
 
 from hma_data.lab import record
+from tests.command import ROOT, fails, hma, hma_process
 from tests.conftest import ARM_YAML, write_toy
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def hma(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run the command as a user would."""
-    return subprocess.run(
-        [sys.executable, "-m", "hma_model.cli", *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-
-
-def fails(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
-    """One line on stderr that says all of `words`, no traceback, and the exit code."""
-    assert done.returncode == code, done.stderr
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1, done.stderr
-    assert "Traceback" not in done.stderr
-    for word in words:
-        assert word in errors[0]
 
 
 @pytest.fixture
@@ -249,7 +225,7 @@ def test_a_folder_of_another_embodiment_is_left_alone(arm: Path, tmp_path: Path)
 
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
-    assert "Traceback" in hma("inspect", str(tmp_path / "no"), "--debug").stderr
+    assert "Traceback" in hma_process("inspect", str(tmp_path / "no"), "--debug").stderr
 
 
 def test_not_a_shard_set(tmp_path: Path) -> None:

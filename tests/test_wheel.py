@@ -29,7 +29,7 @@ def hma(site: Path, where: Path, *arguments: str) -> str:
 import sys, hma_data
 assert sys.argv.pop(1) in hma_data.__file__
 from hma_model.cli import main
-main()
+sys.exit(main())
 """
     done = subprocess.run(
         [sys.executable, "-P", "-c", code, str(site), *arguments],

@@ -21,9 +21,9 @@ from hma_model.files import to_json
 from hma_model.model import HMA
 from hma_model.released import config_from_released, config_to_released
 from hma_model.released_state import state_to_released
+from tests.command import fails, hma
 from tests.hub_server import connect, serve
 from tests.model.network_parts import small_batch, small_config
-from tests.test_cli import fails, hma
 
 RELEASED: dict[str, Any] = {
     "time_position": "learned", "action_alignment": "current", "temporal_norm": False, "final_norm": False,
