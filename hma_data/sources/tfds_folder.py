@@ -18,7 +18,7 @@ import fsspec
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
 from hma_data.sources.base import leaves
 from hma_data.sources.fetching import attempt, fetch_whole, is_listless, is_local
-from hma_data.sources.record_file import RecordFile, open_records
+from hma_data.sources.record_file import RecordFile, is_array_record, open_records
 from hma_data.sources.record_index import EMPTY, Framing
 from hma_data.sources.tf_example import Example
 from hma_data.sources.tfds_features import Feature, read_features
@@ -243,6 +243,11 @@ def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], p
     if not shards:
         shards, more = named_shards(root, listing or [], info)
         problems += more
+    paths = [shard.path for items in shards.values() for shard in items]
+    if not is_local(files) and any(map(is_array_record, paths)):
+        raise SourceError(
+            uri, "holds ArrayRecord files, which are read from this machine's disks only", "copy it here"
+        )
     if only:  # the others were left out on purpose
         problems = []
     folder = Folder(
