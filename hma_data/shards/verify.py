@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from hma_data.engines.local import usable_cores
 from hma_data.errors import HMAError
 from hma_data.files import PART, file_sha256
-from hma_data.output import JOURNAL, LOCK
+from hma_data.output import WORKING
 from hma_data.shards.check import Checked, check_shard, plan_problem, same_stats
 from hma_data.shards.manifest import (
     EMBODIMENT,
@@ -117,7 +117,7 @@ def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
     known = {shard.path for shard in manifest.shards} | {MANIFEST, EPISODES, QUARANTINE, EMBODIMENT} | BESIDE
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if name in known or name.startswith((LOCK, JOURNAL)) or (path.is_dir() and name in SPLITS):
+        if name in known or name.startswith(WORKING) or (path.is_dir() and name in SPLITS):
             continue
         if path.name.endswith(PART):
             yield f"{path}: is left of a job that runs or was killed — run the same hma convert again"
