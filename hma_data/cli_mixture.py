@@ -8,7 +8,7 @@ import typer
 from hma_data.console import print_json, print_table
 
 if TYPE_CHECKING:
-    from hma_data.mixture import Mixture
+    from hma_data.mixture import Mixture, plot_mixture
     from hma_data.windows import WindowIndex
 
 Pairs = list[str] | None
@@ -75,8 +75,6 @@ def mixture(
     totals = {name: shards.manifest.splits.get(split, {}) for name, shards in sets.items()}
     rows = _rows(mix, indexes, totals, planned)
     if plot:
-        from hma_data.plots import plot_mixture
-
         plot_mixture(mix, tau, plot)
     if json:
         said = tau if tau != float("inf") else "inf"
