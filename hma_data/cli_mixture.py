@@ -8,7 +8,7 @@ import typer
 from hma_data.console import print_json, print_table
 
 if TYPE_CHECKING:
-    from hma_data.mixture import Mixture, plot_mixture
+    from hma_data.mixture import Mixture
     from hma_data.windows import WindowIndex
 
 Pairs = list[str] | None
@@ -45,7 +45,7 @@ def mixture(
     """
     from hma_data.errors import UsageError
     from hma_data.loader import open_sets
-    from hma_data.mixture import TEMPERATURES, Mixture
+    from hma_data.mixture import TEMPERATURES, Mixture, plot_mixture
     from hma_data.shards.manifest import SPLITS
     from hma_data.windows import WindowIndex
 
