@@ -45,7 +45,7 @@ def mixture(
     """
     from hma_data.errors import UsageError
     from hma_data.loader import open_sets
-    from hma_data.mixture import TEMPERATURES, Mixture
+    from hma_data.mixture import TEMPERATURES, Mixture, plot_mixture
     from hma_data.shards.manifest import SPLITS
     from hma_data.windows import WindowIndex
 
@@ -75,8 +75,6 @@ def mixture(
     totals = {name: shards.manifest.splits.get(split, {}) for name, shards in sets.items()}
     rows = _rows(mix, indexes, totals, planned)
     if plot:
-        from hma_data.plots import plot_mixture
-
         plot_mixture(mix, tau, plot)
     if json:
         said = tau if tau != float("inf") else "inf"

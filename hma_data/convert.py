@@ -27,7 +27,6 @@ from hma_data.extend import extended
 from hma_data.files import remove_parts
 from hma_data.hub_output import HubOutput
 from hma_data.output import (
-    Held,
     Journal,
     Made,
     Share,
@@ -36,7 +35,7 @@ from hma_data.output import (
     finished_shards,
     known_hashes,
     locked,
-    remove_journals,
+    remove_notes,
     shard_names,
 )
 from hma_data.paths import StrPath, as_text
@@ -173,7 +172,7 @@ def convert(
         device,
         limits,
     )
-    with locked(folder) as lock:
+    with locked(folder):
         if overwrite:
             clear(folder)
         plan, base = conversion.plan(extend)
@@ -181,7 +180,7 @@ def convert(
             hub.prepare()
             if not overwrite:
                 hub.refuse_other(plan.facts)
-        done, made = conversion.make(plan, base, None, on_progress, lock)
+        done, made = conversion.make(plan, base, None, on_progress)
         manifest = conversion.finish(plan, base, bool(made))
         reasons, flags = _reasons(folder), _flags(folder)
         if not any(split["episodes"] for split in manifest.splits.values()):
@@ -220,16 +219,15 @@ def convert_share(
     conversion = _Conversion(
         embodiment, source, tokenizer, out, settings or Settings(), workers, "local", weights, device, limits
     )
-    with locked(out, share) as lock:
+    with locked(out, share):
         plan, base = conversion.plan(extend)
-        done, made = conversion.make(plan, base, share, on_progress, lock)
-    missing = len(plan.units)
-    with suppress(OutputError), locked(out):  # others are still writing: the last of them comes here
-        missing -= len(finished_shards(out, plan, base, shared=False))
-        if not missing:
-            conversion.finish(plan, base, True)
-    if missing:
-        missing = len({unit.name for unit in plan.units} - shard_names(out))
+        done, made = conversion.make(plan, base, share, on_progress)
+    missing = len({unit.name for unit in plan.units} - shard_names(out))
+    if not missing:
+        with suppress(OutputError), locked(out):  # others are still writing: the last of them comes here
+            missing = len(plan.units) - len(finished_shards(out, plan, base, shared=False))
+            if not missing:
+                conversion.finish(plan, base, True)
     return Shared(out, done, made, missing, time.monotonic() - begun)
 
 
@@ -286,7 +284,6 @@ class _Conversion:
         base: Manifest | None,
         share: Share | None,
         on_progress: Callable[[Progress], None],
-        lock: Held,
     ) -> tuple[int, int]:
         """Make the shards that are not there; how many were, and how many are made."""
         mine = plan.units[share.index :: share.count] if share else plan.units
@@ -304,10 +301,8 @@ class _Conversion:
         if todo:
             with Journal(self._out, share) as journal:
                 for made in self._run(todo, plan, _Counter(progress, on_progress)):
-                    lock.check()
                     journal.add(made)
                     on_progress(progress)
-            lock.check()
         return progress.kept_shards, len(todo)
 
     def _run(self, todo: list[ShardUnit], plan: Plan, on_event: "_Counter") -> Iterator[Made]:
@@ -330,6 +325,7 @@ class _Conversion:
         if not changed and (out / MANIFEST).is_file():
             manifest = Manifest.load(out)
             if not damaged_files(out, manifest):
+                remove_notes(out)
                 return manifest
         kept = base.shards if base else ()
         names = [*(shard.path for shard in kept), *(unit.name for unit in plan.units)]
@@ -342,7 +338,7 @@ class _Conversion:
             self.uri,
             hashes={**{shard.path: shard.sha256 for shard in kept}, **known_hashes(out)},
         )
-        remove_journals(out)
+        remove_notes(out)
         return manifest
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-import shutil
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,8 +62,9 @@ def _uploaded(final: RemotePath) -> Iterator[Path]:
 
 
 def upload_folder(folder: RemotePath) -> Path:
-    """Where files that will go into a folder of a store are written first."""
-    return cache_folder() / "uploads" / hashlib.sha256(str(folder).encode()).hexdigest()[:16]
+    """Return where this machine writes files that will go into a folder of a store."""
+    name = f"{folder} {platform.node()}"  # a cache may be shared by machines
+    return cache_folder() / "uploads" / hashlib.sha256(name.encode()).hexdigest()[:16]
 
 
 def write_atomic(final: Path, content: str | bytes) -> None:
@@ -103,6 +104,19 @@ def remove_parts(folder: Path) -> None:
     """Delete what a killed run left unfinished in a folder and the folders right below it."""
     if isinstance(folder, RemotePath):
         for place in (folder, folder / "train", folder / "val"):
-            shutil.rmtree(upload_folder(place), ignore_errors=True)
+            for part in upload_folder(place).glob(f".*{PART}"):  # another job may be writing the same set
+                if not is_running(int(part.name.removesuffix(PART).rpartition(".")[2])):
+                    part.unlink(missing_ok=True)
     for part in [*folder.glob(f".*{PART}"), *folder.glob(f"*/.*{PART}")]:
         part.unlink(missing_ok=True)
+
+
+def is_running(pid: int) -> bool:
+    """Check whether this machine has a process of that number."""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,37 +1,210 @@
-"""Which keys of a recording are cameras, actions, states and words, judged by their names and shapes.
+"""Choose which keys of a recording are cameras, actions, states and words, by their names and shapes.
 
-A choice that the names do not settle carries a question, which ends as a TODO in the YAML. Bags are
-judged by topics, in `infer_topics`.
+The words in a key's name say whether it is a command or a measurement, a gripper or a base, or noise.
+Keys, message types or a controller's name state the action space and the names of values. A choice that
+the names do not settle carries a question, which ends as a TODO in the YAML. Bags are judged by topics,
+in `infer_topics`.
 """
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from hma_data.infer_words import (
-    BASE,
-    CARTESIAN,
-    GIVEN,
-    JOINT,
-    MEASURED,
-    MOTION,
-    PLACE,
-    ROTATION,
-    SIDES,
-    STATES,
-    is_gripper,
-    is_next,
-    is_observed,
-    is_whole_state,
-    last,
-    natural,
-    shown,
-    snake,
-    strength,
-    words,
-)
 from hma_data.sources.base import KeyInfo
+
+MAX_DIMS = 4096  # of a component
+
+
+def _set(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+NOISE = _set("""
+    reward rewards return returns discount done dones terminal terminate success is embedding embeddings
+    language instruction text image images img depth mask masks segmentation flow timestamp timestamps stamp
+    stamps index idx id episode seq layout covariance calibration intrinsic intrinsics extrinsic extrinsics
+    camera cameras info matrix width height distortion imu battery temperature wrench force forces torque
+    torques effort efforts contact contacts tactile object objects obj cube obstacle bbox bounds attention
+    feature features latent latents rosout diagnostics clock log parameter tf marker markers map scan cloud
+    pointcloud color colour pad padding next acceleration accelerations acc error errors duration status
+    feedback result event events environment noise
+    time
+""")
+_COMMANDS = (
+    (5, _set("action actions command commands commanded cmd cmds cmdvel")),
+    (4, _set("desired target targets setpoint setpoints")),
+    (3, _set("leader leaders master teleop gello")),
+    (1, _set("goal control controls reference ref joy spacemouse actuation actuations")),
+)
+MEASURED = _set("actual measured current feedback state states observed odom odometry")
+STATES = _set("""
+    state states joint joints jointstates qpos proprio proprioception pose eef ee tcp effector tool position
+    positions pos gripper odom odometry encoder encoders xyz
+""")
+MOTION = _set("velocity velocities vel vels qvel jvel twist")
+PLACE = _set("position positions pos pose poses qpos angle angles")
+BASE = _set("base displacement torso waist head body chassis wheel wheels")
+ROTATION = _set("rotation rot quat quaternion orientation euler rpy axis angular")
+JOINT = _set("joint joints qpos")
+CARTESIAN = _set("cartesian eef ee tcp end")
+GIVEN = _set("go start src box delta")  # poses that are given, not measured
+SIDES = _set("left right l r")
+_GRIPPER = _set("gripper grippers grip closedness close closed open finger fingers")
+_WHOLE_STATE = re.compile(r"(robot_)?(state|proprio|proprioception|obs)|qpos|agent_pos")
+_OBSERVED = re.compile(r"(^|[/.])(obs|observations?)([/.]|$)", re.IGNORECASE)
+_NEXT = re.compile(r"(^|[/.])next([_./]|$)", re.IGNORECASE)
+
+
+def words(key: str) -> list[str]:
+    """The lower-case words of a key, without digits: robot0_eefPos -> robot, eef, pos."""
+    return re.findall(r"[a-z]+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", key).lower())
+
+
+def snake(key: str) -> str:
+    """Its words joined by underscores."""
+    return "_".join(words(key))
+
+
+def last(key: str) -> str:
+    """What follows the last separator."""
+    return re.split(r"[/.]", key)[-1]
+
+
+def natural(text: str) -> list[tuple[int, str]]:
+    """Sort key that puts image before image_2 before image_10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
+
+
+def shown(keys: Iterable[str], most: int = 12) -> str:
+    """Keys in one line, the first of many."""
+    listed = [" ".join(key.split())[:120] for key in keys]
+    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
+
+
+def dims(key: KeyInfo) -> int:
+    """Values a sample; 0 where it is none that a component could hold."""
+    count = 1
+    for side in key.shape:
+        count *= max(side, 0)
+    return count if key.key and count <= MAX_DIMS else 0
+
+
+def is_next(key: str) -> bool:
+    """Whether it is of the step after: robomimic's next_obs, LeRobot's next.reward."""
+    return bool(_NEXT.search(key))
+
+
+def is_observed(key: str) -> bool:
+    """Whether it lies under observations."""
+    return bool(_OBSERVED.search(key))
+
+
+def is_gripper(key: str) -> bool:
+    """Whether its name says that it opens and closes."""
+    said = set(words(key))
+    return bool(said & _GRIPPER or ("effector" in said and "end" not in said))
+
+
+def is_whole_state(key: str) -> bool:
+    """Whether its name says that it is all of the robot's state."""
+    return bool(_WHOLE_STATE.fullmatch(snake(last(key))))
+
+
+def strength(said: Iterable[str]) -> int:
+    """How clearly words say that it is a command; 0 for not at all."""
+    said = set(said)
+    return next((rank for rank, names in _COMMANDS if said & names), 0)
+
+
+def vectors(keys: Iterable[KeyInfo]) -> list[KeyInfo]:
+    """Keys of numbers that could be part of an action or a state."""
+    numbers = [key for key in keys if key.kind == "vector" and dims(key) and not is_next(key.key)]
+    return [
+        key
+        for key in numbers
+        if not NOISE & set(words(key.key)) and snake(key.key)[-4:] not in ("_cos", "_sin")
+    ]
+
+
+_DELTA = frozenset(("delta", "deltas", "rel", "relative"))
+_CONTROLLERS = {  # robosuite's, where they take changes; a gripper's value follows
+    "OSC_POSE": ("eef_delta", ("dx", "dy", "dz", "drx", "dry", "drz")),
+    "OSC_POSITION": ("eef_delta", ("dx", "dy", "dz")),
+    "IK_POSE": ("eef_delta", ("dx", "dy", "dz", "drx", "dry", "drz")),
+    "JOINT_POSITION": ("joint_delta", ()),
+    "JOINT_VELOCITY": ("joint_velocity", ()),
+}
+_ABSOLUTE = {
+    "OSC_POSE": ("eef_pose", ("x", "y", "z", "rx", "ry", "rz")),
+    "OSC_POSITION": ("eef_pose", ("x", "y", "z")),
+    "JOINT_POSITION": ("joint_position", ()),
+}
+
+
+def _controller(facts: Mapping[str, str]) -> tuple[str | None, tuple[str, ...]]:
+    name, _, absolute = facts.get("controller", "").partition(" ")
+    return (_ABSOLUTE if absolute else _CONTROLLERS).get(name, (None, ()))
+
+
+def names_of(key: KeyInfo, facts: Mapping[str, str]) -> tuple[str, ...] | None:
+    """Names of an action's values by the controller that takes them; None where it does not say."""
+    names = _controller(facts)[1]
+    if not names or snake(key.key) not in ("action", "actions"):
+        return None
+    return {len(names): names, len(names) + 1: (*names, "gripper")}.get(dims(key))
+
+
+def space_of(keys: Iterable[KeyInfo], facts: Mapping[str, str]) -> str | None:
+    """The action's space where it is stated; None where it would be a guess."""
+    keys = list(keys)
+    stated = _controller(facts)[0]
+    if stated and all(snake(key.key) in ("action", "actions") for key in keys):
+        return stated
+    arms = [key for key in keys if not is_gripper(key.key)]
+    moved = any(
+        {"rotation", "delta"} <= set(words(key.key)) for key in keys
+    )  # a world_vector beside it is a step
+    spaces = {
+        "eef_delta" if moved and snake(key.key).endswith("world_vector") else _space(key) for key in arms
+    }
+    if not spaces or None in spaces:
+        return None
+    return spaces.pop() if len(spaces) == 1 else "mixed"
+
+
+def _space(key: KeyInfo) -> str | None:
+    said, text = set(words(key.key)), snake(key.key)
+    if key.topic and re.search(r"Joint(State|Trajectory)$", key.topic.type):
+        said = said | {"joint"}
+    if "cmd_vel" in text or "cmdvel" in text or "base_velocity" in text:
+        return "base_velocity"
+    if "base" in said:
+        return "base_velocity" if said & MOTION else None
+    if said & JOINT and not said & CARTESIAN:
+        if said & _DELTA:
+            return "joint_delta"
+        return "joint_position" if said & PLACE else "joint_velocity" if said & MOTION else _by_names(key)
+    if said & _DELTA and said & (ROTATION | CARTESIAN):
+        return "eef_delta"
+    if said & CARTESIAN and said & (PLACE | ROTATION):
+        return "eef_pose"
+    return _by_names(key)
+
+
+def _by_names(key: KeyInfo) -> str | None:
+    """By names such as shoulder_pan.pos and delta_x; grippers aside."""
+    names = [name for name in key.names or () if not is_gripper(name)]
+    if names and all(re.search(r"(delta_|(^|_)d)([xyz]|roll|pitch|yaw)$", name) for name in names):
+        return "eef_delta"
+    joints = {"shoulder", "elbow", "wrist", "waist", "forearm", "joint", "hip", "knee", "ankle"}
+    if not names or not all(joints & set(words(name)) for name in names):
+        return None
+    for ending, space in ((".pos", "joint_position"), (".vel", "joint_velocity")):
+        if all(name.endswith(ending) for name in names):
+            return space
+    return None
+
 
 MIN_SIDE, MAX_RATIO = 8, 8  # of a camera's picture
 _NOT_CAMERA = re.compile(

@@ -4,15 +4,17 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable
 
-from hma_data.infer_choices import Choice, likely, question
-from hma_data.infer_words import (
+from hma_data.infer_choices import (
     JOINT,
     MEASURED,
     MOTION,
     PLACE,
     SIDES,
     STATES,
+    Choice,
     is_gripper,
+    likely,
+    question,
     shown,
     strength,
     words,

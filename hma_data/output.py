@@ -1,4 +1,6 @@
-"""The folder a conversion writes: locked while it runs, never mixed with anything else."""
+"""The folder a conversion writes: locked while it runs (in a store, claimed for its plan), never mixed
+with anything else.
+"""
 
 import errno
 import fcntl
@@ -11,18 +13,17 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hma_data.errors import HMAError, OutputError, StorageAwayError
 from hma_data.extend import hashes, ways
 from hma_data.files import PART, remove_parts
 from hma_data.plan import Plan, differences
-from hma_data.remote_lock import PROBE, RemoteLock, held_by, living_holder
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SPLITS, Manifest
 from hma_data.shards.schema import Footer, read_footer
-from hma_data.store import RemotePath, is_remote, put_bytes
+from hma_data.store import RemotePath, create_bytes, is_remote, put_bytes
 
-LOCK, JOURNAL = ".lock", ".journal"
+LOCK, JOURNAL, PLAN = WORKING = ".lock", ".journal", ".plan"  # begin the names of what is there meanwhile
 READERS, JOURNAL_S = 16, 20.0  # footers asked for at a time, and seconds between two writes, in a store
 OURS = {"train", "val", MANIFEST, EPISODES, EMBODIMENT, QUARANTINE}
 
@@ -43,62 +44,27 @@ class Share:
 # -- locks
 
 
-class Held(Protocol):
-    """A lock that is held."""
-
-    def check(self) -> None:
-        """Raises OutputError where it was lost, which only one in a store can be."""
-        ...
-
-
-class _Flock:
-    def check(self) -> None:
-        """The kernel keeps it."""
-
-
 @contextmanager
-def locked(out: Path, share: Share | None = None) -> Iterator[Held]:
-    """Only one job writes a folder, or a share of it; a lock goes with its process, however that ends.
+def locked(out: Path, share: Share | None = None) -> Iterator[None]:
+    """Let one job alone write a folder, or a share of it; the kernel's lock goes with the process.
+
+    A store has no such lock. Jobs of one plan write the same bytes there; another plan is refused by
+    `finished_shards`.
 
     Raises:
         OutputError: another job is writing, or the folder cannot be written.
     """
-    if isinstance(out, RemotePath):
-        with _locked_in_store(out, share) as held:
-            yield held
+    if not isinstance(out, RemotePath):
+        with _locked_here(out, share):
+            yield
         return
-    with _locked_here(out, share):
-        yield _Flock()
-
-
-@contextmanager
-def _locked_in_store(out: RemotePath, share: Share | None) -> Iterator[Held]:
     if out.scheme == "hf":
         raise OutputError(
             out,
             "a hub's repository is written by one whole hma convert only",
             "write a folder, then upload it",
         )
-    what = f"share {share.name} of it" if share else "it"
-    _refuse_living(out, share, what)
-    with RemoteLock(out / (f"{LOCK}-{share.name}" if share else LOCK), what) as lock:
-        _refuse_living(out, share, what)  # two that came at once see each other here
-        if share is None:
-            for path in _locks(out):
-                if path.name != LOCK:
-                    path.unlink(missing_ok=True)  # of jobs that are gone
-        yield lock
-
-
-def _refuse_living(out: RemotePath, share: Share | None, what: str) -> None:
-    """A share goes with other shares, and nothing else with anything."""
-    for path in _locks(out):
-        if (path.name == LOCK) == (share is not None) and (holder := living_holder(path)):
-            raise held_by(path, holder, what)
-
-
-def _locks(out: RemotePath) -> list[RemotePath]:
-    return [item for item in out.iterdir() if item.name.startswith(LOCK) and not item.name.startswith(PROBE)]
+    yield
 
 
 @contextmanager
@@ -161,7 +127,7 @@ def clear(out: Path) -> None:
     """
     _refuse_foreign(out)
     if isinstance(out, RemotePath):
-        out.delete_tree(keep=lambda name: name.startswith(LOCK))
+        out.delete_tree()
         return
     for item in out.iterdir():
         if not item.name.startswith(LOCK):
@@ -179,7 +145,7 @@ def _refuse_foreign(out: Path) -> None:
 
 
 def _working(name: str) -> bool:
-    return name.endswith(PART) or name.startswith((LOCK, JOURNAL))
+    return name.endswith(PART) or name.startswith(WORKING)
 
 
 def base_manifest(out: Path) -> Manifest | None:
@@ -189,7 +155,7 @@ def base_manifest(out: Path) -> Manifest | None:
 
 
 def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
-    """Names of the plan's shards that are there and whole.
+    """Return the names of the plan's shards that are there and whole; in a store, claim it for the plan.
 
     Args:
         base: the set the plan extends; its shards belong.
@@ -199,6 +165,8 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
         OutputError: the folder holds another conversion's shards, or something else.
     """
     _refuse_foreign(out)
+    if isinstance(out, RemotePath):
+        _refuse_claimed(out, plan)
     if not shared:
         remove_parts(out)
     kept = {shard.path for shard in base.shards} if base else set()
@@ -215,7 +183,24 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
         theirs = Manifest.load(out).plan
         if theirs["hash"] != plan.facts["hash"]:
             raise _other(out, plan, theirs)
+    if isinstance(out, RemotePath) and done != planned:
+        create_bytes(json.dumps(plan.facts).encode(), out / PLAN)
+        _refuse_claimed(out, plan)  # of two that came at once
     return done
+
+
+def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
+    """Raise OutputError where another plan is being written into a store."""
+    try:
+        theirs = json.loads((out / PLAN).read_bytes())
+    except FileNotFoundError:
+        return
+    if theirs["hash"] != plan.facts["hash"]:
+        raise OutputError(
+            out,
+            f"another conversion is being written there; different: {differences(plan.facts, theirs)}",
+            f"wait for it, or choose another --out; where no such job runs any more, delete {out / PLAN}",
+        )
 
 
 def shard_names(out: Path) -> set[str]:
@@ -304,7 +289,7 @@ def known_hashes(out: Path) -> dict[str, str]:
     return found
 
 
-def remove_journals(out: Path) -> None:
-    """After the manifest is there."""
-    for path in out.glob(f"{JOURNAL}*"):
+def remove_notes(out: Path) -> None:
+    """Delete the journals and the claim of a set whose manifest is there."""
+    for path in [*out.glob(f"{JOURNAL}*"), out / PLAN]:
         path.unlink(missing_ok=True)

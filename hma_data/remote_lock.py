@@ -20,6 +20,7 @@ from pathlib import Path
 from types import TracebackType
 
 from hma_data.errors import HMAError, OutputError, StorageAwayError
+from hma_data.files import is_running
 from hma_data.store import RemotePath, create_bytes, put_bytes
 
 REFRESH_S, STALE_S, SETTLE_S = 30.0, 180.0, 2.0
@@ -68,7 +69,7 @@ class RemoteLock:
         self._path, self._what = path, what
         self._me = Holder.me()
         self._ended = threading.Event()
-        self._taken_by: Holder | None = None
+        self._taken = False
         self._written = 0.0
         self._thread = threading.Thread(target=self._keep, name="hma-lock", daemon=True)
 
@@ -96,24 +97,12 @@ class RemoteLock:
         self._thread.join()
         with suppress(Exception):  # what was done stays done; the lock is forgotten by itself
             if isinstance(fault, StorageAwayError):  # one try: it was waited for long enough
-                if self._taken_by is None and time.monotonic() - self._written < STALE_S:
+                if not self._taken and time.monotonic() - self._written < STALE_S:
                     self._path.files.rm_file(self._path.key)
                 return
             read = _read(self._path)
             if read and read.job == self._me.job:
                 self._path.unlink(missing_ok=True)
-
-    def check(self) -> None:
-        """Before something is committed.
-
-        Raises:
-            OutputError: another job took the lock, as this one was not heard of for too long.
-            StorageError: it cannot be told.
-        """
-        if self._taken_by is None and time.monotonic() - self._written > STALE_S:
-            self._renew()
-        if self._taken_by:
-            raise held_by(self._path, self._taken_by, self._what)
 
     def _content(self) -> bytes:
         return json.dumps(asdict(replace(self._me, time=time.time()))).encode()
@@ -125,12 +114,12 @@ class RemoteLock:
     def _renew(self) -> None:
         read = _read(self._path)
         if read and read.job != self._me.job:
-            self._taken_by = read
+            self._taken = True
         else:
             self._write()
 
     def _keep(self) -> None:
-        while not self._ended.wait(REFRESH_S) and self._taken_by is None:
+        while not self._ended.wait(REFRESH_S) and not self._taken:
             try:
                 self._renew()
             except (HMAError, OSError) as fault:  # the next turn may do better; `check` looks at the time
@@ -180,17 +169,6 @@ def _age(path: RemotePath, holder: Holder) -> float | None:
         return time.time() - holder.time
     finally:
         probe.unlink(missing_ok=True)
-
-
-def is_running(pid: int) -> bool:
-    """Whether this machine has a process of that number."""
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def _machine() -> str:

@@ -9,10 +9,12 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from queue import Queue
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -35,7 +37,6 @@ from hma_data.errors import (
 )
 from hma_data.output import Made
 from hma_data.plan import ShardUnit
-from hma_data.prefetch import prefetch
 from hma_data.retry import WAITS_S, disk_is_full, storage_is_away, worth_another_try
 from hma_data.shards.schema import EpisodeRow, Footer, Refused, arrow_schema, flags_text, mask_columns
 from hma_data.shards.writer import EpisodeRows, ShardWriter
@@ -324,3 +325,42 @@ def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> 
         group=item.ref.group,
         content=item.content,
     )
+
+
+def prefetch[T](items: Iterable[T], depth: int = 2) -> Iterator[T]:
+    """The same items in the same order; errors surface where the item would have.
+
+    Args:
+        items: used in the thread only.
+        depth: how many may wait.
+    """
+    queue: Queue[tuple[str, T | BaseException | None]] = Queue(maxsize=depth)
+    stop = Event()
+
+    def produce() -> None:
+        try:
+            for item in items:
+                queue.put(("item", item))
+                if stop.is_set():
+                    return
+            queue.put(("end", None))
+        except BaseException as fault:  # handed over, not handled
+            queue.put(("fault", fault))
+
+    thread = Thread(target=produce, daemon=True)
+    thread.start()
+    try:
+        while True:
+            kind, value = queue.get()
+            if kind == "end":
+                return
+            if kind == "fault":
+                assert isinstance(value, BaseException)
+                raise value
+            yield value  # type: ignore[misc]
+    finally:
+        stop.set()
+        while thread.is_alive():  # the thread may be waiting to put one more
+            while not queue.empty():
+                queue.get_nowait()
+            thread.join(timeout=0.05)

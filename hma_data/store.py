@@ -7,30 +7,24 @@ pass by itself is tried again, the rest becomes FileNotFoundError, or one Storag
 
 import errno
 import io
-import logging
 import os
 import re
 import stat
-import time
 from collections.abc import Callable, Generator
 from fnmatch import fnmatchcase
 from inspect import signature
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
-from hma_data.errors import HMAError, MissingDependencyError, StorageAwayError, StorageError
+from hma_data.errors import HMAError, StorageAwayError, StorageError
+from hma_data.fetching import file_system
 from hma_data.paths import StrPath, as_text
-from hma_data.reach import reach
-from hma_data.retry import worth_another_try
-from hma_data.sources.fetching import ABSENT, may_pass, said
+from hma_data.retry import ABSENT, address_hint, may_pass, retried, said
 
 WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
 TAIL, AHEAD = 256 << 10, 8 << 20  # bytes: read at once from the end of a file; ahead of who reads on
-DRIVERS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs"}
 WHOLE_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "memory"}  # an object appears whole or not at all
 _SCHEME = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
-
-log = logging.getLogger(__name__)
 
 
 def place(where: StrPath) -> Path:
@@ -47,7 +41,7 @@ def place(where: StrPath) -> Path:
         return where
     text = as_text(where)
     found, bare = _SCHEME.fullmatch(text), text.rstrip("/")
-    if bare.endswith(":") and bare[:-1] in {*DRIVERS, "hf"}:
+    if bare.endswith(":") and bare[:-1] in WHOLE_PUTS | {"hf"}:
         raise StorageError(f"{bare}//", "names no bucket or repository", f"as in {bare}//bucket/folder")
     if not found:
         return Path(text)
@@ -71,30 +65,21 @@ def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
 
     Raises:
         FileNotFoundError: there is no such file.
-        StorageAwayError: it failed in such a way every time, or was never reached.
+        StorageAwayError: it failed in such a way every time.
         StorageError: it fails for good.
     """
-    for wait_s in (*WAITS_S, None):
-        try:
-            if isinstance(where, RemotePath):
-                reach(where.files, where)
-            return action()
-        except HMAError:
-            raise
-        except ABSENT as fault:
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(where)) from fault
-        except Exception as fault:  # stores raise what they like
-            passing = may_pass(fault) or (isinstance(fault, OSError) and worth_another_try(fault))
-            if passing and wait_s is not None:
-                log.info("%s: %s; trying again", where, said(fault))
-                time.sleep(wait_s)
-                continue
-            text = f"cannot be {doing}: {said(fault)}"
-            if passing:
-                remedy = "everything finished is kept: run the same command again"
-                raise StorageAwayError(where, text, remedy) from fault
-            raise StorageError(where, text, _remedy(fault)) from fault
-    raise AssertionError("a try returns or raises")
+    try:
+        return retried(action, where, WAITS_S)
+    except HMAError:
+        raise
+    except ABSENT as fault:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(where)) from fault
+    except Exception as fault:  # stores raise what they like
+        text = f"cannot be {doing}: {said(fault)}"
+        if may_pass(fault):
+            remedy = address_hint(fault) + "everything finished is kept: run the same command again"
+            raise StorageAwayError(where, text, remedy) from fault
+        raise StorageError(where, text, _remedy(fault)) from fault
 
 
 def _remedy(fault: BaseException) -> str:
@@ -138,7 +123,7 @@ class RemotePath(PosixPath):
             StorageError: no store is known by that scheme.
             MissingDependencyError: its package is not installed.
         """
-        return _files(str(self), self.scheme)
+        return _files(str(self))
 
     @property
     def key(self) -> str:
@@ -270,19 +255,12 @@ class RemotePath(PosixPath):
                 (self / name).unlink(missing_ok=True)
 
 
-def _files(uri: str, scheme: str) -> Any:
-    import fsspec
-
+def _files(uri: str) -> Any:
     try:
-        files, _ = fsspec.core.url_to_fs(uri)
-    except ImportError as fault:
-        package = DRIVERS.get(scheme)
-        remedy = f"pip install {package}" if package else said(fault)
-        raise MissingDependencyError(uri, f"needs the package of {scheme}://", remedy) from fault
+        return file_system(uri)[0]
     except ValueError as fault:
         remedy = "use s3://, gs:// or hf://"
         raise StorageError(uri, f"is of no store that is known: {said(fault)}", remedy) from fault
-    return files
 
 
 # -- writing

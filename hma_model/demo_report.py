@@ -10,7 +10,7 @@ import numpy as np
 from hma_data.align import to_clip
 from hma_data.console import human_bytes, human_seconds
 from hma_data.embodiment import find
-from hma_data.plots import plot_mixture
+from hma_data.mixture import plot_mixture
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.sheets import grid, png_bytes, webp_bytes

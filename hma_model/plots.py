@@ -2,14 +2,16 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+Values = NDArray[np.floating[Any]]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D")
@@ -28,9 +30,9 @@ def loss_curve(
     if training:
         steps, losses = np.array(training, float).T
         axes.plot(steps, losses, color=COLOURS[0], alpha=0.25, lw=0.8)
-        width = max(1, len(losses) // 30)
-        smooth = np.convolve(losses, np.ones(width) / width, "valid")
-        axes.plot(steps[width - 1 :], smooth, color=COLOURS[0], lw=1.8, label="training (masked tokens)")
+        axes.plot(
+            *_running_mean(steps, losses, 30), color=COLOURS[0], lw=1.8, label="training (masked tokens)"
+        )
     if validation:
         steps, losses = np.array(validation, float).T
         axes.plot(steps, losses, "s--", color=COLOURS[1], ms=5, label="validation (whole frames masked)")
@@ -55,9 +57,7 @@ def losses_by_robot(
     for i, name in enumerate(sorted(training)):
         colour, style = COLOURS[i % len(COLOURS)], STYLES[i // len(COLOURS) % len(STYLES)]
         steps, losses = np.array(training[name], float).T
-        width = max(1, len(losses) // 40)
-        smooth = np.convolve(losses, np.ones(width) / width, "valid")
-        axes.plot(steps[width - 1 :], smooth, color=colour, ls=style, lw=1.6, label=name)
+        axes.plot(*_running_mean(steps, losses, 40), color=colour, ls=style, lw=1.6, label=name)
         if validation.get(name):
             steps, losses = np.array(validation[name], float).T
             axes.plot(steps, losses, MARKERS[i % len(MARKERS)], color=colour, ms=5)
@@ -94,6 +94,12 @@ def psnr_over_horizon(curves: Mapping[str, Sequence[float]], seconds_per_frame: 
         axes.plot(time, values, color=COLOURS[i], ls=STYLES[i], marker=MARKERS[i], ms=5, label=name)
     axes.legend(frameon=False, fontsize=9)
     return _svg(figure)
+
+
+def _running_mean(steps: Values, values: Values, parts: int) -> tuple[Values, Values]:
+    """Return steps and means over a `parts`-th of all values each."""
+    width = max(1, len(values) // parts)
+    return steps[width - 1 :], np.convolve(values, np.ones(width) / width, "valid")
 
 
 def _axes(x: str, y: str) -> "tuple[Figure, Axes]":

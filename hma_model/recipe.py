@@ -139,7 +139,9 @@ class Recipe(_Settings):
     keep_last: Count = Field(3, ge=1)
     report: bool = Field(True, description="write report.html")
     track: Annotated[tuple[Literal["tensorboard", "trackio", "wandb"], ...], BeforeValidator(_listed)] = (
-        "tensorboard",
+        Field(
+            (), description="where figures go besides metrics.jsonl and report.html; each needs its package"
+        )
     )
     project: str = Field("hma", description="the name trackio and wandb file the run under")
     out: Place | None = Field(None, description="the run's folder")

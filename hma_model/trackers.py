@@ -1,12 +1,10 @@
-"""Where else a run's figures go: TensorBoard event files by default, trackio or wandb on request.
+"""Where else a run's figures go, on request: TensorBoard event files, trackio or wandb.
 
-Event files need no package: a TFRecord frame around a small protobuf, in `tensorboard/` of the run's folder.
-`pip install tensorboard && tensorboard --logdir RUN` shows them.
+Event files lie in `tensorboard/` of the run's folder; `tensorboard --logdir RUN` shows them.
 """
 
 import hashlib
 import importlib
-import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -94,7 +92,9 @@ class Remote:
 
 
 class EventFile:
-    """A TensorBoard event file.
+    """A TensorBoard event file, written with the protocol buffers of the `tensorboard` package.
+
+    `torch.utils.tensorboard.SummaryWriter` is not used: it imports TensorFlow wherever that is installed.
 
     Args:
         folder: made where it is not there; every session adds a file.
@@ -102,78 +102,49 @@ class EventFile:
     """
 
     def __init__(self, folder: Path, step: int = 0) -> None:
-        now = time.time()
+        try:
+            self._protos = importlib.import_module("tensorboard.compat.proto.event_pb2")
+            records = importlib.import_module("tensorboard.summary.writer.record_writer")
+        except ImportError as fault:
+            raise MissingDependencyError(
+                "recipe: track=tensorboard",
+                "tensorboard is not installed",
+                "uv sync --extra tensorboard, or leave it out",
+            ) from fault
         try:
             folder.mkdir(exist_ok=True)
             count = len(list(folder.glob("events.out.tfevents.*")))
-            self._path = folder / f"events.out.tfevents.{int(now):010d}.hma.{count:04d}"
-            self._file = self._path.open("wb")
+            self._path = folder / f"events.out.tfevents.{int(time.time()):010d}.hma.{count:04d}"
+            self._records = records.RecordWriter(self._path.open("wb"))
         except OSError as fault:
             raise OutputError(folder, f"cannot be written: {fault.strerror}", "free space") from fault
-        self._write(_double(1, now) + _bytes(3, b"brain.Event:2"))
-        if count:  # SessionLog.START: what comes after this step in older files is to be forgotten
-            self._write(_double(1, now) + _integer(2, step + 1) + _bytes(7, _integer(1, 1)))
+        self._write(file_version="brain.Event:2")
+        if count:  # what comes after this step in older files is to be forgotten
+            self._write(step=step + 1, session_log={"status": self._protos.SessionLog.START})
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """See `Tracker`."""
-        rows = b"".join(
-            _bytes(1, _bytes(1, tag.encode()) + _float(2, value)) for tag, value in values.items()
-        )
-        self._event(step, rows)
+        rows = [{"tag": tag, "simple_value": value} for tag, value in values.items()]
+        self._write(step=step, summary={"value": rows})
 
     def picture(self, step: int, tag: str, path: Path) -> None:
         """See `Tracker`."""
+        from PIL import Image
+
         content = path.read_bytes()
-        width, height = struct.unpack(">II", content[16:24])  # PNG's first chunk
-        image = _integer(1, height) + _integer(2, width) + _integer(3, 3) + _bytes(4, content)
-        self._event(step, _bytes(1, _bytes(1, tag.encode()) + _bytes(4, image)))
+        with Image.open(path) as opened:
+            width, height = opened.size
+        image = {"height": height, "width": width, "colorspace": 3, "encoded_image_string": content}
+        self._write(step=step, summary={"value": [{"tag": tag, "image": image}]})
 
     def close(self) -> None:
         """See `Tracker`."""
-        self._file.close()
+        self._records.close()
 
-    def _event(self, step: int, summary: bytes) -> None:
-        self._write(_double(1, time.time()) + _integer(2, step) + _bytes(5, summary))
-
-    def _write(self, event: bytes) -> None:
-        length = struct.pack("<Q", len(event))
-        record = length + struct.pack("<I", _masked_crc(length)) + event
+    def _write(self, **fields: Any) -> None:
+        event = self._protos.Event(wall_time=time.time(), **fields)
         try:
-            self._file.write(record + struct.pack("<I", _masked_crc(event)))
-            self._file.flush()
+            self._records.write(event.SerializeToString())
+            self._records.flush()
         except OSError as fault:
             raise OutputError(self._path, f"cannot be written: {fault.strerror}", "free space") from fault
-
-
-# -- TFRecord and protobuf, as far as an event needs them
-
-
-def _masked_crc(content: bytes) -> int:
-    import google_crc32c
-
-    crc = int(google_crc32c.value(content))
-    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
-
-
-def _varint(value: int) -> bytes:
-    parts = bytearray()
-    while value > 0x7F:
-        parts.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*parts, value])
-
-
-def _integer(field: int, value: int) -> bytes:
-    return _varint(field << 3) + _varint(value)
-
-
-def _double(field: int, value: float) -> bytes:
-    return _varint(field << 3 | 1) + struct.pack("<d", value)
-
-
-def _float(field: int, value: float) -> bytes:
-    return _varint(field << 3 | 5) + struct.pack("<f", value)
-
-
-def _bytes(field: int, value: bytes) -> bytes:
-    return _varint(field << 3 | 2) + _varint(len(value)) + value

@@ -31,7 +31,6 @@ from hma_data.plan import Settings
 from hma_data.shards.info import describe
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.memmap import export
-from hma_data.shards.memmap_import import import_memmap
 from hma_data.shards.preview import preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.remake import merge, split
@@ -192,7 +191,6 @@ def shards_made_anew(made: Made, given: Given, out: Path) -> Any:
     merge([given(made.shards)], given(out / "merged"))
     split(given(made.shards), given(out / "split"), seed=3)
     export(given(made.shards), given(out / "flat"))
-    import_memmap(given(made.memmap), given(out / "back"))
     return content(out), restat(given(out / "merged")).to_text()
 
 
@@ -385,8 +383,8 @@ def test_home_is_meant_by_a_tilde_in_any_form(tmp_path: Path, monkeypatch: pytes
 PUBLIC = (
     "hma_data.convert", "hma_data.convert_recipe", "hma_data.doctor", "hma_data.embodiment",
     "hma_data.estimate", "hma_data.infer", "hma_data.inspect", "hma_data.lab", "hma_data.loader",
-    "hma_data.plots", "hma_data.registry", "hma_data.shards.info", "hma_data.shards.manifest",
-    "hma_data.shards.memmap", "hma_data.shards.memmap_import", "hma_data.shards.preview",
+    "hma_data.mixture", "hma_data.registry", "hma_data.shards.info", "hma_data.shards.manifest",
+    "hma_data.shards.memmap", "hma_data.shards.preview",
     "hma_data.shards.reader", "hma_data.shards.remake", "hma_data.shards.restat", "hma_data.shards.verify",
     "hma_data.sources.base", "hma_data.sources.hands", "hma_data.sources.hands_models",
     "hma_data.sources.hands_preview", "hma_data.sources.hands_scan", "hma_data.sources.hdf5",

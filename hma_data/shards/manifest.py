@@ -327,11 +327,18 @@ def derive(
         hashes: sha256 of shards that need not be read for it.
 
     Raises:
-        ShardError: a shard is damaged.
+        ShardError: a shard is damaged, or of another plan.
     """
     gathered = Gathered(source)
     files: list[ShardFile] = []
+    plans = {plan["hash"], *plan.get("extends", ())}
     for file, footer in _described(folder, names, hashes or {}):
+        if footer.plan["hash"] not in plans:
+            raise ShardError(
+                folder / file.path,
+                f"is of the plan {footer.plan['hash']}, the set of {plan['hash']}: two jobs wrote here",
+                "start one of them anew with --overwrite, the other with another --out",
+            )
         files.append(file)
         gathered.add(footer)
     episodes = gathered.episodes()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError, UsageError
-from hma_data.output import finished_shards, locked
+from hma_data.output import finished_shards, locked, remove_notes
 from hma_data.paths import StrPath
 from hma_data.plan import Plan, Settings, ShardUnit, digest, make_plan
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
@@ -118,7 +118,9 @@ def remake(
                 written += frames
                 on_progress(written, plan.frames)
         names = [unit.name for unit in plan.units]
-        return finish(out, names, job.embodiment, job.tokenizer, plan.facts, job.source)
+        manifest = finish(out, names, job.embodiment, job.tokenizer, plan.facts, job.source)
+        remove_notes(out)
+        return manifest
 
 
 def _plan(job: Job) -> Plan:

@@ -15,7 +15,6 @@ from hma_data.files import file_sha256
 from hma_data.output import locked
 from hma_data.paths import StrPath
 from hma_data.plan import digest
-from hma_data.shards.check import REMAKE
 from hma_data.shards.manifest import (
     EMBODIMENT,
     EPISODES,
@@ -30,7 +29,7 @@ from hma_data.shards.manifest import (
     stored_embodiment,
 )
 from hma_data.shards.schema import Footer, read_footer
-from hma_data.shards.verify import check_rows
+from hma_data.shards.verify import REMAKE, check_rows
 from hma_data.store import parquet_input, place
 from hma_data.tokenizers.base import TokenizerSpec
 

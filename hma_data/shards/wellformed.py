@@ -6,13 +6,13 @@ Each check raises ValueError with what is wrong; whoever reads makes one clear e
 import math
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, get_args
+from typing import Any
 
 from hma_data.embodiment import Embodiment
-from hma_data.plan import Settings
 from hma_data.tokenizers.base import TokenizerSpec
 
 DTYPES = {"discrete": ("uint16", "uint32"), "continuous": ("float16", "uint8")}
+FRAMES = ("all", "strided")
 LARGEST = 2**20  # cells, pixels and channels of a tokenizer; beyond is no tokenizer
 
 
@@ -79,7 +79,7 @@ def check_plan(plan: dict[str, Any]) -> None:
     cameras = plan["cameras"]
     if not isinstance(cameras, list) or not cameras or not all(type(name) is str for name in cameras):
         raise ValueError("its plan names no cameras")
-    if plan.get("frames", "all") not in get_args(Settings.__annotations__["frames"]):
+    if plan.get("frames", "all") not in FRAMES:
         raise ValueError(f"its plan's frames are {plan['frames']!r}")
     settings, extends = plan.get("settings", {}), plan.get("extends", [])
     if not isinstance(settings, dict) or not isinstance(extends, list):

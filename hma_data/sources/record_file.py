@@ -11,11 +11,11 @@ from threading import RLock
 from typing import Any
 
 from hma_data.errors import EpisodeError
+from hma_data.fetching import attempt, info, is_local, mark, protocol
 from hma_data.sources import tfrecord
 from hma_data.sources.array_record import read_record as read_array_record
 from hma_data.sources.array_record import scan as scan_array_record
 from hma_data.sources.base import file_fingerprint
-from hma_data.sources.fetching import attempt, info, is_local, mark, protocol
 from hma_data.sources.record_index import EMPTY, Framing, drop_index, load_index, save_index
 
 KEPT_FROM = 64  # records of a local file; fewer are found again as fast as an index is read

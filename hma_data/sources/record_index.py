@@ -36,7 +36,7 @@ class Framing:
     """Where the records of a file lie.
 
     Attributes:
-        offsets: (N,) int64, first byte of each record's data; of its chunk in an ArrayRecord file.
+        offsets: (N,) int64, first byte of each record's data; in an ArrayRecord file the record's number.
         lengths: (N,) int64, bytes of data.
         checks: (N,) uint32, checksum of the data as stored.
         fault: why nothing could be read after the last record; empty when the file ends there.

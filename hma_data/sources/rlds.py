@@ -15,9 +15,9 @@ import math
 from hma_data.embodiment import Embodiment
 from hma_data.episode import Episode, Floats, Pictures, Signal, rate_times
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.fetching import info, mark
 from hma_data.paths import StrPath, as_text
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
-from hma_data.sources.fetching import info, mark
 from hma_data.sources.rlds_steps import (
     Steps,
     described,

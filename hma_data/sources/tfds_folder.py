@@ -15,10 +15,10 @@ from typing import Any
 
 import fsspec
 
-from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.fetching import attempt, fetch_whole, file_system, is_listless, is_local
 from hma_data.sources.base import leaves
-from hma_data.sources.fetching import attempt, fetch_whole, is_listless, is_local
-from hma_data.sources.record_file import RecordFile, open_records
+from hma_data.sources.record_file import RecordFile, is_array_record, open_records
 from hma_data.sources.record_index import EMPTY, Framing
 from hma_data.sources.tf_example import Example
 from hma_data.sources.tfds_features import Feature, read_features
@@ -26,10 +26,6 @@ from hma_data.sources.tfds_shards import FORMATS, Shard, named_shards, stated_sh
 
 LISTED = 10_000  # records missing from a shard that are still listed, to be quarantined one by one
 LONGEST_JSON = 64 << 20  # bytes of a description; more is a mistake
-PACKAGES = {
-    "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",
-    "hf": "huggingface_hub", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -180,10 +176,7 @@ def _file_system(uri: str) -> tuple[Any, str]:
     if "://" not in uri:  # a path, whatever signs of a chain of file systems stand in it
         return fsspec.filesystem("file"), str(Path(uri).expanduser().absolute())
     try:
-        files, path = fsspec.core.url_to_fs(uri)
-    except ImportError as fault:
-        package = PACKAGES.get(uri.split("://", 1)[0], "")
-        raise MissingDependencyError(uri, str(fault), f"pip install {package}" if package else "") from fault
+        files, path = file_system(uri)
     except ValueError as fault:
         raise SourceError(uri, str(fault), "give a path or an fsspec URI such as gs://bucket/path") from fault
     return files, path.rstrip("/")
@@ -199,7 +192,7 @@ def _stamp(files: Any, path: str) -> str:
 
 def _version_folder(uri: str, files: Any, path: str) -> str:
     """The folder with features.json, at most two below `path` (configuration and version)."""
-    if files.isfile(f"{path}/features.json"):
+    if _is_described(files, path):
         return path
     if not files.exists(path) and not is_listless(files):
         raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
@@ -211,9 +204,19 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
         raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
     raise SourceError(
         uri,
-        "cannot be reached, or has no features.json" if is_listless(files) else "has no features.json",
+        "has no features.json",
         "records cannot be understood without; copy it from where they are from, or write it with TFDS",
     )
+
+
+def _is_described(files: Any, path: str) -> bool:
+    if not is_listless(files):
+        return bool(files.isfile(f"{path}/features.json"))
+    try:  # isfile() of a web server takes a lost connection for a missing file
+        files.cat_file(f"{path}/features.json", start=0, end=1)
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _described(files: Any, path: str) -> list[str]:
@@ -243,6 +246,11 @@ def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], p
     if not shards:
         shards, more = named_shards(root, listing or [], info)
         problems += more
+    paths = [shard.path for items in shards.values() for shard in items]
+    if not is_local(files) and any(map(is_array_record, paths)):
+        raise SourceError(
+            uri, "holds ArrayRecord files, which are read from this machine's disks only", "copy it here"
+        )
     if only:  # the others were left out on purpose
         problems = []
     folder = Folder(

@@ -16,7 +16,7 @@ import google_crc32c
 import numpy as np
 
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.fetching import attempt, fetch, is_local
+from hma_data.fetching import attempt, fetch, is_local
 from hma_data.sources.record_index import EMPTY, Framing
 
 HEADER = struct.Struct("<QI")

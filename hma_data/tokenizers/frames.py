@@ -14,13 +14,13 @@ from hma_data.episode import Episode
 from hma_data.errors import EpisodeError, SourceError, TokenizerError
 from hma_data.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_data.tokenizers.corpus import VIDEOS, read_pictures
 from hma_data.video import Filter, prepare, resize
 
 if TYPE_CHECKING:
     from hma_data.embodiment import Embodiment
 
 Frame = NDArray[np.uint8]
+VIDEOS = {".mp4", ".avi", ".mkv", ".webm", ".gif"}
 PICTURES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
 EPISODES = 16  # of a recording, evenly
 
@@ -70,6 +70,30 @@ def read_frames(
             "holds no picture and no video" + (f" that can be decoded: {skipped}" if skipped else ""),
             "name a file or folder of png, jpg, mp4; a recording needs --embodiment",
         )
+
+
+def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
+    """The picture in a file, or `frames` evenly taken from a video; nothing where neither is."""
+    import cv2
+
+    if path.suffix.lower() in VIDEOS:
+        yield from _read_video(path, frames)
+        return
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is not None:
+        yield np.ascontiguousarray(picture[:, :, ::-1])
+
+
+def _read_video(path: Path, frames: int) -> Iterator[Frame]:
+    import av
+
+    with av.open(str(path)) as container:
+        count = sum(1 for _ in container.decode(video=0))
+    wanted = set(np.linspace(0, count - 1, min(frames, count)).astype(int).tolist())
+    with av.open(str(path)) as container:
+        for index, frame in enumerate(container.decode(video=0)):
+            if index in wanted:
+                yield frame.to_ndarray(format="rgb24")
 
 
 def _pictures(file: Path, frames: int) -> Iterator[Frame]:

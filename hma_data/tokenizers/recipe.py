@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from hma_data.errors import RecipeError
 from hma_data.paths import StrPath, as_path
-from hma_data.tokenizers.corpus import DrawnSource, FileSource, PushtSource
 from hma_data.tokenizers.fsq_network import STRIDE, FsqConfig
 from hma_data.tokenizers.vae_network import VaeConfig
 from hma_data.yaml_io import read_yaml
@@ -120,6 +119,48 @@ class LossRecipe(_Strict):
     ssim: float = Field(ge=0)
 
 
+class FileSource(_Strict):
+    """Pictures and videos under a folder of the corpus.
+
+    Attributes:
+        path: folder below the recipe's `corpus`.
+        glob: which files.
+        origin: the package and version they come from.
+        weight: how often a crop is from this source, relative to the others.
+        frames: taken from each video, evenly.
+    """
+
+    kind: Literal["files"]
+    path: str
+    glob: list[str]
+    origin: str
+    weight: float = Field(gt=0, default=1.0)
+    frames: int = Field(gt=0, default=40)
+
+
+class DrawnSource(_Strict):
+    """Pictures made by `recipes/tokenizer/draw.py`, in a folder of the corpus named by their kind."""
+
+    kind: Literal["pusht", "drawn"]
+    pictures: int = Field(gt=0, default=200)
+    weight: float = Field(gt=0, default=1.0)
+
+    @property
+    def path(self) -> str:
+        """Folder below the recipe's `corpus`."""
+        return self.kind
+
+    @property
+    def glob(self) -> list[str]:
+        """Which files."""
+        return ["*.png"]
+
+    @property
+    def frames(self) -> int:
+        """Taken from each file."""
+        return 1
+
+
 class TokenizerRecipe(_Strict):
     """A whole training, so that it can be done again."""
 
@@ -130,7 +171,7 @@ class TokenizerRecipe(_Strict):
     network: FsqRecipe | VaeRecipe
     training: TrainingRecipe
     loss: LossRecipe
-    sources: list[FileSource | PushtSource | DrawnSource] = Field(min_length=1)
+    sources: list[FileSource | DrawnSource] = Field(min_length=1)
 
     def digest(self) -> str:
         """SHA-256 over all but where the corpus lies."""

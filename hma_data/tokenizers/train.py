@@ -31,7 +31,7 @@ from torch.nn import functional
 from hma_data.errors import RecipeError
 from hma_data.files import write_atomic
 from hma_data.paths import StrPath, as_path
-from hma_data.tokenizers.corpus import Pool, draw_batch, load_pools
+from hma_data.tokenizers.crops import Pool, draw_batch, load_pools
 from hma_data.tokenizers.embedded import save_weights
 from hma_data.tokenizers.eval import ssim_map
 from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig
@@ -270,7 +270,7 @@ def train(
     place, out = open_device("tokenizer train", device), as_path(out)
     recipe = load_recipe(recipe_path, overrides)
     torch.set_num_threads(recipe.training.threads)
-    pools, corpus_sha256 = load_pools(list(recipe.sources), Path(recipe.corpus).expanduser(), recipe.seed)
+    pools, corpus_sha256 = load_pools(recipe.sources, Path(recipe.corpus).expanduser())
     report("pictures: " + ", ".join(f"{pool.name} {len(pool.pictures)}" for pool in pools))
     run, state = Run(recipe, pools, place), out.with_name(out.name + ".state")
     if state.exists():

@@ -3,11 +3,11 @@
 #
 #   recipes/tokenizer/corpus.sh build/tokenizer-corpus
 #
-# Needs pip, Debian's apt-get and dpkg, unzip, Python 3.12, and libosmesa6. About 600 MB are
+# Needs pip, Debian's apt-get and dpkg, unzip, Python 3.12 as `python` with this toolkit, and libosmesa6. About 600 MB are
 # downloaded; the renderings take about 10 minutes on one core.
 set -euo pipefail
 out=$(realpath -m "${1:?where the corpus goes}")
-repo=$(realpath "$(dirname "$0")/../..")
+here=$(realpath "$(dirname "$0")")
 downloads=$out/.downloads
 mkdir -p "$downloads"
 
@@ -35,5 +35,6 @@ pip=("$downloads/simulators/bin/python" -m pip install --quiet)
 "${pip[@]}" gym-aloha==0.1.5 mujoco==3.3.2 robosuite==1.5.2 packaging PettingZoo imageio jinja2 h5py
 # Their declared bounds on MuJoCo exclude one another; all three run with 3.3.2.
 "${pip[@]}" --no-deps gymnasium-robotics==1.4.2 metaworld==3.1.1 mujoco==3.3.2
-MUJOCO_GL=osmesa PYTHONPATH=$repo "$downloads/simulators/bin/python" -W ignore \
-    -m hma_data.tokenizers.render "$out/renders" --pictures 130 --seed 20
+MUJOCO_GL=osmesa "$downloads/simulators/bin/python" -W ignore \
+    "$here/render.py" "$out/renders" --pictures 130 --seed 20
+python "$here/draw.py" "$out" --pusht 200 --drawn 300 --seed 20

@@ -16,10 +16,9 @@ from hma_data.files import file_sha256
 from hma_data.inspect import inspect_recording
 from hma_data.loader import MixtureDataset, WindowDataset
 from hma_data.plan import Settings
-from hma_data.shards.check import check_shard
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_counts, flags_text, mask_columns
-from hma_data.shards.verify import verify
+from hma_data.shards.verify import check_shard, verify
 from tests.conftest import BlockTokenizer
 from tests.data.bag_files import COMMAND, STATE, Recording, arm, as_json, make_recording, write_mcap
 

@@ -15,8 +15,9 @@ from fsspec.implementations.memory import MemoryFileSystem
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from hma_data import fetching
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
-from hma_data.sources import fetching, record_file
+from hma_data.sources import record_file
 from hma_data.sources.base import open_source
 from hma_data.sources.record_index import Framing, index_path, load_index, save_index
 from hma_data.sources.tfds_folder import open_folder
@@ -216,7 +217,7 @@ class Handler(SimpleHTTPRequestHandler):
 def served(tmp_path, monkeypatch):
     """(folder that is served, its URI, the handler)."""
     pytest.importorskip("aiohttp")
-    monkeypatch.setattr(fetching, "FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
 
     class Own(Handler):
         asked: list = []  # noqa: RUF012 - one for each test
@@ -260,7 +261,7 @@ def test_what_passes_by_itself_is_tried_again_and_what_does_not_is_one_error(ser
     handler.fail[0] = 1000
     with pytest.raises(SourceError, match=r"cannot be read.*503.*network failed again and again"):
         number(uri, "train/000003")
-    assert handler.fail[0] >= 1000 - 2 * fetching.TRIES
+    assert handler.fail[0] >= 1000 - 2 * (len(fetching.WAITS_S) + 1)
     handler.fail[0] = 0
     shard(folder / "d").unlink()
     with pytest.raises(SourceError, match="cannot be read"):
@@ -277,7 +278,7 @@ def test_a_server_without_ranges_is_named(served):
 
 def test_a_server_that_is_not_there_is_one_error(monkeypatch):
     pytest.importorskip("aiohttp")
-    monkeypatch.setattr(fetching, "FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
     with pytest.raises(SourceError):
         RLDS.index("http://127.0.0.1:9/nothing")
 
@@ -302,7 +303,7 @@ def test_a_connection_that_breaks_is_tried_again(memory, monkeypatch):
         return true(self, path, start, end, **options)
 
     monkeypatch.setattr(MemoryFileSystem, "cat_file", cat_file)
-    monkeypatch.setattr(fetching, "FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
     assert number(memory, "train/000007") == 7
     assert len(broken) == 3
 

@@ -1,28 +1,24 @@
-"""Conversions into object stores: the bytes a folder here would hold, whole shards only, a job at a time."""
+"""Conversions into object stores: the bytes of a folder here, whole shards only, one plan at a time."""
 
-import json
 import os
 import random
 import subprocess
 import sys
 import threading
-import time
 import uuid
-from dataclasses import asdict, replace
-from datetime import timedelta
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data import remote_lock, store
+from hma_data import store
 from hma_data.convert import Shared, convert, convert_share
 from hma_data.embodiment import Embodiment
-from hma_data.errors import MissingDependencyError, OutputError, StorageAwayError, StorageError
-from hma_data.files import cache_folder
-from hma_data.output import LOCK, Share, locked
+from hma_data.errors import MissingDependencyError, OutputError, ShardError, StorageAwayError, StorageError
+from hma_data.files import cache_folder, remove_parts, upload_folder
+from hma_data.output import PLAN, Share
 from hma_data.plan import Settings
-from hma_data.remote_lock import Holder
 from hma_data.shards.remake import merge
 from hma_data.shards.restat import restat
 from hma_data.shards.verify import verify
@@ -36,7 +32,6 @@ SMALL = Settings(val_fraction=0.2, shard_frames=60)
 def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """No waiting, and a cache of its own."""
     monkeypatch.setattr(store, "WAITS_S", (0.0, 0.0, 0.0))
-    monkeypatch.setattr(remote_lock, "SETTLE_S", 0.02)
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
 
 
@@ -199,7 +194,7 @@ def test_a_store_that_goes_away_is_one_error_and_what_was_put_is_kept(
         patch.setattr(MemoryFileSystem, "put_file", away)
         with pytest.raises(StorageAwayError, match="cannot be written: .* run the same command again"):
             run(toy_arm, toy_recording, out)
-    assert {name.split("/")[0] for name in out.listing()} <= {"train", "val"}
+    assert {name.split("/")[0] for name in out.listing()} <= {"train", "val", PLAN}
     assert run(toy_arm, toy_recording, out).kept_shards == 2
     assert remote(out) == whole
 
@@ -221,96 +216,97 @@ def test_a_driver_that_is_not_installed_is_named(toy_arm, toy_recording, monkeyp
         run(toy_arm, toy_recording, Path("az://box/set"))
 
 
-# -- the lock
+# -- several jobs
 
 
-def holder(**facts: object) -> Holder:
-    return replace(Holder.me(), **{"job": "theirs", "host": "far", "machine": "other", "pid": 7, **facts})
+@pytest.fixture
+def other(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
+    """What a job of another plan writes."""
+    run(toy_arm, toy_recording, tmp_path / "other", settings=replace(SMALL, seed=3))
+    return local(tmp_path / "other")
 
 
-def hold(path: RemotePath, who: Holder, age_s: float = 0.0) -> None:
-    put_bytes(json.dumps(asdict(who)).encode(), path)
-    path.files.store[path.key].modified -= timedelta(seconds=age_s)
+def once(act):
+    """A progress callback that acts when a job has seen what is there, and made nothing yet."""
+    calls = iter([act])
+
+    def on_progress(progress) -> None:
+        if call := next(calls, None):
+            call()
+
+    return on_progress
 
 
-def test_another_job_on_one_output_is_told_who_writes(out: RemotePath) -> None:
-    hold(out / LOCK, holder())
-    said = r"another job is writing it: process 7 on far, since 20\S+ \S+ UTC — wait for it"
-    with pytest.raises(OutputError, match=said), locked(out):
-        pass
-    assert json.loads((out / LOCK).read_bytes())["job"] == "theirs"
+def test_another_plan_is_refused_while_a_job_runs(toy_arm, toy_recording, out, whole) -> None:
+    def differ() -> None:
+        assert not [name for name in out.listing() if "shard-" in name]
+        said = (
+            rf"{out}: another conversion is being written there; different: settings — .* delete {out}/\.plan"
+        )
+        with pytest.raises(OutputError, match=said):
+            run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
+
+    run(toy_arm, toy_recording, out, on_progress=once(differ))
+    assert remote(out) == whole
 
 
-def test_a_job_that_was_not_heard_of_for_three_minutes_is_forgotten(out: RemotePath) -> None:
-    hold(out / LOCK, holder(), age_s=170)
-    with pytest.raises(OutputError, match="another job"), locked(out):
-        pass
-    hold(out / LOCK, holder(), age_s=181)
-    with locked(out):
-        assert json.loads((out / LOCK).read_bytes())["pid"] == os.getpid()
-    assert out.listing() == {}
+def test_an_equal_job_at_the_same_time_only_wastes_work(toy_arm, toy_recording, out, whole) -> None:
+    run(toy_arm, toy_recording, out, on_progress=once(lambda: run(toy_arm, toy_recording, out)))
+    assert remote(out) == whole
 
 
-def test_a_job_whose_process_on_this_machine_has_ended_is_forgotten_at_once(out: RemotePath) -> None:
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    hold(out / LOCK, replace(Holder.me(), job="theirs", pid=ended.pid))
-    with locked(out):
-        pass
-    hold(out / LOCK, replace(Holder.me(), job="theirs"))
-    with pytest.raises(OutputError, match="another job"), locked(out):
-        pass
+def test_of_several_plans_at_once_one_is_made(toy_arm, toy_recording, out, tmp_path) -> None:
+    start, made, refused = threading.Barrier(4), [], []
 
-
-def test_of_two_that_come_at_once_one_has_it(out: RemotePath, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_lock, "SETTLE_S", 0.2)
-    inside, most, refused, start = 0, 0, 0, threading.Barrier(4)
-
-    def one() -> None:
-        nonlocal inside, most, refused
+    def one(seed: int) -> None:
         start.wait()
         try:
-            with locked(out):
-                inside += 1
-                most = max(most, inside)
-                time.sleep(0.3)
-                inside -= 1
-        except OutputError:
-            refused += 1
+            run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=seed))
+            made.append(seed)
+        except OutputError as fault:
+            refused.append(str(fault))
 
-    threads = [threading.Thread(target=one) for _ in range(4)]
+    threads = [threading.Thread(target=one, args=[seed]) for seed in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert (most, refused) == (1, 3)
+    assert len(made) == 1 and len(refused) == 3
+    run(toy_arm, toy_recording, tmp_path / "alone", settings=replace(SMALL, seed=made[0]))
+    assert remote(out) == local(tmp_path / "alone")
 
 
-def test_a_lock_is_written_again_and_its_loss_is_noticed(
-    out: RemotePath, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(remote_lock, "REFRESH_S", 0.05)
-    with locked(out) as lock:
-        first = json.loads((out / LOCK).read_bytes())["time"]
-        time.sleep(0.5)
-        assert json.loads((out / LOCK).read_bytes())["time"] > first
-        lock.check()
-        hold(out / LOCK, holder())
-        time.sleep(0.5)
-        with pytest.raises(OutputError, match="another job is writing it: process 7 on far"):
-            lock.check()
-    assert json.loads((out / LOCK).read_bytes())["job"] == "theirs"
+def test_a_shard_of_another_plan_is_found_before_the_manifest(toy_arm, toy_recording, out, other) -> None:
+    name = "train/shard-00000.parquet"
+
+    def finished(progress) -> None:
+        if (out / name).is_file():
+            put_bytes(other[name], out / name)
+
+    with pytest.raises(ShardError, match=rf"{out}/{name}: is of the plan \w+, the set of \w+: two jobs"):
+        run(toy_arm, toy_recording, out, on_progress=finished)
+    assert not (out / "manifest.json").is_file()
 
 
-def test_shares_go_beside_each_other_and_not_beside_a_whole_job(out: RemotePath) -> None:
-    with locked(out, Share(0, 2)), locked(out, Share(1, 2)):
-        with (
-            pytest.raises(OutputError, match="another job is writing share 1-of-2"),
-            locked(out, Share(1, 2)),
-        ):
-            pass
-        with pytest.raises(OutputError, match="another job is writing it"), locked(out):
-            pass
-    with locked(out), pytest.raises(OutputError, match="another job"), locked(out, Share(0, 2)):
-        pass
-    assert out.listing() == {}
+def test_after_a_kill_another_plan_needs_the_claim_deleted(toy_arm, toy_recording, out, other) -> None:
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(toy_arm, toy_recording, out, on_progress=once(stop))
+    with pytest.raises(OutputError, match=r"delete .*\.plan"):
+        run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
+    (out / PLAN).unlink()
+    run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
+    assert remote(out) == other
+
+
+def test_a_part_of_a_running_process_is_left(out: RemotePath) -> None:
+    folder = upload_folder(out / "train")
+    folder.mkdir(parents=True)
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    for pid in (os.getpid(), ended.pid):
+        (folder / f".shard-00000.parquet.{pid}.part").touch()
+    remove_parts(out)
+    assert [path.name for path in folder.iterdir()] == [f".shard-00000.parquet.{os.getpid()}.part"]

@@ -1,7 +1,6 @@
 """Shard sets on S3, against moto's server on loopback: kills, lost connections, busy answers, no access."""
 
 import http.client
-import json
 import os
 import random
 import signal
@@ -11,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -23,7 +22,7 @@ moto_server = pytest.importorskip("moto.server")
 
 import fsspec  # noqa: E402
 
-from hma_data import remote_lock, store  # noqa: E402
+from hma_data import store  # noqa: E402
 from hma_data.convert import convert  # noqa: E402
 from hma_data.embodiment import Embodiment  # noqa: E402
 from hma_data.errors import HMAError, OutputError, ShardError, StorageAwayError, StorageError  # noqa: E402
@@ -134,7 +133,6 @@ def proxy(server: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Itera
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
     monkeypatch.setattr(store, "WAITS_S", (0.0, 0.05, 0.1))
-    monkeypatch.setattr(remote_lock, "SETTLE_S", 0.05)
     files = fsspec.get_filesystem_class("s3")
     monkeypatch.setattr(files, "retries", 1)  # the driver's own tries take long
     files.clear_instance_cache()
@@ -195,7 +193,7 @@ def test_s3_gets_the_bytes_that_a_folder_gets_and_gives_them_back(
 
 def test_the_manifest_is_put_last(toy_arm, toy_recording, out, proxy) -> None:
     run(toy_arm, toy_recording, out)
-    puts = [path for method, path, _ in proxy.log if method == "PUT" and ".lock" not in path]
+    puts = [path for method, path, _ in proxy.log if method == "PUT" and not path.endswith(".plan")]
     assert puts[-1].endswith("manifest.json")
     assert sum("shard-" in path for path in puts) == len(ShardSet(out).manifest.shards)
 
@@ -281,13 +279,12 @@ def test_a_server_that_went_away_is_one_error_and_the_job_goes_on_later(
     there = set(out.listing())
     assert "manifest.json" not in there and sum("shard-" in name for name in there) == 2
     assert not [path for path in cache_folder().rglob("*") if path.is_file()]
-    (out / ".lock").unlink(missing_ok=True)
     assert run(toy_arm, toy_recording, out).kept_shards == 2
     assert remote(out) == whole
 
 
 def test_a_bucket_that_is_not_there_is_named(toy_arm, toy_recording, proxy) -> None:
-    with pytest.raises(StorageError, match="s3://no-such-bucket/set/.lock: cannot be written: .*bucket"):
+    with pytest.raises(StorageError, match="s3://no-such-bucket/set/.plan: cannot be written: .*bucket"):
         run(toy_arm, toy_recording, place("s3://no-such-bucket/set"))
     with pytest.raises(ShardError, match="s3://no-such-bucket/set: is not a folder"):
         ShardSet("s3://no-such-bucket/set")
@@ -327,7 +324,7 @@ def test_a_shard_cut_short_is_an_error_and_no_hang(toy_arm, toy_recording, out, 
 COMMAND = f"""
 import sys, time
 from pathlib import Path
-from hma_data import remote_lock, shard_work
+from hma_data import shard_work
 import hma_data.convert
 from hma_data.embodiment import Embodiment
 from hma_data.plan import Settings
@@ -339,22 +336,21 @@ def slowly(self, uri, episode_id, embodiment):
     time.sleep(0.1)
     return read(self, uri, episode_id, embodiment)
 Hdf5Source.read = slowly
-remote_lock.SETTLE_S = 0.1
 shard_work.get_tokenizer = lambda *a, **k: BlockTokenizer()
 hma_data.convert.get_tokenizer = shard_work.get_tokenizer
 if __name__ == "__main__":
     hma_data.convert.convert(
         Embodiment.from_yaml({ARM_YAML!r}), sys.argv[1], "block", Path(sys.argv[2]),
-        workers=int(sys.argv[3]), settings=Settings(val_fraction=0.2, shard_frames=60),
+        workers=int(sys.argv[3]), settings=Settings(val_fraction=0.2, shard_frames=60, seed=int(sys.argv[4])),
     )
 """
 
 
-def job(folder: Path, recording: Path, out: RemotePath, workers: int) -> subprocess.Popen:
+def job(folder: Path, recording: Path, out: RemotePath, workers: int, seed: int = 0) -> subprocess.Popen:
     script = folder / "job.py"
     script.write_text(COMMAND)
     return subprocess.Popen(
-        [sys.executable, str(script), str(recording), str(out), str(workers)],
+        [sys.executable, str(script), str(recording), str(out), str(workers), str(seed)],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         cwd=ROOT,
         stdout=subprocess.PIPE,
@@ -373,7 +369,7 @@ def test_a_killed_job_is_continued_by_the_same_command(toy_recording, out, whole
             time.sleep(0.02)
         process.communicate()
         assert process.returncode == -signal.SIGKILL
-    assert json.loads((out / ".lock").read_bytes())["pid"] == process.pid
+    assert (out / ".plan").is_file()
     process = job(tmp_path, toy_recording, out, workers=0)
     _, errors = process.communicate(timeout=100)
     assert process.returncode == 0, errors
@@ -381,14 +377,56 @@ def test_a_killed_job_is_continued_by_the_same_command(toy_recording, out, whole
     assert not list(cache_folder().rglob("*.part"))
 
 
-def test_two_jobs_at_once_on_one_output(toy_recording, out, whole, tmp_path) -> None:
+def test_two_equal_jobs_at_once_on_one_output_only_waste_work(toy_recording, out, whole, tmp_path) -> None:
     jobs = [job(tmp_path, toy_recording, out, workers=0) for _ in range(2)]
     said = [process.communicate(timeout=100)[1] for process in jobs]
-    codes = sorted(process.returncode for process in jobs)
-    assert codes in ([0, 1], [0, 0]), said
-    if codes == [0, 1]:
-        assert any(f"OutputError: {out}: another job is writing it: process " in text for text in said), said
+    assert [process.returncode for process in jobs] == [0, 0], said
     assert remote(out) == whole
+
+
+def test_of_two_jobs_of_different_plans_at_once_one_is_refused(
+    toy_arm, toy_recording, out, whole, tmp_path
+) -> None:
+    convert(
+        toy_arm,
+        str(toy_recording),
+        BlockTokenizer(),
+        tmp_path / "other",
+        settings=replace(SMALL, seed=3),
+    )
+    jobs = {seed: job(tmp_path, toy_recording, out, 0, seed) for seed in (0, 3)}
+    said = {seed: process.communicate(timeout=100)[1] for seed, process in jobs.items()}
+    (winner,) = (seed for seed, process in jobs.items() if process.returncode == 0)
+    loser = 3 - winner
+    assert jobs[loser].returncode == 1
+    assert "OutputError" in said[loser] and "different: settings" in said[loser], said[loser]
+    assert remote(out) == {0: whole, 3: local(tmp_path / "other")}[winner]
+    assert verify(out) == []
+
+
+def test_a_job_of_another_plan_is_refused_at_its_start(toy_arm, toy_recording, out, whole, tmp_path) -> None:
+    first = job(tmp_path, toy_recording, out, workers=0)
+    while first.poll() is None and not (out / ".plan").is_file():
+        pass
+    with pytest.raises(OutputError, match="another conversion is being written there; different: settings"):
+        convert(toy_arm, str(toy_recording), BlockTokenizer(), out, settings=replace(SMALL, seed=3))
+    _, errors = first.communicate(timeout=100)
+    assert first.returncode == 0, errors
+    assert remote(out) == whole
+
+
+def test_a_claim_whose_answer_was_lost_is_ones_own(toy_arm, toy_recording, out, whole, proxy) -> None:
+    lost = []
+
+    def lose_first(method: str, path: str, number: int) -> str | None:
+        if method == "PUT" and path.endswith("/.plan") and not lost:
+            lost.append(path)
+            return "lost"
+        return None
+
+    proxy.trouble = lose_first
+    run(toy_arm, toy_recording, out)
+    assert lost and remote(out) == whole
 
 
 def test_workers_of_their_own_put_shards_too(toy_recording, out, whole, tmp_path) -> None:
@@ -396,45 +434,3 @@ def test_workers_of_their_own_put_shards_too(toy_recording, out, whole, tmp_path
     _, errors = process.communicate(timeout=200)
     assert process.returncode == 0, errors
     assert remote(out) == whole
-
-
-def test_of_two_that_see_no_lock_the_store_lets_one_write(out, monkeypatch) -> None:
-    from hma_data.output import LOCK, locked
-
-    create, theirs = remote_lock.create_bytes, remote_lock.Holder("theirs", "far", 7, "x", time.time(), 0.0)
-
-    def late(content: bytes, to: RemotePath) -> bool:
-        store.put_bytes(json.dumps(asdict(theirs)).encode(), out / LOCK)
-        return create(content, to)
-
-    monkeypatch.setattr(remote_lock, "create_bytes", late)
-    with pytest.raises(OutputError, match="another job is writing it: process 7 on far"), locked(out):
-        pass
-    assert json.loads((out / LOCK).read_bytes())["job"] == "theirs"
-
-
-def test_a_lock_whose_answer_was_lost_is_ones_own(out, proxy) -> None:
-    from hma_data.output import locked
-
-    lost = []
-
-    def lose_first(method: str, path: str, number: int) -> str | None:
-        if method == "PUT" and path.endswith("/.lock") and not lost:
-            lost.append(path)
-            return "lost"
-        return None
-
-    proxy.trouble = lose_first
-    with locked(out):
-        assert json.loads((out / ".lock").read_bytes())["pid"] == os.getpid()
-    assert lost and not out.listing()
-
-
-def test_another_job_is_told(toy_arm, toy_recording, out) -> None:
-    from hma_data.output import locked
-
-    with (
-        locked(out),
-        pytest.raises(OutputError, match=f"{out}: another job is writing it: process {os.getpid()}"),
-    ):
-        run(toy_arm, toy_recording, out)

@@ -21,13 +21,13 @@ from hma_data.sources.base import open_source
 from hma_data.tokenizers import perceptual
 from hma_data.tokenizers.base import TOKENIZERS, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED, Entry
-from hma_data.tokenizers.corpus import draw_scene
 from hma_data.tokenizers.eval import LatentMoments, evaluate
 from hma_data.tokenizers.frames import frames_of, read_frames
 from hma_data.tokenizers.perceptual import open_lpips
 from hma_data.tokenizers.report import to_markdown, write_report
 from hma_data.video import prepare
 from tests.conftest import ARM_YAML, write_toy
+from tests.data.tokenizer_files import draw_scene
 
 RUNNER = CliRunner()
 

@@ -1,6 +1,8 @@
 """The training of the embedded tokenizers: recipes, crops, optimizers, stopping and going on."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +13,15 @@ from safetensors.torch import load_file
 from hma_data.errors import RecipeError, TokenizerError
 from hma_data.shipped import shipped
 from hma_data.tokenizers.base import get_tokenizer
-from hma_data.tokenizers.corpus import DrawnSource, draw_batch, draw_scene, load_pools
+from hma_data.tokenizers.crops import draw_batch, load_pools
 from hma_data.tokenizers.embedded import read_weights
 from hma_data.tokenizers.eval import psnr_db
 from hma_data.tokenizers.fsq import WEIGHTS
 from hma_data.tokenizers.fsq_network import FORMAT, FsqConfig
 from hma_data.tokenizers.muon import Muon, orthogonal
-from hma_data.tokenizers.recipe import load_recipe
+from hma_data.tokenizers.recipe import DrawnSource, load_recipe
 from hma_data.tokenizers.train import train
+from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
 SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
@@ -48,7 +51,7 @@ def write_recipe(folder: Path, **training: object) -> Path:
             **training,
         },
         "loss": {"l2": 10.0, "l1": 0.3, "gradient": 0.3, "ssim": 0.05},
-        "sources": [{"kind": "drawn", "pictures": 4}],
+        "sources": [drawn_corpus(folder, 4)],
     }
     path = folder / "recipe.yaml"
     path.write_text(yaml.safe_dump(json.loads(json.dumps(values))))
@@ -135,8 +138,9 @@ def test_a_state_of_another_training_is_refused(tmp_path):
 
 
 def test_crops_depend_on_seed_and_step_alone(tmp_path):
-    pools, digest = load_pools([DrawnSource(kind="drawn", pictures=3)], tmp_path, 7)
-    again, same = load_pools([DrawnSource(kind="drawn", pictures=3)], tmp_path, 7)
+    source = DrawnSource(**drawn_corpus(tmp_path, 3))
+    pools, digest = load_pools([source], tmp_path)
+    again, same = load_pools([source], tmp_path)
     assert digest == same
     crops = draw_batch(pools, 48, 6, 7, 3)
     assert np.array_equal(crops, draw_batch(again, 48, 6, 7, 3))
@@ -170,6 +174,22 @@ def test_recipe_faults_name_the_key(overrides, named):
 def test_a_corpus_that_is_not_there_is_named(tmp_path):
     with pytest.raises(RecipeError, match="scikit-image"):
         train(RECIPE, tmp_path / "w", {"corpus": str(tmp_path)})
+
+
+def test_pictures_that_were_not_drawn_are_named_with_what_draws_them(tmp_path):
+    drawn_corpus(tmp_path, 3)
+    with pytest.raises(RecipeError, match=r"holds 3 pictures, the recipe says 4 — recipes/tokenizer/draw.py"):
+        load_pools([DrawnSource(kind="drawn", pictures=4)], tmp_path)
+
+
+def test_the_script_draws_what_the_recipe_lists(tmp_path):
+    script = Path(__file__).parents[2] / "recipes/tokenizer/draw.py"
+    command = [sys.executable, str(script), str(tmp_path), "--pusht", "2", "--drawn", "3"]
+    subprocess.run(command, check=True)
+    pools, _ = load_pools(
+        [DrawnSource(kind="pusht", pictures=2), DrawnSource(kind="drawn", pictures=3)], tmp_path
+    )
+    assert [(pool.name, len(pool.pictures)) for pool in pools] == [("pusht", 2), ("drawn", 3)]
 
 
 @pytest.mark.parametrize("shape", [(6, 40), (40, 6)])

@@ -10,7 +10,6 @@ import torch
 from hma_data.errors import TokenizerError
 from hma_data.shipped import shipped
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
-from hma_data.tokenizers.corpus import draw_scene
 from hma_data.tokenizers.embedded import read_weights, save_weights
 from hma_data.tokenizers.eval import evaluate, psnr_db
 from hma_data.tokenizers.fsq import WEIGHTS as FSQ_WEIGHTS
@@ -18,6 +17,7 @@ from hma_data.tokenizers.recipe import load_recipe
 from hma_data.tokenizers.train import train
 from hma_data.tokenizers.vae import WEIGHTS
 from hma_data.tokenizers.vae_network import FORMAT, VaeAutoencoder, VaeConfig
+from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "vae.yaml"
 SMALL = VaeConfig(width=8, hidden=8, encoder_blocks=1, decoder_blocks=(1, 1), fine_width=4)
@@ -107,7 +107,7 @@ def _recipe(folder: Path) -> Path:
             "fall": [[2, 1], [8, 0]],
         },
         "loss": {"l2": 10.0, "l1": 0.3, "gradient": 0.3, "ssim": 0.05},
-        "sources": [{"kind": "drawn", "pictures": 6}],
+        "sources": [drawn_corpus(folder, 6)],
     }
     path = folder / "recipe.yaml"
     path.write_text(json.dumps(values))

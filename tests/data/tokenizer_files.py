@@ -1,5 +1,6 @@
-"""Small weights' files of the network tokenizers, with random numbers, in the layouts of their releases."""
+"""Small weights' files of the network tokenizers, with random numbers; drawn pictures to train on."""
 
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,16 @@ from torch import Tensor, nn
 
 from hma_data.tokenizers.magvit2_network import Magvit2, Magvit2Config
 
+DRAW = runpy.run_path(str(Path(__file__).parents[2] / "recipes/tokenizer/draw.py"))
+draw_scene, write_pictures = DRAW["draw_scene"], DRAW["write_pictures"]
 TINY_MAGVIT2 = Magvit2Config(base=32, z=18, mult=(1, 1, 1, 1, 1), res_blocks=1)
+
+
+def drawn_corpus(folder: Path, count: int) -> dict[str, object]:
+    """Write drawn scenes as recipes/tokenizer/draw.py does; return the recipe's entry for them."""
+    rng = np.random.default_rng([1, 2])
+    write_pictures(folder / "drawn", (draw_scene(rng) for _ in range(count)))
+    return {"kind": "drawn", "pictures": count}
 
 
 def frames(count: int, seed: int = 0, size: int = 256) -> np.ndarray:

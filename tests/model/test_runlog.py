@@ -4,22 +4,25 @@ import io
 import json
 import math
 import re
-import struct
 import sys
 from pathlib import Path
 from types import ModuleType
 
-import google_crc32c
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.tensorflow_stub.errors import OutOfRangeError
+from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_New
 
-from hma_data.errors import MissingDependencyError
+from hma_data.errors import MissingDependencyError, OutputError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import checkpoint, runlog
 from hma_model.recipe import make_recipe
 from hma_model.report import write_report
 from hma_model.runlog import RunLog, read_metrics
+from hma_model.trackers import open_trackers
 from hma_model.train import train
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
@@ -59,19 +62,19 @@ def run(data, painter, tmp_path) -> Path:
     return tmp_path / "run"
 
 
-def events(path: Path) -> list[bytes]:
-    """The records of an event file, their checksums compared."""
-    content, found, at = path.read_bytes(), [], 0
-    while at < len(content):
-        (length,) = struct.unpack_from("<Q", content, at)
-        record = content[at + 12 : at + 12 + length]
-        for part, place in ((content[at : at + 8], at + 8), (record, at + 12 + length)):
-            crc = google_crc32c.value(part)
-            masked = ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
-            assert struct.unpack_from("<I", content, place) == (masked,)
-        found.append(record)
-        at += 16 + length
-    return found
+def events(path: Path) -> list[Event]:
+    """What TensorBoard's own reader finds in an event file, checksums compared."""
+    reader, found = PyRecordReader_New(str(path)), []
+    while True:
+        try:
+            reader.GetNext()
+        except OutOfRangeError:
+            return found
+        found.append(Event.FromString(reader.record()))
+
+
+def values(found: list[Event], tag: str) -> list[float]:
+    return [v.simple_value for event in found for v in event.summary.value if v.tag == tag]
 
 
 # -- trackers
@@ -80,20 +83,20 @@ def events(path: Path) -> list[bytes]:
 def test_event_files_have_a_version_every_step_and_every_evaluation(run):
     (path,) = (run / "tensorboard").iterdir()
     first, *rest = events(path)
-    assert b"brain.Event:2" in first
-    scalars = [record for record in rest if b"train/loss" in record]
-    assert len(scalars) == 6 and sum(b"eval/loss" in record for record in rest) == 2
-    assert all(b"train_loss/" in record for record in scalars)
-    assert sum(b"\x89PNG" in record for record in rest) == 4
+    assert first.file_version == "brain.Event:2"
+    assert len(values(rest, "train/loss")) == 6 and len(values(rest, "eval/loss")) == 2
+    assert len(values(rest, "train_loss/arm")) == 6
+    images = [v.image for event in rest for v in event.summary.value if v.HasField("image")]
+    assert len(images) == 4
+    for image in images:
+        with Image.open(io.BytesIO(image.encoded_image_string)) as opened:
+            assert opened.size == (image.width, image.height)
 
 
 def test_figures_in_event_files_are_those_of_the_metrics(run):
     (path,) = (run / "tensorboard").iterdir()
-    record = next(r for r in events(path) if b"train/loss" in r)
-    at = record.index(b"train/loss") + len(b"train/loss")
-    assert record[at] == 0x15  # field 2, four bytes
-    (value,) = struct.unpack_from("<f", record, at + 1)
-    assert value == pytest.approx(read_metrics(run)[0]["loss"], rel=1e-6)
+    losses = [line["loss"] for line in read_metrics(run) if line["kind"] == "train"]
+    assert values(events(path), "train/loss") == pytest.approx(losses, rel=1e-6)
 
 
 def test_a_resumed_run_supersedes_what_was_written_beyond_its_step(data, tmp_path):
@@ -107,10 +110,22 @@ def test_a_resumed_run_supersedes_what_was_written_beyond_its_step(data, tmp_pat
         train(make_recipe(given), out=tmp_path / "run", show=False, on_progress=kill)
     train(make_recipe(given), out=tmp_path / "run", show=False)
     first, second = sorted((tmp_path / "run" / "tensorboard").iterdir())
-    assert sum(b"train/loss" in r for r in events(first)) == 5
+    assert len(values(events(first), "train/loss")) == 5
     start, *rest = events(second)[1:]
-    assert start[9:] == bytes([0x10, 5, 0x3A, 2, 0x08, 1])  # step 5, session log: start
-    assert sum(b"train/loss" in r for r in rest) == 2
+    assert (start.step, start.session_log.status) == (5, SessionLog.START)
+    assert len(values(rest, "train/loss")) == 2
+
+
+def test_without_a_package_for_it_nothing_is_tracked(data, tmp_path):
+    given = {key: value for key, value in TINY.items() if key != "track"}
+    train(make_recipe({**given, "data": data, "steps": 1}), out=tmp_path / "run", show=False)
+    assert not (tmp_path / "run" / "tensorboard").exists()
+
+
+def test_an_event_file_that_cannot_be_written_is_one_error(tmp_path):
+    (tmp_path / "tensorboard").write_text("a file")
+    with pytest.raises(OutputError, match="cannot be written"):
+        open_trackers(make_recipe({**TINY, "data": ["d"], "track": ["tensorboard"]}), tmp_path, 0)
 
 
 @pytest.fixture(params=["trackio", "wandb"])
@@ -136,10 +151,19 @@ def test_trackio_and_wandb_get_the_recipe_the_figures_and_the_pictures(package, 
     assert last == ("finish",) and ("id" in init) == (package.__name__ == "wandb")
 
 
-@pytest.mark.parametrize("name", ["trackio", "wandb"])
-def test_a_package_that_is_missing_is_said_with_how_to_install_it(data, tmp_path, monkeypatch, name):
-    monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(MissingDependencyError, match=f"{name} is not installed — pip install {name}"):
+@pytest.mark.parametrize(
+    ("name", "module", "install"),
+    [
+        ("trackio", "trackio", "pip install trackio"),
+        ("wandb", "wandb", "pip install wandb"),
+        ("tensorboard", "tensorboard.compat.proto.event_pb2", "uv sync --extra tensorboard"),
+    ],
+)
+def test_a_package_that_is_missing_is_said_with_how_to_install_it(
+    data, tmp_path, monkeypatch, name, module, install
+):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingDependencyError, match=f"{name} is not installed — {install}"):
         train(make_recipe({**TINY, "data": data, "track": [name]}), out=tmp_path / "run", show=False)
 
 

@@ -4,23 +4,52 @@ A file system raises what it likes; here that becomes one SourceError that names
 pass by itself (a lost connection, a server that is busy) is tried again, what will not is not.
 """
 
-import errno
-import logging
-import time
 from collections.abc import Callable
 from typing import Any
 
-from hma_data.errors import HMAError, SourceError, StorageAwayError
-from hma_data.reach import reach
+import fsspec
 
-TRIES, FIRST_PAUSE_S = 4, 0.2  # each pause is three times the one before
-BUSY = {408, 425, 429, 500, 502, 503, 504}
-ABSENT = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
-BROKEN = {errno.ECONNRESET, errno.EPIPE, errno.ETIMEDOUT, errno.ENETUNREACH, errno.EHOSTUNREACH}
+from hma_data.errors import HMAError, MissingDependencyError, SourceError, StorageAwayError
+from hma_data.retry import ABSENT, address_hint, may_pass, retried, said
+
+CONNECT_S = 3.0  # seconds until a server that does not answer is given up on
+WAITS_S = (0.2, 0.6, 1.8)  # before the second, third and fourth try
+PACKAGES = {
+    "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",
+    "hf": "huggingface_hub", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
+}  # fmt: skip
 MARKS = ("etag", "ETag", "md5Hash", "crc32c", "mtime", "updated", "LastModified", "Last-Modified", "oid")
 NO_LISTING = ("http", "https")
 
-log = logging.getLogger(__name__)
+
+def file_system(uri: str) -> tuple[Any, str]:
+    """Return the fsspec file system of a URI, and the path on it.
+
+    Its driver soon gives up on an address where nobody answers, and leaves the further tries to us.
+
+    Raises:
+        MissingDependencyError: the file system's package is not installed.
+        ValueError: no file system is known by that scheme.
+    """
+    scheme = uri.split("://", 1)[0]
+    try:
+        files, path = fsspec.core.url_to_fs(uri, **_client_options(scheme))
+    except ImportError as fault:
+        package = PACKAGES.get(scheme)
+        remedy = f"pip install {package}" if package else said(fault)
+        raise MissingDependencyError(uri, f"needs the package of {scheme}://", remedy) from fault
+    return files, path
+
+
+def _client_options(scheme: str) -> dict[str, Any]:
+    if scheme in ("s3", "s3a"):
+        ours = {"connect_timeout": CONNECT_S, "retries": {"total_max_attempts": 1}}
+        return {"config_kwargs": ours | fsspec.config.conf.get("s3", {}).get("config_kwargs", {})}
+    if scheme in NO_LISTING:
+        import aiohttp
+
+        return {"client_kwargs": {"timeout": aiohttp.ClientTimeout(total=300, sock_connect=CONNECT_S)}}
+    return {}
 
 
 def protocol(files: Any) -> str:
@@ -45,21 +74,16 @@ def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
     Raises:
         SourceError: it fails for good.
     """
-    tries = 1 if is_local(files) else TRIES
-    for turn in range(tries):
-        try:
-            if tries > 1:
-                reach(files, path)
-            return action()
-        except HMAError:
-            raise
-        except Exception as fault:  # file systems raise what they like
-            if turn == tries - 1 or not may_pass(fault):
-                kind = StorageAwayError if may_pass(fault) else SourceError
-                raise kind(path, f"cannot be read: {said(fault)}", _remedy(fault)) from fault
-            log.info("%s: %s; trying again", path, said(fault))
-            time.sleep(FIRST_PAUSE_S * 3**turn)
-    raise AssertionError("a try returns or raises")
+    try:
+        return retried(action, path, () if is_local(files) else WAITS_S)
+    except HMAError:
+        raise
+    except Exception as fault:  # file systems raise what they like
+        text = f"cannot be read: {said(fault)}"
+        if may_pass(fault):
+            remedy = "the network failed again and again; run it again later, it continues where it was"
+            raise StorageAwayError(path, text, address_hint(fault) + remedy) from fault
+        raise SourceError(path, text, "check the path and your access to it") from fault
 
 
 def info(files: Any, path: str) -> dict[str, Any]:
@@ -118,50 +142,3 @@ def fetch_whole(files: Any, path: str, limit: int) -> bytes | None:
                 path, f"has {size:,} bytes, more than {limit:,}", "it is no description of TFDS"
             )
     return attempt(files, path, whole)
-
-
-def _status(fault: BaseException) -> int:
-    for name in ("status", "code", "status_code"):
-        value = getattr(fault, name, None) or getattr(getattr(fault, "response", None), name, None)
-        if isinstance(value, int):
-            return value
-        if isinstance(value, str) and value.isdecimal():
-            return int(value)
-    return 0
-
-
-def may_pass(fault: BaseException) -> bool:
-    """Whether what a remote file system raised may be gone on the next try."""
-    if isinstance(fault, (*ABSENT, PermissionError, ImportError)):
-        return False
-    if status := _status(fault):
-        return status in BUSY
-    if isinstance(fault, ConnectionError | TimeoutError) or getattr(fault, "errno", None) in BROKEN:
-        return True
-    names = {kind.__name__ for kind in type(fault).__mro__}
-    return bool(
-        names
-        & {
-            "ClientConnectionError",  # aiohttp
-            "ClientPayloadError",
-            "ConnectTimeoutError",  # botocore
-            "EndpointConnectionError",
-            "HTTPClientError",
-            "ReadTimeoutError",
-            "ResponseParserError",
-            "IncompleteRead",
-            "TransportError",  # google-auth, httpx
-        }
-    )
-
-
-def said(fault: BaseException) -> str:
-    """An exception in one line."""
-    text = " ".join(str(fault).split())
-    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
-
-
-def _remedy(fault: BaseException) -> str:
-    if may_pass(fault):
-        return "the network failed again and again; run it again later, it continues where it was"
-    return "check the path and your access to it"

@@ -1,6 +1,6 @@
 """Render robots in MuJoCo for the tokenizer's training: many scenes, cameras, lights and colours.
 
-    MUJOCO_GL=osmesa python -m hma_data.tokenizers.render OUT [--pictures 120] [--seed 20]
+    MUJOCO_GL=osmesa python recipes/tokenizer/render.py OUT [--pictures 120] [--seed 20]
 
 Needs, in an environment of its own (their versions of MuJoCo exclude others): gym-aloha,
 gymnasium-robotics, metaworld, mujoco; and Debian's libosmesa6. Scenes come from the simulators'

@@ -1,0 +1,117 @@
+"""Make the pictures that the tokenizers' corpus takes from no package: gym-pusht, and drawn scenes.
+
+    python recipes/tokenizer/draw.py OUT [--pusht 200] [--drawn 300] [--seed 20]
+
+They are written to OUT/pusht/00000.png … and OUT/drawn/00000.png …, where recipes look for them.
+"""
+
+import argparse
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Picture = NDArray[np.uint8]
+
+
+def push_pictures(count: int, seed: int) -> Iterator[Picture]:
+    """Frames of gym-pusht, 256×256, the agent wandering towards random points."""
+    import gym_pusht  # noqa: F401  registers the environment
+    import gymnasium
+
+    rng = np.random.default_rng([seed, 1])
+    env = gymnasium.make(
+        "gym_pusht/PushT-v0",
+        obs_type="state",
+        render_mode="rgb_array",
+        max_episode_steps=40,
+        observation_width=256,
+        observation_height=256,
+    )
+    made = 0
+    while made < count:
+        env.reset(seed=int(rng.integers(2**31)))
+        goal = rng.uniform(50, 460, 2)
+        for step in range(24):
+            if step % 6 == 0:
+                goal = rng.uniform(50, 460, 2)
+            env.step(goal.astype(np.float32))
+            if step % 6 == 5 and made < count:
+                whole = bool(rng.random() < 0.5)  # at 680 pixels with the target of the action, or at 256
+                yield np.asarray(env.unwrapped._render(visualize=whole), np.uint8)
+                made += 1
+    env.close()
+
+
+def draw_scene(rng: np.random.Generator, size: int = 384) -> Picture:
+    """A scene of smooth and sharp parts: gradients, noise of several scales, shapes, bars."""
+    import cv2
+
+    def colour() -> tuple[float, float, float]:
+        grey = rng.uniform(0, 255)
+        spread = rng.choice([8.0, 40.0, 120.0])
+        r, g, b = np.clip(grey + rng.normal(0, spread, 3), 0, 255)
+        return float(r), float(g), float(b)
+
+    corners = np.array([[colour(), colour()], [colour(), colour()]], np.float32)
+    canvas = cv2.resize(corners, (size, size), interpolation=cv2.INTER_LINEAR)
+    for grain in (4, 16, 64, 192):
+        if rng.random() < 0.35:
+            noise = rng.normal(0, rng.uniform(2, 25), (grain, grain, 1)).astype(np.float32)
+            canvas = canvas + cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC)[:, :, None]
+    canvas = np.ascontiguousarray(np.clip(canvas, 0, 255).astype(np.uint8))
+    for _ in range(int(rng.integers(3, 28))):
+        _draw_shape(canvas, rng, colour())
+    if rng.random() < 0.3:
+        canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), rng.uniform(0.5, 2.0)), np.uint8)
+    return canvas
+
+
+def _draw_shape(canvas: Picture, rng: np.random.Generator, colour: tuple[float, float, float]) -> None:
+    import cv2
+
+    size = canvas.shape[0]
+    x, y = (int(v) for v in rng.integers(0, size, 2))
+    reach = int(math.exp(rng.uniform(math.log(5), math.log(size / 2.5))))
+    kind = rng.integers(0, 4)
+    if kind == 0:
+        points = rng.integers(-reach, reach, (int(rng.integers(3, 7)), 2)) + np.array([x, y])
+        cv2.fillPoly(canvas, [np.asarray(points, np.int32)], colour, cv2.LINE_AA)
+    elif kind == 1:
+        axes = (max(2, reach // 2), max(2, int(reach * rng.uniform(0.15, 0.5))))
+        cv2.ellipse(canvas, (x, y), axes, rng.uniform(0, 180), 0, 360, colour, -1, cv2.LINE_AA)
+    elif kind == 2:
+        other = rng.integers(-2 * reach, 2 * reach, 2) + np.array([x, y])
+        thick = int(rng.integers(1, max(2, reach // 4) + 1))
+        cv2.line(canvas, (x, y), (int(other[0]), int(other[1])), colour, min(thick, 60), cv2.LINE_AA)
+    else:
+        box = cv2.boxPoints(((x, y), (reach, reach * rng.uniform(0.2, 1.0)), rng.uniform(0, 90)))
+        cv2.fillPoly(canvas, [np.asarray(box, np.int32)], colour, cv2.LINE_AA)
+
+
+def write_pictures(folder: Path, pictures: Iterator[Picture]) -> None:
+    """Write folder/00000.png …"""
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{index:05d}.png"), picture[:, :, ::-1])
+
+
+def main() -> None:
+    """Write both folders."""
+    parser = argparse.ArgumentParser(description="Draw pictures for the tokenizers' training")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--pusht", type=int, default=200, help="pictures of gym-pusht")
+    parser.add_argument("--drawn", type=int, default=300, help="drawn scenes")
+    parser.add_argument("--seed", type=int, default=20)
+    arguments = parser.parse_args()
+    write_pictures(arguments.out / "pusht", push_pictures(arguments.pusht, arguments.seed))
+    rng = np.random.default_rng([arguments.seed, 2])
+    write_pictures(arguments.out / "drawn", (draw_scene(rng) for _ in range(arguments.drawn)))
+
+
+if __name__ == "__main__":
+    main()
