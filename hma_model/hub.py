@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from hma_data.embodiment import ID_PATTERN
 from hma_data.errors import CheckpointError, HMAError, HubError
+from hma_data.hub.partial import remove_dead_parts
 from hma_model import checkpoint as checkpoints
 from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
 from hma_model.files import parse_json
 from hma_model.hub_check import require_publishable, require_yaml
-from hma_model.hub_partial import remove_dead_parts
 from hma_model.model_card import render
 
 if TYPE_CHECKING:
@@ -37,6 +37,11 @@ class Store(Protocol):
     """Where a checkpoint is published."""
 
     name: str  # for errors
+
+    @property
+    def from_cache(self) -> bool:
+        """Whether the hub was out of reach, so that `files` told what the cache has."""
+        ...
 
     @property
     def repo(self) -> str | None:
@@ -61,7 +66,7 @@ class Store(Protocol):
         ...
 
     def pull(self, names: list[str], out: Path | None) -> Path:
-        """Bring files here, card last; returns their folder."""
+        """Bring files here, card last; return their folder, which may be a cache and not `out`."""
         ...
 
 
@@ -79,9 +84,9 @@ def open_store(
     if not write:
         address, revision = addressed(address, revision)
     if is_repository(address):
-        from hma_model.hub_hf import HuggingFaceStore
+        from hma_data.hub.repository import Repository
 
-        return HuggingFaceStore(str(address).removeprefix("hf://"), revision, write, private=private)
+        return Repository(str(address).removeprefix("hf://"), revision, write, private=private)
     from hma_model.hub_folder import FolderStore
 
     if revision is not None:
@@ -182,19 +187,25 @@ def _pull(
         check_id(name, store.name)
         if name not in there:
             known = ", ".join(there[:SHOWN]) or "none"
-            raise HubError(store.name, f"has no embodiment {name!r}", f"it has: {known}")
+            away = " in the cache, and is out of reach" if store.from_cache else ""
+            raise HubError(store.name, f"has no embodiment {name!r}{away}", f"it has: {known}")
         lacking = [part for part in PARTS if f"embodiments/{name}/{part}" not in files]
-        if lacking:
+        if lacking and not store.from_cache:
             fault = f"lacks {lacking[0]} of embodiment {name!r}"
             raise HubError(store.name, fault, "name the embodiments you want, or have it pushed again")
-    if TRUNK not in files:
+    if TRUNK not in files and not store.from_cache:
         raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
     names = [f"embodiments/{name}/{part}" for name in wanted for part in (SAMPLE, *PARTS)]
+    names = [CONFIG, TRUNK, *(name for name in names if name in files or not name.endswith(SAMPLE))]
     place = out
     if place is None and "://" in str(source) and not is_repository(source):
         key = f"{store.name} {values.get('trunk_sha256')}".encode()
         place = cache_folder() / "hub" / hashlib.sha256(key).hexdigest()[:24]
-    folder = store.pull([CONFIG, TRUNK, *(name for name in names if name in files)], place)
+    folder = store.pull(names, place)
+    if place and folder != place and is_repository(source):
+        from hma_model.hub_folder import FolderStore
+
+        folder = FolderStore(folder).pull(names, place)
     pulled = Checkpoint.open(folder)
     pulled.trunk()
     for name in wanted:

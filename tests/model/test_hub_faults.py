@@ -1,6 +1,5 @@
 """Hubs that differ, that are hostile, or that fail in the middle: the client's side of it."""
 
-import gzip
 import json
 import os
 import subprocess
@@ -12,12 +11,12 @@ from pathlib import Path
 import pytest
 from huggingface_hub import constants
 
-from hma_data import hub_bounds, remote_lock
+from hma_data import remote_lock
 from hma_data.errors import HubError
-from hma_model import checkpoint, hub, hub_fetch, hub_hf, hub_partial, hub_swap
+from hma_data.hub import partial
+from hma_model import checkpoint, hub, hub_swap
 from hma_model.checkpoint import PARTS
-from hma_model.hub_fetch import Wanted
-from tests.hub_server import Hub, serve
+from tests.hub_server import Hub
 from tests.hub_state import REPO, sha256
 from tests.model.robots import make_model, save
 
@@ -59,7 +58,7 @@ def test_hubs_of_other_habits_are_pushed_to_and_pulled_from(server, source, habi
     }
 
 
-@pytest.mark.parametrize("status", [404, 200])
+@pytest.mark.parametrize("status", [404, 501])
 def test_a_hub_without_xet_gets_the_files_by_lfs(server, source, monkeypatch, status):
     pytest.importorskip("hf_xet")
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", False)
@@ -84,10 +83,11 @@ def test_a_failed_transfer_by_xet_goes_on_by_lfs(server, source, monkeypatch):
 
 
 def test_a_file_that_a_gitignore_leaves_out_stops_the_push_before_its_commit(server, source):
+    server.create(REPO).commit({".gitignore": b"stats.json"})
     server.habits.ignored = ("*/stats.json",)
     with pytest.raises(HubError, match=r"leaves out embodiments/arm/stats\.json, by its \.gitignore"):
         hub.push(source, REPO)
-    assert kinds(server) == []
+    assert kinds(server) == ["by hand"]
 
 
 @pytest.mark.parametrize("told", [True, False])
@@ -161,13 +161,6 @@ def test_a_pull_cut_at_any_request_is_ended_by_the_same_command(published, sourc
     assert 10 < at < 199
 
 
-def test_an_address_that_is_no_longer_good_is_asked_for_again(published):
-    published.fail("GET /cdn/.*trunk", after=500)
-    published.fail("GET /cdn/.*trunk", 403)
-    hub.pull(REPO, ["arm"])
-    assert published.count("HEAD .*trunk") == 2
-
-
 def test_a_file_of_the_cache_that_was_damaged_comes_again(published):
     folder = hub.pull(REPO, ["arm"])
     blob = (folder / "embodiments/arm/stem.safetensors").resolve()
@@ -180,54 +173,12 @@ def test_a_file_of_the_cache_that_was_damaged_comes_again(published):
 def test_a_file_that_grows_beyond_its_size_is_not_kept(published, tmp_path):
     trunk = published.model(REPO).files["trunk.safetensors"]
     published.objects[sha256(trunk)] = trunk + bytes(5_000_000)
-    with pytest.raises(HubError, match=rf"more than the {len(trunk):,} bytes that were stated"):
+    with pytest.raises(HubError, match="did not come whole"):
         hub.pull(REPO, ["arm"])
     assert all(path.stat().st_size <= len(trunk) for path in tmp_path.rglob("*") if path.is_file())
 
 
-def test_a_small_file_that_unpacks_to_a_large_one_is_not_kept(published, tmp_path):
-    bomb = gzip.compress(bytes(20_000_000))
-    published.fail("GET .*/resolve/.*/config.json", 200, headers={"Content-Encoding": "gzip"}, body=bomb)
-    with pytest.raises(HubError, match="bytes that were stated"):
-        hub.pull(REPO, ["arm"])
-    assert all(path.stat().st_size < 1_000_000 for path in tmp_path.rglob("*") if path.is_file())
-
-
-def test_what_is_answered_unlike_what_is_listed_is_refused(published):
-    other = {"Content-Length": "0", "X-Linked-Size": "7", "X-Linked-ETag": f'"{"0" * 64}"'}
-    published.fail("HEAD .*trunk", 200, headers=other)
-    with pytest.raises(HubError, match=r"is listed with size \d+, and answered with 7"):
-        hub.pull(REPO, ["arm"])
-
-
-@pytest.mark.parametrize("tag", ['"../../../escaped"', '"/escaped"', 'W/"a/b"', '""'])
-def test_a_hubs_tag_does_not_become_a_path(published, tmp_path, tag):
-    size = len(published.model(REPO).files["embodiments/arm/stats.json"])
-    facts = {"ETag": tag, "X-Linked-Size": str(size)}
-    published.fail("HEAD .*stats.json", 200, headers=facts, times=9)
-    hub.pull(REPO, ["arm"])
-    assert not [path for path in tmp_path.parent.rglob("*escaped*") if tmp_path in path.parents]
-
-
-@pytest.mark.parametrize("name", ["../x", "/x", "a/../../x", "C:\\x", "a\\..\\x", "a\0b", ""])
-def test_a_name_that_leads_out_of_the_cache_is_refused(name):
-    with pytest.raises(HubError, match="is not a name that can be stored"):
-        hub_fetch.cached(Wanted(REPO, "model", name, "0" * 40))
-
-
-def test_the_token_is_not_shown_to_another_port_of_the_same_host(published):
-    with serve() as other:
-        trunk = published.model(REPO).files["trunk.safetensors"]
-        other.objects[sha256(trunk)] = trunk
-        place = f"{other.url}/cdn/{sha256(trunk)}/trunk.safetensors"
-        facts = {"Location": place, "X-Linked-Size": str(len(trunk)), "X-Linked-ETag": sha256(trunk)}
-        published.fail("HEAD .*trunk", 302, headers=facts)
-        hub.pull(REPO, ["arm"])
-        assert other.log and not any(asked.authorized for asked in other.log)
-
-
 def test_pulls_at_once_fetch_every_byte_once(published, source):
-    published.fail("GET /cdn/.*trunk", after=500)
     faults: list[BaseException] = []
 
     def pull() -> None:
@@ -256,32 +207,6 @@ def test_a_commit_of_a_strange_name_is_refused(published, sha):
         hub.pull(REPO)
 
 
-@pytest.mark.parametrize("entries", [0, 1])
-def test_a_listing_that_leads_to_itself_ends(published, entries):
-    file = {"type": "file", "path": "config.json", "size": 3, "oid": "0" * 40}
-    link = {"Link": f'<{published.url}/api/models/{REPO}/tree/main>; rel="next"'}
-    published.fail("GET .*/tree/", 200, headers=link, body=json.dumps([file] * entries).encode(), times=10**6)
-    with pytest.raises(HubError, match=r"in circles|lists 'config\.json' twice"):
-        hub.pull(REPO)
-    assert published.count("GET .*/tree/") < 100
-
-
-def test_a_listing_without_end_ends(published, monkeypatch):
-    monkeypatch.setattr(hub_hf, "MOST_FILES", 3)
-    with pytest.raises(HubError, match="has too many files"):
-        hub.pull(REPO)
-
-
-@pytest.mark.parametrize("packed", [True, False])
-def test_a_long_answer_is_not_read_whole(published, monkeypatch, packed):
-    monkeypatch.setattr(hub_bounds, "LONGEST_ANSWER", 100_000)
-    body = b"[" + b" " * 1_000_000 + b"]"
-    headers = {"Content-Encoding": "gzip"} if packed else {}
-    published.fail("GET /api/models", 200, headers=headers, body=gzip.compress(body) if packed else body)
-    with pytest.raises(HubError, match="answers with more than 100,000 bytes"):
-        hub.pull(REPO)
-
-
 def test_an_embodiment_that_is_not_whole_is_told_before_anything_is_fetched(published):
     published.model(REPO).commit({"embodiments/arm/head.safetensors": None})
     with pytest.raises(HubError, match=r"lacks head\.safetensors of embodiment 'arm'"):
@@ -307,10 +232,10 @@ def ended_process() -> int:
 
 def test_what_a_killed_push_staged_is_deleted_by_the_next(folder, source, monkeypatch):
     path = folder / "embodiments/arm/stem.safetensors"
-    living, dead = hub_partial.beside(path), ended_process()
+    living, dead = partial.beside(path), ended_process()
     with monkeypatch.context() as patched:
         patched.setattr(os, "getpid", lambda: dead)
-        left = hub_partial.beside(path)
+        left = partial.beside(path)
     elsewhere = path.with_name(".stem.safetensors.partial-00000000-1-0123456789ab")
     older = path.with_name(".stem.safetensors.partial-0123456789ab")
     strange = path.with_name("notes.partial-of-mine")
@@ -325,7 +250,7 @@ def test_what_a_killed_pull_left_is_deleted_by_the_next(folder, tmp_path, monkey
     dead, target = ended_process(), tmp_path / "out/trunk.safetensors"
     with monkeypatch.context() as patched:
         patched.setattr(os, "getpid", lambda: dead)
-        left = hub_partial.beside(target)
+        left = partial.beside(target)
     target.parent.mkdir()
     left.write_bytes(b"x")
     hub.pull(folder, ["arm"], tmp_path / "out")
