@@ -13,6 +13,7 @@ import re
 import stat
 import time
 from collections.abc import Callable, Generator
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from inspect import signature
 from pathlib import Path, PosixPath, PurePosixPath
@@ -248,9 +249,11 @@ class RemotePath(PosixPath):
     def read_bytes(self) -> bytes:
         try:
             return attempt(self, "read", lambda: bytes(self.files.cat_file(self.key)))
-        except FileNotFoundError:
-            if self.info()["size"] == 0:  # some hubs do not send empty files
-                return b""
+        except (FileNotFoundError, StorageError):
+            with suppress(FileNotFoundError, StorageError):
+                found = self.info()
+                if (found["type"], found["size"]) == ("file", 0):  # some hubs do not send empty files
+                    return b""
             raise
 
     def read_text(self, encoding: str | None = None, errors: str | None = None, **_: Any) -> str:

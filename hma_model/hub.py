@@ -225,7 +225,10 @@ def list_embodiments(source: str | Path, revision: str | None = None) -> list[di
 
 
 def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
-    """What is published: the trunk's hash and bytes, tokenizer and model, and of each id `card`, `bytes`."""
+    """Return what is published: the trunk's hash and bytes, tokenizer and model; of each id `card`, `bytes`.
+
+    Bytes are None where the hub is out of reach and the client's cache does not have the files.
+    """
     store = open_store(source, revision)
     files = store.files()
     values = _config(store, files)
@@ -233,15 +236,23 @@ def describe(source: str | Path, revision: str | None = None) -> dict[str, Any]:
     return {
         "source": store.name,
         **{key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
-        "trunk_bytes": files.get(TRUNK, 0),
+        "trunk_bytes": total_bytes(store, files, [TRUNK]),
         "embodiments": {
             name: {
                 "card": _card(store, name),
-                "bytes": sum(files.get(f"embodiments/{name}/{part}", 0) for part in PARTS),
+                "bytes": total_bytes(store, files, [f"embodiments/{name}/{part}" for part in PARTS]),
             }
             for name in embodiment_ids(files)
         },
     }
+
+
+def total_bytes(store: Store, files: Mapping[str, int], names: Iterable[str]) -> int | None:
+    """Return the bytes of files; None where the hub is out of reach and the cache has not all of them."""
+    sizes = [files.get(name) for name in names]
+    if store.from_cache and None in sizes:
+        return None
+    return sum(size or 0 for size in sizes)
 
 
 def from_pretrained(

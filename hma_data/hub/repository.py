@@ -9,7 +9,7 @@ import random
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import batched
 from pathlib import Path, PurePosixPath
@@ -189,17 +189,7 @@ class Repository:
 
     def pull(self, names: list[str], out: Path | None = None) -> Path:
         """Bring files to the client's cache, whatever `out`; return their folder there."""
-        first, *_ = self._brought(names)
-        folder = first.parents[len(PurePosixPath(names[0]).parts) - 1]
-        named = self._revision or "main"
-        if not self.from_cache and not _COMMIT.fullmatch(named):  # for who asks for it by this name, offline
-            with explained(self.name):
-                ref = folder.parent.parent / "refs" / named
-                ref.parent.mkdir(parents=True, exist_ok=True)
-                new = beside(ref)
-                new.write_text(str(self._commit))
-                new.replace(ref)
-        return folder
+        return _snapshot(self._brought(names)[0], names[0])
 
     def download(self, names: list[str], out: Path) -> None:
         """Bring files to a folder, past the client's cache; each gets its name once it is whole."""
@@ -226,7 +216,7 @@ class Repository:
             self.files()
         return self._entries or {}
 
-    def _brought(self, names: Iterable[str]) -> list[Path]:
+    def _brought(self, names: Sequence[str]) -> list[Path]:
         """Return paths of files in the cache, which are fetched unless they are there and whole."""
         known = self._known()
         if (folder := self._cached) is not None:
@@ -235,7 +225,21 @@ class Repository:
                 raise HubError(self.name, fault, "go online and pull again")
             return [folder / name for name in names]
         commit = str(self._commit)
-        return self._each(lambda name: fetch(self.repo, self.kind, commit, known[name]), names)
+        paths = self._each(lambda name: fetch(self.repo, self.kind, commit, known[name]), names)
+        if paths:
+            self._remember(_snapshot(paths[0], names[0]))
+        return paths
+
+    def _remember(self, snapshot: Path) -> None:
+        """Note in the cache which commit the revision is, for who asks for it by this name offline."""
+        named = self._revision or "main"
+        ref = snapshot.parent.parent / "refs" / named
+        with explained(self.name):
+            if not _COMMIT.fullmatch(named) and not (ref.is_file() and ref.read_text() == self._commit):
+                ref.parent.mkdir(parents=True, exist_ok=True)
+                new = beside(ref)
+                new.write_text(str(self._commit))
+                new.replace(ref)
 
     def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
         """Return what an action gives for each file, a few at once; the first error ends it."""
@@ -382,3 +386,8 @@ class Repository:
         session = get_session()
         if session.timeout.read is None:
             session.timeout = SILENCE_S
+
+
+def _snapshot(path: Path, name: str) -> Path:
+    """Return the folder of the client's cache in which a file of this name lies."""
+    return path.parents[len(PurePosixPath(name).parts) - 1]

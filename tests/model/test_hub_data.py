@@ -54,6 +54,20 @@ def test_a_published_set_is_read_in_place_by_its_uri(server, shards):
     HfFileSystem.clear_instance_cache()
 
 
+def test_empty_files_that_a_hub_does_not_send_are_there(server, shards, tmp_path):
+    from huggingface_hub import HfFileSystem
+
+    from hma_data.shards.info import describe
+
+    server.habits.empty = False
+    push_data(shards, REPO)
+    HfFileSystem.clear_instance_cache()
+    assert (shards / "quarantine.jsonl").read_bytes() == b""
+    assert contents(pull_data(REPO, tmp_path / "out")) == contents(shards)
+    assert describe(Path(f"hf://datasets/{REPO}"))["totals"]["episodes"]
+    HfFileSystem.clear_instance_cache()
+
+
 def test_a_small_set_is_one_commit(server, shards):
     assert push_data(shards, REPO) == f"{server.url}/datasets/{REPO}"
     assert [commit.message for commit in dataset(server).commits] == ["initial commit", "Add arm"]
@@ -116,7 +130,7 @@ def test_an_interrupted_pull_goes_on_file_by_file(server, shards, tmp_path):
     server.fail("GET /cdn/.*train", after=500, times=99)
     with pytest.raises(HubError, match="connection was cut"):
         pull_data(REPO, tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out").iterdir()} <= {"val", "episodes.parquet"}
+    assert not (tmp_path / "out/train").exists() and not (tmp_path / "out/manifest.json").exists()
     server.faults.clear()
     server.log.clear()
     pull_data(REPO, tmp_path / "out")

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from huggingface_hub import constants
 from hma_data import remote_lock
 from hma_data.errors import HubError
 from hma_data.hub import partial
+from hma_data.hub.download import Entry
 from hma_model import checkpoint, hub, hub_swap
 from hma_model.checkpoint import PARTS
 from tests.hub_server import Hub
@@ -107,6 +109,28 @@ def test_a_commit_that_was_made_though_its_answer_was_lost_stays_alone(server, s
     assert kinds(server) == ["Add arm", "Add hand"]
 
 
+def test_a_repository_that_is_missing_without_a_code_is_made(server, source):
+    server.habits.codes = False
+    hub.push(source, REPO)
+    assert kinds(server) == ["Add arm, hand"]
+    with pytest.raises(HubError, match=r"answered 404.*check the name"):
+        hub.pull("team/none")
+
+
+@pytest.mark.parametrize("kind", ["directory", "file"])
+def test_entries_without_a_path_are_no_files(server, source, kind):
+    server.habits.folders = kind
+    hub.push(source, REPO, ["arm"])
+    hub.push(source, REPO, ["hand"])
+    assert sorted(checkpoint.load(hub.pull(REPO)).embodiments) == ["arm", "hand"]
+
+
+def test_a_robot_pushed_again_unchanged_makes_no_commit_though_no_oid_is_told(published, source):
+    published.habits.tells_oids = False
+    hub.push(source, REPO, ["arm"])
+    assert kinds(published) == ["Add arm, hand"] and published.count("POST .*/commit/") == 0
+
+
 def test_what_a_hub_says_is_shown_but_never_the_token(server, source):
     said = json.dumps({"error": f"no room\nfor you, {TOKEN}"}).encode()
     server.fail("POST /api/repos/create", 400, body=said, times=9)
@@ -161,13 +185,20 @@ def test_a_pull_cut_at_any_request_is_ended_by_the_same_command(published, sourc
     assert 10 < at < 199
 
 
-def test_a_file_of_the_cache_that_was_damaged_comes_again(published):
-    folder = hub.pull(REPO, ["arm"])
-    blob = (folder / "embodiments/arm/stem.safetensors").resolve()
-    blob.write_bytes(blob.read_bytes()[:-1] + b"x")
+@pytest.mark.parametrize("name", ["stem.safetensors", "stats.json"])
+def test_a_file_of_the_cache_that_was_damaged_comes_again(published, name):
+    damaged = damage(hub.pull(REPO, ["arm"]) / "embodiments/arm" / name)
     published.log.clear()
     hub.pull(REPO, ["arm"])
-    assert list(published.sent()) == ["embodiments/arm/stem.safetensors"]
+    assert list(published.sent()) == [f"embodiments/arm/{name}"] and not damaged()
+
+
+def damage(path: Path) -> Callable[[], bool]:
+    """Change a byte of a file of the cache; whether it is still changed."""
+    whole = path.read_bytes()
+    at = next(at for at in range(len(whole) - 1, -1, -1) if whole[at : at + 1].isdigit())
+    path.resolve().write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+    return lambda: path.read_bytes() != whole
 
 
 def test_a_file_that_grows_beyond_its_size_is_not_kept(published, tmp_path):
@@ -178,22 +209,118 @@ def test_a_file_that_grows_beyond_its_size_is_not_kept(published, tmp_path):
     assert all(path.stat().st_size <= len(trunk) for path in tmp_path.rglob("*") if path.is_file())
 
 
+def sizes(folder: Path, names: Iterable[str]) -> dict[str, int]:
+    return {name: (folder / name).stat().st_size for name in names}
+
+
+ARM = ("config.json", "trunk.safetensors", *(f"embodiments/arm/{part}" for part in PARTS))
+STEM = "embodiments/arm/stem.safetensors"
+
+
 def test_pulls_at_once_fetch_every_byte_once(published, source):
-    faults: list[BaseException] = []
+    published.fail("GET /cdn/.*trunk", stall=60.0, late=True)  # for the one, while the others come to it
+    with ThreadPoolExecutor(3) as pool:
+        pulls = [pool.submit(hub.pull, REPO, ["arm"]) for _ in range(3)]
+        published.await_count("HEAD .*trunk", 3)
+        published.stalled.set()
+        folders = {pull.result(60) for pull in pulls}
+    assert len(folders) == 1 and published.sent() == sizes(source, ARM)
 
-    def pull() -> None:
-        try:
+
+def test_pulls_at_once_of_a_damaged_cache_all_end_well(published, monkeypatch):
+    """Each has found the damage before the first mends it; the last then finds a good file, and keeps it."""
+    path = hub.pull(REPO, ["arm"]) / STEM
+    damaged, found, plain = damage(path), threading.Barrier(2), Entry.states
+
+    def states(entry: Entry, content: Path | bytes) -> bool:
+        right = plain(entry, content)
+        if not right:
+            found.wait(60)
+        return right
+
+    monkeypatch.setattr(Entry, "states", states)
+    published.log.clear()
+    with ThreadPoolExecutor(2) as pool:
+        pulls = [pool.submit(hub.pull, REPO, ["arm"]) for _ in range(2)]
+        assert {pull.result(60) for pull in pulls} == {path.parents[2]}
+    assert not damaged() and set(published.sent()) == {STEM}
+
+
+def test_a_file_that_another_pull_has_mended_stays_while_it_comes_again(published, monkeypatch):
+    path = hub.pull(REPO, ["arm"]) / STEM
+    damaged, plain, others = damage(path), Entry.states, [True]
+
+    def states(entry: Entry, content: Path | bytes) -> bool:
+        right = plain(entry, content)
+        if not right and others:  # between the check and what follows from it
+            others.pop()
             hub.pull(REPO, ["arm"])
-        except BaseException as fault:
-            faults.append(fault)
+            assert not damaged()
+            published.fail("GET /cdn/.*stem", stall=60.0, late=True)
+        return right
 
-    threads = [threading.Thread(target=pull, daemon=True) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(30)
-    assert not faults and not any(thread.is_alive() for thread in threads)
-    assert published.sent("trunk") == {"trunk.safetensors": (source / "trunk.safetensors").stat().st_size}
+    monkeypatch.setattr(Entry, "states", states)
+    published.log.clear()
+    with ThreadPoolExecutor(1) as pool:
+        pull = pool.submit(hub.pull, REPO, ["arm"])
+        published.await_count("GET /cdn/.*stem", 2)
+        assert not damaged()
+        published.stalled.set()
+        assert pull.result(60) and not damaged()
+
+
+@pytest.mark.parametrize("at", ["before", "after"])
+def test_a_file_that_another_pull_renames_into_place_meanwhile_is_used(published, monkeypatch, at):
+    path, plain = hub.pull(REPO, ["arm"]) / STEM, Entry.states
+
+    def rename() -> None:
+        new = path.resolve().with_name("another.incomplete")
+        new.write_bytes(path.read_bytes())
+        new.replace(path.resolve())
+
+    def states(entry: Entry, content: Path | bytes) -> bool:
+        if at == "before" and entry.name == STEM:
+            rename()
+        right = plain(entry, content)
+        if at == "after" and entry.name == STEM:
+            rename()
+        return right
+
+    monkeypatch.setattr(Entry, "states", states)
+    published.log.clear()
+    assert list(checkpoint.load(hub.pull(REPO, ["arm"])).embodiments) == ["arm"]
+    assert published.sent() == {}
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_processes_that_pull_at_once_all_end_well(published, source, tmp_path, damaged):
+    still = damage(hub.pull(REPO, ["arm"]) / STEM) if damaged else None
+    published.log.clear()
+    script = (
+        "from hma_data.hub.repository import Repository\n"
+        f"store = Repository({REPO!r})\nstore.files()\nprint(store.pull({list(ARM)!r}))"
+    )
+    facts = {"HF_ENDPOINT": published.url, "HF_HUB_CACHE": str(tmp_path / "cache"), "HF_TOKEN": TOKEN}
+    published.fail("GET .*/tree/", stall=60.0, late=True, times=2)  # so that they begin together
+    pulls = [
+        subprocess.Popen(
+            [sys.executable, "-c", script],
+            env={**os.environ, **facts, "HF_HUB_DISABLE_XET": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(2)
+    ]
+    published.await_count("GET .*/tree/", 2)
+    published.stalled.set()
+    for pull in pulls:
+        shown, said = pull.communicate(timeout=60)
+        assert pull.returncode == 0 and shown, said
+    if still:
+        assert not still() and set(published.sent()) == {STEM}
+    else:
+        assert published.sent() == sizes(source, ARM)
 
 
 # -- answers

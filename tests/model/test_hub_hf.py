@@ -14,11 +14,13 @@ import pytest
 import torch
 import yaml as plain_yaml
 from huggingface_hub import constants
+from typer.testing import CliRunner
 
 from hma_data.errors import CheckpointError, HubError
 from hma_data.hub import errors as hub_errors
 from hma_model import checkpoint, hub
 from hma_model.checkpoint import PARTS
+from hma_model.cli import app
 from hma_model.model import HMA
 from tests.hub_server import Hub
 from tests.hub_state import REPO, ROBOTS, TOKEN
@@ -291,6 +293,30 @@ def test_what_was_never_pulled_is_not_there_offline(published, monkeypatch):
         hub.pull(REPO, ["hand"])
     with pytest.raises(HubError, match=r"out of reach, and not in the cache.*go online"):
         hub.pull("team/other")
+
+
+def test_what_was_only_listed_is_not_there_offline(published, monkeypatch):
+    described = hub.describe(REPO)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    said = r"is out of reach, and trunk\.safetensors is not in the cache — go online and pull again"
+    for act in (hub.pull, HMA.from_pretrained):
+        with pytest.raises(HubError, match=said):
+            act(REPO, ["arm"])
+    again = hub.describe(REPO)
+    assert again["trunk_bytes"] is None and again["embodiments"]["arm"]["bytes"] is None
+    assert again["embodiments"]["arm"]["card"] == described["embodiments"]["arm"]["card"]
+
+
+def test_a_listing_from_the_cache_says_so(published, monkeypatch):
+    shown = CliRunner().invoke(app, ["hub", "list", REPO]).output
+    assert "usable here" in shown and "cache" not in shown
+    hub.pull(REPO, ["arm"])
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    shown = CliRunner().invoke(app, ["hub", "list", REPO]).output
+    assert "the hub is out of reach, this is what the cache has" in shown and " 0.0 " not in shown
+    rows = json.loads(CliRunner().invoke(app, ["hub", "list", REPO, "--json"]).output)
+    assert rows["from_cache"] and [bool(row["bytes"]) for row in rows["embodiments"]] == [True, False]
+    assert [row["problems"][:1] for row in rows["embodiments"]] == [[], ["the cache lacks stem.safetensors"]]
 
 
 def test_a_full_disk_says_so_and_the_pull_goes_on_later(published, tmp_path, monkeypatch):
