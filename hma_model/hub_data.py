@@ -116,7 +116,9 @@ def _whole(folder: Path) -> Manifest:
     return manifest
 
 
-def _open(address: str | Path, revision: str | None = None, **settings: bool) -> DataStore:
+def _open(
+    address: str | Path, revision: str | None = None, write: bool = False, private: bool = False
+) -> DataStore:
     text = str(address)
     given = text.startswith(_DATASETS)
     name = text.removeprefix(_DATASETS)
@@ -126,12 +128,12 @@ def _open(address: str | Path, revision: str | None = None, **settings: bool) ->
         name = name.removeprefix("hf://")
         if not REPOSITORY.fullmatch(name):
             raise HubError(address, f"is not {_DATASETS}ORGANISATION/NAME", "name a dataset repository")
-        return Repository(name, revision, kind="dataset", **settings)
+        return Repository(name, revision, write, "dataset", private)
     from hma_model.hub_folder import FolderStore
 
     if revision is not None:
         raise HubError(address, f"is a folder, and has no revision {revision!r}", "leave the revision out")
-    return FolderStore(address, settings.get("write", False))
+    return FolderStore(address, write)
 
 
 def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[Manifest, bytes]:

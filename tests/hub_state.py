@@ -5,9 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 REPO = "team/model"
 ROBOTS = {"arm": 2, "hand": 3}  # of the checkpoint in it: id -> action dims
 TOKEN = "hf_TheSecretOfThisTest"
+EVERY = [pytest.param(4, id="some"), pytest.param(1, id="all", marks=pytest.mark.slow)]  # requests to be cut
 LFS_BYTES = 10_000_000  # larger files, and those of binary kinds, go by LFS
 LFS_KINDS = (".safetensors", ".png", ".parquet", ".bin")
 

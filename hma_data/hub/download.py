@@ -98,7 +98,7 @@ def fetch(repo: str, kind: str, commit: str, entry: Entry, folder: Path | None =
 def _no_bar() -> Any:
     from huggingface_hub.utils import tqdm
 
-    class NoBar(tqdm):  # type: ignore[type-arg]
+    class NoBar(tqdm):
         def __init__(self, *given: Any, **options: Any) -> None:
             super().__init__(*given, **options | {"disable": True})
 

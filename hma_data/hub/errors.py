@@ -59,8 +59,8 @@ def explain(where: str, fault: BaseException) -> HubError:
             return HubError(where, fault_text, AGAIN)
         case errors.FileMetadataError():
             return HubError(where, "was not answered by a hub", "check HF_ENDPOINT and your proxy")
-    wraps = isinstance(cause, httpx.HTTPError | errors.OfflineModeIsEnabled)
-    if isinstance(fault, RuntimeError | ValueError) and wraps:  # in an upload, or a download made anew
+    wrapped = isinstance(fault, RuntimeError | ValueError)  # of an upload, or of a download made anew
+    if wrapped and isinstance(cause, httpx.HTTPError | errors.OfflineModeIsEnabled):
         return explain(where, cause)
     return _plain(where, fault)
 

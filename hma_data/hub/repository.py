@@ -258,9 +258,10 @@ class Repository:
             HubError: the token may not write a file of this name.
         """
         self._make()
-        if self._revision:
-            options = {"repo_type": self.kind, "branch": self._revision, "exist_ok": True}
-            self._ask(lambda: self._api.create_branch(self.repo, **options))
+        if branch := self._revision:
+            self._ask(
+                lambda: self._api.create_branch(self.repo, repo_type=self.kind, branch=branch, exist_ok=True)
+            )
         self._ask(lambda: self._upload_modes([name]))
 
     def check_card(self, page: bytes) -> None:
@@ -348,8 +349,10 @@ class Repository:
         return list(self._posted(f"{self.kind}s/{self.repo}/preupload/{branch}", asked)["files"])
 
     def _make(self) -> None:
-        options = {"repo_type": self.kind, "exist_ok": True, "private": self._private or None}
-        self._ask(lambda: self._api.create_repo(self.repo, **options))
+        private = self._private or None
+        self._ask(
+            lambda: self._api.create_repo(self.repo, repo_type=self.kind, private=private, exist_ok=True)
+        )
 
     # -- asking
 

@@ -12,6 +12,7 @@ from hma_data.shards import publish
 from hma_data.shards.reader import ShardSet
 from hma_model.hub_data import pull_data, push_data
 from tests.hub_server import Hub
+from tests.hub_state import EVERY
 from tests.model.robots import yaml as yaml_of
 from tests.model.shards import make_shards
 
@@ -93,9 +94,10 @@ def test_a_push_that_was_cut_goes_on_with_what_is_missing(server, shards, monkey
     assert "manifest.json" in dataset(server).files
 
 
-def test_a_push_cut_at_any_request_is_ended_by_the_same_command(server, shards, monkeypatch):
+@pytest.mark.parametrize("step", EVERY)
+def test_a_push_cut_at_any_request_is_ended_by_the_same_command(server, shards, monkeypatch, step):
     monkeypatch.setattr(publish, "FILES", 1)
-    for at in range(200):
+    for at in range(0, 200, step):
         server.repositories.clear()
         server.objects.clear()
         server.gone_after = len(server.log) + at
@@ -111,7 +113,7 @@ def test_a_push_cut_at_any_request_is_ended_by_the_same_command(server, shards, 
         assert len(said) == len(set(said)) <= 2 and said[-1] == "Add arm"
         whole = contents(shards)
         assert {name: dataset(server).files[name] for name in whole} == whole
-    assert 10 < at < 199
+    assert 10 < at < 200 - step
 
 
 def test_an_unfinished_push_is_no_shard_set(server, shards, tmp_path, monkeypatch):
