@@ -126,9 +126,8 @@ class Repository:
                 if self._write:
                     raise
                 return None
-            except (
-                errors.HfHubHTTPError
-            ) as fault:  # some hubs answer 404 without the code for what is missing
+            except errors.HfHubHTTPError as fault:
+                # some hubs answer 404 without the code that tells what is missing
                 missing = isinstance(fault, errors.RepositoryNotFoundError) or status(fault) == 404
                 there = isinstance(fault, errors.GatedRepoError | errors.RevisionNotFoundError)
                 if there or not (missing and self._write):
