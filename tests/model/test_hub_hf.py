@@ -459,7 +459,7 @@ def test_the_command_never_shows_or_stores_the_token(server, source, tmp_path):
     out = ["--out", str(tmp_path / "pulled")]
     calls = [
         ["push", str(source), REPO], ["list", REPO, "--json"], ["pull", REPO, "-e", "arm", *out],
-        ["--debug", "push", str(source), "other/model"],
+        ["--debug", "pull", REPO, "-e", "hand"],
     ]  # fmt: skip
     shown = []
     for call in calls:
