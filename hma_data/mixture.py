@@ -9,15 +9,14 @@ E embodiments, B samples a batch.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import UsageError
-from hma_data.paths import StrPath, as_path
 from hma_data.files import atomic_path
+from hma_data.paths import StrPath, as_path
 
 Floats = NDArray[np.float64]
 Draw = Literal["per_sample", "per_batch"]

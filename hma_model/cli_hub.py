@@ -173,12 +173,15 @@ def _summary(facts: dict[str, Any]) -> str:
         if isinstance(facts["trunk_sha256"], str)
         else "weights "
     )
-    parts.append(f"{trunk}{_megabytes(facts['trunk_bytes'])} MB")
+    size = _megabytes(facts["trunk_bytes"])
+    parts.append(f"{trunk}{'not in the cache' if size is None else f'{size} MB'}")
+    if facts["from_cache"]:
+        parts.append("the hub is out of reach, this is what the cache has")
     return f"{_cell(facts['checkpoint'], 1000)}: {'; '.join(parts)}; {_state(facts)}"
 
 
-def _megabytes(size: int) -> float:
-    return round(size / 1e6, 2)
+def _megabytes(size: int | None) -> float | None:
+    return None if size is None else round(size / 1e6, 2)
 
 
 def _state(facts: dict[str, Any]) -> str:

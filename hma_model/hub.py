@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from hma_data.embodiment import ID_PATTERN
 from hma_data.errors import CheckpointError, HMAError, HubError
+from hma_data.hub.partial import remove_dead_parts
 from hma_data.paths import StrPath, as_address, as_path
 from hma_model import checkpoint as checkpoints
 from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
 from hma_model.files import parse_json
 from hma_model.hub_check import require_publishable, require_yaml
-from hma_model.hub_partial import remove_dead_parts
 from hma_model.model_card import render
 
 if TYPE_CHECKING:
@@ -38,6 +38,11 @@ class Store(Protocol):
     """Where a checkpoint is published."""
 
     name: str  # for errors
+
+    @property
+    def from_cache(self) -> bool:
+        """Whether the hub was out of reach, so that `files` told what the cache has."""
+        ...
 
     @property
     def repo(self) -> str | None:
@@ -62,7 +67,7 @@ class Store(Protocol):
         ...
 
     def pull(self, names: list[str], out: Path | None) -> Path:
-        """Bring files here, card last; returns their folder."""
+        """Bring files here, card last; return their folder, which may be a cache and not `out`."""
         ...
 
 
@@ -81,9 +86,9 @@ def open_store(
     if not write:
         place, revision = addressed(place, revision)
     if is_repository(place):
-        from hma_model.hub_hf import HuggingFaceStore
+        from hma_data.hub.repository import Repository
 
-        return HuggingFaceStore(str(place).removeprefix("hf://"), revision, write, private=private)
+        return Repository(str(place).removeprefix("hf://"), revision, write, private=private)
     from hma_model.hub_folder import FolderStore
 
     if revision is not None:
@@ -185,19 +190,25 @@ def _pull(
         check_id(name, store.name)
         if name not in there:
             known = ", ".join(there[:SHOWN]) or "none"
-            raise HubError(store.name, f"has no embodiment {name!r}", f"it has: {known}")
+            away = " in the cache, and is out of reach" if store.from_cache else ""
+            raise HubError(store.name, f"has no embodiment {name!r}{away}", f"it has: {known}")
         lacking = [part for part in PARTS if f"embodiments/{name}/{part}" not in files]
-        if lacking:
+        if lacking and not store.from_cache:
             fault = f"lacks {lacking[0]} of embodiment {name!r}"
             raise HubError(store.name, fault, "name the embodiments you want, or have it pushed again")
-    if TRUNK not in files:
+    if TRUNK not in files and not store.from_cache:
         raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
     names = [f"embodiments/{name}/{part}" for name in wanted for part in (SAMPLE, *PARTS)]
+    names = [CONFIG, TRUNK, *(name for name in names if name in files or not name.endswith(SAMPLE))]
     place = out
     if place is None and "://" in str(source) and not is_repository(source):
         key = f"{store.name} {values.get('trunk_sha256')}".encode()
         place = cache_folder() / "hub" / hashlib.sha256(key).hexdigest()[:24]
-    folder = store.pull([CONFIG, TRUNK, *(name for name in names if name in files)], place)
+    folder = store.pull(names, place)
+    if place and folder != place and is_repository(source):
+        from hma_model.hub_folder import FolderStore
+
+        folder = FolderStore(folder).pull(names, place)
     pulled = Checkpoint.open(folder)
     pulled.trunk()
     for name in wanted:
@@ -217,7 +228,10 @@ def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[
 
 
 def describe(source: StrPath, revision: str | None = None) -> dict[str, Any]:
-    """What is published: the trunk's hash and bytes, tokenizer and model, and of each id `card`, `bytes`."""
+    """Return what is published: the trunk's hash and bytes, tokenizer and model; of each id `card`, `bytes`.
+
+    Bytes are None where the hub is out of reach and the client's cache does not have the files.
+    """
     store = open_store(source, revision)
     files = store.files()
     values = _config(store, files)
@@ -225,15 +239,23 @@ def describe(source: StrPath, revision: str | None = None) -> dict[str, Any]:
     return {
         "source": store.name,
         **{key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
-        "trunk_bytes": files.get(TRUNK, 0),
+        "trunk_bytes": total_bytes(store, files, [TRUNK]),
         "embodiments": {
             name: {
                 "card": _card(store, name),
-                "bytes": sum(files.get(f"embodiments/{name}/{part}", 0) for part in PARTS),
+                "bytes": total_bytes(store, files, [f"embodiments/{name}/{part}" for part in PARTS]),
             }
             for name in embodiment_ids(files)
         },
     }
+
+
+def total_bytes(store: Store, files: Mapping[str, int], names: Iterable[str]) -> int | None:
+    """Return the bytes of files; None where the hub is out of reach and the cache has not all of them."""
+    sizes = [files.get(name) for name in names]
+    if store.from_cache and None in sizes:
+        return None
+    return sum(size or 0 for size in sizes)
 
 
 def from_pretrained(

@@ -1,40 +1,27 @@
 """Publish and pull shard sets: a dataset repository of the hub, a folder, or any fsspec URI.
 
-Shards go up first and the manifest last, in one commit where they are at most `BATCH`. What is there already
-with the same SHA-256 is left out, so that running it again goes on where it stopped. The files lie as
-`docs/format.md` has them, and the card tells the hub's viewer which of them are tables.
+The files lie as `docs/format.md` has them, and the card tells the hub's viewer which of them are tables.
 """
 
 import tempfile
-from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from hma_data.errors import HubError, ShardError
 from hma_data.files import file_sha256, write_atomic
 from hma_data.paths import StrPath, as_address, as_path
-from hma_data.shards.manifest import (
-    EMBODIMENT,
-    EPISODES,
-    MANIFEST,
-    QUARANTINE,
-    SHARD_NAME,
-    Manifest,
-    seal_problem,
-)
+from hma_data.shards.manifest import MANIFEST, SHARD_NAME, Manifest, seal_problem
+from hma_data.shards.publish import SMALL, Place, publish
 from hma_model.checkpoint import README
 from hma_model.data_card import render
-from hma_model.hub import REPOSITORY, Content, is_repository
+from hma_model.hub import REPOSITORY, is_repository
 
-BATCH = 1000  # shards of a commit
-SMALL = (EMBODIMENT, EPISODES, QUARANTINE)
 _OURS = {*SMALL, MANIFEST, README, ".gitattributes"}
 _AGAIN = "pull again; if it stays so, have it pushed again"
 _DATASETS = "hf://datasets/"
 
 
-class DataStore(Protocol):
+class DataStore(Place, Protocol):
     """Where a shard set is published; see `hma_model.hub.Store`."""
 
     name: str
@@ -42,16 +29,8 @@ class DataStore(Protocol):
     @property
     def repo(self) -> str | None: ...
 
-    def files(self) -> dict[str, int]: ...
-
-    def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str: ...
-
     def check_card(self, page: bytes) -> None:
         """Raise where the page would not be taken."""
-        ...
-
-    def digests(self) -> dict[str, str]:
-        """SHA-256 by name, where it is known."""
         ...
 
     def download(self, names: list[str], out: Path) -> None:
@@ -80,26 +59,7 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
     page = render(manifest, store.repo)
     _refuse_others(store, manifest)
     store.check_card(page)
-    known = store.digests()
-    missing = [shard.path for shard in manifest.shards if known.get(shard.path) != shard.sha256]
-    name = manifest.embodiment.id
-    batches = [missing[start : start + BATCH] for start in range(0, len(missing), BATCH)] or [[]]
-
-    def part(batch: list[str]) -> dict[str, Content | None]:
-        _refuse_others(store, manifest)
-        files: dict[str, Content | None] = {path: folder / path for path in batch}
-        return files | ({MANIFEST: None} if MANIFEST in store.files() else {})  # it would name other shards
-
-    def last() -> dict[str, Content | None]:
-        _refuse_others(store, manifest)
-        small = [name for name in SMALL if (folder / name).is_file()]
-        files: dict[str, Content | None] = {path: folder / path for path in (*batches[-1], *small)}
-        files |= dict.fromkeys(_left_over(store, manifest))
-        return files | {README: page, MANIFEST: folder / MANIFEST}
-
-    for number, batch in enumerate(batches[:-1], 1):
-        store.publish(partial(part, batch), f"Add shards of {name}, {number} of {len(batches)}")
-    return store.publish(last, f"Add {name}")
+    return publish(store, folder, lambda: _refuse_others(store, manifest), page=page)
 
 
 def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> Path:
@@ -157,22 +117,24 @@ def _whole(folder: Path) -> Manifest:
     return manifest
 
 
-def _open(address: str | Path, revision: str | None = None, **settings: bool) -> DataStore:
+def _open(
+    address: str | Path, revision: str | None = None, write: bool = False, private: bool = False
+) -> DataStore:
     text = str(address)
     given = text.startswith(_DATASETS)
     name = text.removeprefix(_DATASETS)
     if given or is_repository(address):
-        from hma_model.hub_hf import HuggingFaceStore
+        from hma_data.hub.repository import Repository
 
         name = name.removeprefix("hf://")
         if not REPOSITORY.fullmatch(name):
             raise HubError(address, f"is not {_DATASETS}ORGANISATION/NAME", "name a dataset repository")
-        return HuggingFaceStore(name, revision, kind="dataset", **settings)
+        return Repository(name, revision, write, "dataset", private)
     from hma_model.hub_folder import FolderStore
 
     if revision is not None:
         raise HubError(address, f"is a folder, and has no revision {revision!r}", "leave the revision out")
-    return FolderStore(address, settings.get("write", False))
+    return FolderStore(address, write)
 
 
 def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[Manifest, bytes]:
@@ -192,26 +154,21 @@ def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[
             raise ShardError(f"{store.name}/{MANIFEST}", fault.fault, remedy) from fault
 
 
-def _refuse_others(store: DataStore, manifest: Manifest) -> None:
-    """Raise HubError unless the place is empty or holds this robot's set under this tokenizer."""
+def _refuse_others(store: DataStore, manifest: Manifest) -> dict[str, int]:
+    """Return what is there; raise HubError unless it is nothing or this robot's set under this tokenizer."""
     files = store.files()
     strange = [name for name in files if not (name in _OURS or SHARD_NAME.fullmatch(name))]
     if strange:
         raise HubError(store.name, f"holds something else: {strange[0]}", "push to a place of its own")
     if MANIFEST not in files:
-        return
+        return files
     there = _published(store, f"delete {MANIFEST} there if the set is yours, and push again")[0]
     ours = (manifest.embodiment.id, manifest.tokenizer.name, manifest.tokenizer.weights_sha256)
     theirs = (there.embodiment.id, there.tokenizer.name, there.tokenizer.weights_sha256)
     if ours != theirs:
         fault = f"holds the shard set of {theirs[0]} under {theirs[1]}, not of {ours[0]} under {ours[1]}"
         raise HubError(store.name, fault, "push to a place of its own")
-
-
-def _left_over(store: DataStore, manifest: Manifest) -> list[str]:
-    """Shards there that the set no longer has."""
-    named = {shard.path for shard in manifest.shards}
-    return [name for name in store.files() if SHARD_NAME.fullmatch(name) and name not in named]
+    return files
 
 
 def _is(path: Path, sha256: str) -> bool:

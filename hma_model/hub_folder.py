@@ -16,13 +16,19 @@ from typing import Any
 
 from hma_data.errors import HMAError, HubError, OutputError, StorageAwayError, StorageError
 from hma_data.files import file_sha256
+from hma_data.hub.partial import (
+    beside,
+    is_abandoned,
+    is_partial,
+    remove_abandoned,
+    remove_abandoned_folders,
+)
 from hma_data.paths import StrPath, as_text
 from hma_data.remote_lock import PROBE, RemoteLock, living_holder
 from hma_data.store import WHOLE_PUTS, RemotePath, attempt
 from hma_model.checkpoint import CARD, CONFIG, README, TRUNK, inside
 from hma_model.files import MAX_JSON_BYTES
-from hma_model.hub_partial import beside, is_abandoned, is_partial, remove_abandoned
-from hma_model.hub_swap import remove_abandoned_folders, swap_in
+from hma_model.hub_swap import swap_in
 
 ATTEMPTS = 10
 PATIENCE = 240.0  # seconds to wait for another push; one that was killed elsewhere is forgotten after 180
@@ -41,6 +47,7 @@ class FolderStore:
     """
 
     repo: str | None = None
+    from_cache = False
 
     def __init__(self, address: StrPath, write: bool = False) -> None:
         import fsspec
@@ -100,10 +107,11 @@ class FolderStore:
     def check_card(self, page: bytes) -> None:
         """Nothing: a folder takes any."""
 
-    def digests(self) -> dict[str, str]:
-        """SHA-256 of the parquet files, where reading them again is cheap."""
-        names = [name for name in self.files() if name.endswith(".parquet")] if self._local else []
-        return {name: file_sha256(inside(Path(self._root), name)) for name in names}
+    def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
+        """Check whether a file has this content already; False where reading it again is not cheap."""
+        if not self._local or not isinstance(content, Path) or not (Path(self._root) / name).is_file():
+            return False
+        return file_sha256(inside(Path(self._root), name)) == (sha256 or file_sha256(content))
 
     def download(self, names: list[str], out: Path) -> None:
         """As `pull`."""

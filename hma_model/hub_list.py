@@ -11,7 +11,7 @@ from hma_data.paths import StrPath
 from hma_model import migrate
 from hma_model.checkpoint import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
 from hma_model.files import parse_json
-from hma_model.hub import Store, embodiment_ids, open_store
+from hma_model.hub import Store, embodiment_ids, open_store, total_bytes
 
 RELEASED_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
@@ -27,8 +27,9 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
 
     Returns:
         For each: `checkpoint` (address), `format` (hma-toolkit or released), `format_version`, `model`,
-        `tokenizer`, `trunk_sha256`, `trunk_bytes`, `problems` (why it cannot be used here, or none) and
-        `embodiments`: rows of id, action, rate, figures, licence, bytes and problems.
+        `tokenizer`, `trunk_sha256`, `trunk_bytes`, `problems` (why it cannot be used here, or none),
+        `from_cache` (the hub was out of reach: this is what the client's cache has of it) and `embodiments`:
+        rows of id, action, rate, figures, licence, bytes and problems. Bytes that the cache lacks are None.
 
     Raises:
         HubError: not there, not reachable, or without any checkpoint.
@@ -36,7 +37,11 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
     store = open_store(source, revision)
     files = store.files()
     roots = sorted(name.removesuffix(CONFIG) for name in files if f"/{name}".endswith(f"/{CONFIG}"))
-    found = [one for root in roots[:MOST] if (one := _checkpoint(store, files, root))]
+    found = [
+        one | {"from_cache": store.from_cache}
+        for root in roots[:MOST]
+        if (one := _checkpoint(store, files, root))
+    ]
     if not found:
         fault = f"has no {CONFIG} of a checkpoint of {LIBRARY} or of the release"
         raise HubError(store.name, fault, "is not of hma-toolkit; check the name")
@@ -70,7 +75,8 @@ def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, 
 def _ours(
     store: Store, files: Mapping[str, int], root: str, where: str, values: dict[str, Any]
 ) -> dict[str, Any]:
-    facts = _facts(where, LIBRARY, files.get(TRUNK, 0), _tokenizer_problems(values.get("tokenizer")))
+    size = total_bytes(store, files, [TRUNK])
+    facts = _facts(where, LIBRARY, size, _tokenizer_problems(values.get("tokenizer")))
     try:
         parse_config(values, f"{where}/{CONFIG}")
         values = migrate.config(values, where) | {"format_version": values["format_version"]}
@@ -78,14 +84,16 @@ def _ours(
         facts["problems"].append(f"{fault.fault}: {fault.remedy}")
     facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
     if TRUNK not in files:
-        facts["problems"].append(f"has no {TRUNK}")
+        facts["problems"].append(f"the cache lacks {TRUNK}" if store.from_cache else f"has no {TRUNK}")
     store.warm([f"{root}embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
     for name in embodiment_ids(files):
         place = f"embodiments/{name}"
-        size = sum(files.get(f"{place}/{part}", 0) for part in PARTS)
+        size = total_bytes(store, files, [f"{place}/{part}" for part in PARTS])
         try:
             card = parse_json(store.read(f"{root}{place}/{CARD}"), f"{where}/{place}/{CARD}", HubError)
-            problems = _card_problems(card, values, files, place)
+            lacks = "the cache lacks" if store.from_cache else "lacks"
+            lacking = [f"{lacks} {part}" for part in PARTS if f"{place}/{part}" not in files]
+            problems = lacking + _card_problems(card, values)
         except HMAError as fault:
             card, problems = {}, [fault.fault]
         facts["embodiments"].append(_row(name, card, size, problems))
@@ -110,7 +118,7 @@ def _unusable(where: str, fault: HMAError) -> dict[str, Any]:
     return _facts(where, LIBRARY, 0, [fault.fault])
 
 
-def _facts(where: str, layout: str, size: int, problems: list[str]) -> dict[str, Any]:
+def _facts(where: str, layout: str, size: int | None, problems: list[str]) -> dict[str, Any]:
     named = ("format_version", "origin", "model", "tokenizer", "trunk_sha256")
     return {
         "checkpoint": where,
@@ -122,7 +130,7 @@ def _facts(where: str, layout: str, size: int, problems: list[str]) -> dict[str,
     }
 
 
-def _row(name: str, card: Mapping[str, Any], size: int, problems: list[str]) -> dict[str, Any]:
+def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[str]) -> dict[str, Any]:
     metrics = card.get("metrics")
     return {
         "embodiment": name,
@@ -139,10 +147,8 @@ def _row(name: str, card: Mapping[str, Any], size: int, problems: list[str]) -> 
     }
 
 
-def _card_problems(
-    card: Mapping[str, Any], config: Mapping[str, Any], files: Mapping[str, int], place: str
-) -> list[str]:
-    problems = [f"lacks {part}" for part in PARTS if f"{place}/{part}" not in files]
+def _card_problems(card: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
+    problems = []
     if card.get("trunk_sha256") != config.get("trunk_sha256"):
         problems.append("belongs to another trunk")
     tokenizer = config.get("tokenizer")

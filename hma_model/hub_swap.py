@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from hma_model.hub_partial import beside, is_abandoned, is_partial
+from hma_data.hub.partial import beside, is_partial
 
 _HERE, _EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of renameat2(2)
 
@@ -44,10 +44,3 @@ def exchange(first: Path, second: Path) -> bool:
         return False
     done: int = call(_HERE, os.fsencode(first), _HERE, os.fsencode(second), ctypes.c_uint(_EXCHANGE))
     return done == 0
-
-
-def remove_abandoned_folders(root: Path) -> None:
-    """Delete what killed pushes were putting together."""
-    for left in root.glob(".*.partial-*"):
-        if left.is_dir() and not left.is_symlink() and is_abandoned(left.name, left.stat().st_mtime):
-            shutil.rmtree(left, ignore_errors=True)

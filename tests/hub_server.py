@@ -50,6 +50,7 @@ class Hub(ThreadingHTTPServer):
         self.gone_after: int | None = None
         self.stalled = threading.Event()
         self.lock = threading.RLock()
+        self.changed = threading.Condition(self.lock)
 
     @property
     def url(self) -> str:
@@ -92,6 +93,11 @@ class Hub(ThreadingHTTPServer):
         """How many requests matched."""
         return sum(re.search(request, f"{asked.method} {asked.path}") is not None for asked in self.log)
 
+    def await_count(self, request: str, times: int) -> None:
+        """Wait until so many requests have matched."""
+        with self.changed:
+            assert self.changed.wait_for(lambda: self.count(request) >= times, 60)
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         pass  # connections are cut on purpose
 
@@ -117,8 +123,10 @@ class _Handler(BaseHTTPRequestHandler):
         with self.server.lock:
             self.fault = self._fault()
             self.server.log.append(self.asked)  # before the answer, after which it is looked at
+            self.server.changed.notify_all()
         if self.fault and self.fault.stall:
             self.server.stalled.wait(self.fault.stall)
+            self.fault = None if self.fault.late else self.fault
         if self.fault and self.fault.status:
             self._body()
             self._answer(self.fault.status, self.fault.body, self.fault.headers)
@@ -209,7 +217,8 @@ class _Handler(BaseHTTPRequestHandler):
         repository = self.server.repositories.get(f"{kind}/{name}")
         if repository is None or (repository.private and not self.right):
             status = 404 if self.right else 401
-            return self._answer(status, {"error": "Repository not found"}, {"X-Error-Code": "RepoNotFound"})
+            coded = {"X-Error-Code": "RepoNotFound"} if self.server.habits.codes else {}
+            return self._answer(status, {"error": "Repository not found"}, coded)
         verb, _, place = rest.partition("/")
         if verb in ("preupload", "commit", "branch") or rest.endswith("objects/batch"):
             if self.right != "write":
@@ -257,6 +266,9 @@ class _Handler(BaseHTTPRequestHandler):
         entries = [
             self.server.habits.entry(path, content) for path, content in files if path.startswith(begin)
         ]
+        if form := self.server.habits.folders:
+            folders = {path.rpartition("/")[0] for path, _ in files if "/" in path}
+            entries += [{"type": form, "path": "", "size": 0, "oid": ""} for _ in folders]
         start = int(self.query.get("cursor", ["0"])[0])
         headers = {}
         if start + self.server.habits.page < len(entries):
@@ -269,7 +281,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _resolve(self, commit: Commit, path: str) -> None:
         headers = {"X-Repo-Commit": commit.id}
         content = commit.files.get(path)
-        if content is None:
+        if content is None or not (content or self.server.habits.empty):
             return self._answer(404, {"error": "no such entry"}, {**headers, "X-Error-Code": "EntryNotFound"})
         if not self.server.habits.by_lfs(path, len(content)):
             weak = "W/" if self.server.habits.weak else ""

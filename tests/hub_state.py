@@ -5,9 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 REPO = "team/model"
 ROBOTS = {"arm": 2, "hand": 3}  # of the checkpoint in it: id -> action dims
 TOKEN = "hf_TheSecretOfThisTest"
+EVERY = [pytest.param(4, id="some"), pytest.param(1, id="all", marks=pytest.mark.slow)]  # requests to be cut
 LFS_BYTES = 10_000_000  # larger files, and those of binary kinds, go by LFS
 LFS_KINDS = (".safetensors", ".png", ".parquet", ".bin")
 
@@ -26,6 +29,9 @@ class Habits:
         ranges: send parts of files.
         ignored: names that a .gitignore there leaves out.
         siblings: list the files in a repository's facts.
+        codes: say by X-Error-Code what is missing.
+        folders: type of an entry without a path that it lists for each folder; "" for none.
+        empty: send empty files; otherwise they are answered by 404.
     """
 
     page: int = 1000
@@ -37,6 +43,9 @@ class Habits:
     ranges: bool = True
     ignored: tuple[str, ...] = ()
     siblings: bool = True
+    codes: bool = True
+    folders: str = ""
+    empty: bool = True
 
     def by_lfs(self, path: str, size: int) -> bool:
         """Whether a file goes by LFS."""
@@ -121,7 +130,8 @@ class Fault:
         status: answered instead; None cuts the connection.
         after: bytes of the body, coming or going, before the cut.
         times: how often; then all is well.
-        stall: seconds without an answer before.
+        stall: seconds without an answer before, or until the hub's `stalled` is set.
+        late: answered as usual after `stall`.
         body: of the answer.
     """
 
@@ -131,6 +141,7 @@ class Fault:
     after: int = 0
     times: int = 1
     stall: float = 0.0
+    late: bool = False
     body: bytes = b'{"error": "made up"}'
 
 

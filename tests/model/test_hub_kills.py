@@ -1,50 +1,38 @@
-"""Pushes to folders and file stores, killed at each file operation, and the same command again."""
+"""Pushes to folders and file stores, killed at file operations, and the same command again.
 
-import os
+A sweep over all operations of a push to a folder is always made; of other acts a sample is killed, and all of
+them where slow tests are run.
+"""
+
 import shutil
-import signal
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import fsspec
 import pytest
-from fsspec.implementations.local import LocalFileSystem
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data import remote_lock
 from hma_data.errors import CheckpointError, HubError, ShardError
-from hma_model import checkpoint, hub, hub_swap
+from hma_model import checkpoint, hub
 from hma_model.checkpoint import PARTS
 from hma_model.hub_data import pull_data, push_data
+from tests.model.kills import FileStore, killed, make_quick
 from tests.model.robots import make_model, save
 from tests.model.shards import make_shards
 
-WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
-CHANGES = ("os.rename", "os.link", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "exchange")
 MOST = 300  # operations of a push
-
-
-class FileStore(LocalFileSystem):
-    """A store that keeps files and folders, as one behind SFTP: what is put is there before it is whole."""
-
-    protocol = "filestore"
-
-    @classmethod
-    def _strip_protocol(cls, path: Any) -> str:
-        text = str(path).removeprefix("filestore://")
-        return str(super()._strip_protocol("/" + text.lstrip("/")))
+SAMPLE = 6  # of them in a quick run
+ALL_OR_SAMPLE = pytest.mark.parametrize(
+    "most", [SAMPLE, pytest.param(MOST, marks=pytest.mark.slow)], ids=["sample", "all"]
+)
 
 
 @pytest.fixture(autouse=True)
 def stores(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    fsspec.register_implementation("filestore", FileStore, clobber=True)
-    monkeypatch.setattr(remote_lock, "SETTLE_S", 0.001)
-    monkeypatch.setattr(remote_lock, "STALE_S", 0.0)  # one cut short names nobody, and counts so long
-    monkeypatch.setattr(os, "fsync", lambda handle: None)  # a killed process loses nothing by it
-    monkeypatch.setattr(hub, "require_publishable", lambda *given: None)  # reads only; has tests of its own
     monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
+    make_quick(monkeypatch.setattr)
     yield
     FileStore.clear_instance_cache()
 
@@ -60,39 +48,12 @@ def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return home / "old", home / "new"
 
 
-def killed(act: Callable[[], object], root: Path, at: int) -> bool:
-    """Run an act in a process that ends at its operation number `at` in a folder; whether it got there.
-
-    A file that is opened to be written is left empty; all else is left undone.
-    """
-    child = os.fork()
-    if child == 0:
-        done = 0
-
-        def watch(event: str, given: Any) -> None:
-            nonlocal done
-            if event == "open" and not (isinstance(given[2], int) and given[2] & WRITES):
-                return
-            if event not in ("open", *CHANGES) or not str(given[0]).startswith((str(root), ".")):
-                return
-            done += 1
-            if done == at + 1:
-                if event == "open":
-                    os.open(given[0], given[2], 0o644)
-                os._exit(7)
-
-        signal.alarm(30)
-        try:
-            plain = hub_swap.exchange
-            hub_swap.exchange = lambda one, other: sys.audit("exchange", str(one)) or plain(one, other)
-            sys.addaudithook(watch)
-            act()
-            os._exit(0)
-        finally:
-            os._exit(1)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert code in (0, 7)
-    return code == 7
+def moments(whole: int, most: int) -> Iterable[int]:
+    """At most so many of the numbers of an act's operations, the first and the last among them."""
+    assert 10 < whole < MOST
+    return (
+        sorted({round(i * (whole - 1) / (most - 1)) for i in range(most)}) if whole > most else range(whole)
+    )
 
 
 def parts(folder: Path, name: str) -> list[bytes]:
@@ -100,28 +61,36 @@ def parts(folder: Path, name: str) -> list[bytes]:
 
 
 @pytest.mark.parametrize(
-    ("place", "begun"),
+    ("place", "begun", "most"),
     [
-        ("folder", False),
-        ("folder", True),
-        ("folder without exchange", True),
-        ("file store", False),
-        ("file store", True),
+        ("folder", True, MOST),
+        *(
+            pytest.param(place, begun, most, marks=[pytest.mark.slow] if most == MOST else [])
+            for most in (SAMPLE, MOST)
+            for place, begun in (
+                ("folder", False),
+                ("folder without exchange", True),
+                ("file store", False),
+                ("file store", True),
+            )
+        ),
     ],
 )
-def test_a_push_killed_anywhere_is_ended_by_the_same_command(versions, tmp_path, monkeypatch, place, begun):
+def test_a_push_killed_anywhere_is_ended_by_the_same_command(versions, tmp_path, place, begun, most):
     old, new = versions
     root, base = tmp_path / "hub", tmp_path / "base"
     target = f"filestore://{root}" if place == "file store" else str(root)
-    if place == "folder without exchange":
-        monkeypatch.setattr(hub_swap, "exchange", lambda first, second: False)
     base.mkdir()
     if begun:
         hub.push(old, base)
-    for at in range(MOST):
+
+    def cut(at: int) -> int:
         shutil.rmtree(root, ignore_errors=True)
         shutil.copytree(base, root)
-        cut = killed(lambda: hub.push(new, target), root, at)
+        return killed("push", (new, target), root, at, place != "folder without exchange")
+
+    for at in moments(cut(MOST), most):
+        assert cut(at) == at
         if begun:
             assert parts(hub.pull(root, ["hand"]), "hand") == parts(old, "hand")
         try:
@@ -133,22 +102,24 @@ def test_a_push_killed_anywhere_is_ended_by_the_same_command(versions, tmp_path,
         assert "| `arm` |" in (root / "README.md").read_text()
         left = [path.name for path in root.rglob("*") if ".part" in path.name or path.name.endswith(".lock")]
         assert not left
-        if not cut:
-            break
-    assert 10 < at < MOST - 1
 
 
+@ALL_OR_SAMPLE
 @pytest.mark.parametrize("place", ["folder", "file store"])
-def test_a_data_push_killed_anywhere_is_ended_by_the_same_command(tmp_path, place):
+def test_a_data_push_killed_anywhere_is_ended_by_the_same_command(tmp_path, place, most):
     old, new = make_shards(tmp_path / "old", "arm"), make_shards(tmp_path / "new", "arm", held_out=0, seed=5)
     root, base, out = tmp_path / "hub", tmp_path / "base", tmp_path / "out"
     target = f"filestore://{root}" if place == "file store" else str(root)
     push_data(old, base)
-    for at in range(MOST):
+
+    def cut(at: int) -> int:
         for folder in (root, out):
             shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(base, root)
-        cut = killed(lambda: push_data(new, target), root, at)
+        return killed("push_data", (new, target), root, at)
+
+    for at in moments(cut(MOST), most):
+        assert cut(at) == at
         try:
             got = (pull_data(root, out) / "manifest.json").read_bytes()
             assert got in [(one / "manifest.json").read_bytes() for one in (old, new)]
@@ -160,33 +131,32 @@ def test_a_data_push_killed_anywhere_is_ended_by_the_same_command(tmp_path, plac
         for path in (path for path in new.rglob("*") if path.is_file()):
             assert (out / path.relative_to(new)).read_bytes() == path.read_bytes()
         assert not (root / "val/shard-00000.parquet").exists()
-        if not cut:
-            break
-    assert 10 < at < MOST - 1
 
 
-def test_a_pull_killed_anywhere_is_ended_by_the_same_command(versions, tmp_path):
+@ALL_OR_SAMPLE
+def test_a_pull_killed_anywhere_is_ended_by_the_same_command(versions, tmp_path, most):
     old, _ = versions
     out = tmp_path / "out"
-    for at in range(MOST):
+
+    def cut(at: int) -> int:
         shutil.rmtree(out, ignore_errors=True)
-        cut = killed(lambda: hub.pull(old, ["arm"], out), out, at)
+        return killed("pull", (old, ["arm"], out), out, at)
+
+    for at in moments(cut(MOST), most):
+        assert cut(at) == at
         if (out / "config.json").is_file() and checkpoint.Checkpoint.open(out).embodiments:
             assert parts(out, "arm") == parts(old, "arm")
         hub.pull(old, ["arm"], out)
         assert parts(out, "arm") == parts(old, "arm")
         assert not [path for path in out.rglob("*") if ".part" in path.name]
-        if not cut:
-            break
-    assert 10 < at < MOST - 1
 
 
 class Killed(BaseException):
     """Nothing comes after it."""
 
 
-def cut_in_memory(act: Callable[[], object], monkeypatch: pytest.MonkeyPatch, at: int) -> bool:
-    """Run an act whose store does nothing from its change number `at` on; whether it got there."""
+def cut_in_memory(act: Callable[[], object], monkeypatch: pytest.MonkeyPatch, at: int) -> int:
+    """Run an act whose store does nothing from its change number `at` on; how many it did."""
     done = 0
     with monkeypatch.context() as patched:
         for name in ("pipe_file", "put_file", "cp_file", "rm_file"):
@@ -194,30 +164,33 @@ def cut_in_memory(act: Callable[[], object], monkeypatch: pytest.MonkeyPatch, at
 
             def change(self: Any, *given: Any, plain: Any = plain, **options: Any) -> Any:
                 nonlocal done
-                done += 1
-                if done > at:
+                if done == at:
                     raise Killed
+                done += 1
                 return plain(self, *given, **options)
 
             patched.setattr(MemoryFileSystem, name, change)
-        try:
+        with suppress(Killed):
             act()
-        except Killed:
-            return True
-    return False
+    return done
 
 
+@ALL_OR_SAMPLE
 @pytest.mark.parametrize("begun", [False, True])
 def test_a_push_to_an_object_store_killed_anywhere_is_ended_by_the_same_command(
-    versions, tmp_path, monkeypatch, begun
+    versions, tmp_path, monkeypatch, begun, most
 ):
     old, new = versions
     target, objects = "memory://hub/kills", fsspec.filesystem("memory").store
-    for at in range(MOST):
+
+    def cut(at: int) -> int:
         objects.clear()
         if begun:
             hub.push(old, target)
-        cut = cut_in_memory(lambda: hub.push(new, target), monkeypatch, at)
+        return cut_in_memory(lambda: hub.push(new, target), monkeypatch, at)
+
+    for at in moments(cut(MOST), most):
+        assert cut(at) == at
         got = tmp_path / f"got{at}"
         if begun:
             assert parts(hub.pull(target, ["hand"], got), "hand") == parts(old, "hand")
@@ -227,7 +200,4 @@ def test_a_push_to_an_object_store_killed_anywhere_is_ended_by_the_same_command(
             assert not begun or "again" in str(fault.remedy)
         hub.push(new, target)
         assert parts(hub.pull(target, ["arm"], tmp_path / f"new{at}"), "arm") == parts(new, "arm")
-        if not cut:
-            break
     objects.clear()
-    assert 10 < at < MOST - 1

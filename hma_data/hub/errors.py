@@ -6,23 +6,18 @@ from contextlib import contextmanager
 from typing import Any
 
 from hma_data.errors import HubError
+from hma_data.retry import causes
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
 AGAIN = "run the same command again; it goes on where it stopped"
 LONGEST_WAIT = 300.0  # seconds; the hub counts requests over five minutes
-_LICENCE = 'correct "license" in the card.json of a checkpoint, in the embodiment of a shard set'
-CHAIN = 20  # causes of an error that are looked through
 _SECRET = re.compile(r"(?i)\b(hf_|bearer )\w+")
-
-
-class CutShortError(OSError):
-    """A file's bytes ended before its size."""
 
 
 @contextmanager
 def explained(where: str) -> Iterator[None]:
-    """Raise what the client raises in the block as HubError."""
+    """Raise what the client raises in the block as a HubError."""
     try:
         yield
     except HubError:
@@ -32,7 +27,7 @@ def explained(where: str) -> Iterator[None]:
 
 
 def explain(where: str, fault: BaseException) -> HubError:
-    """The HubError for an error of the client or of the disk."""
+    """Return the HubError for an error of the client or of the disk."""
     import httpx
     from huggingface_hub import errors
 
@@ -64,16 +59,26 @@ def explain(where: str, fault: BaseException) -> HubError:
             return HubError(where, fault_text, AGAIN)
         case errors.FileMetadataError():
             return HubError(where, "was not answered by a hub", "check HF_ENDPOINT and your proxy")
-    if isinstance(fault, RuntimeError) and cause is not None:  # wraps what went wrong in an upload
+    wrapped = isinstance(fault, RuntimeError | ValueError)  # of an upload, or of a download made anew
+    if wrapped and isinstance(cause, httpx.HTTPError | errors.OfflineModeIsEnabled):
         return explain(where, cause)
     return _plain(where, fault)
 
 
+def status(fault: BaseException) -> int | None:
+    """Return the HTTP status that an error came from; None where it came from none."""
+    found = _response(fault)
+    return None if found is None else int(found.status_code)
+
+
 def waiting(fault: BaseException, attempt: int) -> float | None:
-    """Seconds to wait before trying again; None where that would not help."""
-    response = getattr(fault, "response", None)
+    """Return seconds to wait before trying again; None where that would not help."""
+    import httpx
+
+    response = _response(fault)
     if response is None:
-        return float(2**attempt) if isinstance(fault, cuts()) else None
+        cut = (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError)
+        return float(2**attempt) if any(isinstance(item, cut) for item in causes(fault)) else None
     if response.status_code not in TRANSIENT:
         return None
     stated = response.headers.get("retry-after", "")
@@ -82,26 +87,41 @@ def waiting(fault: BaseException, attempt: int) -> float | None:
     return seconds if seconds <= LONGEST_WAIT else None
 
 
-def cuts() -> tuple[type[BaseException], ...]:
-    """What the client raises for a connection that ended too early."""
-    import httpx
+def failed_by_xet(fault: BaseException) -> bool:
+    """Check whether an upload in chunks failed; from then on this process uploads by plain LFS.
 
-    return (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError)
+    The client uploads by its Xet protocol to every hub, also to one that does not know it and through a
+    firewall that lets none of it pass. Every hub takes files by LFS.
+    """
+    import httpx
+    from huggingface_hub import constants
+
+    chain = list(causes(fault))
+    of_library = any(isinstance(item, ConnectionError | TimeoutError | RuntimeError) for item in chain)
+    if constants.HF_HUB_DISABLE_XET or not of_library or any(isinstance(c, httpx.HTTPError) for c in chain):
+        return False
+    constants.HF_HUB_DISABLE_XET = True
+    return True
 
 
 def raised() -> tuple[type[BaseException], ...]:
-    """What the client raises when something goes wrong."""
+    """Return what the client raises when something goes wrong."""
     import httpx
     from huggingface_hub import errors
 
-    others = (OSError, ValueError, RuntimeError, KeyError, TypeError)
+    others = (OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError)
     return (*others, httpx.HTTPError, errors.EntryNotFoundError)
+
+
+def _response(fault: BaseException) -> Any:
+    found = (getattr(item, "response", None) for item in causes(fault))
+    return next((response for response in found if response is not None), None)
 
 
 def _answered(where: str, fault: Any) -> HubError:
     response = fault.response
-    status = response.status_code if response is not None else None
-    if status == 401 and "authorization" not in response.request.headers:
+    code = response.status_code if response is not None else None
+    if code == 401 and "authorization" not in response.request.headers:
         return HubError(where, "no such repository, or it is private", "check the name; " + LOG_IN)
     reading = response is not None and response.request.method in ("GET", "HEAD")
     remedies = {
@@ -116,22 +136,19 @@ def _answered(where: str, fault: Any) -> HubError:
         429: "too many requests: wait some minutes and run it again",
         507: "the storage of this account is full",
     }
-    remedy = remedies.get(status or 0, "try again later; what was there is as it was")
-    said = _shown(getattr(fault, "server_message", None) or "")
-    return HubError(where, f"the hub answered {status}" + (f": {said}" if said else ""), remedy)
+    remedy = remedies.get(code or 0, "run the same command again later; what was there is as it was")
+    said = shown(getattr(fault, "server_message", None) or "")
+    return HubError(where, f"the hub answered {code}" + (f": {said}" if said else ""), remedy)
 
 
 def _plain(where: str, fault: BaseException) -> HubError:
-    text = _shown(str(fault))
-    if isinstance(fault, ValueError) and "metadata in README" in text:
-        return HubError(where, f"the hub refuses the card: {text}", _LICENCE)
+    text = shown(str(fault))
     if isinstance(fault, OSError) and fault.errno is not None:
         return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
     if isinstance(fault, OSError):
         return HubError(where, f"did not come whole: {text}", AGAIN)
-    if isinstance(fault, RuntimeError) and not isinstance(
-        fault, RecursionError
-    ):  # what the transfer library of the hub raises
+    library = isinstance(fault, RuntimeError) and not isinstance(fault, RecursionError)
+    if library:  # of the hub, for transfers
         return HubError(where, f"the transfer failed: {text}", "run it again; HF_HUB_DISABLE_XET=1 may help")
     return _strange(where, fault)
 
@@ -140,8 +157,8 @@ def _strange(where: str, fault: BaseException) -> HubError:
     return HubError(where, f"did not answer as a hub does: {type(fault).__name__}", "check HF_ENDPOINT")
 
 
-def _shown(text: str) -> str:
-    """What a stranger said, as one short line without a token."""
+def shown(text: str) -> str:
+    """Return what a stranger said as one short line without a token."""
     plain = "".join(c if c.isprintable() else " " for c in text)
     return _hidden(" ".join(plain.split()))[:300]
 
@@ -154,12 +171,8 @@ def _hidden(text: str) -> str:
 
 
 def without_token(fault: BaseException) -> BaseException:
-    """The error, whose text and causes a traceback may show though the hub has put the token into them."""
-    link: BaseException | None = fault
-    for _ in range(CHAIN):
-        if link is None:
-            break
+    """Return the error without the token, which the hub may have put into its text or its causes'."""
+    for link in causes(fault):
         if any(isinstance(part, str) and part != _hidden(part) for part in link.args):
             link.args = tuple(_hidden(part) if isinstance(part, str) else part for part in link.args)
-        link = link.__cause__ or link.__context__
     return fault

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+import shutil
 import time
 import uuid
 from pathlib import Path
@@ -45,6 +46,13 @@ def remove_abandoned(path: Path) -> None:
     for left in path.parent.glob(f".{path.name}.partial-*"):
         if not left.is_dir() and is_abandoned(left.name, left.lstat().st_mtime):
             left.unlink(missing_ok=True)
+
+
+def remove_abandoned_folders(root: Path) -> None:
+    """Delete folders in which dead processes were putting something together."""
+    for left in root.glob(".*.partial-*"):
+        if left.is_dir() and not left.is_symlink() and is_abandoned(left.name, left.stat().st_mtime):
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def remove_dead_parts(path: Path) -> None:

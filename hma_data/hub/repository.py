@@ -1,0 +1,395 @@
+"""A repository of the Hugging Face Hub: what it holds at one commit, how to pull and how to push.
+
+A push is one commit on top of the commit it was prepared for; when somebody else has committed in between, it
+is prepared again. What is pulled lies in the cache of the hub's client, which works offline.
+"""
+
+import logging
+import random
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import batched
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import quote
+
+from hma_data.errors import HubError
+from hma_data.hub.download import Entry, fetch
+from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, waiting
+from hma_data.hub.partial import beside, remove_abandoned_folders
+
+ATTEMPTS = 8  # to commit; half as many for anything else
+LISTING_S, SILENCE_S = 30.0, 300.0  # a commit of many files takes the hub minutes
+AT_ONCE = 4  # downloads
+MOST_READ = 16_000_000  # bytes of a file that is read rather than pulled
+CARD = "README.md"
+_ABSENT = object()
+_CONFLICTS = (409, 412)
+_COMMIT = re.compile(r"[0-9a-f]{40}|[0-9a-f]{64}")
+
+log = logging.getLogger(__name__)
+
+
+class Repository:
+    """See `hma_model.hub.Store`.
+
+    Args:
+        repo: organisation/name.
+        revision: branch, tag or commit; None for main.
+        write: make the repository where it is not there.
+        kind: model or dataset.
+        private: make it a private one.
+        name: for errors, instead of its URI.
+
+    Attributes:
+        address: of its page.
+        from_cache: the hub was out of reach, so `files` told what the cache has.
+
+    Raises:
+        HubError: it is to be written, and there is no token.
+    """
+
+    def __init__(
+        self,
+        repo: str,
+        revision: str | None = None,
+        write: bool = False,
+        kind: str = "model",
+        private: bool | None = None,
+        name: str | None = None,
+    ) -> None:
+        from huggingface_hub import HfApi, get_token
+
+        prefix = "datasets/" if kind == "dataset" else ""
+        self.name, self.repo, self.kind, self._revision = name or f"hf://{prefix}{repo}", repo, kind, revision
+        self._api = HfApi(library_name="hma-toolkit")
+        self.address = f"{self._api.endpoint}/{prefix}{repo}"
+        self._write, self._private, self._absent = write, private, False
+        self._commit: str | None = None
+        self._cached: Path | None = None
+        self._entries: dict[str, Entry] | None = None
+        if write and get_token() is None:
+            raise HubError(self.name, "needs a token to be written", f"{LOG_IN}; for a folder write ./{repo}")
+
+    @property
+    def from_cache(self) -> bool:
+        return self._cached is not None
+
+    # -- what is there
+
+    def files(self) -> dict[str, int]:
+        """Return sizes by name at the newest commit; out of the hub's reach, of what the cache has.
+
+        Of a repository that is to be written and is not there yet there are none.
+        """
+        info = self._info()
+        self._absent = info is _ABSENT
+        if info is None:
+            self._commit, self._entries = None, self._of_cache()
+        else:
+            self._commit, self._cached = getattr(info, "sha", None), None
+            if self._commit is not None and not _COMMIT.fullmatch(self._commit):
+                fault = f"names a commit {self._commit[:60]!r}"
+                raise HubError(self.name, fault, "check HF_ENDPOINT and your proxy")
+            self._entries = self._ask(self._listing) if self._commit else {}
+        return {name: entry.size for name, entry in self._entries.items()}
+
+    def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
+        """Check whether the commit that `files` saw has this content under this name.
+
+        Args:
+            sha256: of the content, where it is known.
+        """
+        entry = self.stated(name)
+        if entry and entry.sha256 and sha256:
+            return entry.sha256 == sha256
+        return entry is not None and entry.states(content)
+
+    def stated(self, name: str) -> Entry | None:
+        """Return what the listing that `files` saw states of a file; None where there is none."""
+        return (self._entries or {}).get(name)
+
+    def _info(self) -> Any:
+        """Return the client's facts; None out of the hub's reach, `_ABSENT` where it is to be made."""
+        import httpx
+        from huggingface_hub import errors
+
+        def ask() -> Any:
+            try:
+                return self._api.repo_info(
+                    self.repo, repo_type=self.kind, revision=self._revision, timeout=LISTING_S
+                )
+            except (errors.OfflineModeIsEnabled, httpx.ConnectError, httpx.TimeoutException):
+                if self._write:
+                    raise
+                return None
+            except errors.HfHubHTTPError as fault:
+                # some hubs answer 404 without the code that tells what is missing
+                missing = isinstance(fault, errors.RepositoryNotFoundError) or status(fault) == 404
+                there = isinstance(fault, errors.GatedRepoError | errors.RevisionNotFoundError)
+                if there or not (missing and self._write):
+                    raise
+                return _ABSENT
+
+        return self._ask(ask)
+
+    def _listing(self) -> dict[str, Entry]:
+        """Return the files of the commit by name."""
+        from huggingface_hub import RepoFile
+
+        entries = self._api.list_repo_tree(
+            self.repo, repo_type=self.kind, revision=self._commit, recursive=True
+        )
+        files = [item for item in entries if isinstance(item, RepoFile) and item.path]
+        return {
+            item.path: Entry(
+                item.path,
+                int(item.size or 0),
+                item.lfs.sha256 if item.lfs else None,
+                "" if item.lfs else str(item.blob_id),
+            )
+            for item in files
+        }
+
+    def _of_cache(self) -> dict[str, Entry]:
+        """Return what the client's cache has of the revision."""
+        from huggingface_hub import snapshot_download
+
+        with explained(self.name):
+            self._cached = folder = Path(
+                snapshot_download(
+                    self.repo,
+                    repo_type=self.kind,
+                    revision=self._revision,
+                    local_files_only=True,
+                    allow_patterns=[],
+                )
+            )
+        names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+        return {name: Entry(name, (folder / name).stat().st_size, None, "") for name in names}
+
+    # -- pulling
+
+    def read(self, name: str) -> bytes:
+        """Return a file of at most 16 MB at the commit that `files` saw."""
+        if self._known()[name].size > MOST_READ:
+            fault = f"is larger than {MOST_READ:,} bytes"
+            raise HubError(f"{self.name}/{name}", fault, "this is not a file of ours")
+        return self._brought([name])[0].read_bytes()
+
+    def warm(self, names: Iterable[str]) -> None:
+        """Bring small files to the cache together, for `read`."""
+        known = self._known()
+        if not self.from_cache:
+            self._brought([name for name in names if name in known and known[name].size <= MOST_READ])
+
+    def pull(self, names: list[str], out: Path | None = None) -> Path:
+        """Bring files to the client's cache, whatever `out`; return their folder there."""
+        return _snapshot(self._brought(names)[0], names[0])
+
+    def download(self, names: list[str], out: Path) -> None:
+        """Bring files to a folder, past the client's cache; each gets its name once it is whole."""
+        known = self._known()
+        if self.from_cache:
+            raise HubError(self.name, "is out of reach", "go online and pull again")
+        with explained(self.name):
+            out.mkdir(parents=True, exist_ok=True)
+            remove_abandoned_folders(out)
+        staging = beside(out / "pull")
+
+        def bring(name: str) -> None:
+            path = fetch(self.repo, self.kind, str(self._commit), known[name], staging)
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            path.replace(out / name)
+
+        try:
+            self._each(bring, [name for name in names if name in known])
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+
+    def _known(self) -> dict[str, Entry]:
+        if self._entries is None:
+            self.files()
+        return self._entries or {}
+
+    def _brought(self, names: Sequence[str]) -> list[Path]:
+        """Return paths of files in the cache, which are fetched unless they are there and whole."""
+        known = self._known()
+        if (folder := self._cached) is not None:
+            if missing := [name for name in names if name not in known]:
+                fault = f"is out of reach, and {missing[0]} is not in the cache"
+                raise HubError(self.name, fault, "go online and pull again")
+            return [folder / name for name in names]
+        commit = str(self._commit)
+        paths = self._each(lambda name: fetch(self.repo, self.kind, commit, known[name]), names)
+        if paths:
+            self._remember(_snapshot(paths[0], names[0]))
+        return paths
+
+    def _remember(self, snapshot: Path) -> None:
+        """Note in the cache which commit the revision is, for who asks for it by this name offline."""
+        named = self._revision or "main"
+        ref = snapshot.parent.parent / "refs" / named
+        with explained(self.name):
+            if not _COMMIT.fullmatch(named) and not (ref.is_file() and ref.read_text() == self._commit):
+                ref.parent.mkdir(parents=True, exist_ok=True)
+                new = beside(ref)
+                new.write_text(str(self._commit))
+                new.replace(ref)
+
+    def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
+        """Return what an action gives for each file, a few at once; the first error ends it."""
+        pool = ThreadPoolExecutor(AT_ONCE, "hub")
+        try:
+            return list(pool.map(lambda name: self._ask(lambda: act(name), f"{self.name}/{name}"), names))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    # -- pushing
+
+    def prepare(self, name: str) -> None:
+        """Make the repository and its branch where they are not there.
+
+        Raises:
+            HubError: the token may not write a file of this name.
+        """
+        self._make()
+        if branch := self._revision:
+            self._ask(
+                lambda: self._api.create_branch(self.repo, repo_type=self.kind, branch=branch, exist_ok=True)
+            )
+        self._ask(lambda: self._upload_modes([name]))
+
+    def check_card(self, page: bytes) -> None:
+        """Raise HubError where the hub would not take a card."""
+        asked = {"content": page.decode(), "repoType": self.kind}
+        answered = self._ask(lambda: self._posted("validate-yaml", asked, (400,)).get("errors"))
+        if said := shown("; ".join(str(fault.get("message")) for fault in answered or ())):
+            remedy = 'correct "license" in the card.json of a checkpoint, in the embodiment of a shard set'
+            raise HubError(self.name, f"the hub refuses the card: {said}", remedy)
+
+    def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
+        """Commit changes, prepared again while others commit first; return the page's address.
+
+        Args:
+            changes: gives contents by name, None to delete; it calls `files`.
+            message: of the commit.
+
+        Raises:
+            HubError: the hub refuses it, or others keep committing.
+        """
+        files = changes()
+        if isinstance(page := files.get(CARD), bytes):
+            self.check_card(page)
+        if self._absent:
+            self._make()
+            files = changes()  # somebody else may have been there meanwhile
+        for attempt in range(ATTEMPTS):
+            try:
+                with explained(self.name):
+                    self._commit_changes(files, message)
+                return self.address
+            except HubError as fault:
+                seconds = self._pause(fault, attempt)
+                if seconds is None:
+                    raise
+                log.info("%s; trying again", fault)
+            time.sleep(seconds)
+            files = changes()
+        raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
+
+    def _pause(self, fault: HubError, attempt: int) -> float | None:
+        """Return seconds to wait before a commit is prepared again; None where that would not help."""
+        if failed_by_xet(fault):
+            return 0.0
+        if status(fault) in _CONFLICTS:
+            return min(0.2 * 2**attempt, 10.0) * (0.5 + random.random())
+        return waiting(fault, attempt) if attempt < ATTEMPTS // 2 else None
+
+    def _commit_changes(self, files: Mapping[str, Path | bytes | None], message: str) -> None:
+        """Commit what the listed commit does not have like this, all of it or nothing."""
+        from huggingface_hub import CommitOperationAdd, CommitOperationDelete
+
+        added = {name: new for name, new in files.items() if new is not None and not self.has(name, new)}
+        deleted = [name for name, new in files.items() if new is None and name in self._known()]
+        if not added and not deleted:
+            return
+        self._refuse_ignored(added)
+        self._limit_silence()
+        self._api.create_commit(
+            self.repo,
+            [
+                *(CommitOperationAdd(n, str(c) if isinstance(c, Path) else c) for n, c in added.items()),
+                *(CommitOperationDelete(name) for name in deleted),
+            ],
+            repo_type=self.kind,
+            revision=self._revision,
+            commit_message=message,
+            parent_commit=self._commit,
+        )
+
+    def _refuse_ignored(self, names: Iterable[str]) -> None:
+        """Raise HubError where a .gitignore there would leave files out of the commit without a word."""
+        if not any(PurePosixPath(name).name == ".gitignore" for name in self._known()):
+            return
+        for some in batched(names, 256):
+            ignored = [facts["path"] for facts in self._upload_modes(some) if facts.get("shouldIgnore")]
+            if ignored:
+                fault = f"leaves out {ignored[0]}, by its .gitignore"
+                raise HubError(self.name, fault, "delete that line there, and push again")
+
+    def _upload_modes(self, names: Iterable[str]) -> list[dict[str, Any]]:
+        """Return how the hub would take files, which it tells only those who may write."""
+        branch = quote(self._revision or "main", safe="")
+        asked = {"files": [{"path": name, "size": 1, "sample": "ew=="} for name in names]}
+        return list(self._posted(f"{self.kind}s/{self.repo}/preupload/{branch}", asked)["files"])
+
+    def _make(self) -> None:
+        private = self._private or None
+        self._ask(
+            lambda: self._api.create_repo(self.repo, repo_type=self.kind, private=private, exist_ok=True)
+        )
+
+    # -- asking
+
+    def _posted(self, place: str, value: Any, accepted: tuple[int, ...] = ()) -> Any:
+        """Return the JSON that the hub answers to JSON; other states than success may be accepted."""
+        from huggingface_hub import get_session
+        from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
+
+        headers = build_hf_headers(library_name="hma-toolkit")
+        answer = get_session().post(f"{self._api.endpoint}/api/{place}", json=value, headers=headers)
+        if answer.status_code not in accepted:
+            hf_raise_for_status(answer)
+        return answer.json()
+
+    def _ask[T](self, call: Callable[[], T], where: str = "") -> T:
+        """Return what a call of the client returns; it is made again where the hub is busy or was cut off."""
+        for attempt in range(ATTEMPTS // 2):
+            self._limit_silence()
+            try:
+                with explained(where or self.name):
+                    return call()
+            except HubError as fault:
+                seconds = waiting(fault, attempt)
+                if seconds is None or attempt == ATTEMPTS // 2 - 1:
+                    raise
+                log.info("%s; trying again", fault)
+            time.sleep(seconds)
+        raise AssertionError("the last attempt returns or raises")
+
+    def _limit_silence(self) -> None:
+        """Let the client's session, which waits for ever by default, wait for an answer only so long."""
+        from huggingface_hub import get_session
+
+        session = get_session()
+        if session.timeout.read is None:
+            session.timeout = SILENCE_S
+
+
+def _snapshot(path: Path, name: str) -> Path:
+    """Return the folder of the client's cache in which a file of this name lies."""
+    return path.parents[len(PurePosixPath(name).parts) - 1]
