@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.messages import child, field_names
-from hma_data.sources.facts import one_channel
+from hma_data.sources.dtype_hints import one_channel
 from hma_data.video import MAX_PIXELS, Images, decode_image, opencv
 
 RAW, STILL, VIDEO = "raw", "still", "video"

@@ -14,7 +14,7 @@ import numpy as np
 
 from hma_data.episode import Floats
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources import looks
+from hma_data.sources import image_checks
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.dtypes import stated_dtype
@@ -24,10 +24,10 @@ from hma_data.sources.bags.pictures import VIDEO, codec, is_grey, picture_kind
 from hma_data.sources.bags.streams import camera_stream
 from hma_data.sources.bags.track import Track
 from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
-from hma_data.sources.clocks import Clock, clock_of, skew
 from hma_data.sources.findings import Finding
 from hma_data.sources.links import unfollowed
 from hma_data.sources.survey import Survey, sampled
+from hma_data.sources.timestamp_checks import Clock, clock_of, skew
 
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
@@ -256,8 +256,8 @@ class _Telling:
         try:
             stream = camera_stream(self.bag, topic.track, "receive")
             keyframes = topic.track.keyframes() if kind == VIDEO else None
-            indices = looks.choose(len(stream.timestamps), _PAIRS, _starts(keyframes))
-            for run in looks.runs(indices):
+            indices = image_checks.choose(len(stream.timestamps), _PAIRS, _starts(keyframes))
+            for run in image_checks.runs(indices):
                 frames = stream.frames(run)
                 self._survey.pictures(self._name, name, frames, run, stored)
         except EpisodeError as fault:
