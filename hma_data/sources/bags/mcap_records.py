@@ -1,4 +1,4 @@
-"""Records of MCAP files: frames, declarations, chunks, messages. See https://mcap.dev/spec
+"""Read the records of MCAP files: frames, declarations, chunks, messages. See https://mcap.dev/spec
 
 Chunks that are not packed need not be read whole: their records are walked in the file itself.
 """
@@ -10,7 +10,6 @@ from functools import lru_cache
 from importlib import import_module
 from typing import BinaryIO, NamedTuple
 
-from hma_data.sources.bags.chunks import Take
 from hma_data.sources.bags.container import (
     HEAD,
     Channel,
@@ -19,9 +18,7 @@ from hma_data.sources.bags.container import (
     Place,
     Record,
     Wanted,
-    checked_size,
     decompress,
-    decompress_begin,
     read_exact,
 )
 
@@ -35,14 +32,14 @@ CODEC_BYTES = 32  # a codec's name is no longer
 
 
 class Declared:
-    """Schemas and channels met so far."""
+    """Keep the schemas and channels met so far."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self.channels: dict[int, Channel] = {}
 
     def learn(self, opcode: int, data: Data) -> None:
-        """Takes a schema or channel record."""
+        """Take a schema or channel record."""
         fields = Fields(data)
         number = fields.number(2)
         if opcode == SCHEMA:
@@ -55,14 +52,14 @@ class Declared:
             self.channels[number] = Channel(topic, name, encoding, kind, schema)
 
     def channel(self, number: int) -> Channel:
-        """The channel of that number."""
+        """Return the channel of that number."""
         if number not in self.channels:
             raise ValueError(f"a message is on channel {number}, which is not declared")
         return self.channels[number]
 
 
 class ChunkHead(NamedTuple):
-    """What a chunk says of itself; its records lie at `at`, `packed` bytes that unpack to `size`."""
+    """Hold what a chunk says of itself; its records lie at `at`, `packed` bytes that unpack to `size`."""
 
     first_ns: int
     last_ns: int
@@ -74,31 +71,22 @@ class ChunkHead(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """Whether its records lie in the file as they are."""
+        """Check whether its records lie in the file as they are."""
         return self.codec in ("", "none") and self.packed == self.size
 
 
-class Ask(NamedTuple):
-    """Which messages of a chunk are asked for; `after` is the offset of what follows it in the file."""
-
-    head: ChunkHead
-    after: int
-    declared: Declared
-    wanted: Wanted
-
-
-Load = Callable[[BinaryIO, int, Ask | None], memoryview]
+Load = Callable[[BinaryIO, int], Data]
 
 
 def frame(file: BinaryIO, at: int) -> tuple[int, int]:
-    """Opcode and length of the record at `at`; the file stands at its content."""
+    """Return opcode and length of the record at `at`; the file stands at its content."""
     file.seek(at)
     opcode, length = FRAME.unpack(read_exact(file, FRAME.size))
     return opcode, length
 
 
 def frames(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """(opcode, offset, length) of the records from `at` to `end`; the file stands at the content."""
+    """Yield (opcode, offset, length) of the records from `at` to `end`; the file stands at the content."""
     while at < end:
         opcode, length = frame(file, at)
         following = at + FRAME.size + length
@@ -111,8 +99,7 @@ def frames(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, int, int]]:
 def between(
     file: BinaryIO, at: int, end: int, declared: Declared, wanted: Wanted, load: Load
 ) -> Iterator[Record]:
-    """The wanted messages from offset `at` to `end` of the data section; `load` unpacks a chunk, or what is
-    asked of it."""
+    """Yield the wanted messages from offset `at` to `end` of the data; `load` unpacks a chunk."""
     for opcode, offset, length in frames(file, at, end):
         if opcode in (DATA_END, FOOTER):
             return
@@ -127,7 +114,7 @@ def between(
 
 
 def message_head(body: Data) -> tuple[int, int]:
-    """Number of the channel, and log time."""
+    """Return the number of the channel, and the log time."""
     if len(body) < MESSAGE_HEAD.size:
         raise ValueError("a message ends too soon")
     channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(body)
@@ -135,7 +122,7 @@ def message_head(body: Data) -> tuple[int, int]:
 
 
 def chunk_head(file: BinaryIO, length: int) -> ChunkHead:
-    """Of the chunk whose content begins where the file stands."""
+    """Return the head of the chunk whose content begins where the file stands."""
     start = file.tell()
     fields = Fields(read_exact(file, min(length, 40 + CODEC_BYTES)))
     first_ns, last_ns = fields.number(8), fields.number(8)
@@ -148,32 +135,18 @@ def chunk_head(file: BinaryIO, length: int) -> ChunkHead:
     return ChunkHead(first_ns, last_ns, size, checksum, codec, at, packed)
 
 
-def _fresh(size: int) -> memoryview:
-    return memoryview(bytearray(size))
-
-
-def load_chunk(file: BinaryIO, at: int, take: Take = _fresh, checked: bool = True) -> memoryview:
-    """The records of the chunk at that offset, unpacked, and `checked` against its checksum."""
+def load_chunk(file: BinaryIO, at: int, checked: bool = True) -> bytes:
+    """Return the records of the chunk at that offset, unpacked; `checked` against its checksum."""
     head = chunk_at(file, at)
     file.seek(head.at)
-    chunk = take(checked_size(head.size))
-    decompress(head.codec, read_exact(file, head.packed), chunk)
-    if checked:
-        check(chunk, head)
-    return chunk
-
-
-def load_begin(file: BinaryIO, at: int, size: int, take: Take) -> memoryview:
-    """The first `size` bytes of a chunk's records; the checksum is not looked at."""
-    head = chunk_at(file, at)
-    file.seek(head.at)
-    chunk = take(size)
-    decompress_begin(head.codec, read_exact(file, head.packed), chunk)
+    chunk = decompress(head.codec, read_exact(file, head.packed), head.size)
+    if checked and head.checksum and _crc32()(chunk) != head.checksum:
+        raise ValueError("a chunk's checksum does not fit its content")
     return chunk
 
 
 def message(chunk: memoryview, at: int) -> memoryview:
-    """The data of the message at that place of a chunk."""
+    """Return the data of the message at that place of a chunk."""
     _, length = FRAME.unpack_from(chunk, at)
     end = at + FRAME.size + length
     if end > len(chunk):
@@ -181,23 +154,23 @@ def message(chunk: memoryview, at: int) -> memoryview:
     return chunk[at + FRAME.size + MESSAGE_HEAD.size : end]
 
 
+def loose(file: BinaryIO, at: int) -> Data:
+    """Return the data of the message outside of chunks at that offset."""
+    _, length = frame(file, at)
+    return memoryview(read_exact(file, length))[MESSAGE_HEAD.size :]
+
+
 def chunk_at(file: BinaryIO, at: int) -> ChunkHead:
-    """The head of the chunk at that offset."""
+    """Return the head of the chunk at that offset."""
     opcode, length = frame(file, at)
     if opcode != CHUNK:
         raise ValueError(f"there is no chunk at {at:,}")
     return chunk_head(file, length)
 
 
-def check(chunk: Data, head: ChunkHead) -> None:
-    """Looks at the checksum of a chunk's records, where there is one."""
-    if head.checksum and _crc32()(chunk) != head.checksum:
-        raise ValueError("a chunk's checksum does not fit its content")
-
-
 @lru_cache(maxsize=1)
 def _crc32() -> Callable[[Data], int]:
-    """CRC-32 by ISA-L where the package `isal` is installed, which takes a sixteenth of zlib's time."""
+    """Return CRC-32 by ISA-L where the package `isal` is installed: a sixteenth of zlib's time."""
     try:
         found: Callable[[Data], int] = import_module("isal.isal_zlib").crc32
     except ImportError:
@@ -209,36 +182,35 @@ def _in_chunk(
     file: BinaryIO, at: int, length: int, declared: Declared, wanted: Wanted, load: Load
 ) -> Iterator[Record]:
     head = chunk_head(file, length)
-    if head.plain and wanted.heads:
-        short = False
-        for record in _walk(file, at, head, declared, wanted):
-            short = short or record.channel.topic in wanted.heads
-            yield record
-        if head.checksum and wanted.checked and not short:
-            load(file, at, None)  # with a picture in it, it will be loaded for that
+    if not (head.plain and wanted.heads):
+        yield from _in_records(memoryview(load(file, at)), at, declared, wanted)
         return
-    chunk = load(file, at, None if head.plain else Ask(head, at + FRAME.size + length, declared, wanted))
-    yield from _in_records(chunk, head.size, at, declared, wanted)
+    whole = short = False
+    for record in _walk(file, at, head, declared, wanted):
+        if record.channel.topic in wanted.heads:
+            short = True
+        else:
+            whole = True
+        yield record
+    if (
+        head.checksum and whole and not short
+    ):  # a chunk with a picture in it is checked when the picture is read
+        load(file, at)
 
 
-def _in_records(
-    chunk: memoryview, size: int, chunk_at: int, declared: Declared, wanted: Wanted
-) -> Iterator[Record]:
-    """The wanted messages of a chunk of that size; of one unpacked in part, those that begin there."""
-    at, known = 0, len(chunk)
-    while at < known and (known == size or at + FRAME.size + MESSAGE_HEAD.size <= known):
+def _in_records(chunk: memoryview, chunk_at: int, declared: Declared, wanted: Wanted) -> Iterator[Record]:
+    at = 0
+    while at < len(chunk):
         opcode, length = FRAME.unpack_from(chunk, at)
         start, following = at + FRAME.size, at + FRAME.size + length
-        if following > size:
+        if following > len(chunk):
             raise ValueError("a record reaches beyond its chunk")
         if opcode == MESSAGE:
             number, log_ns = message_head(chunk[start:following])
             channel = declared.channel(number)
             if wanted.topic(channel.topic) and wanted.time(log_ns):
-                if following > known and channel.topic not in wanted.heads:
-                    raise ValueError("an index tells another place of a message")
                 yield Record(channel, log_ns, chunk[start + MESSAGE_HEAD.size : following], (chunk_at, at))
-        elif opcode in (SCHEMA, CHANNEL) and following <= known:
+        elif opcode in (SCHEMA, CHANNEL):
             declared.learn(opcode, chunk[start:following])
         at = following
 
@@ -246,7 +218,7 @@ def _in_records(
 def _walk(
     file: BinaryIO, chunk_at: int, head: ChunkHead, declared: Declared, wanted: Wanted
 ) -> Iterator[Record]:
-    """The messages of a chunk that is not packed, without reading more of them than is wanted."""
+    """Yield the messages of a chunk that is not packed, without reading more of them than is wanted."""
     for opcode, offset, length in frames(file, head.at, head.at + head.size):
         if opcode == MESSAGE:
             record = _loose(file, length, (chunk_at, offset - head.at), declared, wanted)
@@ -257,7 +229,7 @@ def _walk(
 
 
 def _loose(file: BinaryIO, length: int, place: Place, declared: Declared, wanted: Wanted) -> Record | None:
-    """The message whose content begins where the file stands, if it is wanted."""
+    """Return the message whose content begins where the file stands, if it is wanted."""
     head = read_exact(file, min(length, MESSAGE_HEAD.size + HEAD))
     number, log_ns = message_head(head)
     channel = declared.channel(number)

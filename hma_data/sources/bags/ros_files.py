@@ -1,49 +1,52 @@
-"""ROS 1 bags, format 2.0, as https://wiki.ros.org/Bags/Format/2.0 lays them out.
+"""Read ROS's own bag files: format 2.0 of ROS 1, and the sqlite3 files of ROS 2.
 
-Indexed or not (a recorder that was killed leaves no index), chunks plain, bz2 or lz4.
+ROS 1 as https://wiki.ros.org/Bags/Format/2.0 lays it out: indexed or not (a recorder that was killed
+leaves no index), chunks plain, bz2 or lz4.
+
+sqlite3 is opened read-only; nothing is written beside the file. Definitions of the messages are inside
+the file since ROS 2 Iron; before it only their names are.
 """
 
+import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
+from urllib.parse import quote
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hma_data.sources.bags.chunks import WORTH, Buffer, ChunkCache, Take, placed, reach
 from hma_data.sources.bags.container import (
     FOREVER,
     HEAD,
     Channel,
+    ChunkCache,
     Data,
     Fields,
     Place,
     Record,
     Wanted,
-    checked_size,
     damaged,
     decompress,
-    decompress_begin,
     read_exact,
     reading,
 )
-from hma_data.sources.bags.pieces import Piece, last_before, overlapping
+from hma_data.sources.bags.time_index import Piece, last_before, overlapping, take_last
 
-MAGIC = b"#ROSBAG V2.0\n"
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 HEADER_BYTES = 1 << 16  # a record's header is no longer
-MESSAGE_BYTES = 128  # before the data of a message: its header has three short fields
 SAMPLE_BYTES = 12  # an entry of an index record: time, offset
 TIME = struct.Struct("<II")
 Header = dict[str, memoryview]
+SQLITE_MAGIC = b"SQLite format 3\x00"
+LATEST = 2**63 - 1  # of an sqlite3 integer
 
 
 class Ros1File:
-    """One ROS 1 bag; see Container.
+    """Read one ROS 1 bag; see Container.
 
     Args:
         chunks: where unpacked chunks are kept; shared by the files of a bag.
@@ -69,7 +72,7 @@ class Ros1File:
             channels = index.channels if index else {}
             found = (piece.at for piece in overlapping(index.pieces(), wanted)) if index else None
             for at in found or _scan(file, channels):
-                yield from _in_chunk(file, at, channels, wanted, self._asked)
+                yield from _in_chunk(file, at, channels, wanted, self._chunk)
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """See Container."""
@@ -79,51 +82,35 @@ class Ros1File:
                 index.pieces(),
                 topics,
                 log_ns,
-                lambda piece, wanted: _in_chunk(file, piece.at, index.channels, wanted, self._asked),
+                lambda piece, wanted: _in_chunk(file, piece.at, index.channels, wanted, self._chunk),
             )
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
-            buffer, heads = Buffer(), dict[int, _ChunkHead]()
+            heads: dict[int, _ChunkHead] = {}
             for offset, at in places:
                 if offset not in heads:
                     heads = {offset: _chunk_head(file, offset)}
-                if heads[offset].plain:
-                    yield _content(file, heads[offset], at, buffer)
-                else:
-                    yield _split(self._chunk(file, heads[offset]), at)[1]
+                head = heads[offset]
+                yield _content(file, head, at) if head.plain else _split(self._chunk(file, head), at)[1]
 
     def _chunk(self, file: BinaryIO, head: "_ChunkHead") -> memoryview:
         return self._chunks.get(self.path, head.offset, partial(_load_chunk, file, head))
 
-    def _asked(
-        self, file: BinaryIO, head: "_ChunkHead", channels: dict[int, Channel], wanted: Wanted
-    ) -> memoryview:
-        """A chunk unpacked, or where there is no room to keep it what is wanted of it."""
-        kept = self._chunks.has(self.path, head.offset) or self._chunks.room(head.size)
-        if wanted.heads and not kept:
-            found = _entries(file, head, channels)
-            size = reach(found, wanted, head.size, MESSAGE_BYTES) if found else head.size
-            if found and size < WORTH * head.size:
-                begin = _load_begin(file, head, size, self._chunks.scratch)
-                placed(found, begin, b"op=" + bytes([MESSAGE]), MESSAGE_BYTES)
-                return begin
-        return self._chunk(file, head)
-
     def _survey(self, file: BinaryIO) -> "_Index":
-        """The index, made from the chunks where the recorder left none."""
+        """Return the index, made from the chunks where the recorder left none."""
         if self._surveyed is None:
             self._surveyed = self._index(file) or _made_index(file)
         return self._surveyed
 
     def _index(self, file: BinaryIO) -> "_Index | None":
-        """The index at the file's end; None where the recorder left none."""
-        magic = file.read(len(MAGIC))
-        if magic != MAGIC:
+        """Return the index at the file's end; None where the recorder left none."""
+        magic = file.read(len(ROS1_MAGIC))
+        if magic != ROS1_MAGIC:
             shown = magic.split(b"\n")[0].decode("ascii", "replace")
             raise damaged(self.path, f"begins with {shown!r}, not as a ROS 1 bag" if magic else "is empty")
-        header, _, _ = _record(file, len(MAGIC))
+        header, _, _ = _record(file, len(ROS1_MAGIC))
         if _number(header, "op") != BAG:
             raise ValueError("the bag's header is missing")
         if bytes(header.get("encryptor", b"")):
@@ -137,7 +124,7 @@ class Ros1File:
 
 
 class _ChunkHead(NamedTuple):
-    """A chunk at `offset`: its content lies at `at`, `packed` bytes that unpack to `size`."""
+    """Describe a chunk at `offset`: its content lies at `at`, `packed` bytes that unpack to `size`."""
 
     offset: int
     codec: str
@@ -147,16 +134,16 @@ class _ChunkHead(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """Whether its records lie in the file as they are."""
+        """Check whether its records lie in the file as they are."""
         return self.codec == "none"
 
 
-Load = Callable[[BinaryIO, _ChunkHead, dict[int, Channel], Wanted], memoryview]
+Load = Callable[[BinaryIO, _ChunkHead], Data]
 
 
 @dataclass
 class _ChunkInfo:
-    """When the messages of a chunk were received, and how many there are of each connection."""
+    """Hold when the messages of a chunk were received, and how many there are of each connection."""
 
     first_ns: int
     last_ns: int
@@ -165,7 +152,7 @@ class _ChunkInfo:
 
 @dataclass
 class _Index:
-    """Connections by number, and what is in the chunk at each offset."""
+    """Hold connections by number, and what is in the chunk at each offset."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: dict[int, _ChunkInfo] = field(default_factory=dict)
@@ -179,7 +166,7 @@ class _Index:
         return total
 
     def pieces(self) -> list[Piece]:
-        """Of chunks the offset is told, not the end."""
+        """Return a piece for each chunk; its offset is told, not its end."""
         if not self._pieces:
             kinds: dict[frozenset[str], frozenset[str]] = {}
             for at, info in sorted(self.chunks.items()):
@@ -190,7 +177,7 @@ class _Index:
 
 
 def _record(file: BinaryIO, at: int) -> tuple[Header, int, int]:
-    """Header of the record at `at`, size and place of its content; the file stands there."""
+    """Return the header of the record at `at`, size and place of its content; the file stands there."""
     file.seek(at)
     length = int.from_bytes(read_exact(file, 4), "little")
     if length > HEADER_BYTES:
@@ -263,7 +250,7 @@ def _read_index(file: BinaryIO, at: int, connections: int, chunks: int) -> _Inde
 
 
 def _made_index(file: BinaryIO) -> _Index:
-    """The index of a bag without one, from the index records behind its chunks, else from the messages."""
+    """Make the index of a bag without one, from index records behind its chunks, else from messages."""
     index, followed = _Index(), set()
     chunk_at = 0
     for at, header, size in _records(file):
@@ -283,7 +270,7 @@ def _made_index(file: BinaryIO) -> _Index:
 
 
 def _count(info: _ChunkInfo, header: Header, entries: Data) -> None:
-    """Takes an index record: times and offsets of a connection's messages in the chunk before it."""
+    """Take an index record: times and offsets of a connection's messages in the chunk before it."""
     if len(entries) % SAMPLE_BYTES or not entries:
         raise ValueError("an index record has half an entry")
     times = [s * 10**9 + ns for s, ns, _ in struct.iter_unpack("<III", entries)]
@@ -294,7 +281,7 @@ def _count(info: _ChunkInfo, header: Header, entries: Data) -> None:
 
 def _counted(file: BinaryIO, at: int, channels: dict[int, Channel]) -> _ChunkInfo:
     info = _ChunkInfo(FOREVER, -1, {})
-    for record in _in_chunk(file, at, channels, Wanted(), _whole):
+    for record in _in_chunk(file, at, channels, Wanted(), _load_chunk):
         info.first_ns, info.last_ns = min(info.first_ns, record.log_ns), max(info.last_ns, record.log_ns)
         number = next(number for number, channel in channels.items() if channel == record.channel)
         info.counts[number] = info.counts.get(number, 0) + 1
@@ -302,8 +289,8 @@ def _counted(file: BinaryIO, at: int, channels: dict[int, Channel]) -> _ChunkInf
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[int, Header, int]]:
-    """Offset, header and size of content of the records to the file's end; the file stands at the content."""
-    at, end = len(MAGIC), file.seek(0, 2)
+    """Yield offset, header and content size of the records to the file's end; the file is at the content."""
+    at, end = len(ROS1_MAGIC), file.seek(0, 2)
     while at < end:
         header, size, content_at = _record(file, at)
         if content_at + size > end:
@@ -313,7 +300,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[int, Header, int]]:
 
 
 def _scan(file: BinaryIO, channels: dict[int, Channel]) -> Iterator[int]:
-    """Offsets of the chunks of a bag without index, to the file's end; connections between are learnt."""
+    """Yield offsets of the chunks of a bag without index, to the file's end; learn connections."""
     for at, header, size in _records(file):
         kind = _number(header, "op")
         if kind == CONNECTION:
@@ -324,17 +311,13 @@ def _scan(file: BinaryIO, channels: dict[int, Channel]) -> Iterator[int]:
             raise ValueError("a message outside a chunk")
 
 
-def _split(view: memoryview, at: int, end: int | None = None) -> tuple[memoryview, memoryview, int]:
-    """Header and content of the record at `at` of a chunk, and where the next one begins.
-
-    The chunk ends at `end`; where less of it is there, a content may be cut.
-    """
-    end = len(view) if end is None else end
+def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
+    """Return header and content of the record at `at` of a chunk, and where the next one begins."""
     parts = []
     for _ in range(2):
         size = int.from_bytes(view[at : at + 4], "little")
         at += 4
-        if at + size > end:
+        if at + size > len(view):
             raise ValueError("a record reaches beyond its chunk")
         parts.append(view[at : at + size])
         at += size
@@ -348,25 +331,19 @@ def _in_chunk(
     if wanted.heads and head.plain:
         yield from _walk(file, offset, head.at, head.at + head.packed, channels, wanted)
         return
-    view, at = load(file, head, channels, wanted), 0
+    view, at = memoryview(load(file, head)), 0
     while at < len(view):
         place = (offset, at)
-        if len(view) < head.size and len(view) < at + 8 + int.from_bytes(view[at : at + 4], "little"):
-            break  # the rest was not asked for
-        header, content, at = _split(view, at, head.size)
-        if at > len(view) and _number(_header(header), "op") == CONNECTION:
-            break
+        header, content, at = _split(view, at)
         channel, log_ns = _take(_header(header), content, channels, wanted)
         if channel:
-            if at > len(view) and channel.topic not in wanted.heads:
-                raise ValueError("an index tells another place of a message")
             yield Record(channel, log_ns, content, place)
 
 
 def _walk(
     file: BinaryIO, chunk_at: int, at: int, end: int, channels: dict[int, Channel], wanted: Wanted
 ) -> Iterator[Record]:
-    """The messages of a chunk that is not packed, without reading more of them than is wanted."""
+    """Yield the messages of a chunk that is not packed, without reading more of them than is wanted."""
     begin = at
     while at < end:
         header, size, content_at = _record(file, at)
@@ -383,7 +360,7 @@ def _walk(
 def _take(
     header: Header, content: Data, channels: dict[int, Channel], wanted: Wanted
 ) -> tuple[Channel | None, int]:
-    """Channel and time of a wanted message; learns a connection; None for anything else."""
+    """Return channel and time of a wanted message; learn a connection; None for anything else."""
     kind = _number(header, "op")
     if kind == CONNECTION:
         _learn(channels, header, content)
@@ -396,7 +373,7 @@ def _take(
 
 
 def _chunk_head(file: BinaryIO, offset: int) -> _ChunkHead:
-    """Of the chunk at that offset; the file stands at its content."""
+    """Return the head of the chunk at that offset; the file stands at its content."""
     header, packed, at = _record(file, offset)
     if _number(header, "op") != CHUNK:
         raise ValueError(f"there is no chunk at {offset:,}, where the index says one is")
@@ -404,49 +381,141 @@ def _chunk_head(file: BinaryIO, offset: int) -> _ChunkHead:
     return _ChunkHead(offset, codec, at, packed, packed if codec == "none" else _number(header, "size"))
 
 
-def _content(file: BinaryIO, head: _ChunkHead, at: int, buffer: Buffer) -> memoryview:
-    """The data of the message at that place of a chunk that is not packed, until the buffer's next."""
+def _content(file: BinaryIO, head: _ChunkHead, at: int) -> bytes:
+    """Return the data of the message at that place of a chunk that is not packed."""
     _, size, begin = _record(file, head.at + at)
     if begin + size > head.at + head.packed:
         raise ValueError("a record reaches beyond its chunk")
-    return buffer.read(file, size)
+    return read_exact(file, size)
 
 
-def _load_chunk(file: BinaryIO, head: _ChunkHead, take: Take) -> memoryview:
+def _load_chunk(file: BinaryIO, head: _ChunkHead) -> bytes:
     file.seek(head.at)
-    chunk = take(checked_size(head.size))
-    decompress(head.codec, read_exact(file, head.packed), chunk)
-    return chunk
+    return decompress(head.codec, read_exact(file, head.packed), head.size)
 
 
-def _load_begin(file: BinaryIO, head: _ChunkHead, size: int, take: Take) -> memoryview:
-    file.seek(head.at)
-    chunk = take(size)
-    decompress_begin(head.codec, read_exact(file, head.packed), chunk)
-    return chunk
+# -- sqlite3
 
 
-def _whole(file: BinaryIO, head: _ChunkHead, channels: dict[int, Channel], wanted: Wanted) -> memoryview:
-    return _load_chunk(file, head, lambda size: memoryview(bytearray(size)))
+class SqliteFile:
+    """Read one .db3 file of rosbag2, any version of its tables; see Container."""
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
-def _entries(
-    file: BinaryIO, head: _ChunkHead, channels: dict[int, Channel]
-) -> dict[str, NDArray[np.uint64]] | None:
-    """Topic -> (n, 2) times and offsets of its messages in a chunk, by the index records behind it.
+    def counts(self) -> Counter[Channel]:
+        """See Container."""
+        with reading(self.path), closing(self._open()) as base:
+            channels = self._channels(base)
+            total: Counter[Channel] = Counter(dict.fromkeys(channels.values(), 0))
+            for topic_id, count in base.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"):
+                total[self._channel(channels, topic_id)] += count
+        return total
 
-    None where there are none, or of a connection that is not declared.
-    """
-    at, end = head.at + head.packed, file.seek(0, 2)
-    found: dict[str, list[NDArray[np.uint64]]] = {}
-    while at < end:
-        header, size, content_at = _record(file, at)
-        if _number(header, "op") != INDEX:
-            break
-        if _number(header, "conn") not in channels or size % SAMPLE_BYTES:
-            return None
-        stored = np.frombuffer(read_exact(file, size), "<u4").reshape(-1, 3).astype(np.uint64)
-        times = np.stack([stored[:, 0] * np.uint64(10**9) + stored[:, 1], stored[:, 2]], -1)
-        found.setdefault(channels[_number(header, "conn")].topic, []).append(times)
-        at = content_at + size
-    return {topic: np.concatenate(parts) for topic, parts in found.items()} or None
+    def records(self, wanted: Wanted) -> Iterator[Record]:
+        """See Container."""
+        with reading(self.path), closing(self._open()) as base:
+            channels = self._channels(base)
+            for row_id, topic_id, log_ns in self._rows(base, channels, wanted):
+                channel = self._channel(channels, topic_id)
+                data = self._data(base, row_id, HEAD if channel.topic in wanted.heads else None)
+                if not isinstance(log_ns, int):
+                    raise ValueError(f"message {row_id} has no time")
+                yield Record(channel, log_ns, data, (0, row_id))
+
+    def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
+        """See Container."""
+        found: dict[str, Record] = {}
+        query = (
+            "SELECT id, topic_id, timestamp FROM messages WHERE timestamp < ? AND topic_id = ? "
+            "ORDER BY timestamp DESC, id DESC LIMIT 1"
+        )
+        with reading(self.path), closing(self._open()) as base:
+            for topic_id, channel in self._channels(base).items():
+                rows = base.execute(query, (min(log_ns, LATEST), topic_id)) if channel.topic in topics else ()
+                take_last(
+                    found,
+                    (Record(channel, at, self._data(base, row, None), (0, row)) for row, _, at in rows),
+                )
+        return found
+
+    def _rows(
+        self, base: sqlite3.Connection, channels: dict[int, Channel], wanted: Wanted
+    ) -> Iterator[tuple[int, int, Any]]:
+        """Yield id, topic and time of the wanted messages; data is left out, for sorting would gather it."""
+        ids = [number for number, channel in channels.items() if wanted.topic(channel.topic)]
+        conditions, values = [], []
+        if wanted.topics is not None:
+            conditions.append(f"topic_id IN ({', '.join('?' * len(ids))})")
+            values += ids
+        if wanted.bounded:
+            conditions.append("timestamp BETWEEN ? AND ?")
+            values += [wanted.first_ns, min(wanted.last_ns, LATEST)]
+        where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
+        return base.execute(f"SELECT id, topic_id, timestamp FROM messages{where} ORDER BY id", values)
+
+    def _data(self, base: sqlite3.Connection, row_id: int, limit: int | None) -> bytes:
+        """Return a message's bytes, or the first of them, without reading the others."""
+        if limit is None:
+            return self._payload(base, row_id)
+        with base.blobopen("messages", "data", row_id, readonly=True) as blob:
+            return blob.read(limit)
+
+    def _payload(self, base: sqlite3.Connection, row_id: int) -> bytes:
+        (data,) = base.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone() or (None,)
+        if not isinstance(data, bytes):
+            raise ValueError(f"message {row_id} has no data")
+        return data
+
+    def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
+        """See Container."""
+        with reading(self.path), closing(self._open()) as base:
+            for _, row_id in places:
+                yield self._payload(base, row_id)
+
+    def _open(self) -> sqlite3.Connection:
+        """Connect without writing anything, not even a lock, unless there is a log still to be read."""
+        self._check_size()
+        log = self.path.with_name(self.path.name + "-wal")
+        pending = log.is_file() and log.stat().st_size > 0
+        place = f"file:{quote(str(self.path))}?mode=ro" + ("" if pending else "&immutable=1")
+        return sqlite3.connect(place, uri=True)
+
+    def _check_size(self) -> None:
+        """Refuse a file that is cut off: sqlite3 notices a missing end only where it reads it."""
+        with self.path.open("rb") as file:
+            head = file.read(100)
+            size = file.seek(0, 2)
+        if not head.startswith(SQLITE_MAGIC):
+            raise damaged(self.path, "does not begin as an sqlite3 file does" if head else "is empty")
+        page = int.from_bytes(head[16:18], "big")
+        page = 65536 if page == 1 else page
+        pages = int.from_bytes(head[28:32], "big")
+        if head[24:28] == head[92:96] and size < page * pages:
+            raise damaged(self.path, f"is cut off: it has {size:,} of {page * pages:,} bytes")
+
+    def _channels(self, base: sqlite3.Connection) -> dict[int, Channel]:
+        tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not {"topics", "messages"} <= tables:
+            raise damaged(self.path, "is an sqlite3 file without rosbag2's tables topics and messages")
+        definitions: dict[str, tuple[Any, Any]] = {}
+        if "message_definitions" in tables:
+            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            definitions = {name: (kind, text) for name, kind, text in base.execute(query)}
+        channels = {}
+        for topic_id, topic, kind, encoding in base.execute(
+            "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
+        ):
+            service = str(kind).removesuffix(
+                "_Event"
+            )  # rosbag2 keeps the definition of a service's events there
+            schema_encoding, schema = definitions.get(kind) or definitions.get(service) or ("", "")
+            channels[topic_id] = Channel(
+                str(topic), str(kind), str(encoding), str(schema_encoding), str(schema).encode()
+            )
+        return channels
+
+    def _channel(self, channels: dict[int, Channel], topic_id: Any) -> Channel:
+        if topic_id not in channels:
+            raise ValueError(f"a message is of topic {topic_id}, which is not declared")
+        return channels[topic_id]
