@@ -11,6 +11,7 @@ and the message indexes behind them, which is sure also where the summary leaves
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -41,8 +42,10 @@ from hma_data.sources.bags.mcap_records import (
     METADATA,
     SCHEMA,
     STATISTICS,
+    ChunkHead,
     Declared,
     between,
+    chunk_at,
     chunk_head,
     frame,
     frames,
@@ -114,20 +117,28 @@ class McapFile:
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
-            for chunk_offset, at in places:
-                yield (
-                    loose(file, at) if chunk_offset == LOOSE else message(self._chunk(file, chunk_offset), at)
-                )
+            heads: dict[int, ChunkHead] = {}
+            for offset, at in places:
+                if offset == LOOSE:
+                    yield loose(file, at)
+                    continue
+                if offset not in heads:
+                    heads = {offset: chunk_at(file, offset)}
+                if heads[offset].plain and offset in self._checked:
+                    yield loose(file, heads[offset].at + at)
+                else:
+                    yield message(self._chunk(file, offset), at)
 
     def _chunk(self, file: BinaryIO, at: int) -> memoryview:
-        """Return a chunk, unpacked; check its checksum the first time."""
+        """Return a chunk, unpacked; check its checksum the first time. Only packed ones are kept."""
+        if chunk_at(file, at).plain:
+            return memoryview(self._load(file, at))
+        return self._chunks.get(self.path, at, partial(self._load, file, at))
 
-        def load() -> bytes:
-            chunk = load_chunk(file, at, at not in self._checked)
-            self._checked.add(at)
-            return chunk
-
-        return self._chunks.get(self.path, at, load)
+    def _load(self, file: BinaryIO, at: int) -> bytes:
+        chunk = load_chunk(file, at, at not in self._checked)
+        self._checked.add(at)
+        return chunk
 
     def _survey(self, file: BinaryIO, end: int) -> "Survey":
         if self._surveyed is None:
