@@ -30,7 +30,6 @@ STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<st
 Step = str | int | slice
 SHOWN = 30  # topics or names in an error
 ROS_BYTES = {"byte": "uint8", "char": "uint8", "octet": "uint8"}
-MAX_DEPTH = 32  # messages within messages; protobuf's may hold their own kind
 # By the numbers of FieldDescriptorProto.Type; 14 is an enum.
 PROTOBUF = {
     1: "float64", 2: "float32", 3: "int64", 4: "uint64", 5: "int32", 6: "uint64", 7: "uint32", 8: "bool",
@@ -236,13 +235,13 @@ def stated_dtype(channel: Channel, message: Any, steps: Sequence[Step]) -> str |
     try:
         if channel.encoding in ("ros1", "cdr"):
             store, kind = ros_store(channel)
-            names = set(_ros_dtypes(store, _ros_field(store, kind, steps), 0))
+            names = set(_ros_dtypes(store, _ros_field(store, kind, steps)))
         elif channel.encoding == "protobuf":
             names = set(_protobuf_at(message.DESCRIPTOR, steps))
         else:
             return None
         return str(np.result_type(*sorted(names))) if names else None
-    except (KeyError, TypeError, AttributeError):  # a kind of number that numpy has not
+    except (KeyError, TypeError, AttributeError, RecursionError):  # no number of numpy's; its own kind within
         return None
 
 
@@ -259,19 +258,17 @@ def _ros_field(store: Any, kind: str, steps: Sequence[Step]) -> Any:
     return found
 
 
-def _ros_dtypes(store: Any, field: Any, depth: int) -> Iterator[str]:
+def _ros_dtypes(store: Any, field: Any) -> Iterator[str]:
     from rosbags.interfaces import Nodetype
 
     node, content = field
-    if depth > MAX_DEPTH:
-        raise TypeError("messages within messages without end")
     if node == Nodetype.BASE:
         yield ROS_BYTES.get(content[0], content[0])
     elif node == Nodetype.NAME:
         for _, inner in store.fielddefs[content][1]:
-            yield from _ros_dtypes(store, inner, depth + 1)
+            yield from _ros_dtypes(store, inner)
     else:
-        yield from _ros_dtypes(store, content[0], depth + 1)
+        yield from _ros_dtypes(store, content[0])
 
 
 def _protobuf_at(kind: Any, steps: Sequence[Step]) -> Iterator[str]:
@@ -283,14 +280,12 @@ def _protobuf_at(kind: Any, steps: Sequence[Step]) -> Iterator[str]:
     if kind is None:
         yield PROTOBUF[field.type]
     else:
-        yield from _protobuf_dtypes(kind, 0)
+        yield from _protobuf_dtypes(kind)
 
 
-def _protobuf_dtypes(kind: Any, depth: int) -> Iterator[str]:
-    if depth > MAX_DEPTH:
-        raise TypeError("messages within messages without end")
+def _protobuf_dtypes(kind: Any) -> Iterator[str]:
     for field in kind.fields:
         if field.message_type is None:
             yield PROTOBUF[field.type]
         else:
-            yield from _protobuf_dtypes(field.message_type, depth + 1)
+            yield from _protobuf_dtypes(field.message_type)

@@ -1,16 +1,20 @@
 """Read the records of MCAP files: frames, declarations, chunks, messages. See https://mcap.dev/spec
 
-Chunks that are not packed need not be read whole: their records are walked in the file itself.
+Chunks that are not packed need not be read whole: their records are walked in the file itself. Counts
+are in the file's summary. Where messages lie in time is gathered from the heads of the chunks and the
+message indexes behind them, which is sure also where the summary leaves it out.
 """
 
 import struct
-import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
-from functools import lru_cache
-from importlib import import_module
+from dataclasses import dataclass
 from typing import BinaryIO, NamedTuple
 
+from isal.isal_zlib import crc32
+
 from hma_data.sources.bags.container import (
+    FOREVER,
     HEAD,
     Channel,
     Data,
@@ -21,6 +25,7 @@ from hma_data.sources.bags.container import (
     decompress,
     read_exact,
 )
+from hma_data.sources.bags.time_index import Piece
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
@@ -28,6 +33,9 @@ STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
 FRAME = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 LOOSE = -1  # in a place: the message is in no chunk
+FOOTER_SIZE = FRAME.size + 20
+NOTE_BYTES = 1 << 20  # a metadata record of more is not a note about the episode
+RUN_BYTES = 1 << 20  # of messages outside of chunks that make one piece
 CODEC_BYTES = 32  # a codec's name is no longer
 
 
@@ -140,7 +148,7 @@ def load_chunk(file: BinaryIO, at: int, checked: bool = True) -> bytes:
     head = chunk_at(file, at)
     file.seek(head.at)
     chunk = decompress(head.codec, read_exact(file, head.packed), head.size)
-    if checked and head.checksum and _crc32()(chunk) != head.checksum:
+    if checked and head.checksum and crc32(chunk) != head.checksum:
         raise ValueError("a chunk's checksum does not fit its content")
     return chunk
 
@@ -166,16 +174,6 @@ def chunk_at(file: BinaryIO, at: int) -> ChunkHead:
     if opcode != CHUNK:
         raise ValueError(f"there is no chunk at {at:,}")
     return chunk_head(file, length)
-
-
-@lru_cache(maxsize=1)
-def _crc32() -> Callable[[Data], int]:
-    """Return CRC-32 by ISA-L where the package `isal` is installed: a sixteenth of zlib's time."""
-    try:
-        found: Callable[[Data], int] = import_module("isal.isal_zlib").crc32
-    except ImportError:
-        found = zlib.crc32
-    return found
 
 
 def _in_chunk(
@@ -238,3 +236,142 @@ def _loose(file: BinaryIO, length: int, place: Place, declared: Declared, wanted
     if channel.topic not in wanted.heads and length > len(head):
         head += read_exact(file, length - len(head))
     return Record(channel, log_ns, memoryview(head)[MESSAGE_HEAD.size :], place)
+
+
+# -- summary
+
+
+def stated_counts(file: BinaryIO, end: int) -> Counter[Channel] | None:
+    """Count the messages of each channel as the summary tells; None where it does not tell all of it."""
+    declared = Declared()
+    counted = summary(file, end, declared)
+    if counted is None or not counted.keys() <= declared.channels.keys():
+        return None
+    total: Counter[Channel] = Counter()
+    for number, channel in declared.channels.items():
+        total[channel] += counted.get(number, 0)
+    return total
+
+
+def summary(file: BinaryIO, end: int, declared: Declared) -> dict[int, int] | None:
+    """Learn what the summary repeats; return messages by channel number, None where it does not tell."""
+    start, counted = _summary_start(file, end), None
+    for opcode, _, length in frames(file, start, end) if start else ():
+        if opcode in (SCHEMA, CHANNEL):
+            try:
+                declared.learn(opcode, read_exact(file, length))
+            except ValueError:  # it need not repeat schemas; the chunks tell what is missing
+                return None
+        elif opcode == STATISTICS:
+            counted = _counted(read_exact(file, length))
+    return counted
+
+
+def _summary_start(file: BinaryIO, end: int) -> int:
+    """Return the offset of the summary; 0 where there is none."""
+    opcode, length = frame(file, end)
+    if opcode != FOOTER or length != FOOTER_SIZE - FRAME.size:
+        raise ValueError("there is no footer at the end")
+    start = int.from_bytes(file.read(8), "little")
+    if start and not len(MAGIC) <= start <= end:
+        raise ValueError("the summary is said to lie outside the file")
+    return start
+
+
+def _counted(data: bytes) -> dict[int, int] | None:
+    """Return the messages by channel number in a Statistics record; None where they are left out."""
+    fields = Fields(data)
+    messages = fields.number(8)
+    fields.take(2 + 4 + 4 + 4 + 4 + 8 + 8)
+    entries = Fields(fields.block())
+    counts = {}
+    while entries:
+        number = entries.number(2)
+        counts[number] = entries.number(8)
+    return counts if sum(counts.values()) == messages else None
+
+
+# -- places in time
+
+
+@dataclass
+class _Part:
+    """Hold a piece while it is surveyed; `channels` by number."""
+
+    at: int
+    end: int
+    first_ns: int
+    last_ns: int
+    channels: set[int]
+    chunk: bool
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Hold every piece of the file, the channels of their messages, and what `notes` gives."""
+
+    pieces: list[Piece]
+    declared: Declared
+    notes: dict[str, str]
+
+
+def survey(file: BinaryIO, end: int) -> Survey:
+    """Walk once over the file's records; chunks are unpacked only where no index tells what is in them."""
+    declared = Declared()
+    parts: list[_Part] = []
+    noted: dict[str, str] = {}
+    for opcode, at, length in frames(file, len(MAGIC), end):
+        if opcode in (DATA_END, FOOTER):
+            break
+        if opcode in (SCHEMA, CHANNEL):
+            declared.learn(opcode, read_exact(file, length))
+        elif opcode == METADATA:
+            noted |= _note(file, length)
+        elif opcode == CHUNK:
+            head = chunk_head(file, length)
+            parts.append(_Part(at, at + FRAME.size + length, head.first_ns, head.last_ns, set(), True))
+        elif opcode == MESSAGE_INDEX and parts and parts[-1].chunk:
+            fields = Fields(read_exact(file, min(length, 6)))
+            number = fields.number(2)
+            if fields.number(4):
+                parts[-1].channels.add(number)
+        elif opcode == MESSAGE:
+            number, log_ns = message_head(read_exact(file, min(length, MESSAGE_HEAD.size)))
+            _add_loose(parts, at, at + FRAME.size + length, number, log_ns)
+    summary(file, end, declared)
+    return Survey([_piece(file, part, declared) for part in parts], declared, noted)
+
+
+def _note(file: BinaryIO, length: int) -> dict[str, str]:
+    """Return the entries of the metadata record whose content begins where the file stands."""
+    if length > NOTE_BYTES:
+        return {}
+    fields = Fields(read_exact(file, length))
+    fields.text()  # the record's name
+    entries, found = Fields(fields.block()), {}
+    while entries:
+        key = entries.text()
+        found[key] = entries.text()
+    return found
+
+
+def _add_loose(parts: list[_Part], at: int, end: int, number: int, log_ns: int) -> None:
+    last = parts[-1] if parts else None
+    if last is None or last.chunk or end - last.at > RUN_BYTES:
+        parts.append(_Part(at, end, log_ns, log_ns, {number}, False))
+        return
+    last.end = end
+    last.first_ns, last.last_ns = min(last.first_ns, log_ns), max(last.last_ns, log_ns)
+    last.channels.add(number)
+
+
+def _piece(file: BinaryIO, part: _Part, declared: Declared) -> Piece:
+    told = part.channels and part.last_ns and part.channels <= declared.channels.keys()
+    if told or not part.chunk:
+        topics = {declared.channel(number).topic for number in part.channels}
+        return Piece(part.at, part.end, part.first_ns, part.last_ns, frozenset(topics))
+    first_ns, last_ns, topics = FOREVER, -1, set()  # no index: its channels may be declared nowhere else
+    for record in between(file, part.at, part.end, declared, Wanted(), load_chunk):
+        first_ns, last_ns = min(first_ns, record.log_ns), max(last_ns, record.log_ns)
+        topics.add(record.channel.topic)
+    return Piece(part.at, part.end, first_ns, last_ns, frozenset(topics))

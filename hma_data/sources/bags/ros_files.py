@@ -36,9 +36,8 @@ from hma_data.sources.bags.container import (
 from hma_data.sources.bags.time_index import Piece, last_before, overlapping, take_last
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
+MESSAGE, BAG, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x05, 0x06, 0x07
 HEADER_BYTES = 1 << 16  # a record's header is no longer
-SAMPLE_BYTES = 12  # an entry of an index record: time, offset
 TIME = struct.Struct("<II")
 Header = dict[str, memoryview]
 SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -60,19 +59,14 @@ class Ros1File:
     def counts(self) -> Counter[Channel]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
-            index = self._index(file)
-            if index:
-                return index.counts()
-        return Counter(record.channel for record in self.records(Wanted()))
+            return self._survey(file).counts()
 
     def records(self, wanted: Wanted) -> Iterator[Record]:
-        """See Container; chunks without a wanted message are not unpacked where an index says so."""
+        """See Container; chunks without a wanted message are not unpacked."""
         with reading(self.path), self.path.open("rb") as file:
-            index = self._survey(file) if wanted.bounded else self._index(file)
-            channels = index.channels if index else {}
-            found = (piece.at for piece in overlapping(index.pieces(), wanted)) if index else None
-            for at in found or _scan(file, channels):
-                yield from _in_chunk(file, at, channels, wanted, self._chunk)
+            index = self._survey(file)
+            for piece in overlapping(index.pieces(), wanted):
+                yield from _in_chunk(file, piece.at, index.channels, wanted, self._chunk)
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
         """See Container."""
@@ -116,11 +110,8 @@ class Ros1File:
         if bytes(header.get("encryptor", b"")):
             raise ValueError("it is encrypted")
         at = _number(header, "index_pos")
-        return (
-            _read_index(file, at, _number(header, "conn_count"), _number(header, "chunk_count"))
-            if at
-            else None
-        )
+        count = _number(header, "conn_count") + _number(header, "chunk_count")
+        return _read_index(file, at, count) if at else None
 
 
 class _ChunkHead(NamedTuple):
@@ -168,11 +159,9 @@ class _Index:
     def pieces(self) -> list[Piece]:
         """Return a piece for each chunk; its offset is told, not its end."""
         if not self._pieces:
-            kinds: dict[frozenset[str], frozenset[str]] = {}
             for at, info in sorted(self.chunks.items()):
                 topics = frozenset(_declared(self.channels, number).topic for number in info.counts)
-                held = kinds.setdefault(topics, topics)
-                self._pieces.append(Piece(at, at, info.first_ns, info.last_ns, held))
+                self._pieces.append(Piece(at, at, info.first_ns, info.last_ns, topics))
         return self._pieces
 
 
@@ -230,9 +219,9 @@ def _declared(channels: dict[int, Channel], number: int) -> Channel:
     return channels[number]
 
 
-def _read_index(file: BinaryIO, at: int, connections: int, chunks: int) -> _Index:
+def _read_index(file: BinaryIO, at: int, count: int) -> _Index:
     index = _Index()
-    for _ in range(connections + chunks):
+    for _ in range(count):
         header, size, content_at = _record(file, at)
         content = read_exact(file, size)
         at = content_at + size
@@ -250,33 +239,21 @@ def _read_index(file: BinaryIO, at: int, connections: int, chunks: int) -> _Inde
 
 
 def _made_index(file: BinaryIO) -> _Index:
-    """Make the index of a bag without one, from index records behind its chunks, else from messages."""
-    index, followed = _Index(), set()
-    chunk_at = 0
-    for at, header, size in _records(file):
+    """Make the index of a bag without one, from its messages; every chunk is unpacked for it."""
+    index, at, end = _Index(), len(ROS1_MAGIC), file.seek(0, 2)
+    while at < end:
+        header, size, content_at = _record(file, at)
+        if content_at + size > end:
+            raise EOFError(f"the file ends {content_at + size - end:,} bytes before a record does")
         kind = _number(header, "op")
         if kind == CONNECTION:
             _learn(index.channels, header, read_exact(file, size))
         elif kind == CHUNK:
-            chunk_at = at
-            index.chunks[at] = _ChunkInfo(FOREVER, -1, {})
-        elif kind == INDEX and chunk_at:
-            _count(index.chunks[chunk_at], header, read_exact(file, size))
-            followed.add(chunk_at)
-    for at, info in index.chunks.items():
-        if at not in followed or not info.counts.keys() <= index.channels.keys():
             index.chunks[at] = _counted(file, at, index.channels)
+        elif kind == MESSAGE:
+            raise ValueError("a message outside a chunk")
+        at = content_at + size
     return index
-
-
-def _count(info: _ChunkInfo, header: Header, entries: Data) -> None:
-    """Take an index record: times and offsets of a connection's messages in the chunk before it."""
-    if len(entries) % SAMPLE_BYTES or not entries:
-        raise ValueError("an index record has half an entry")
-    times = [s * 10**9 + ns for s, ns, _ in struct.iter_unpack("<III", entries)]
-    info.first_ns, info.last_ns = min(info.first_ns, *times), max(info.last_ns, *times)
-    number = _number(header, "conn")
-    info.counts[number] = info.counts.get(number, 0) + len(times)
 
 
 def _counted(file: BinaryIO, at: int, channels: dict[int, Channel]) -> _ChunkInfo:
@@ -286,29 +263,6 @@ def _counted(file: BinaryIO, at: int, channels: dict[int, Channel]) -> _ChunkInf
         number = next(number for number, channel in channels.items() if channel == record.channel)
         info.counts[number] = info.counts.get(number, 0) + 1
     return info
-
-
-def _records(file: BinaryIO) -> Iterator[tuple[int, Header, int]]:
-    """Yield offset, header and content size of the records to the file's end; the file is at the content."""
-    at, end = len(ROS1_MAGIC), file.seek(0, 2)
-    while at < end:
-        header, size, content_at = _record(file, at)
-        if content_at + size > end:
-            raise EOFError(f"the file ends {content_at + size - end:,} bytes before a record does")
-        yield at, header, size
-        at = content_at + size
-
-
-def _scan(file: BinaryIO, channels: dict[int, Channel]) -> Iterator[int]:
-    """Yield offsets of the chunks of a bag without index, to the file's end; learn connections."""
-    for at, header, size in _records(file):
-        kind = _number(header, "op")
-        if kind == CONNECTION:
-            _learn(channels, header, read_exact(file, size))
-        elif kind == CHUNK:
-            yield at
-        elif kind == MESSAGE:
-            raise ValueError("a message outside a chunk")
 
 
 def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
