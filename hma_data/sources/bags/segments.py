@@ -90,6 +90,11 @@ class Table:
         return self.frames - sum(map(len, self.segments))
 
 
+# by process: a child that was forked must not clean up after its parent
+_bags: dict[int, OrderedDict[Key, Bag]] = {}
+_tables: OrderedDict[Key, Table] = OrderedDict()
+
+
 def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -> tuple[Bag, Table]:
     """Return the bag and its episodes, kept ones where no file changed.
 
@@ -110,55 +115,6 @@ def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -
     while len(_tables) > KEPT_TABLES:
         _tables.popitem(last=False)
     return bag, table
-
-
-# by process: a child that was forked must not clean up after its parent
-_bags: dict[int, OrderedDict[Key, Bag]] = {}
-_tables: OrderedDict[Key, Table] = OrderedDict()
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Describe one episode: pictures `first` to `stop` of the primary camera.
-
-    Attributes:
-        first_ns, last_ns: receipt of its first and last picture.
-        skip: pictures before it that were received at first_ns too.
-    """
-
-    first: int
-    stop: int
-    first_ns: int
-    last_ns: int
-    skip: int
-
-    def __len__(self) -> int:
-        return self.stop - self.first
-
-
-@dataclass(frozen=True)
-class Table:
-    """List the episodes of a bag.
-
-    Attributes:
-        frames: pictures of the primary camera in the whole bag.
-        clock: of that camera, header or receive.
-        reach_ns: how far from an episode's receipt times a message of it may have been received.
-        empty: parts without a picture, which are no episodes.
-        keyframes: camera of video -> receipt of its key frames, ascending; empty where none can be told.
-    """
-
-    segments: tuple[Segment, ...]
-    frames: int
-    clock: str
-    reach_ns: int
-    empty: int = 0
-    keyframes: dict[str, NDArray[np.int64]] = field(default_factory=dict)
-
-    @property
-    def left_out(self) -> int:
-        """Count the pictures that are in no episode."""
-        return self.frames - sum(map(len, self.segments))
 
 
 def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
