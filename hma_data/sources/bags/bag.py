@@ -22,8 +22,8 @@ from hma_data.sources.bags.container import (
     reading,
     unzstd,
 )
+from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
-from hma_data.sources.bags.mcap_records import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.ros_files import SQLITE_MAGIC, Ros1File, SqliteFile
 from hma_data.sources.base import file_fingerprint, first_bytes, leaves
 from hma_data.yaml_io import read_yaml

@@ -380,26 +380,22 @@ class H264Count:
         return whole
 
     def _unit(self, unit: bytes) -> bool:
-        kind, reference = unit[0] & 31, bool(unit[0] >> 5 & 3)
-        bits = _Bits(unit[1:97])
+        kind, reference, bits = unit[0] & 31, bool(unit[0] >> 5 & 3), _Bits(unit[1:97])
         if kind == 7:
             self._sequence(bits)
         elif kind == 8:
             number = bits.ue()
             self._of[number] = bits.ue()
-        elif kind in (1, 2, 5) and not bits.ue():  # the picture's first slice
-            return self._slice(bits, kind == 5, reference)
-        return True
-
-    def _slice(self, bits: "_Bits", first: bool, reference: bool) -> bool:
+        if kind not in (1, 2, 5) or bits.ue():  # not the first slice of a picture
+            return True
         bits.ue()  # its type
         size = self._bits.get(self._of.get(bits.ue(), 0))
         if size is None:
             return True
         number, before = bits.u(size), self._last
-        if reference or first:
+        if reference or kind == 5:
             self._last = number
-        return first or before is None or number in (before, (before + 1) % (1 << size))
+        return kind == 5 or before is None or number in (before, (before + 1) % (1 << size))
 
     def _sequence(self, bits: "_Bits") -> None:
         """Take a sequence parameter set; what is rare in live video is not counted."""
