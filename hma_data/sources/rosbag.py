@@ -154,12 +154,7 @@ class _EpisodeReading:
     """
 
     def __init__(
-        self,
-        bag: Bag,
-        episode_id: str,
-        embodiment: Embodiment,
-        table: Table | None = None,
-        number: int = 0,
+        self, bag: Bag, episode_id: str, embodiment: Embodiment, table: Table | None = None, number: int = 0
     ) -> None:
         self._bag, self._id, self._embodiment = bag, episode_id, embodiment
         self._table, self._number = table, number

@@ -49,11 +49,7 @@ CODEC_BYTES = 32  # a codec's name is no longer
 
 
 class McapFile:
-    """Read one MCAP file; see Container.
-
-    Args:
-        chunks: where unpacked chunks are kept; shared by the files of a bag.
-    """
+    """Read one MCAP file, its packed chunks kept unpacked in `chunks`; see Container."""
 
     def __init__(self, path: Path, chunks: ChunkCache | None = None) -> None:
         self.path = path

@@ -45,11 +45,7 @@ LATEST = 2**63 - 1  # of an sqlite3 integer
 
 
 class Ros1File:
-    """Read one ROS 1 bag; see Container.
-
-    Args:
-        chunks: where unpacked chunks are kept; shared by the files of a bag.
-    """
+    """Read one ROS 1 bag, its unpacked chunks kept in `chunks`; see Container."""
 
     def __init__(self, path: Path, chunks: ChunkCache | None = None) -> None:
         self.path = path
@@ -59,13 +55,13 @@ class Ros1File:
     def counts(self) -> Counter[Channel]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
-            return self._survey(file).counts()
+            return self._survey(file).counts.copy()
 
     def records(self, wanted: Wanted) -> Iterator[Record]:
         """See Container; chunks without a wanted message are not unpacked."""
         with reading(self.path), self.path.open("rb") as file:
             index = self._survey(file)
-            for piece in overlapping(index.pieces(), wanted):
+            for piece in overlapping(index.pieces, wanted):
                 yield from _in_chunk(file, piece.at, index.channels, wanted, self._chunk)
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
@@ -73,7 +69,7 @@ class Ros1File:
         with reading(self.path), self.path.open("rb") as file:
             index = self._survey(file)
             return last_before(
-                index.pieces(),
+                index.pieces,
                 topics,
                 log_ns,
                 lambda piece, wanted: _in_chunk(file, piece.at, index.channels, wanted, self._chunk),
@@ -133,36 +129,18 @@ Load = Callable[[BinaryIO, _ChunkHead], Data]
 
 
 @dataclass
-class _ChunkInfo:
-    """Hold when the messages of a chunk were received, and how many there are of each connection."""
-
-    first_ns: int
-    last_ns: int
-    counts: dict[int, int]
-
-
-@dataclass
 class _Index:
-    """Hold connections by number, and what is in the chunk at each offset."""
+    """Hold connections by number, how many messages each has, and a piece for each chunk, without its end."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: dict[int, _ChunkInfo] = field(default_factory=dict)
-    _pieces: list[Piece] = field(default_factory=list)
+    counts: Counter[Channel] = field(default_factory=Counter)
+    pieces: list[Piece] = field(default_factory=list)
 
-    def counts(self) -> Counter[Channel]:
-        total: Counter[Channel] = Counter(dict.fromkeys(self.channels.values(), 0))
-        for info in self.chunks.values():
-            for number, count in info.counts.items():
-                total[_declared(self.channels, number)] += count
-        return total
-
-    def pieces(self) -> list[Piece]:
-        """Return a piece for each chunk; its offset is told, not its end."""
-        if not self._pieces:
-            for at, info in sorted(self.chunks.items()):
-                topics = frozenset(_declared(self.channels, number).topic for number in info.counts)
-                self._pieces.append(Piece(at, at, info.first_ns, info.last_ns, topics))
-        return self._pieces
+    def add(self, at: int, first_ns: int, last_ns: int, counts: Counter[Channel]) -> None:
+        """Take the chunk at that offset."""
+        self.counts.update(counts)
+        topics = frozenset(channel.topic for channel in counts)
+        self.pieces.append(Piece(at, at, first_ns, last_ns, topics))
 
 
 def _record(file: BinaryIO, at: int) -> tuple[Header, int, int]:
@@ -220,7 +198,7 @@ def _declared(channels: dict[int, Channel], number: int) -> Channel:
 
 
 def _read_index(file: BinaryIO, at: int, count: int) -> _Index:
-    index = _Index()
+    index, chunks = _Index(), list[tuple[Header, bytes]]()
     for _ in range(count):
         header, size, content_at = _record(file, at)
         content = read_exact(file, size)
@@ -229,12 +207,16 @@ def _read_index(file: BinaryIO, at: int, count: int) -> _Index:
         if kind == CONNECTION:
             _learn(index.channels, header, content)
         elif kind == CHUNK_INFO:
-            fields = Fields(content)
-            counts = {fields.number(4): fields.number(4) for _ in range(_number(header, "count"))}
-            first_ns, last_ns = _time(header, "start_time"), _time(header, "end_time")
-            index.chunks[_number(header, "chunk_pos")] = _ChunkInfo(first_ns, last_ns, counts)
+            chunks.append((header, content))
         else:
             raise ValueError(f"the index holds a record of kind {kind}")
+    index.counts.update(dict.fromkeys(index.channels.values(), 0))
+    for header, content in sorted(chunks, key=lambda chunk: _number(chunk[0], "chunk_pos")):
+        fields, counts = Fields(content), Counter[Channel]()
+        for _ in range(_number(header, "count")):
+            counts[_declared(index.channels, fields.number(4))] += fields.number(4)
+        first_ns, last_ns = _time(header, "start_time"), _time(header, "end_time")
+        index.add(_number(header, "chunk_pos"), first_ns, last_ns, counts)
     return index
 
 
@@ -249,20 +231,15 @@ def _made_index(file: BinaryIO) -> _Index:
         if kind == CONNECTION:
             _learn(index.channels, header, read_exact(file, size))
         elif kind == CHUNK:
-            index.chunks[at] = _counted(file, at, index.channels)
+            times, counts = [FOREVER, -1], Counter[Channel]()
+            for record in _in_chunk(file, at, index.channels, Wanted(), _load_chunk):
+                times = [min(times[0], record.log_ns), max(times[1], record.log_ns)]
+                counts[record.channel] += 1
+            index.add(at, times[0], times[1], counts)
         elif kind == MESSAGE:
             raise ValueError("a message outside a chunk")
         at = content_at + size
     return index
-
-
-def _counted(file: BinaryIO, at: int, channels: dict[int, Channel]) -> _ChunkInfo:
-    info = _ChunkInfo(FOREVER, -1, {})
-    for record in _in_chunk(file, at, channels, Wanted(), _load_chunk):
-        info.first_ns, info.last_ns = min(info.first_ns, record.log_ns), max(info.last_ns, record.log_ns)
-        number = next(number for number, channel in channels.items() if channel == record.channel)
-        info.counts[number] = info.counts.get(number, 0) + 1
-    return info
 
 
 def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
@@ -388,8 +365,7 @@ class SqliteFile:
             for topic_id, channel in self._channels(base).items():
                 rows = base.execute(query, (min(log_ns, LATEST), topic_id)) if channel.topic in topics else ()
                 take_last(
-                    found,
-                    (Record(channel, at, self._data(base, row, None), (0, row)) for row, _, at in rows),
+                    found, (Record(channel, at, self._data(base, row, None), (0, row)) for row, _, at in rows)
                 )
         return found
 
