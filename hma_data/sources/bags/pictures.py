@@ -302,7 +302,7 @@ class VideoDecoder:
             self._made_without[index] = self._lost
 
     def _decode(self, data: bytes | None, wanted: int) -> None:
-        """Give the decoder its next message, or with None lets it finish."""
+        """Give the decoder its next message, or with None let it finish."""
         import av
 
         if self._context is None:

@@ -15,18 +15,18 @@ class Piece(NamedTuple):
 
     Attributes:
         first_ns, last_ns: earliest and latest receipt of its messages.
-        topics: of them; None where the file does not tell.
+        topics: of them.
     """
 
     at: int
     end: int
     first_ns: int
     last_ns: int
-    topics: frozenset[str] | None
+    topics: frozenset[str]
 
     def holds(self, topics: frozenset[str] | None) -> bool:
         """Check whether a message of those topics can be in it."""
-        return topics is None or self.topics is None or not self.topics.isdisjoint(topics)
+        return topics is None or not self.topics.isdisjoint(topics)
 
 
 Load = Callable[[Piece, Wanted], Iterator[Record]]
