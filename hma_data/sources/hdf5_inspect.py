@@ -10,9 +10,9 @@ import h5py
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
-from hma_data.sources import clocks, looks
+from hma_data.sources import image_checks, timestamp_checks
 from hma_data.sources.base import Inspection, KeyInfo, local_path
-from hma_data.sources.facts import is_times, one_channel, seconds_a_unit, seconds_of
+from hma_data.sources.dtype_hints import is_times, one_channel, seconds_a_unit, seconds_of
 from hma_data.sources.findings import Finding
 from hma_data.sources.hdf5 import TEXT_KEYS, as_rgb, encoded, environment, picture_kind
 from hma_data.sources.hdf5_file import (
@@ -64,7 +64,7 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
         survey.note(link)
     lengths: dict[str, int] = {}
     held: Counter[str] = Counter()
-    pairs = max(1, looks.PAIRS // len(chosen))
+    pairs = max(1, image_checks.PAIRS // len(chosen))
     for name in [*order[:LENGTHS], *(name for name in order[LENGTHS:] if name in chosen)]:
         place = found[name]
         try:
@@ -141,12 +141,12 @@ def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, fir
         survey.made.add("rate")
         measured = first.facts["rate"].startswith(_MEASURED)
         source = f"{first.name} at" if measured else "the recording states"
-        for found in clocks.drift(f"{name}: {key}", clock.hz, first.rate, source):
+        for found in timestamp_checks.drift(f"{name}: {key}", clock.hz, first.rate, source):
             survey.note(found)
 
 
 def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int) -> None:
-    for run in looks.runs(looks.choose(item.shape[0], pairs)):
+    for run in image_checks.runs(image_checks.choose(item.shape[0], pairs)):
         found = rows(item, run)
         if info.codec == "raw":
             survey.pictures(name, key, as_rgb(found), run, info.codec)
@@ -154,7 +154,7 @@ def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Su
         pictures = [
             decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, run, strict=True)
         ]
-        for start, frames in looks.stacked(pictures):
+        for start, frames in image_checks.stacked(pictures):
             survey.pictures(name, key, frames, run[start : start + len(frames)], info.codec)
 
 

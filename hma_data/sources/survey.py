@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from hma_data.episode import Floats
 from hma_data.errors import HMAError
-from hma_data.sources import clocks, looks
+from hma_data.sources import image_checks, timestamp_checks
 from hma_data.sources.base import KeyInfo
-from hma_data.sources.clocks import Clock
 from hma_data.sources.findings import Finding, Severity
-from hma_data.sources.looks import Look
+from hma_data.sources.image_checks import Look
+from hma_data.sources.timestamp_checks import Clock
 from hma_data.video import Images
 
 CHECKS = {  # what a look at a recording can check, in the order it is printed
@@ -162,7 +162,7 @@ class Survey:
         """The times (T,) of one key of an episode, in the order of receipt."""
         self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
         held = self._times.setdefault(key, _Times(camera=camera))
-        held.met[name] = clocks.clock_of(seconds)
+        held.met[name] = timestamp_checks.clock_of(seconds)
         return held.met[name]
 
     def skew(self, key: str, found: tuple[float, float, float] | None, period_s: float) -> None:
@@ -196,7 +196,7 @@ class Survey:
             rates = [clock.hz for clock in times.met.values() if clock.hz]
             jitters = [clock.jitter_ms for clock in times.met.values() if clock.jitter_ms is not None]
             measured = float(np.median(rates)) if rates else None
-            stated = info.hz and any(abs(one / info.hz - 1) <= clocks.DRIFT for one in rates)
+            stated = info.hz and any(abs(one / info.hz - 1) <= timestamp_checks.DRIFT for one in rates)
             info = replace(
                 info,
                 hz=info.hz if stated or not measured else measured,
@@ -211,7 +211,7 @@ class Survey:
         """Everything that was found, check by check."""
         found = [
             *self._readable(), *_merged(self._extra), *self._keys(), *self._rows(), *self._clocks(),
-            *self._finite(), *self._constant(keys), *looks.findings(self.looks),
+            *self._finite(), *self._constant(keys), *image_checks.findings(self.looks),
         ]  # fmt: skip
         order = list(CHECKS)
         return tuple(sorted(found, key=lambda one: order.index(one.check) if one.check in order else 99))
@@ -254,7 +254,7 @@ class Survey:
             worst: dict[str, Finding] = {}
             counts: Counter[str] = Counter()
             for name, clock in held.met.items():
-                for one in clocks.findings(key, clock, held.camera, "" if self.alone else name):
+                for one in timestamp_checks.findings(key, clock, held.camera, "" if self.alone else name):
                     worst.setdefault(one.check, one)
                     counts[one.check] += 1
             for check, one in worst.items():

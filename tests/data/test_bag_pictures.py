@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.pictures import picture
-from hma_data.sources.bags.video import VideoDecoder
+from hma_data.sources.bags.pictures import VideoDecoder, picture
 from tests.data.bag_files import SOURCE, arm, read
 from tests.data.test_video_kinds import make
 
@@ -224,8 +223,7 @@ def test_key_frames_of_every_codec_are_told(
 ) -> None:
     from hma_data.sources.bags.bag import Bag
     from hma_data.sources.bags.messages import decode
-    from hma_data.sources.bags.pictures import payload
-    from hma_data.sources.bags.video import is_keyframe
+    from hma_data.sources.bags.pictures import is_keyframe, payload
 
     pictures = write_video(tmp_path / "v.mcap", codec, name, options)
     records = Bag(tmp_path / "v.mcap").records(frozenset({"/video"}))

@@ -128,9 +128,9 @@ def test_messages_out_of_order_come_in_order_of_receipt(tmp_path: Path) -> None:
         writer.finish()
     with path.open("rb") as file:
         expected = [json.loads(message.data)["value"] for _, _, message in make_reader(file).iter_messages()]
-    from hma_data.sources.bags.track import Track
+    from hma_data.sources.bags.topic_track import TopicTrack
 
-    track, values = Track("/n"), []
+    track, values = TopicTrack("/n"), []
     for place, record in Bag(path).records():
         message = decode(record.channel, record.data, "")
         track.add(record.channel, record.log_ns, place, message)

@@ -1,4 +1,4 @@
-"""A bag: one recording, in one file or in a ROS 2 folder of several, told apart by content."""
+"""Open a bag: one recording, in one file or in a ROS 2 folder of several, told apart by content."""
 
 import os
 import tempfile
@@ -10,10 +10,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.chunks import ChunkCache
 from hma_data.sources.bags.container import (
     MAX_CHUNK,
     Channel,
+    ChunkCache,
     Container,
     Data,
     Record,
@@ -22,11 +22,9 @@ from hma_data.sources.bags.container import (
     reading,
     unzstd,
 )
+from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
-from hma_data.sources.bags.mcap_records import MAGIC as MCAP_MAGIC
-from hma_data.sources.bags.ros1 import Ros1File
-from hma_data.sources.bags.sqlite import MAGIC as SQLITE_MAGIC
-from hma_data.sources.bags.sqlite import SqliteFile
+from hma_data.sources.bags.ros_files import SQLITE_MAGIC, Ros1File, SqliteFile
 from hma_data.sources.base import file_fingerprint, first_bytes, leaves
 from hma_data.yaml_io import read_yaml
 
@@ -35,7 +33,7 @@ MAX_EXPANSION = 200  # a file that unpacks to more than so many times its size i
 
 
 class Place(NamedTuple):
-    """Where a message is: which file of the bag, and the place in it."""
+    """Say where a message is: which file of the bag, and the place in it."""
 
     file: int
     first: int
@@ -43,7 +41,7 @@ class Place(NamedTuple):
 
 
 class Bag:
-    """One recording. Cheap to make; holds no open files, and unpacked chunks up to a fixed size.
+    """Read one recording. Cheap to make; holds no open files, and unpacked chunks up to a fixed size.
 
     Args:
         path: a bag file, or a folder with rosbag2's metadata.yaml.
@@ -71,14 +69,14 @@ class Bag:
         self._counts: Counter[Channel] | None = None
 
     def files(self) -> list[Container]:
-        """Its files in recording order; packed ones (.zstd) are unpacked to a temporary folder first."""
+        """Return its files in recording order; packed ones (.zstd) are unpacked to a temporary folder."""
         if self._files is None:
             chunks = ChunkCache()
             self._files = [_container(self._plain(path), chunks) for path in self._paths]
         return self._files
 
     def notes(self) -> dict[str, str]:
-        """What MCAP metadata records say of it; empty for the other kinds."""
+        """Return what MCAP metadata records say of it; empty for the other kinds."""
         found: dict[str, str] = {}
         for file in self.files():
             if isinstance(file, McapFile):
@@ -86,7 +84,7 @@ class Bag:
         return found
 
     def counts(self) -> Counter[Channel]:
-        """Messages of each channel, from indexes where there are any."""
+        """Count the messages of each channel, from indexes where there are any."""
         if self._counts is None:
             self._counts = self._count()
         return self._counts.copy()
@@ -101,11 +99,11 @@ class Bag:
         return total
 
     def records(self, topics: frozenset[str] | None = None) -> Iterator[tuple[Place, Record]]:
-        """The messages of those topics (of all, with None), file by file."""
+        """Yield the messages of those topics (of all, with None), file by file."""
         return self.wanted(Wanted(topics))
 
     def wanted(self, wanted: Wanted) -> Iterator[tuple[Place, Record]]:
-        """The wanted messages, file by file; a part of the time costs about its own bytes."""
+        """Yield the wanted messages, file by file; a part of the time costs about its own bytes."""
         if self._message_packed:
             wanted = replace(wanted, heads=frozenset())
         for number, file in enumerate(self.files()):
@@ -113,7 +111,7 @@ class Bag:
                 yield Place(number, *record.place), self._plain_record(record)
 
     def before(self, topics: frozenset[str], log_ns: int) -> list[tuple[Place, Record]]:
-        """Of each topic the last message received before that time, from the last file that has one."""
+        """Return each topic's last message received before that time, from the last file that has one."""
         found: dict[str, tuple[Place, Record]] = {}
         for number, file in reversed(list(enumerate(self.files()))):
             missing = topics - found.keys()
@@ -125,18 +123,18 @@ class Bag:
         return record._replace(data=self._unpack(record.data)) if self._message_packed else record
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
-        """The data of the messages at those places, in that order; each until the next is asked for."""
+        """Yield the data of the messages at those places, in that order."""
         files = self.files()
         for number, group in groupby(places, key=lambda place: place.file):
             for data in files[number].payloads([(place.first, place.second) for place in group]):
                 yield self._unpack(data) if self._message_packed else data
 
     def fingerprint(self) -> str:
-        """Changes when a byte does; see EpisodeRef."""
+        """Return what changes when a byte does; see EpisodeRef."""
         return "-".join(file_fingerprint(path) for path in self._paths)
 
     def state(self) -> tuple[tuple[str, ...], ...]:
-        """Equal only while no file of the bag changes; for what is kept of it in memory."""
+        """Return what is equal only while no file of the bag changes; for what is kept of it in memory."""
         found = []
         with reading(self.path):
             for path in [*self._paths, *(item for item in map(_log, self._paths) if item.is_file())]:
@@ -182,7 +180,7 @@ class Bag:
 
 
 def find_bags(root: Path) -> dict[str, Path]:
-    """Episode id -> bag at or under that path, in order of the ids.
+    """Return episode id -> bag at or under that path, in order of the ids.
 
     An id is the path relative to `root` without suffix; the suffix stays where two would be equal.
     A folder with rosbag2's metadata.yaml is one bag; elsewhere every bag file is.
@@ -206,7 +204,7 @@ def find_bags(root: Path) -> dict[str, Path]:
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Whether the folder is a ROS 2 bag."""
+    """Check whether the folder is a ROS 2 bag."""
     return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 4096)
 
 
@@ -230,7 +228,7 @@ def _refuse_link(path: Path, root: Path) -> None:
 
 
 def _log(path: Path) -> Path:
-    """Where sqlite3 keeps what is not merged yet."""
+    """Return where sqlite3 keeps what is not merged yet."""
     return path.with_name(path.name + "-wal")
 
 
@@ -257,7 +255,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
-    """The files metadata.yaml names, by their last name alone: older versions put the folder before it."""
+    """List the files metadata.yaml names, by their last name: older versions put the folder before it."""
     where = folder / "metadata.yaml"
     names = metadata.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):

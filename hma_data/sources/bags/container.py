@@ -1,4 +1,4 @@
-"""What the three kinds of bag file have in common.
+"""Define what the three kinds of bag file share: the contract, records, chunks, binary fields.
 
 A container is one file. It yields the messages of wanted topics in the file's order, tells how
 many there are without reading them where it has an index, and finds a message again by its
@@ -9,8 +9,8 @@ between calls.
 import bz2
 import sqlite3
 import struct
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import BinaryIO, NamedTuple, Protocol
 
 from hma_data.errors import EpisodeError
 
+CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
 MAX_CHUNK = 512 << 20  # bytes; a chunk that unpacks to more is a bomb or an error
 FOREVER = 2**64
 HEAD = 64  # bytes: the stamp of a message is within them
@@ -32,7 +33,7 @@ Place = tuple[int, int]
 
 @dataclass(frozen=True)
 class Channel:
-    """A topic as one writer declared it.
+    """Describe a topic as one writer declared it.
 
     Attributes:
         type: of its messages, "sensor_msgs/msg/JointState" or as the schema names it.
@@ -49,7 +50,7 @@ class Channel:
 
 
 class Record(NamedTuple):
-    """A message as stored: `log_ns` is when it was received, `place` where `payloads` finds it again."""
+    """Hold a message as stored: `log_ns` is when it was received, `place` where `payloads` finds it again."""
 
     channel: Channel
     log_ns: int
@@ -59,60 +60,58 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which messages are asked of a container.
+    """Say which messages are asked of a container.
 
     Attributes:
         topics: None for all.
         first_ns, last_ns: received from the one to the other, both included.
         heads: topics of whose messages the first HEAD bytes will do; more may come.
-        checked: whether a checksum must be looked at also where no head is met, whose message is read later.
     """
 
     topics: frozenset[str] | None = None
     first_ns: int = 0
     last_ns: int = FOREVER
     heads: frozenset[str] = frozenset()
-    checked: bool = True
 
     @property
     def bounded(self) -> bool:
-        """Whether a part of the recording's time is asked for."""
+        """Check whether a part of the recording's time is asked for."""
         return self.first_ns > 0 or self.last_ns < FOREVER
 
     def topic(self, name: str) -> bool:
-        """Whether messages of that topic are asked for."""
+        """Check whether messages of that topic are asked for."""
         return self.topics is None or name in self.topics
 
     def time(self, log_ns: int) -> bool:
-        """Whether a message received then is asked for."""
+        """Check whether a message received then is asked for."""
         return self.first_ns <= log_ns <= self.last_ns
 
 
 class Container(Protocol):
-    """One file of a bag. Every method raises EpisodeError when the file is damaged."""
+    """Read one file of a bag. Every method raises EpisodeError when the file is damaged."""
 
     path: Path
 
     def counts(self) -> Counter[Channel]:
-        """Messages of each channel, from the index where there is one; channels without any included."""
+        """Count the messages of each channel, from the index where there is one; also those without any."""
         ...
 
     def records(self, wanted: Wanted) -> Iterator[Record]:
-        """Those messages, in the file's order."""
+        """Yield those messages, in the file's order."""
         ...
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
-        """Of each topic the last message received before that time; topics without one are left out."""
+        """Return each topic's last message before that time; topics without one are left out."""
         ...
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
-        """The data of the messages at those places; each is there until the next is asked for."""
+        """Yield the data of the messages at those places."""
         ...
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Whatever goes wrong inside is told as damage of that file."""
+    """Tell whatever goes wrong inside as damage of that file."""
     try:
         yield
     except FAULTS as fault:
@@ -121,86 +120,59 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def damaged(path: Path, fault: str) -> EpisodeError:
-    """The error of a file that cannot be read to its end."""
+    """Return the error of a file that cannot be read to its end."""
     return EpisodeError(
         path, fault, "copy it again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
     )
 
 
-def decompress(codec: str, data: Data, into: memoryview) -> None:
-    """Fills `into` with what was packed.
+class ChunkCache:
+    """Keep the chunks of one bag that were unpacked last: at most CACHED_BYTES of them, and always one."""
+
+    def __init__(self) -> None:
+        self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()
+        self._bytes = 0
+
+    def get(self, path: Path, offset: int, load: Callable[[], bytes]) -> memoryview:
+        """Return the chunk at that offset of that file; `load` unpacks it where it is not kept."""
+        key = (path, offset)
+        if key in self._chunks:
+            self._chunks.move_to_end(key)
+            return memoryview(self._chunks[key])
+        chunk = self._chunks[key] = load()
+        self._bytes += len(chunk)
+        while self._bytes > CACHED_BYTES and len(self._chunks) > 1:
+            self._bytes -= len(self._chunks.popitem(last=False)[1])
+        return memoryview(chunk)
+
+
+def decompress(codec: str, data: bytes, size: int) -> bytes:
+    """Return the `size` bytes that a chunk unpacks to.
 
     Raises:
-        ValueError: another codec, or another size.
-    """
-    if codec in ("", "none"):
-        unpacked: Data = data
-    elif codec == "zstd":
-        _unzstd_into(data, into)
-        return
-    else:
-        unpacked = _unpacked(codec, data, len(into) + 1)
-    if len(unpacked) != len(into):
-        raise ValueError(f"a chunk unpacks to {len(unpacked):,} bytes where {len(into):,} are announced")
-    into[:] = unpacked
-
-
-def decompress_begin(codec: str, data: Data, into: memoryview) -> None:
-    """Fills `into` with the first bytes of what was packed; the rest is not looked at.
-
-    Raises:
-        ValueError: another codec, or fewer bytes.
-    """
-    if codec == "zstd":
-        _unzstd_into(data, into, whole=False)
-        return
-    unpacked = data[: len(into)] if codec in ("", "none") else _unpacked(codec, data, len(into))
-    if len(unpacked) != len(into):
-        raise ValueError(f"a chunk unpacks to {len(unpacked):,} bytes, fewer than its index says")
-    into[:] = unpacked
-
-
-def _unpacked(codec: str, data: Data, limit: int) -> bytes:
-    """Up to `limit` bytes of what was packed by bz2 or lz4."""
-    if codec == "bz2":
-        return bz2.BZ2Decompressor().decompress(data, limit)
-    if codec == "lz4":
-        from lz4.frame import LZ4FrameDecompressor
-
-        unpacked: bytes = LZ4FrameDecompressor().decompress(data, limit)
-        return unpacked
-    raise ValueError(f"chunks packed with {codec!r} cannot be read; none, bz2, lz4 and zstd can")
-
-
-def _unzstd_into(data: Data, into: memoryview, whole: bool = True) -> None:
-    """Fills `into`; `whole`: there must be no more than that, and its checksum is looked at."""
-    import zstandard
-
-    filled = more = 0
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-            while filled < len(into) and (got := stream.readinto(into[filled:])):
-                filled += got
-            more = len(stream.read(1)) if whole else 0
-    except zstandard.ZstdError as fault:
-        raise ValueError(str(fault)) from fault
-    if filled != len(into) or more:
-        raise ValueError(f"a chunk unpacks to {filled + more:,} bytes where {len(into):,} are announced")
-
-
-def checked_size(size: int) -> int:
-    """That size of a chunk.
-
-    Raises:
-        ValueError: it is more than MAX_CHUNK.
+        ValueError: another codec or size, or more than MAX_CHUNK bytes.
     """
     if size > MAX_CHUNK:
         raise ValueError(f"a chunk claims {size:,} bytes, more than {MAX_CHUNK:,}")
-    return size
+    if codec in ("", "none"):
+        unpacked = data
+    elif codec == "zstd":
+        unpacked = unzstd(data, size)
+    elif codec == "bz2":
+        unpacked = bz2.BZ2Decompressor().decompress(data, size + 1)
+    elif codec == "lz4":
+        from lz4.frame import LZ4FrameDecompressor
+
+        unpacked = LZ4FrameDecompressor().decompress(data, size + 1)
+    else:
+        raise ValueError(f"chunks packed with {codec!r} cannot be read; none, bz2, lz4 and zstd can")
+    if len(unpacked) != size:
+        raise ValueError(f"a chunk unpacks to {len(unpacked):,} bytes where {size:,} are announced")
+    return unpacked
 
 
 def unzstd(data: Data, limit: int) -> bytes:
-    """Up to `limit` + 1 unpacked bytes.
+    """Return up to `limit` + 1 unpacked bytes.
 
     Raises:
         ValueError: not zstd.
@@ -218,29 +190,29 @@ def unzstd(data: Data, limit: int) -> bytes:
 
 
 class Fields:
-    """Reads little-endian fields off bytes; ValueError where they end too soon."""
+    """Read little-endian fields off bytes; ValueError where they end too soon."""
 
     def __init__(self, data: Data) -> None:
         self._data = memoryview(data)
         self._at = 0
 
     def take(self, size: int) -> memoryview:
-        """The next `size` bytes."""
+        """Take the next `size` bytes."""
         if self._at + size > len(self._data):
             raise ValueError("a record ends too soon")
         self._at += size
         return self._data[self._at - size : self._at]
 
     def number(self, size: int) -> int:
-        """An unsigned number of `size` bytes."""
+        """Read an unsigned number of `size` bytes."""
         return int.from_bytes(self.take(size), "little")
 
     def block(self) -> memoryview:
-        """Bytes after their 32-bit length."""
+        """Take the bytes after their 32-bit length."""
         return self.take(self.number(4))
 
     def text(self) -> str:
-        """UTF-8 after its 32-bit length."""
+        """Read UTF-8 after its 32-bit length."""
         return str(self.block(), "utf-8")
 
     def __bool__(self) -> bool:
@@ -248,7 +220,7 @@ class Fields:
 
 
 def read_exact(file: BinaryIO, size: int) -> bytes:
-    """That many bytes.
+    """Read that many bytes.
 
     Raises:
         EOFError: the file ends before.

@@ -1,15 +1,18 @@
-"""Keys of bags, and the numbers they stand for.
+"""Read the numbers that the keys of bags stand for.
 
 A camera's key is its topic. A number's key is the topic and a path into its messages:
 `/joint_states.position`, `/joint_states.position[0:7]`, `/markers.poses[2].position.x`,
 `/cmd_vel.linear` (a message of numbers gives them in its fields' order), `/cmd_vel`.
+
+A key's dtype is the one that the message definition states: ROS messages are looked up in the typestore,
+protobuf's in their descriptor; JSON states none.
 
 T messages of a topic, A values of a component.
 """
 
 import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -19,24 +22,31 @@ from numpy.typing import NDArray
 
 from hma_data.episode import Floats
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.messages import child, field_names, is_list, numbers
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.messages import child, field_names, is_list, numbers, ros_store
 from hma_data.spec import Component
 
 STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\]")
 Step = str | int | slice
 SHOWN = 30  # topics or names in an error
+ROS_BYTES = {"byte": "uint8", "char": "uint8", "octet": "uint8"}
+# By the numbers of FieldDescriptorProto.Type; 14 is an enum.
+PROTOBUF = {
+    1: "float64", 2: "float32", 3: "int64", 4: "uint64", 5: "int32", 6: "uint64", 7: "uint32", 8: "bool",
+    13: "uint32", 14: "int32", 15: "int32", 16: "int64", 17: "int32", 18: "int64",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Field:
-    """A key taken apart."""
+    """Hold a key taken apart."""
 
     key: str
     topic: str
     steps: tuple[Step, ...]
 
     def value(self, message: Any, where: str) -> Any:
-        """What is there in the message.
+        """Return what is there in the message.
 
         Raises:
             EpisodeError: nothing is; names what would be.
@@ -46,7 +56,7 @@ class Field:
         return message
 
     def owner(self, message: Any, where: str) -> Any:
-        """The message that holds the last field."""
+        """Return the message that holds the last field."""
         return Field(self.key, self.topic, self.steps[:-1]).value(message, where)
 
     def _step(self, value: Any, step: Step, i: int, where: str) -> Any:
@@ -67,7 +77,7 @@ class Field:
 
 
 def parse_key(key: str, topics: Iterable[str], where: str) -> Field:
-    """The key taken apart; its topic is the longest of the bag's that it begins with.
+    """Take a key apart; its topic is the longest of the bag's that it begins with.
 
     Raises:
         EpisodeError: no topic fits, or the path is not one.
@@ -100,7 +110,7 @@ def _steps(key: str, at: int, where: str) -> tuple[Step, ...]:
 
 
 def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
-    """The error of a key whose topic the bag does not have."""
+    """Return the error of a key whose topic the bag does not have."""
     known = sorted(" ".join(topic.split()) for topic in topics)
     near = get_close_matches(re.split(r"[.\[]", key)[0], known, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
@@ -110,7 +120,7 @@ def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
 
 
 class Column:
-    """The values of one component, message by message.
+    """Gather the values of one component, message by message.
 
     Where the message that holds the field also holds a list `name` (JointState), the component's
     `names` select and order the values, unless the key or the YAML slices; messages of another
@@ -129,7 +139,7 @@ class Column:
         )
 
     def add(self, message: Any, row: int) -> None:
-        """Takes the values out of message `row`."""
+        """Take the values out of message `row`."""
         value = self.field.value(message, self._where)
         try:
             values = numbers(value)
@@ -150,7 +160,7 @@ class Column:
         self._rows.append(row)
 
     def rows(self) -> NDArray[np.int64]:
-        """Which messages gave values.
+        """Return which messages gave values.
 
         Raises:
             EpisodeError: none did.
@@ -164,11 +174,11 @@ class Column:
         return np.frombuffer(self._rows, np.int64)
 
     def values(self) -> Floats:
-        """(T, A) as recorded."""
+        """Return (T, A) as recorded."""
         return np.frombuffer(self._values, np.float64).reshape(len(self._rows), -1)
 
     def _pick(self, message: Any, width: int) -> list[int] | None:
-        """Indices of the wanted names; None where the message has none of them."""
+        """Return the indices of the wanted names; None where the message has none of them."""
         owner = self.field.owner(message, self._where)
         try:
             names = tuple(child(owner, "name"))
@@ -206,3 +216,76 @@ class Column:
                 if width
                 else f"{self.field.key} is empty in message {row}",
             )
+
+
+# -- dtypes
+
+
+def stated_dtype(channel: Channel, message: Any, steps: Sequence[Step]) -> str | None:
+    """Return what the definition says of the numbers at that path.
+
+    Args:
+        channel: of the message.
+        message: any of the channel, decoded.
+        steps: of the key.
+
+    Returns:
+        numpy's name, of a message of several the one that holds all; None where nothing states it.
+    """
+    try:
+        if channel.encoding in ("ros1", "cdr"):
+            store, kind = ros_store(channel)
+            names = set(_ros_dtypes(store, _ros_field(store, kind, steps)))
+        elif channel.encoding == "protobuf":
+            names = set(_protobuf_at(message.DESCRIPTOR, steps))
+        else:
+            return None
+        return str(np.result_type(*sorted(names))) if names else None
+    except (KeyError, TypeError, AttributeError, RecursionError):  # no number of numpy's; its own kind within
+        return None
+
+
+def _ros_field(store: Any, kind: str, steps: Sequence[Step]) -> Any:
+    """Return rosbags's (node type, content) of the field at that path."""
+    from rosbags.interfaces import Nodetype
+
+    found: Any = (Nodetype.NAME, kind)
+    for step in steps:
+        if isinstance(step, str):
+            found = dict(store.fielddefs[found[1]][1])[step]
+        elif isinstance(step, int):
+            found = found[1][0]
+    return found
+
+
+def _ros_dtypes(store: Any, field: Any) -> Iterator[str]:
+    from rosbags.interfaces import Nodetype
+
+    node, content = field
+    if node == Nodetype.BASE:
+        yield ROS_BYTES.get(content[0], content[0])
+    elif node == Nodetype.NAME:
+        for _, inner in store.fielddefs[content][1]:
+            yield from _ros_dtypes(store, inner)
+    else:
+        yield from _ros_dtypes(store, content[0])
+
+
+def _protobuf_at(kind: Any, steps: Sequence[Step]) -> Iterator[str]:
+    field: Any = None
+    for step in steps:
+        if isinstance(step, str):
+            field = kind.fields_by_name[step]
+            kind = field.message_type
+    if kind is None:
+        yield PROTOBUF[field.type]
+    else:
+        yield from _protobuf_dtypes(kind)
+
+
+def _protobuf_dtypes(kind: Any) -> Iterator[str]:
+    for field in kind.fields:
+        if field.message_type is None:
+            yield PROTOBUF[field.type]
+        else:
+            yield from _protobuf_dtypes(field.message_type)

@@ -1,12 +1,17 @@
-"""From a message's bytes to its fields: ROS 1, CDR, JSON and protobuf.
+"""Read the fields of a message from its bytes: ROS 1, CDR, JSON and protobuf.
 
 ROS definitions come from inside the bag; ROS 2 bags before Iron carry none, then the standard
 types of Humble, and after them of the newest release, are used. Whatever the encoding, a message is
 read through `child` and `field_names`.
+
+Service introspection publishes each call on `<service>/_service_event`; rosbag2 stores with it the
+definition of the service, not of the event (https://github.com/ros2/rosbag2, issue 2365), so the
+latter is put together here: info, and the request and response where contents are published.
 """
 
 import dataclasses
 import json
+import re
 import struct
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -16,17 +21,27 @@ import numpy as np
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.container import FAULTS, Channel, Data
-from hma_data.sources.bags.services import event_definitions, is_service_event
 
 Decode = Callable[[Data], Any]
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 TIME = "builtin_interfaces/msg/Time"
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
+EVENT = re.compile(r"^(?P<package>\w+)/srv/(?P<name>\w+)_Event$")
+SEPARATOR = re.compile(r"^={80}\s*$", re.MULTILINE)
+REQUEST_SENT, REQUEST_RECEIVED, RESPONSE_SENT, RESPONSE_RECEIVED = range(4)
+# which event stands for a call: the first that is recorded of these
+OF_A_CALL = (REQUEST_RECEIVED, REQUEST_SENT, RESPONSE_SENT, RESPONSE_RECEIVED)
+STANDARD = {  # in bags that carry no definition
+    "std_srvs/srv/Empty": "---",
+    "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message",
+    "std_srvs/srv/Trigger": "---\nbool success\nstring message",
+}
+EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
 
 def decode(channel: Channel, data: Data, where: str) -> Any:
-    """The message.
+    """Return the message.
 
     Raises:
         EpisodeError: its encoding or type is unknown, or the bytes do not fit it.
@@ -43,7 +58,7 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
 
 
 def head_stamp(channel: Channel) -> Callable[[Data], int] | None:
-    """What reads a ROS message's own time, in nanoseconds, from its first HEAD bytes.
+    """Return what reads a ROS message's own time, in nanoseconds, from its first HEAD bytes.
 
     None where the time is not at a fixed place there; `decode` is needed then.
     """
@@ -78,7 +93,7 @@ def _time_at(at: int, cdr: bool, data: Data) -> int:
 
 
 def _line(fault: BaseException) -> str:
-    """A fault of a library in one short line."""
+    """Tell a fault of a library in one short line."""
     return " ".join(str(fault.args[0] if fault.args else fault).split())[:200]
 
 
@@ -108,7 +123,7 @@ def _ros_decoder(channel: Channel) -> Decode:
 
 @lru_cache(maxsize=256)
 def ros_store(channel: Channel) -> tuple[Any, str]:
-    """A store that knows the channel's type, and its name there."""
+    """Return a store that knows the channel's type, and its name there."""
     from rosbags.typesys import Stores, TypesysError, get_typestore
     from rosbags.typesys.msg import normalize_msgtype
 
@@ -130,7 +145,7 @@ def ros_store(channel: Channel) -> tuple[Any, str]:
 
 
 def _telling(read: Decode, error: type[Exception]) -> Decode:
-    """`read`, with a library's own error told as ValueError."""
+    """Wrap `read`, with a library's own error told as ValueError."""
 
     def told(data: Data) -> Any:
         try:
@@ -178,16 +193,80 @@ def _protobuf_decoder(channel: Channel) -> Decode:
     return _telling(lambda data: kind.FromString(bytes(data)), DecodeError)
 
 
+# -- services
+
+
+def is_service_event(channel: Channel) -> bool:
+    """Check whether its messages are events of a service."""
+    return channel.encoding == "cdr" and EVENT.match(channel.type) is not None
+
+
+def event_type(data: Data) -> int:
+    """Return which event of a call the message tells of, REQUEST_SENT to RESPONSE_RECEIVED.
+
+    Raises:
+        ValueError: the message is none.
+    """
+    if len(data) < 5 or data[4] > RESPONSE_RECEIVED:
+        raise ValueError("a message is no event of a service")
+    return data[4]
+
+
+def event_definitions(stated: str, kind: str, text: str) -> dict[str, Any]:
+    """Return definitions for rosbags of an event's type and of those it holds.
+
+    Args:
+        stated: its name in the bag, `std_srvs/srv/SetBool_Event`.
+        kind: the name to define it under.
+        text: the service's definition, or the event's own.
+
+    Raises:
+        ValueError: the bag carries none, and the service is not a standard one.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    match = EVENT.match(stated)
+    assert match
+    service = f"{match['package']}/srv/{match['name']}"
+    text = text if text.strip() else STANDARD.get(service, "")
+    sections = [part for part in SEPARATOR.split(text.replace("\r\n", "\n")) if part.strip()]
+    if not sections:
+        raise ValueError(f"the bag does not carry the definition of {service}")
+    if not re.search(r"^---\s*$", sections[0], re.MULTILINE):
+        return dict(get_types_from_msg(text, kind))
+    body = re.sub(r"^\s*SRV:.*\n", "", sections[0])
+    request, response = re.split(r"^---\s*$", body, flags=re.MULTILINE)[:2]
+    rest = "".join(f"\n{'=' * 80}\n{part.strip()}\n" for part in sections[1:])
+    known = get_typestore(Stores.LATEST).fielddefs
+    types: dict[str, Any] = {EVENT_INFO: known[EVENT_INFO], TIME: known[TIME]}
+    for part, members in (("Request", request), ("Response", response)):
+        name = f"{match['package']}/msg/{match['name']}_{part}"
+        types |= get_types_from_msg(_members(members) + rest, name)
+    held = f"{match['package']}/{match['name']}"
+    event = f"""service_msgs/ServiceEventInfo info
+{held}_Request[<=1] request
+{held}_Response[<=1] response
+"""
+    return types | get_types_from_msg(event, kind)
+
+
+def _members(body: str) -> str:
+    """Return the fields of a request or response; one without any takes a byte in CDR."""
+    lines = [line.split("#")[0].strip() for line in body.splitlines()]
+    fields = [line for line in lines if line and "=" not in line.replace("<=", "")]
+    return body if fields else f"{body}\nuint8 structure_needs_at_least_one_member\n"
+
+
 # -- any message
 
 
 def is_message(value: Any) -> bool:
-    """Whether it has fields."""
+    """Check whether it has fields."""
     return isinstance(value, dict) or dataclasses.is_dataclass(value) or hasattr(value, "DESCRIPTOR")
 
 
 def field_names(message: Any) -> list[str]:
-    """Names of its fields, in order; constants, which rosbags makes fields with a default, are none."""
+    """Return the names of its fields, in order; constants (rosbags: fields with a default) are none."""
     if isinstance(message, dict):
         return list(message)
     if dataclasses.is_dataclass(message):
@@ -198,7 +277,7 @@ def field_names(message: Any) -> list[str]:
 
 
 def child(message: Any, name: str) -> Any:
-    """The value of a field.
+    """Return the value of a field.
 
     Raises:
         KeyError: there is none of that name.
@@ -214,12 +293,12 @@ def child(message: Any, name: str) -> Any:
 
 
 def is_list(value: Any) -> bool:
-    """Whether it is a list or an array, not text or bytes."""
+    """Check whether it is a list or an array, not text or bytes."""
     return isinstance(value, np.ndarray | Sequence) and not isinstance(value, str | bytes)
 
 
 def numbers(value: Any) -> list[float]:
-    """All its numbers: an array's in order, a message's field by field.
+    """Return all its numbers: an array's in order, a message's field by field.
 
     Raises:
         TypeError: something in it is not a number; the message says what.
@@ -247,7 +326,7 @@ def _field_numbers(message: Any, name: str) -> list[float]:
 
 
 def stamp_ns(message: Any) -> int:
-    """The time the message itself carries, in nanoseconds; 0 when it carries none."""
+    """Return the time the message itself carries, in nanoseconds; 0 when it carries none."""
     for path in STAMPS:
         value = message
         try:

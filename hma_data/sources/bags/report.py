@@ -1,4 +1,4 @@
-"""What `hma inspect` tells of bags: topics with rates and jitter, keys as a YAML would name them.
+"""Inspect bags: topics with rates and jitter, keys as a YAML would name them.
 
 Every bag is counted by its index. A sample of them is read message by message, up to a limit over
 all: the first that can be read tells the keys, each adds its times and numbers.
@@ -14,20 +14,18 @@ import numpy as np
 
 from hma_data.episode import Floats
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources import looks
+from hma_data.sources import image_checks
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
-from hma_data.sources.bags.dtypes import stated_dtype
-from hma_data.sources.bags.fields import Field, parse_key
+from hma_data.sources.bags.fields import Field, parse_key, stated_dtype
 from hma_data.sources.bags.messages import child, decode, field_names, is_list, is_message, numbers
 from hma_data.sources.bags.pictures import VIDEO, codec, is_grey, picture_kind
-from hma_data.sources.bags.streams import camera_stream
-from hma_data.sources.bags.track import Track
+from hma_data.sources.bags.topic_track import TopicTrack, camera_stream
 from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
-from hma_data.sources.clocks import Clock, clock_of, skew
 from hma_data.sources.findings import Finding
 from hma_data.sources.links import unfollowed
 from hma_data.sources.survey import Survey, sampled
+from hma_data.sources.timestamp_checks import Clock, clock_of, skew
 
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
@@ -41,7 +39,7 @@ APART_S = 1.0  # header stamps further than this from receive times are worth a 
 
 @dataclass
 class _Values:
-    """The numbers at one key, message by message; those of another width than the first are left out."""
+    """Gather the numbers at one key, message by message; leave out those of another width than the first."""
 
     place: Field
     width: int = 0
@@ -58,7 +56,7 @@ class _Values:
             self.held.extend(found)
 
     def hand_on(self, survey: Survey, episode: str) -> None:
-        """What is held goes into the survey."""
+        """Hand what is held to the survey."""
         if self.held:
             read = np.array(self.held).reshape(-1, self.width)
             survey.numbers(episode, self.place.key, read, self.taken)
@@ -67,9 +65,9 @@ class _Values:
 
 @dataclass
 class _Topic:
-    """A topic while it is measured; `sample` is its first message, or that which names most joints."""
+    """Hold a topic while it is measured; `sample` is its first message, or that which names most joints."""
 
-    track: Track
+    track: TopicTrack
     count: int = 0
     sample: Any = None
     named: int = 0
@@ -77,7 +75,7 @@ class _Topic:
     values: list[_Values] = field(default_factory=list)
 
     def look_at(self, message: Any, where: str) -> None:
-        """Two publishers of one JointState topic name different joints."""
+        """Take a message's values; two publishers of one JointState topic name different joints."""
         named = child(message, "name") if "name" in field_names(message) else ""
         count = len(named) if is_list(named) else 0
         first = self.sample is None
@@ -94,7 +92,7 @@ class _Topic:
 
 @dataclass
 class _Budget:
-    """What may still be read."""
+    """Count what may still be read."""
 
     bytes: int = MAX_BYTES
     messages: int = MAX_MESSAGES
@@ -105,7 +103,7 @@ class _Budget:
 
 
 def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspection:
-    """The inspection of those bags.
+    """Return the inspection of those bags.
 
     Raises:
         SourceError: none of them can be read.
@@ -177,7 +175,7 @@ def _length(counts: Counter[Channel], cameras: list[KeyInfo]) -> int:
 
 
 class _Telling:
-    """One bag, read once: its keys, and into the survey its numbers, times, skew and some pictures.
+    """Read one bag once: its keys, and into the survey its numbers, times, skew and some pictures.
 
     Raises:
         EpisodeError: the bag is damaged.
@@ -188,7 +186,7 @@ class _Telling:
     ) -> None:
         self.bag, self._name, self._survey = bag, name, survey
         self._frozen: list[str] = []
-        self._topics = {topic: _Topic(Track(topic)) for topic in sorted({at.topic for at in counts})}
+        self._topics = {topic: _Topic(TopicTrack(topic)) for topic in sorted({at.topic for at in counts})}
         for channel, count in counts.items():
             self._topics[channel.topic].count += count
         self._measure(budget)
@@ -204,7 +202,7 @@ class _Telling:
             budget.bytes, budget.messages = budget.bytes - len(record.data), budget.messages - 1
             if budget.spent:
                 return
-            topic = self._topics.setdefault(record.channel.topic, _Topic(Track(record.channel.topic)))
+            topic = self._topics.setdefault(record.channel.topic, _Topic(TopicTrack(record.channel.topic)))
             try:
                 message = None if topic.fault else decode(record.channel, record.data, where)
                 topic.track.add(record.channel, record.log_ns, place, message)
@@ -239,7 +237,7 @@ class _Telling:
         ]
 
     def _times(self, topic: _Topic, times: Floats, camera: bool) -> Clock:
-        """Into the survey, with what only messages with two times can show."""
+        """Hand the times to the survey, with what only messages with two times can show."""
         track, name = topic.track, topic.track.topic
         self._survey.made.add("stamps")
         self._frozen += [name] if track.frozen else []
@@ -256,8 +254,8 @@ class _Telling:
         try:
             stream = camera_stream(self.bag, topic.track, "receive")
             keyframes = topic.track.keyframes() if kind == VIDEO else None
-            indices = looks.choose(len(stream.timestamps), _PAIRS, _starts(keyframes))
-            for run in looks.runs(indices):
+            indices = image_checks.choose(len(stream.timestamps), _PAIRS, _starts(keyframes))
+            for run in image_checks.runs(indices):
                 frames = stream.frames(run)
                 self._survey.pictures(self._name, name, frames, run, stored)
         except EpisodeError as fault:
@@ -267,7 +265,7 @@ class _Telling:
         return KeyInfo(name, "camera", (*frames.shape[1:3], channels), "uint8", codec=stored)
 
     def _skew(self) -> None:
-        """Of each stream that a YAML could name, from the frames of the first camera."""
+        """Measure the skew of each stream that a YAML could name from the frames of the first camera."""
         topics = {key.topic.name: key.kind for key in self.keys if key.topic and key.kind in _STREAMS}
         cameras = [name for name, kind in topics.items() if kind == "camera"]
         if not cameras:
@@ -284,7 +282,7 @@ _STREAMS, _PAIRS = ("camera", "vector"), 4
 
 
 def _starts(keyframes: Any) -> Any:
-    """For each frame that of the keyframe before it, counted from the first; None where it is not known."""
+    """Return for each frame the keyframe before it, counted from the first; None where it is not known."""
     if keyframes is None or not keyframes.any():
         return None
     shown = keyframes[int(np.argmax(keyframes)) :]
@@ -309,7 +307,7 @@ def _about(topic: _Topic, times: Floats, kind: str) -> TopicInfo:
 
 
 def _recorded(topic: _Topic) -> list[KeyInfo]:
-    """The keys of a topic without pictures, with the dtypes their definition states."""
+    """Return the keys of a topic without pictures, with the dtypes their definition states."""
     name, channel = topic.track.topic, topic.track.channels[0]
     found = _values(name, topic.sample)
     if channel.encoding == "json":
@@ -323,7 +321,7 @@ def _recorded(topic: _Topic) -> list[KeyInfo]:
 
 
 def _values(key: str, value: Any) -> list[KeyInfo]:
-    """What a YAML could name at or below that key."""
+    """Return what a YAML could name at or below that key."""
     if isinstance(value, str):
         return [KeyInfo(key, "text", (), "string")]
     if not is_message(value):
@@ -341,7 +339,7 @@ def _values(key: str, value: Any) -> list[KeyInfo]:
 
 
 def _trajectory(key: str, value: Any, names: list[str]) -> list[KeyInfo]:
-    """The first point of a JointTrajectory, the one in force when it is sent."""
+    """Return the first point of a JointTrajectory, the one in force when it is sent."""
     points: Any = child(value, "points") if {"points", "joint_names"} <= set(names) else ()
     if not is_list(points) or not len(points) or not is_message(points[0]):
         return []
@@ -353,7 +351,7 @@ def _trajectory(key: str, value: Any, names: list[str]) -> list[KeyInfo]:
 
 
 def _named(found: list[KeyInfo], owner: Any, name: str) -> list[KeyInfo]:
-    """With the names of the owner's list `name`, where it has one of that length (JointState)."""
+    """Add the names of the owner's list `name`, where it has one of that length (JointState)."""
     labels = child(owner, "name") if "name" in field_names(owner) and name != "name" else ()
     if len(found) != 1 or not is_list(labels) or found[0].shape != (len(labels),) or not len(labels):
         return found

@@ -1,4 +1,4 @@
-"""What a few pictures of a camera tell: still, blank, of several sizes, red and blue changed over.
+"""Check a few pictures of a camera: still, blank, of several sizes, red and blue swapped.
 
 Two signs speak for swapped channels. Where pictures were decoded from JPEG or video and then kept
 without loss, every pixel is one that the conversion from YCbCr gives: only a quarter of all colours
@@ -28,7 +28,7 @@ STILL, BLANK = 0.5, 2.0  # share of equal neighbours; standard deviation of all 
 
 @dataclass
 class Look:
-    """What was seen of one camera.
+    """Gather what was seen of one camera.
 
     Attributes:
         lossless: whether they are stored without loss, so that their colours tell how they once were.
@@ -59,7 +59,7 @@ class Look:
     _size: tuple[int, int] = (0, 0)
 
     def add(self, frames: Images, indices: NDArray[np.int64], again: bool = False) -> None:
-        """Takes pictures (n, H, W, 3) of one episode, and which of its frames they are (n,) rising.
+        """Take pictures (n, H, W, 3) of one episode, and which of its frames they are (n,) rising.
 
         `again` where they are of the same episode as those before.
         """
@@ -84,7 +84,7 @@ class Look:
             self.colours.append(pixels)
 
     def swapped(self) -> tuple[str, str]:
-        """Whether red and blue changed places, and the reason.
+        """Check whether red and blue changed places; return also the reason.
 
         sure, hint, no (they are in order for sure), or nothing where it cannot be told.
         """
@@ -107,13 +107,13 @@ class Look:
 
 
 def _some(frame: Images) -> NDArray[np.uint8]:
-    """(m, 3) pixels on a grid over the picture."""
+    """Return (m, 3) pixels on a grid over the picture."""
     step = max(1, int(np.sqrt(frame.shape[0] * frame.shape[1] / PIXELS)))
     return frame[::step, ::step].reshape(-1, 3)
 
 
 def _tones(pixels: NDArray[np.uint8]) -> tuple[float, float]:
-    """Shares of saturated pixels that are warm (red > green > blue), and cold (blue > green > red)."""
+    """Return the shares of saturated pixels that are warm (red > green > blue) and cold (blue > … > red)."""
     red, green, blue = pixels.astype(np.int16).T
     strong = np.abs(red - blue) > 32
     warm = strong & (red >= green) & (green >= blue)
@@ -122,7 +122,7 @@ def _tones(pixels: NDArray[np.uint8]) -> tuple[float, float]:
 
 
 def ycbcr_share(colours: NDArray[np.uint8]) -> float | None:
-    """The share of RGB colours (m, 3) that JPEG's YCbCr can give; a quarter of all by chance.
+    """Return the share of RGB colours (m, 3) that JPEG's YCbCr can give; a quarter of all by chance.
 
     None where there are too few distinct colours, neither grey nor at the edge of the range, to tell.
     """
@@ -145,7 +145,7 @@ def ycbcr_share(colours: NDArray[np.uint8]) -> float | None:
 
 
 def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-    """Frames (n,) of an episode, in runs of neighbours over its length.
+    """Choose frames (n,) of an episode, in runs of neighbours over its length.
 
     Args:
         length: of the episode.
@@ -161,12 +161,12 @@ def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> 
 
 
 def runs(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """The chosen frames run by run, which bounds how many pictures are in memory."""
+    """Yield the chosen frames run by run, which bounds how many pictures are in memory."""
     return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
 
 
 def stacked(pictures: list[Images]) -> Iterator[tuple[int, Images]]:
-    """Runs of pictures of one size as (n, H, W, 3), with the place each begins at."""
+    """Yield runs of pictures of one size as (n, H, W, 3), with the place each begins at."""
     start = 0
     for i in range(1, len(pictures) + 1):
         if i == len(pictures) or pictures[i].shape != pictures[start].shape:
@@ -175,7 +175,7 @@ def stacked(pictures: list[Images]) -> Iterator[tuple[int, Images]]:
 
 
 def findings(looks: dict[str, Look]) -> Iterator[Finding]:
-    """What looks wrong, camera by camera."""
+    """Yield what looks wrong, camera by camera."""
     for key, look in looks.items():
         if not look.pictures:
             continue

@@ -1,4 +1,4 @@
-"""What the first bytes of a picture, and a column of times, tell of a recording; for `inspect`."""
+"""Guess what a recording does not state: grey pictures, the unit of a column of times; for `inspect`."""
 
 import re
 from typing import Any
@@ -13,7 +13,7 @@ STEPS_S = (1e-4, 5.0)  # between samples of a recording
 
 
 def one_channel(data: bytes) -> bool:
-    """Whether a JPEG or PNG is grey, by its header."""
+    """Check whether a JPEG or PNG is grey, by its header."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return data[25:26] in (b"\0", b"\4")
     at, head = 2, data[:HEAD]
@@ -26,7 +26,7 @@ def one_channel(data: bytes) -> bool:
 
 
 def seconds_a_unit(values: NDArray[Any]) -> float | None:
-    """What one unit of a column of times is in seconds, by size and steps; None where it is not clear.
+    """Return what one unit of a column of times is in seconds, by size and steps; None where it is not clear.
 
     Args:
         values: (T,) as recorded.
@@ -44,12 +44,12 @@ def seconds_a_unit(values: NDArray[Any]) -> float | None:
 
 
 def is_times(key: str, shape: tuple[int, ...]) -> bool:
-    """Whether a key of one number a sample is called as a column of times is."""
+    """Check whether a key of one number a sample has the name of a column of times."""
     return shape in ((), (1,)) and bool(TIMES.fullmatch(key.lower()))
 
 
 def seconds_of(values: NDArray[Any]) -> NDArray[np.float64] | None:
-    """A column of times (T,) in seconds; None where its unit is not clear.
+    """Return a column of times (T,) in seconds; None where its unit is not clear.
 
     Stamps may repeat or go back here; the unit is taken from those in order.
     """

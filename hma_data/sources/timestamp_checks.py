@@ -1,4 +1,4 @@
-"""What the times of a stream tell: its rate and jitter, stamps that repeat or go back, pauses, lost frames.
+"""Check the timestamps of a stream: rate and jitter, stamps that repeat or go back, pauses, losses.
 
 T samples of a stream; times are float64 seconds in the order of receipt.
 """
@@ -21,7 +21,7 @@ DRIFT = 0.02  # of the rate, between what is stated and what stamps say
 
 @dataclass(frozen=True)
 class Clock:
-    """What the times of one stream in one episode say.
+    """Hold what the timestamps of one stream in one episode say.
 
     Attributes:
         hz, jitter_ms: rate and standard deviation of the intervals; None for too few or bursts without sum.
@@ -47,7 +47,7 @@ class Clock:
 
 
 def clock_of(times: Floats) -> Clock:
-    """Measured on (T,) seconds."""
+    """Measure the clock of a stream on (T,) seconds."""
     finite = np.isfinite(times)
     times = times[finite]
     steps = np.diff(times)
@@ -71,7 +71,7 @@ def clock_of(times: Floats) -> Clock:
 
 
 def rate(times: Floats) -> tuple[float | None, float | None]:
-    """Hz and jitter_ms, the standard deviation of the intervals.
+    """Return Hz and jitter_ms, the standard deviation of the intervals.
 
     The rate is of the median interval, which a pause does not change; of the mean one where bursts
     make them differ by half.
@@ -85,13 +85,13 @@ def rate(times: Floats) -> tuple[float | None, float | None]:
 
 
 def _lost(steps: Floats, period: float) -> int:
-    """By intervals that are whole multiples of the median one; pauses are told apart."""
+    """Count lost frames by intervals that are whole multiples of the median one, pauses left out."""
     usual = steps[steps <= max(PAUSE * period, PAUSE_S)]
     return max(int(np.sum(np.rint(usual / period) - 1)), 0)  # a late frame is not a lost one
 
 
 def findings(key: str, clock: Clock, camera: bool = False, episode: str = "") -> Iterator[Finding]:
-    """What looks wrong with one stream's times.
+    """Yield what looks wrong with one stream's timestamps.
 
     Args:
         key: the stream's name.
@@ -122,7 +122,7 @@ def findings(key: str, clock: Clock, camera: bool = False, episode: str = "") ->
 def drift(
     key: str, measured_hz: float | None, stated_hz: float | None, source: str = "the recording states"
 ) -> Iterator[Finding]:
-    """Stamps that tick at another rate than the recording states, or than `source` says was measured."""
+    """Find stamps that tick at another rate than the recording states, or than `source` says was measured."""
     if measured_hz and stated_hz and abs(measured_hz / stated_hz - 1) > DRIFT:
         said = f"{key}: ticks at {measured_hz:.4g} Hz, {source} {stated_hz:.4g}"
         numbers = {"measured_hz": measured_hz, "stated_hz": stated_hz}
@@ -130,7 +130,7 @@ def drift(
 
 
 def skew(times: Floats, primary: Floats) -> tuple[float, float, float] | None:
-    """p50, p95 and max in ms from each frame of the primary stream to the sample nearest to it.
+    """Return p50, p95 and max in ms from each frame of the primary stream to the sample nearest to it.
 
     Only where both run; None where they never do together.
     """

@@ -1,4 +1,4 @@
-"""Where in a bag file which messages are: what lets a part of its time be read alone.
+"""Find where in a bag file which messages are, so that a part of its time is read alone.
 
 A piece is a run of a file's records, a chunk or messages outside of chunks, of which is known when
 its messages were received and of which topics they are. A file has some thousands of them.
@@ -11,29 +11,29 @@ from hma_data.sources.bags.container import Record, Wanted
 
 
 class Piece(NamedTuple):
-    """Records from offset `at` to `end`.
+    """Describe the records from offset `at` to `end`.
 
     Attributes:
         first_ns, last_ns: earliest and latest receipt of its messages.
-        topics: of them; None where the file does not tell.
+        topics: of them.
     """
 
     at: int
     end: int
     first_ns: int
     last_ns: int
-    topics: frozenset[str] | None
+    topics: frozenset[str]
 
     def holds(self, topics: frozenset[str] | None) -> bool:
-        """Whether a message of those topics can be in it."""
-        return topics is None or self.topics is None or not self.topics.isdisjoint(topics)
+        """Check whether a message of those topics can be in it."""
+        return topics is None or not self.topics.isdisjoint(topics)
 
 
 Load = Callable[[Piece, Wanted], Iterator[Record]]
 
 
 def overlapping(pieces: Sequence[Piece], wanted: Wanted) -> Iterator[Piece]:
-    """The pieces in which wanted messages can be, in the file's order."""
+    """Yield the pieces in which wanted messages can be, in the file's order."""
     for piece in pieces:
         within = piece.first_ns <= wanted.last_ns and piece.last_ns >= wanted.first_ns
         if within and piece.holds(wanted.topics):
@@ -43,7 +43,7 @@ def overlapping(pieces: Sequence[Piece], wanted: Wanted) -> Iterator[Piece]:
 def last_before(
     pieces: Sequence[Piece], topics: frozenset[str], log_ns: int, load: Load
 ) -> dict[str, Record]:
-    """Of each topic the last message received before that time; looks back no further than it must."""
+    """Return each topic's last message received before that time; look back no further than needed."""
     found: dict[str, Record] = {}
     earlier = (piece for piece in pieces if piece.first_ns < log_ns and piece.holds(topics))
     for piece in sorted(earlier, key=lambda piece: piece.last_ns, reverse=True):
@@ -57,7 +57,7 @@ def last_before(
 
 
 def take_last(found: dict[str, Record], records: Iterator[Record]) -> None:
-    """Puts the last message of each topic into `found`, with a copy of its bytes."""
+    """Put the last message of each topic into `found`, with a copy of its bytes."""
     newest: dict[str, Record] = {}
     for record in records:
         topic = record.channel.topic
