@@ -34,7 +34,6 @@ def base(tmp_path_factory) -> TrainResult:
     folder = tmp_path_factory.mktemp("base")
     arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
     data = [str(arm), str(hand)]
-    torch.set_num_threads(1)
     recipe = make_recipe({**TINY, "data": data, "model": {**TINY["model"], "mup": True, "base_width": 8}})
     return train(recipe, out=folder / "run", show=False)
 

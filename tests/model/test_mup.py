@@ -13,7 +13,6 @@ from hma_model.model import HMA
 from hma_model.mup_world import SPACE, make_model, train, windows
 
 WIDTHS = (64, 128, 256)
-torch.set_num_threads(1)
 
 
 def _activations(model: HMA) -> dict[str, Tensor]:

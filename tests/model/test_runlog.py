@@ -12,7 +12,6 @@ from types import ModuleType
 import google_crc32c
 import numpy as np
 import pytest
-import torch
 
 from hma_data.errors import MissingDependencyError
 from hma_data.tokenizers.base import TokenizerSpec
@@ -41,7 +40,6 @@ class Painter:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("shards")
     arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
     return [str(arm), str(hand)]

@@ -12,7 +12,6 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, TrainingError
 from hma_model import checkpoint
@@ -28,7 +27,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
-    torch.set_num_threads(1)
     return [str(make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm"))]
 
 

@@ -32,15 +32,6 @@ from tests.model.runs import TINY, same
 from tests.model.shards import make_shards
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Models this small only lose by more threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
     folder = tmp_path_factory.mktemp("shards")

@@ -21,7 +21,6 @@ from tests.model.shards import make_shards
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("shards")
     arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
     return [str(arm), str(hand)]
