@@ -116,8 +116,8 @@ def join(device: torch.device) -> Iterator[World]:
             raise
         raise error from fault
     finally:
-        failed = sys.exc_info()[0] is not None
-        if ours and dist.is_initialized() and not (failed and device.type == "cuda"):  # NCCL waits for a rank that is gone
+        waits = device.type == "cuda" and sys.exc_info()[0] is not None  # NCCL, for a rank that is gone
+        if ours and dist.is_initialized() and not waits:
             dist.destroy_process_group()
 
 

@@ -15,12 +15,14 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import torch
 from torch.distributed import TCPStore
 
 from hma_data.errors import HMAError
+from hma_model.cli import main
 from hma_model.rank_errors import report_once
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,8 +36,15 @@ ALONE = {  # no library of the server starts a thread
 
 def start(work: Callable[[], Any], said: Path) -> BaseProcess:
     """Start `work`, which can be pickled, in a process whose output and errors go to the file `said`."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*PRELOAD, __name__])
+    serve()
+    process = multiprocessing.get_context("forkserver").Process(target=_run, args=(work, said))
+    process.start()
+    return process
+
+
+def serve() -> None:
+    """Start the server of this test process, unless it runs."""
+    multiprocessing.get_context("forkserver").set_forkserver_preload([*PRELOAD, __name__])
     before = dict(os.environ)
     os.environ.update(ALONE)
     try:
@@ -43,9 +52,6 @@ def start(work: Callable[[], Any], said: Path) -> BaseProcess:
     finally:
         os.environ.clear()
         os.environ.update(before)
-    process = context.Process(target=_run, args=(work, said))
-    process.start()
-    return process
 
 
 def _run(work: Callable[[], Any], said: Path) -> None:
@@ -75,6 +81,44 @@ def end(processes: Sequence[BaseProcess], said: Path) -> list[int]:
         process.kill()
     assert not hung, f"{len(hung)} of {len(processes)} processes hang\n{said.read_text()}"
     return [process.exitcode or 0 for process in processes]
+
+
+def run(work: Callable[[], Any], said: Path, code: int = 0) -> str:
+    """Run `work` in a process that must end with this exit code; returns what it said."""
+    found, text = end([start(work, said)], said), said.read_text()
+    assert found == [code], text
+    return text
+
+
+def run_command(folder: Path, *words: str, env: dict[str, str] | None = None) -> CompletedProcess[str]:
+    """Run `hma` with these words; what it says is kept in the folder."""
+    out, said = folder / "stdout.txt", folder / "stderr.txt"
+    (code,) = end([start(partial(command, *words, out=out, env=env), said)], said)
+    return CompletedProcess(words, code, out.read_text(), said.read_text())
+
+
+def command(*words: str, out: Path | None = None, env: dict[str, str] | None = None) -> None:
+    """Be the command `hma`, with its output in a file of its own if need be."""
+    os.environ.update(env or {})
+    if out:
+        os.dup2(os.open(out, os.O_CREAT | os.O_WRONLY), 1)
+    sys.argv = ["hma", *words]
+    main()
+
+
+def kill_at_write(number: int, place: str, work: Callable[[], Any]) -> None:
+    """Run `work`; kill this process before it writes, moves or deletes its n-th path with `place` in it."""
+    left = [number]
+
+    def watch(event: str, given: tuple[Any, ...]) -> None:
+        opens = event == "open" and isinstance(given[2], int) and given[2] & (os.O_WRONLY | os.O_RDWR)
+        if (opens or event in ("os.rename", "os.remove", "os.mkdir", "os.rmdir")) and place in str(given[0]):
+            left[0] -= 1
+            if not left[0]:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(watch)
+    work()
 
 
 def run_ranks(work: Callable[[int], Any], said: Path, codes: Sequence[int] = (0, 0)) -> str:

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import re
+import shutil
 import struct
 import sys
 from pathlib import Path
@@ -50,11 +51,20 @@ def painter(monkeypatch):
     monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Painter())
 
 
-@pytest.fixture
-def run(data, painter, tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def seen(data, tmp_path_factory) -> Path:
     """The folder of a short run with everything to see."""
-    train(make_recipe({**TINY, **SEEN, "data": data}), out=tmp_path / "run", show=False)
-    return tmp_path / "run"
+    out = tmp_path_factory.mktemp("seen") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Painter())
+        train(make_recipe({**TINY, **SEEN, "data": data}), out=out, show=False)
+    return out
+
+
+@pytest.fixture
+def run(seen, painter, tmp_path) -> Path:
+    """A copy of that folder."""
+    return shutil.copytree(seen, tmp_path / "run")
 
 
 def events(path: Path) -> list[bytes]:

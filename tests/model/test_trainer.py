@@ -78,6 +78,7 @@ def test_recomputing_activations_changes_no_loss(recipe, tmp_path):
     assert losses(recipe, tmp_path / "b", model=network, checkpointing=True) == plain
 
 
+@pytest.mark.slow
 def test_compiled_blocks_give_the_same_losses(recipe, tmp_path, monkeypatch):
     compiled, plain = [], torch.nn.Module.compile
 
