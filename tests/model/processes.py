@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SAFETY = 120.0  # seconds after which a process counts as hung
 PRELOAD = ["torch._dynamo", "torch.distributed.nn.functional", "hma_model.train", "hma_model.cli", "pytest"]
 ALONE = {  # no library of the server starts a thread
-    "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JE_ARROW_MALLOC_CONF": "background_thread:false",
     "PYTHONPATH": str(ROOT),
 }  # fmt: skip
 
