@@ -36,11 +36,11 @@ def train(
 
     Example: hma train discrete_tiny data=[shards/my_arm] --out runs/first
     """
+    from hma_model.rank_errors import report_once
     from hma_model.recipe import load_recipe
     from hma_model.train import train as run
-    from hma_model.voice import one_voice
 
-    with one_voice():
+    with report_once():
         result = run(load_recipe(recipe, overrides or []), out=out, force=force)
     _tell(result, json)
 
@@ -71,12 +71,12 @@ def finetune(
     Example: hma finetune --from team/model --data shards/my_arm --freeze-trunk --out runs/my_arm
     """
     from hma_model.finetune import finetune as run
-    from hma_model.voice import one_voice
+    from hma_model.rank_errors import report_once
 
     given = overrides or []
     folders = [*data, *(Path(text) for text in given if "=" not in text)]
     changes = [text for text in given if "=" in text]
-    with one_voice():
+    with report_once():
         result = run(
             source,
             folders,

@@ -8,9 +8,7 @@ stay whole, because the ranks of one step may use different ones.
 """
 
 import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -22,7 +20,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
-from hma_model.voice import Voice
+from hma_model.rank_errors import PREFIX, read_error, write_error
 
 if TYPE_CHECKING:
     from hma_model.model import HMA
@@ -109,35 +107,18 @@ def join(device: torch.device) -> Iterator[World]:
     ours = not dist.is_initialized()
     store = _met(device) if ours else None
     world = World(dist.get_rank(), dist.get_world_size(), local_rank())
-    voice = Voice(store, world.rank, world.size)
     try:
         yield world
-    except (HMAError, RuntimeError) as fault:
-        with _to_its_end(world):
-            ended = _ended(fault, world, voice)
-            voice.leave(ended)
-            if ours and device.type != "cuda":  # NCCL waits for a rank that is gone
-                dist.destroy_process_group()
-            voice.settle(ended)
-        if ended is fault:
+    except Exception as fault:
+        error = _explained(fault, world, store)
+        write_error(store, world.rank, error)  # before the group goes, by which the others find out
+        if error is fault:
             raise
-        raise ended from fault
+        raise error from fault
     finally:
-        if ours and dist.is_initialized() and (device.type != "cuda" or sys.exc_info()[0] is None):
+        waits = device.type == "cuda" and sys.exc_info()[0] is not None  # NCCL, for a rank that is gone
+        if ours and dist.is_initialized() and not waits:
             dist.destroy_process_group()
-
-
-@contextmanager
-def _to_its_end(world: World) -> Iterator[None]:
-    """Let torchrun's signal, which follows the end of any rank, not end rank 0 before it has spoken."""
-    if not world.main or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _met(device: torch.device) -> dist.Store:
@@ -151,19 +132,19 @@ def _met(device: torch.device) -> dist.Store:
     except (RuntimeError, ValueError) as fault:
         text = f"cannot find each other: {str(fault).splitlines()[0]}"
         raise RecipeError("ranks", text, "start them with torchrun") from fault
-    return dist.PrefixStore("voice", store)
+    return dist.PrefixStore(PREFIX, store)
 
 
-def _ended(fault: HMAError | RuntimeError, world: World, voice: Voice) -> HMAError:
-    """What ends this rank, in words: where it has lost the others, what another one has left."""
-    if isinstance(fault, HMAError):
+def _explained(fault: Exception, world: World, store: dist.Store | None) -> Exception:
+    """Return the error to raise for a fault: where this rank has lost the others, what has ended them."""
+    if isinstance(fault, HMAError) or not isinstance(fault, RuntimeError):
         return fault
+    said = (str(fault).splitlines() or [""])[0][:200]
     if not isinstance(fault, dist.DistError) and "gloo" not in str(fault):
-        said = (str(fault).splitlines() or [""])[0][:200]
         return TrainingError(f"rank {world.rank}", f"{type(fault).__name__}: {said}", "--debug shows where")
-    return voice.heard() or TrainingError(
+    return read_error(store) or TrainingError(
         f"rank {world.rank}",
-        f"has lost the others: {str(fault).splitlines()[0][:200]}",
+        f"has lost the others: {said}",
         "see what ended another rank; the same command goes on from the last checkpoint",
     )
 
@@ -174,6 +155,22 @@ def local_rank() -> int:
 
 
 # -- how the network is spread
+
+
+class _DDP(nn.parallel.DistributedDataParallel):
+    """DDP that frees its reducer before the last Python reference to its process group.
+
+    To free a group is to wait for its threads, and these take the GIL to free the tensors of their last
+    collectives. A Python reference frees the group without the GIL; the reducer would free it with the GIL,
+    and the process would hang. It is the last owner where an error, or somebody's variable, keeps the network
+    past `destroy_process_group()`.
+    """
+
+    def __del__(self) -> None:
+        group = self.__dict__.get("process_group")
+        for owner in ("logger", "reducer"):
+            self.__dict__.pop(owner, None)
+        del group
 
 
 class Spread:
@@ -193,9 +190,7 @@ class Spread:
             _shard(model, world)
         elif world.size > 1:
             device = [model.device] if model.device.type == "cuda" else None
-            self._call = nn.parallel.DistributedDataParallel(
-                model, device_ids=device, find_unused_parameters=True, broadcast_buffers=False
-            )
+            self._call = _DDP(model, device_ids=device, find_unused_parameters=True, broadcast_buffers=False)
 
     def __call__(self, *given: Any, **named: Any) -> Any:
         """The network's forward pass."""

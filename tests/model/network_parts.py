@@ -8,8 +8,6 @@ import torch
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.model import HMA
 
-torch.set_num_threads(1)  # on tensors this small, more threads only wait for one another
-
 ARM = ActionSpace("arm", 3, 2, (1.0, -2.0, 0.5), (2.0, 0.5, 1.0), (True, True, False))
 HAND = ActionSpace("hand.v1", 2, 1, (0.0, 3.0), (1.0, 0.0), (True, True))
 

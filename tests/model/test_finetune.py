@@ -1,10 +1,7 @@
 """Finetuning: what is new, what goes on, and what stays byte for byte."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,11 +14,11 @@ from hma_model.checkpoint import Checkpoint
 from hma_model.finetune import finetune
 from hma_model.recipe import make_recipe
 from hma_model.train import TrainResult, train
+from tests.model.processes import run_command
 from tests.model.robots import SPEC
 from tests.model.runs import TINY, same, weights
 from tests.model.shards import make_shards
 
-ROOT = Path(__file__).resolve().parents[2]
 SHORT = [
     "steps=4", "batch_size=4", "device=cpu", "warmup=1", "eval_every=0", "eval_windows=4",
     "checkpoint_every=2", "report=false", "pictures=0", "track=[]", "lr=3e-3",
@@ -34,7 +31,6 @@ def base(tmp_path_factory) -> TrainResult:
     folder = tmp_path_factory.mktemp("base")
     arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
     data = [str(arm), str(hand)]
-    torch.set_num_threads(1)
     recipe = make_recipe({**TINY, "data": data, "model": {**TINY["model"], "mup": True, "base_width": 8}})
     return train(recipe, out=folder / "run", show=False)
 
@@ -171,14 +167,8 @@ def test_heads_learn_on_a_frozen_trunk_when_actions_are_the_objective(base, leg,
 
 def test_the_command_takes_shards_overrides_and_json(base, leg, tmp_path):
     foot = make_shards(tmp_path / "foot", "foot", dims=1, seed=5)
-    command = ["-m", "hma_model.cli", "finetune", "--from", str(base.out), "--data", str(leg), str(foot)]
-    done = subprocess.run(
-        [sys.executable, *command, "--freeze-trunk", "--out", str(tmp_path / "run"), "--json", *SHORT],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ["finetune", "--from", str(base.out), "--data", str(leg), str(foot), "--freeze-trunk"]
+    done = run_command(tmp_path, *words, "--out", str(tmp_path / "run"), "--json", *SHORT)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["step"] == 4 and "trunk frozen" in done.stderr and "fresh stem and head: leg" in done.stderr
@@ -186,14 +176,8 @@ def test_the_command_takes_shards_overrides_and_json(base, leg, tmp_path):
 
 
 def test_the_command_says_what_is_wrong_in_one_line(base, tmp_path):
-    command = ["-m", "hma_model.cli", "finetune", "--from", str(base.out), "--data", str(tmp_path / "none")]
-    done = subprocess.run(
-        [sys.executable, *command, "--out", str(tmp_path / "run")],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ["finetune", "--from", str(base.out), "--data", str(tmp_path / "none")]
+    done = run_command(tmp_path, *words, "--out", str(tmp_path / "run"))
     assert done.returncode == 1 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
 
 

@@ -1,8 +1,5 @@
 """Finetuning from a hub: what is fetched, which revision, and how the verb says that there is none."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,9 +9,10 @@ from hma_model import checkpoint, hub
 from hma_model.checkpoint import Checkpoint
 from hma_model.finetune import finetune
 from tests.hub_fixtures import REPO
+from tests.model.processes import run_command
 from tests.model.robots import make_model, save
 from tests.model.shards import make_shards
-from tests.model.test_finetune import ROOT, SHORT
+from tests.model.test_finetune import SHORT
 
 pytest_plugins = ["tests.hub_fixtures"]
 
@@ -75,13 +73,9 @@ def test_of_a_folder_hub_by_its_uri_the_trunk_alone_comes_along(leg, tmp_path):
 
 
 def test_the_command_finetunes_from_a_repository_and_the_run_goes_on_without_it(published, leg, tmp_path):
-    command = ["-m", "hma_model.cli", "finetune", "--from", REPO, "--data", str(leg), "--freeze-trunk"]
     cache = {"HF_ENDPOINT": published.url, "HF_HUB_CACHE": str(tmp_path / "c"), "HF_HUB_DISABLE_XET": "1"}
-    done = subprocess.run(
-        [sys.executable, *command, "--out", str(tmp_path / "run"), *SHORT],
-        env={**os.environ, **cache, "PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
+    words = ["finetune", "--from", REPO, "--data", str(leg), "--freeze-trunk", "--out", str(tmp_path / "run")]
+    done = run_command(tmp_path, *words, *SHORT, env=cache)
     assert done.returncode == 0 and "trunk frozen" in done.stderr, done.stderr
     asked = len(published.log)
     assert tune(REPO, leg, tmp_path / "run").step == 4 and len(published.log) == asked

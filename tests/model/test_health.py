@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from hma_data.errors import RecipeError, TrainingError
 from hma_data.shards.writer import EpisodeRows, ShardWriter
@@ -14,20 +13,12 @@ from hma_model import checkpoint
 from hma_model.recipe import make_recipe
 from hma_model.runlog import read_metrics
 from hma_model.train import train
+from tests.model.processes import errors
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards
 from tests.model.test_parallel import spread
 
 EPISODE, ROW = 2, 10
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def make_hurt(folder: Path) -> Path:
@@ -111,7 +102,7 @@ def test_two_ranks_leave_out_the_steps_that_one_leaves_out(tmp_path):
 
 
 def test_two_ranks_stop_with_one_error_that_names_the_window(tmp_path):
-    told = spread(recipe(make_hurt(tmp_path / "hurt"), batch_size=1, accumulate=4), tmp_path / "run")
-    faults = [line for line in told.splitlines() if line.startswith("hma_data.errors.")]
-    assert len(faults) == 1, told
-    assert f"windows: arm episode {EPISODE} (e{EPISODE}) frames" in faults[0] and "; arm" not in faults[0]
+    hurt = recipe(make_hurt(tmp_path / "hurt"), batch_size=1, accumulate=4)
+    said = errors(spread(hurt, tmp_path / "run", codes=(1, 1)))
+    assert len(said) == 1, said
+    assert f"windows: arm episode {EPISODE} (e{EPISODE}) frames" in said[0] and "; arm" not in said[0]

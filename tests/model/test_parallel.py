@@ -1,35 +1,33 @@
-"""Ranks, forked here as torchrun starts them: one process's curve, and any number of ranks goes on."""
+"""Ranks of a run: one process's curve, any number of ranks goes on, and one error where they fail."""
 
 import errno
 import json
-import multiprocessing
-import multiprocessing.connection
 import os
 import subprocess
 import sys
+import time
+from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
-from torch.distributed import HashStore, TCPStore
+import torch.distributed as dist
 
-from hma_data.errors import ShardError, TrainingError
-from hma_model import checkpoint, voice
-from hma_model.parallel import World
+from hma_data.errors import HMAError, ShardError, TrainingError
+from hma_model import checkpoint
+from hma_model.parallel import Spread, World, join
+from hma_model.rank_errors import read_error, report_once, write_error
 from hma_model.recipe import make_recipe
 from hma_model.runlog import read_metrics
 from hma_model.train import train
-from hma_model.voice import Voice, one_voice
+from tests.model.processes import ROOT, errors, run_ranks
 from tests.model.runs import TINY, weights
 from tests.model.shards import make_shards
-
-ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("shards")
     arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
     return [str(arm), str(hand)]
@@ -51,45 +49,31 @@ def alone(recipe, tmp_path_factory):
     return train(recipe(), out=tmp_path_factory.mktemp("alone") / "run", show=False)
 
 
-def spread(recipe, out: Path, kill_after: int = 0, ranks: int = 2, fail: int | None = None) -> str:
-    """Train on forked ranks, which spares them torch's import; returns what they said.
-
-    A rank that fails or is killed ends the others, as torchrun does. Rank `fail` has a fault after two steps.
-    """
-    store = TCPStore(
-        "127.0.0.1", 0, is_master=True, wait_for_workers=False
-    )  # torchrun's, which outlives ranks
-    told = out.with_name("told.txt")
-    context = multiprocessing.get_context("fork")
-    processes = [
-        context.Process(target=_rank, args=(rank, ranks, store.port, recipe, out, kill_after, told, fail))
-        for rank in range(ranks)
-    ]
-    for process in processes:
-        process.start()
-    multiprocessing.connection.wait([p.sentinel for p in processes])
-    for process in processes:
-        process.join(60 if all(p.exitcode in (0, None) for p in processes) else 10)
-        process.kill()
-    return told.read_text()
+def spread(recipe, out: Path, on_step=None, codes=(0, 0)) -> str:
+    """Train on ranks that end with these exit codes, with on_step(rank, facts) after each step."""
+    return run_ranks(partial(train_rank, recipe, out, on_step), out.with_name("said.txt"), codes)
 
 
-def _rank(rank, ranks, port, recipe, out, kill_after, told, fail) -> None:
-    os.environ.update(
-        RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE=str(ranks),
-        MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), TORCHELASTIC_USE_AGENT_STORE="True",
-    )  # fmt: skip
-    os.dup2(os.open(told, os.O_CREAT | os.O_WRONLY | os.O_APPEND), 2)
-    sys.stderr = os.fdopen(2, "w")
+def train_rank(recipe, out: Path, on_step, rank: int) -> None:
+    train(recipe, out=out, on_progress=on_step and partial(on_step, rank))
 
-    def kill(facts) -> None:
-        if facts["step"] == kill_after:
-            os._exit(9)
-        if facts["step"] == 2 and rank == fail:
-            raise ShardError("shards/arm", "lies on a disk that this rank alone has lost", "mount it")
 
-    with one_voice():
-        train(recipe, out=out, on_progress=kill)
+def exit_after_five(rank: int, facts) -> None:
+    if facts["step"] == 5:
+        os._exit(9)
+
+
+def fail_and_outlast(failing: int, pid: Path, rank: int, facts) -> None:
+    """After two steps one rank fails; the other goes on once that one is gone."""
+    if facts["step"] == 2 and rank == failing:
+        pid.write_text(str(os.getpid()))
+        raise ShardError("shards/arm", "lies on a disk that this rank alone has lost", "mount it")
+    while facts["step"] == 2 and not (pid.exists() and pid.read_text() and not alive(int(pid.read_text()))):
+        time.sleep(0.01)
+
+
+def alive(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists()
 
 
 def curve(out: Path) -> list[float]:
@@ -114,7 +98,7 @@ def close(one: Path, other: Path) -> None:
         assert torch.allclose(value.float(), b[name].float(), rtol=1e-3, atol=2e-5), name
 
 
-@pytest.mark.parametrize("mode", ["ddp", "fsdp"])
+@pytest.mark.parametrize("mode", ["ddp", pytest.param("fsdp", marks=pytest.mark.slow)])
 def test_two_ranks_give_the_curve_and_the_weights_of_one(recipe, alone, tmp_path, mode):
     told = spread(recipe(parallel=mode), tmp_path / "run")
     assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4), told
@@ -123,14 +107,16 @@ def test_two_ranks_give_the_curve_and_the_weights_of_one(recipe, alone, tmp_path
     assert json.loads((tmp_path / "run" / "environment.json").read_text())["ranks"] == 2
 
 
+@pytest.mark.slow
 def test_a_sharded_run_cut_on_two_ranks_goes_on_on_one(recipe, alone, tmp_path):
-    spread(recipe(parallel="fsdp"), tmp_path / "run", kill_after=5)
+    spread(recipe(parallel="fsdp"), tmp_path / "run", exit_after_five, codes=(9, 9))
     assert checkpoint.resolve(tmp_path / "run").name == "step-00000004"
     again = train(recipe(), out=tmp_path / "run", show=False)
     assert [loss for _, loss in again.losses] == pytest.approx([loss for _, loss in alone.losses], rel=1e-4)
     close(alone.checkpoint, again.checkpoint)
 
 
+@pytest.mark.slow
 def test_a_run_cut_on_one_rank_goes_on_on_two(recipe, alone, tmp_path):
     train_until(recipe(), tmp_path / "run", 3)
     told = spread(recipe(parallel="fsdp"), tmp_path / "run")
@@ -147,88 +133,131 @@ def test_a_step_shared_otherwise_goes_on_with_windows_anew_and_says_so(recipe, t
     assert len(curve(tmp_path / "run")) == 6
 
 
-def test_torchrun_starts_the_command(recipe, data, alone, tmp_path):
-    path = tmp_path / "recipe.yaml"
-    path.write_text(json.dumps(recipe(steps=2).values()))
-    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "hma_model.cli"]
-    done = subprocess.run(
-        [sys.executable, *command, "train", str(path), "--out", str(tmp_path / "run")],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+@pytest.mark.slow
+def test_torchrun_starts_the_command(recipe, alone, tmp_path):
+    done = torchrun(recipe(steps=2), tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("step 2, ") == 1
     first, _ = curve(tmp_path / "run")
     assert first == pytest.approx(alone.losses[0][1], rel=1e-4)
 
 
+@pytest.mark.slow
+def test_the_command_says_once_why_it_cannot_start_on_any_rank(recipe, tmp_path):
+    done = torchrun(recipe(data=[str(tmp_path / "gone")]), tmp_path)
+    assert done.returncode and len(errors(done.stderr)) == 1, done.stderr
+
+
+def torchrun(recipe, folder: Path) -> subprocess.CompletedProcess[str]:
+    path = folder / "recipe.yaml"
+    path.write_text(json.dumps(recipe.values()))
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "hma_model.cli"]
+    return subprocess.run(
+        [sys.executable, *command, "train", str(path), "--out", str(folder / "run")],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
 def test_ranks_that_cannot_share_a_step_are_told(recipe, tmp_path):
-    told = spread(recipe(batch_size=3, accumulate=1), tmp_path / "run")
-    assert "RecipeError" in told and "3 windows a step cannot be shared evenly by 2 ranks" in told
+    said = errors(spread(recipe(batch_size=3, accumulate=1), tmp_path / "run", codes=(1, 1)))
+    assert len(said) == 1 and "3 windows a step cannot be shared evenly by 2 ranks" in said[0]
 
 
-def test_a_full_disk_on_the_first_rank_ends_all(recipe, tmp_path, monkeypatch):
-    def write(path, content):
-        raise OSError(errno.ENOSPC, "No space left on device")
+def test_a_full_disk_on_the_first_rank_ends_all(recipe, tmp_path):
+    work = partial(train_on_a_full_disk, recipe(), tmp_path / "run")
+    said = errors(run_ranks(work, tmp_path / "said.txt", codes=(1, 1)))
+    assert len(said) == 1 and "No space left on device" in said[0]
 
-    monkeypatch.setattr("hma_model.trainer.write_atomic", write)
-    told = spread(recipe(), tmp_path / "run")
-    faults = [line for line in told.splitlines() if line.startswith("hma_data.errors.OutputError: ")]
-    assert len(faults) == 1 and "No space left on device" in faults[0]
+
+def train_on_a_full_disk(recipe, out: Path, rank: int) -> None:
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with mock.patch("hma_model.trainer.write_atomic", side_effect=full):
+        train(recipe, out=out)
 
 
 @pytest.mark.parametrize("rank", [0, 1])
-def test_a_fault_that_one_rank_has_is_said_once(recipe, tmp_path, rank):
-    told = spread(recipe(steps=60), tmp_path / "run", fail=rank)
-    faults = [line for line in told.splitlines() if line.startswith("hma_data.errors.")]
-    assert len(faults) == 1 and "lies on a disk that this rank alone has lost — mount it" in faults[0]
+def test_a_fault_that_one_rank_has_is_said_once_however_much_later_the_other_ends(recipe, tmp_path, rank):
+    on_step = partial(fail_and_outlast, rank, tmp_path / "pid")
+    said = errors(spread(recipe(), tmp_path / "run", on_step, codes=(1, 1)))
+    assert len(said) == 1 and "lies on a disk that this rank alone has lost — mount it" in said[0]
 
 
-def test_a_rank_says_itself_what_the_first_does_not_and_the_first_is_silent_then(monkeypatch):
-    monkeypatch.setattr(voice, "MOMENT", 0.05)
-    store, fault = HashStore(), ShardError("here", "is gone")
-    first, second = Voice(store, 0, 2), Voice(store, 1, 2)
-    assert first.heard() is None
-    second.leave(fault)
-    second.settle(fault)
-    assert not silent(fault, "1", monkeypatch)
-    heard = first.heard()
-    assert str(heard) == "rank 1: here: is gone" and silent(heard, "0", monkeypatch)
+def test_a_fault_that_all_ranks_have_before_they_meet_is_said_once(tmp_path):
+    assert errors(run_ranks(fail, tmp_path / "said.txt", codes=(1, 1, 1))) == ["error: here: is gone"]
 
 
-def test_a_rank_is_silent_where_the_first_has_spoken(monkeypatch):
-    store, fault = HashStore(), ShardError("here", "is gone")
-    first, second = Voice(store, 0, 2), Voice(store, 1, 2)
-    second.leave(fault)
-    heard = first.heard()
-    first.leave(heard)
-    second.settle(fault)
-    assert silent(fault, "1", monkeypatch) and not silent(heard, "0", monkeypatch)
+def fail(rank: int) -> None:
+    raise ShardError("here", "is gone")
 
 
-def silent(fault, rank: str, monkeypatch) -> bool:
-    """Whether a command on a rank ends without a word, with the fault's exit code."""
-    monkeypatch.setenv("RANK", rank)
+def test_a_rank_that_has_lost_the_others_finds_their_first_error():
+    store = dist.HashStore()
+    assert read_error(store) is None and read_error(None) is None
+    write_error(store, 1, ShardError("here", "is gone"))
+    write_error(store, 0, TypeError("another"))
+    assert str(read_error(store)) == "rank 1: here: is gone"
+
+
+def test_an_error_that_is_none_of_ours_is_written_with_its_kind():
+    store = dist.HashStore()
+    write_error(store, 0, TypeError("no number"))
+    assert str(read_error(store)) == "rank 0: TypeError: no number"
+
+
+def test_one_process_raises_its_own_error():
+    with pytest.raises(ShardError), report_once():
+        raise ShardError("here", "is gone")
+
+
+def test_a_rank_ends_though_an_error_keeps_the_network_past_its_group(tmp_path):
+    run_ranks(free_the_error_last, tmp_path / "said.txt")
+
+
+def free_the_error_last(rank: int) -> None:
+    """Rank 0 frees the error of a run while a collective is under way, which rank 1 then completes.
+
+    The collective's thread frees a tensor that Python knows, for which it takes the GIL. The error's
+    traceback holds the network under DDP, and with it the last reference to the process group.
+    """
+    store = dist.TCPStore("127.0.0.1", int(os.environ["MASTER_PORT"]), is_master=False)
     try:
-        with one_voice():
-            raise fault
-    except (ShardError, TrainingError):
-        return False
-    except SystemExit as ended:
-        return ended.code == fault.exit_code
+        with join(torch.device("cpu")) as world:
+            if rank == 0:
+                fail_under_ddp(world)
+            network = Spread(Network(), world, "ddp")
+            store.wait(["freeing"])
+            await_sleep(int(store.get("freeing")))
+            world.sum(torch.ones(1))
+            del network
+    except HMAError as fault:
+        held = fault
+        store.set("freeing", str(os.getpid()))
+        del held, fault
 
 
-def test_before_ranks_have_met_the_others_give_the_first_a_moment(monkeypatch):
-    waited: list[float] = []
-    monkeypatch.setattr(voice.time, "sleep", waited.append)
-    for rank, moments in (("0", []), ("1", [voice.MOMENT])):
-        monkeypatch.setenv("RANK", rank)
-        waited.clear()
-        with pytest.raises(ShardError), one_voice():
-            raise ShardError("here", "is gone")
-        assert waited == moments
+class Network(torch.nn.Linear):
+    device = torch.device("cpu")
+
+    def __init__(self) -> None:
+        super().__init__(2, 2)
+
+
+def fail_under_ddp(world: World) -> None:
+    network = Spread(Network(), world, "ddp")
+    dist.all_reduce(torch.ones(1), async_op=True)
+    raise TrainingError(str(network), "fails")
+
+
+def await_sleep(pid: int) -> None:
+    """Wait until a process waits for something itself, ten times in a row."""
+    asleep = 0
+    while asleep < 10 and alive(pid):
+        time.sleep(0.01)
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        asleep = asleep + 1 if state == "S" else 0
 
 
 def test_one_process_is_a_world_of_one():

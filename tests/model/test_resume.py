@@ -18,7 +18,6 @@ from tests.model.shards import make_shards
 
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory):
-    torch.set_num_threads(1)
     data = [str(make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm"))]
 
     def recipe(**changes):

@@ -4,13 +4,13 @@ import io
 import json
 import math
 import re
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.tensorflow_stub.errors import OutOfRangeError
@@ -44,7 +44,6 @@ class Painter:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("shards")
     arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
     return [str(arm), str(hand)]
@@ -55,11 +54,20 @@ def painter(monkeypatch):
     monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Painter())
 
 
-@pytest.fixture
-def run(data, painter, tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def seen(data, tmp_path_factory) -> Path:
     """The folder of a short run with everything to see."""
-    train(make_recipe({**TINY, **SEEN, "data": data}), out=tmp_path / "run", show=False)
-    return tmp_path / "run"
+    out = tmp_path_factory.mktemp("seen") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Painter())
+        train(make_recipe({**TINY, **SEEN, "data": data}), out=out, show=False)
+    return out
+
+
+@pytest.fixture
+def run(seen, painter, tmp_path) -> Path:
+    """A copy of that folder."""
+    return shutil.copytree(seen, tmp_path / "run")
 
 
 def events(path: Path) -> list[Event]:

@@ -3,32 +3,27 @@
 import errno
 import json
 import multiprocessing
-import os
 import random
+import resource
 import signal
-import subprocess
-import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 
-from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, TrainingError
+from hma_data.errors import CheckpointError, HMAError, OutputError, RecipeError, ShardError, TrainingError
 from hma_model import checkpoint
 from hma_model.recipe import make_recipe
 from hma_model.runlog import read_metrics
 from hma_model.train import train
+from tests.model.processes import command, end, kill_at_write, run, start
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards
-
-ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
-    torch.set_num_threads(1)
     return [str(make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm"))]
 
 
@@ -40,46 +35,43 @@ def recipe(data):
     return recipe
 
 
-def test_kills_at_random_moments_leave_the_run_that_was_never_killed(recipe, tmp_path):
+def train_quietly(recipe, out: Path) -> None:
+    train(recipe, out=out, show=False)
+
+
+def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_bit_for_bit(recipe, tmp_path):
+    whole = train(recipe(), out=tmp_path / "whole", show=False)
+    work = partial(train_quietly, recipe(), tmp_path / "cut")
+    killed = partial(kill_at_write, 10, "step-00000004", work)
+    run(killed, tmp_path / "said.txt", code=-signal.SIGKILL)
+    assert checkpoint.resolve(tmp_path / "cut").name == "step-00000002"
+    assert {line["step"] for line in read_metrics(tmp_path / "cut")} == {1, 2, 3, 4}
+    again = train(recipe(), out=tmp_path / "cut", show=False)
+    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
+
+
+@pytest.mark.slow
+def test_a_run_killed_again_and_again_goes_on_bit_for_bit(recipe, tmp_path):
     long = recipe(steps=60, checkpoint_every=3, eval_every=20, keep_last=2)
     whole = train(long, out=tmp_path / "whole", show=False)
-    moments, cuts = random.Random(7), 0
+    work, writes = partial(train_quietly, long, tmp_path / "cut"), random.Random(7)
     for _ in range(12):
-        pid = os.fork()  # a process of its own without torch's import
-        if not pid:
-            code = 1
-            try:
-                train(long, out=tmp_path / "cut", show=False)
-                code = 0
-            finally:
-                os._exit(code)
-        time.sleep(moments.uniform(0.05, 0.6))
-        os.kill(pid, signal.SIGKILL)
-        _, status = os.waitpid(pid, 0)
-        cuts += os.WIFSIGNALED(status)
-        if not os.WIFSIGNALED(status):
-            break
+        killed = partial(kill_at_write, writes.randint(1, 80), "cut", work)
+        run(killed, tmp_path / "said.txt", code=-signal.SIGKILL)
     again = train(long, out=tmp_path / "cut", show=False)
-    assert cuts >= 2
     assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
     assert sorted(p.name for p in (again.out / "checkpoints").iterdir()) == ["step-00000057", "step-00000060"]
 
 
 def test_the_command_saves_on_sigterm_and_says_how_to_go_on(recipe, tmp_path):
-    path = tmp_path / "recipe.yaml"
+    path, said = tmp_path / "recipe.yaml", tmp_path / "said.txt"
     path.write_text(json.dumps(recipe(steps=100_000, checkpoint_every=0, eval_every=0).values()))
-    run = subprocess.Popen(
-        [sys.executable, "-m", "hma_model.cli", "train", str(path), "--out", str(tmp_path / "run")],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    while not read_metrics(tmp_path / "run") and run.poll() is None:
+    process = start(partial(command, "train", str(path), "--out", str(tmp_path / "run")), said)
+    while not read_metrics(tmp_path / "run") and process.is_alive():
         time.sleep(0.05)
-    run.terminate()
-    _, said = run.communicate(timeout=120)
-    assert run.returncode == 130 and "the same command goes on" in said and "Traceback" not in said
+    process.terminate()
+    assert end([process], said) == [130]
+    assert "the same command goes on" in said.read_text() and "Traceback" not in said.read_text()
     step = int(checkpoint.resolve(tmp_path / "run").name.removeprefix("step-"))
     assert step == read_metrics(tmp_path / "run")[-1]["step"] > 0
 
@@ -114,27 +106,20 @@ def test_a_full_disk_is_one_error_and_leaves_the_last_checkpoint(recipe, tmp_pat
 
 
 def test_a_disk_that_takes_no_more_bytes_is_one_error(recipe, tmp_path):
-    program = (
-        "import json, resource, sys, torch\n"
-        "torch.set_num_threads(1)\n"
-        "from hma_model.recipe import make_recipe\n"
-        "from hma_model.train import train\n"
-        "def limit(facts):\n"
-        "    if facts['step'] == 3:\n"
-        "        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
-        "from hma_data.errors import HMAError\n"
-        "try:\n"
-        "    train(make_recipe(json.loads(sys.argv[1])), out=sys.argv[2], show=False, on_progress=limit)\n"
-        "except HMAError as fault:\n"
-        "    print(type(fault).__name__, fault)\n"
-    )
-    values = json.dumps(recipe().values())
-    done = subprocess.run(
-        [sys.executable, "-c", program, values, str(tmp_path / "run")],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.stdout.startswith("CheckpointError") and "cannot be written" in done.stdout, done.stderr
+    said = run(partial(train_on_a_small_disk, recipe(), tmp_path / "run"), tmp_path / "said.txt")
+    assert said.startswith("CheckpointError") and "cannot be written" in said
     assert checkpoint.resolve(tmp_path / "run").name == "step-00000002"
+
+
+def train_on_a_small_disk(recipe, out: Path) -> None:
+    def limit(facts) -> None:
+        if facts["step"] == 3:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+    try:
+        train(recipe, out=out, show=False, on_progress=limit)
+    except HMAError as fault:
+        print(type(fault).__name__, fault)
 
 
 @pytest.mark.parametrize("writer", ["trainer", "runlog", "report"])
@@ -193,7 +178,7 @@ def test_shards_of_two_tokenizers_are_refused_with_both_names(recipe, data, tmp_
         train(recipe(data=[*data, str(other)]), out=tmp_path / "run", show=False)
 
 
-def test_a_run_may_go_on_with_other_workers(recipe, tmp_path):
+def test_a_run_may_go_on_with_other_workers(recipe, tmp_path, quick_workers):
     whole = train(recipe(), out=tmp_path / "whole", show=False)
 
     def kill(facts):
@@ -206,7 +191,7 @@ def test_a_run_may_go_on_with_other_workers(recipe, tmp_path):
     assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
 
 
-def test_a_worker_that_is_killed_is_said_and_the_run_goes_on_from_its_last_checkpoint(recipe, tmp_path):
+def test_a_worker_that_is_killed_is_said_and_the_run_goes_on(recipe, tmp_path, quick_workers):
     long = {"steps": 30, "eval_every": 0, "checkpoint_every": 2}
     whole = train(recipe(**long), out=tmp_path / "whole", show=False)
 

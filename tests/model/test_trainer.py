@@ -21,7 +21,6 @@ from tests.model.shards import make_shards
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> list[str]:
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("shards")
     arm, hand = make_shards(folder / "arm", "arm"), make_shards(folder / "hand", "hand", dims=3, seed=1)
     return [str(arm), str(hand)]
@@ -79,6 +78,7 @@ def test_recomputing_activations_changes_no_loss(recipe, tmp_path):
     assert losses(recipe, tmp_path / "b", model=network, checkpointing=True) == plain
 
 
+@pytest.mark.slow
 def test_compiled_blocks_give_the_same_losses(recipe, tmp_path, monkeypatch):
     compiled, plain = [], torch.nn.Module.compile
 
