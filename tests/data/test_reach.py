@@ -8,13 +8,13 @@ from pathlib import Path
 
 import fsspec
 import pytest
+import s3fs
 
 from hma_data import reach, store
 from hma_data.errors import StorageAwayError, StorageError
 from hma_data.sources.base import open_source
 from hma_data.store import place
 
-s3fs = pytest.importorskip("s3fs")
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
 
 
@@ -81,7 +81,6 @@ def test_a_recording_at_a_closed_port_is_tried_three_times(
 
 
 def test_a_web_server_that_is_not_there_is_named(asked: Asked, closed: int) -> None:
-    pytest.importorskip("aiohttp")
     with pytest.raises(StorageAwayError, match="check the network, and the address$"):
         open_source("rlds").index(f"http://127.0.0.1:{closed}/toy/1.0.0")
     assert len(asked.connections) == 3

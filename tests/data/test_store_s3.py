@@ -15,24 +15,21 @@ from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import fsspec
 import numpy as np
 import pytest
+import torch
 
-pytest.importorskip("s3fs")
-moto_server = pytest.importorskip("moto.server")
-
-import fsspec  # noqa: E402
-
-from hma_data import remote_lock, store  # noqa: E402
-from hma_data.convert import convert  # noqa: E402
-from hma_data.embodiment import Embodiment  # noqa: E402
-from hma_data.errors import HMAError, OutputError, ShardError, StorageAwayError, StorageError  # noqa: E402
-from hma_data.files import cache_folder  # noqa: E402
-from hma_data.plan import Settings  # noqa: E402
-from hma_data.shards.reader import ShardSet  # noqa: E402
-from hma_data.shards.verify import verify  # noqa: E402
-from hma_data.store import RemotePath, place, put_file  # noqa: E402
-from tests.conftest import ARM_YAML, BlockTokenizer  # noqa: E402
+from hma_data import remote_lock, store
+from hma_data.convert import convert
+from hma_data.embodiment import Embodiment
+from hma_data.errors import HMAError, OutputError, ShardError, StorageAwayError, StorageError
+from hma_data.files import cache_folder
+from hma_data.plan import Settings
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from hma_data.store import RemotePath, place, put_file
+from tests.conftest import ARM_YAML, BlockTokenizer
 
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
 ROOT = Path(__file__).parents[2]
@@ -116,7 +113,9 @@ class _Hand(BaseHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[int]:
-    running = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    import moto.server
+
+    running = moto.server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     running.start()
     yield running.get_host_and_port()[1]
     running.stop()
@@ -228,7 +227,6 @@ def test_a_large_shard_goes_up_in_parts_and_appears_whole(out, proxy, tmp_path) 
 def test_forked_readers_of_a_dataloader_see_the_same_batches(
     toy_arm, toy_recording, out, tmp_path, whole
 ) -> None:
-    torch = pytest.importorskip("torch")
     from hma_data.loader import WindowDataset
 
     run(toy_arm, toy_recording, out)

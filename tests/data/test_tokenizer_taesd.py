@@ -131,7 +131,8 @@ def test_the_network_is_the_one_written_out(tmp_path, pooled):
 
 
 def test_it_is_diffusers_autoencoder_tiny(tmp_path):
-    diffusers = pytest.importorskip("diffusers")
+    import diffusers
+
     torch.manual_seed(0)
     sizes = {"encoder_block_out_channels": (16,) * 4, "decoder_block_out_channels": (24,) * 4}
     theirs = diffusers.AutoencoderTiny(**sizes, num_encoder_blocks=(1, 2, 1, 1)).eval()
