@@ -209,6 +209,7 @@ def test_a_row_group_costs_one_request_after_the_footer(toy_arm, toy_recording, 
     assert [(method, bool(asked)) for method, _, asked in proxy.log] == [("GET", True)]
 
 
+@pytest.mark.slow
 def test_a_large_shard_goes_up_in_parts_and_appears_whole(out, proxy, tmp_path) -> None:
     data = np.random.default_rng(0).bytes(120 << 20)
     (tmp_path / "large").write_bytes(data)
@@ -224,6 +225,7 @@ def test_a_large_shard_goes_up_in_parts_and_appears_whole(out, proxy, tmp_path) 
     assert (out / "large").open("rb").read(100) == data[:100]
 
 
+@pytest.mark.slow
 def test_forked_readers_of_a_dataloader_see_the_same_batches(
     toy_arm, toy_recording, out, tmp_path, whole
 ) -> None:
@@ -361,6 +363,7 @@ def job(folder: Path, recording: Path, out: RemotePath, workers: int) -> subproc
     )
 
 
+@pytest.mark.slow
 def test_a_killed_job_is_continued_by_the_same_command(toy_recording, out, whole, proxy, tmp_path) -> None:
     for wanted in (1, 3):
         process = job(tmp_path, toy_recording, out, workers=0)
@@ -379,6 +382,7 @@ def test_a_killed_job_is_continued_by_the_same_command(toy_recording, out, whole
     assert not list(cache_folder().rglob("*.part"))
 
 
+@pytest.mark.slow
 def test_two_jobs_at_once_on_one_output(toy_recording, out, whole, tmp_path) -> None:
     jobs = [job(tmp_path, toy_recording, out, workers=0) for _ in range(2)]
     said = [process.communicate(timeout=100)[1] for process in jobs]
@@ -389,6 +393,7 @@ def test_two_jobs_at_once_on_one_output(toy_recording, out, whole, tmp_path) -> 
     assert remote(out) == whole
 
 
+@pytest.mark.slow
 def test_workers_of_their_own_put_shards_too(toy_recording, out, whole, tmp_path) -> None:
     process = job(tmp_path, toy_recording, out, workers=2)
     _, errors = process.communicate(timeout=200)

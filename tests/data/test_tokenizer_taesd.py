@@ -69,6 +69,7 @@ def test_taef2_gives_a_robots_frames_back(real_data, taef2):
     assert psnr_db(true, taef2.decode(latents)).min() > 34
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_taef2_keeps_its_known_quality_on_a_whole_frame(real_data, taef2):
     import av
@@ -275,6 +276,7 @@ def test_latents_too_large_to_store_are_refused(tmp_path, weights):
 # -- in shards
 
 
+@pytest.mark.slow
 def test_it_makes_the_same_shards_with_any_number_of_workers(toy_arm: Embodiment, tmp_path, weights, tiny):
     write_toy(tmp_path / "toy.hdf5", [6, 5, 4])
     settings = Settings(val_fraction=0, cameras=("top",), shard_frames=6)
