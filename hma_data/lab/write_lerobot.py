@@ -66,11 +66,13 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
         encoder_threads=1,  # the bytes depend on their number
     )
     with _quiet():
-        for episode in episodes:
-            for frame in _frames(episode):
-                writer.add_frame(frame)
-            writer.save_episode()
-        writer.finalize()
+        try:
+            for episode in episodes:
+                for frame in _frames(episode):
+                    writer.add_frame(frame)
+                writer.save_episode()
+        finally:
+            writer.finalize()  # after a failure too: else it writes when collected, into a removed folder
 
 
 def _frames(episode: LeRobotEpisode) -> Iterable[dict[str, Any]]:

@@ -354,7 +354,8 @@ def test_a_storm_of_kills_ends_with_the_same_bytes(
     assert contents(out) == whole
 
 
-@pytest.mark.parametrize("kind", ["SIGSEGV", pytest.param("hang", marks=pytest.mark.slow)])
+@pytest.mark.slow  # test_engines has both, quickly, without a conversion around them
+@pytest.mark.parametrize("kind", ["SIGSEGV", "hang"])
 def test_an_episode_that_crashes_or_hangs_its_reader_is_refused_and_the_rest_kept(
     kind: str, script: Path, toy_recording: Path, tmp_path: Path
 ) -> None:

@@ -133,10 +133,9 @@ def theirs(root: Path) -> Any:
 
 
 def as_picture(tensor: Any) -> np.ndarray:
-    """Return (H, W, C) uint8 of lerobot's (C, H, W) uint8."""
-    picture: np.ndarray = tensor.permute(1, 2, 0).numpy()
-    assert picture.dtype == np.uint8
-    return picture
+    """Return (H, W, C) uint8 of lerobot's (C, H, W): bytes of a video, parts of one of a still picture."""
+    values: np.ndarray = tensor.permute(1, 2, 0).numpy()
+    return values if values.dtype == np.uint8 else np.rint(values * 255).astype(np.uint8)
 
 
 def rows_of(items: list[Any], robot: Embodiment, root: Path) -> Iterator[tuple[Any, Any, int]]:

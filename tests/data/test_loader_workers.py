@@ -1,7 +1,6 @@
 """The stream of batches: the same with any workers, in any DataLoader, over stops and ranks."""
 
 import copy
-import multiprocessing
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -32,12 +31,6 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
             make_set(folder / str(i), i, SMALL | {"frames": frames, "shard_frames": frames})
             for i, frames in enumerate((3_000, 600))
         ]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def preloaded() -> None:
-    """Workers fork from a server that has torch and the loader already."""
-    multiprocessing.set_forkserver_preload(["hma_data.loader"])
 
 
 def dataset(sets: Sequence[str | Path], **others: Any) -> MixtureDataset:
