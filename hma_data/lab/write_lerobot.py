@@ -70,7 +70,7 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
             for episode in episodes:
                 for frame in _frames(episode):
                     writer.add_frame(frame)
-                writer.save_episode()
+                writer.save_episode(parallel_encoding=False)  # else it forks this process, one for a camera
         finally:
             writer.finalize()  # after a failure too: else it writes when collected, into a removed folder
 

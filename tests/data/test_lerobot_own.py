@@ -207,7 +207,7 @@ def test_depth_is_a_feature_but_no_camera(tmp_path: Path) -> None:
         metres = np.full((HEIGHT, WIDTH, 1), 400 + 100 * row, np.uint16)
         colour = frame_of(0, row, {key: FEATURES[key] for key in ("action", CAM)})
         writer.add_frame(colour | {"depth": metres, "still_depth": metres, "task": "look"})
-    writer.save_episode()
+    writer.save_episode(parallel_encoding=False)
     writer.finalize()
     kinds = {info.key: info.kind for info in open_source("lerobot").inspect(str(root)).keys}
     assert (kinds[CAM], kinds["depth"], kinds["still_depth"]) == ("camera", "other", "other")
