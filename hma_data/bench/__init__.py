@@ -17,6 +17,7 @@ from hma_data.errors import UsageError
 
 BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
     "convert": "hma_data.bench.convert",
+    "lerobot": "hma_data.bench.lerobot",
     "loader": "hma_data.bench.loader",
     "registry": "hma_data.bench.registry",
     "shards": "hma_data.bench.shards",

@@ -22,6 +22,7 @@ RECORDERS = {
     "pusht_slow": "hma_data.lab.pusht",
     "pendulum": "hma_data.lab.pendulum",
     "planar_arm": "hma_data.lab.planar_arm",
+    "planar_arm_lerobot": "hma_data.lab.planar_arm",
 }
 
 
@@ -43,7 +44,7 @@ def record(
     Raises:
         UsageError: no such robot, or no episodes asked for.
         OutputError: the recording is there already, or cannot be written.
-        MissingDependencyError: the simulator is not installed.
+        MissingDependencyError: the simulator, or the writer of the format, is not installed.
     """
     if robot not in RECORDERS:
         raise UsageError(robot, "is not a laboratory robot", f"known: {', '.join(RECORDERS)}")
@@ -73,11 +74,11 @@ def written_beside(final: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def imported(simulator: str, install: str) -> Iterator[None]:
-    """Imports of a third-party simulator, without pygame's greeting and the warnings they make.
+def imported(package: str, install: str) -> Iterator[None]:
+    """Import a third-party package, without pygame's greeting and the warnings that imports make.
 
     Args:
-        simulator: its name, for the error.
+        package: its name, for the error.
         install: the command that installs it.
 
     Raises:
@@ -89,4 +90,4 @@ def imported(simulator: str, install: str) -> Iterator[None]:
             warnings.simplefilter("ignore", UserWarning)
             yield
     except ImportError as fault:
-        raise MissingDependencyError(simulator, f"cannot be imported: {fault}", install) from fault
+        raise MissingDependencyError(package, f"cannot be imported: {fault}", install) from fault

@@ -1,4 +1,6 @@
-"""Record a two-joint arm seen from above into HDF5: physics by pymunk, driven by joint velocities at 30 Hz.
+"""Record a two-joint arm seen from above: physics by pymunk, driven by joint velocities at 30 Hz.
+
+`planar_arm` goes into HDF5; `planar_arm_lerobot`, the same arm, into a LeRobotDataset.
 
 The arm stands in the middle of a walled square and shoves three loose blocks about. Each joint has a
 motor of limited torque, and the elbow has stops; blocks are slowed by the table. The velocities in a
@@ -27,11 +29,12 @@ if TYPE_CHECKING:
     import pymunk
 
     from hma_data.lab.write_hdf5 import Demo
+    from hma_data.lab.write_lerobot import LeRobotEpisode
 
 Floats = NDArray[np.float64]
 Manoeuvre = Callable[["Arm"], Floats]  # velocities (J,) now
 
-ROBOT = "planar_arm"
+TASK = "shove the blocks about"
 STEPS, HZ, TICKS = 96, 30, 8  # frames of an episode, their rate, ticks of the physics a frame
 ARENA, BASE = 512.0, np.array([256.0, 256.0])
 UPPER, FORE, RADIUS = 122.0, 102.0, 21.0  # lengths of the links, and half their width
@@ -47,14 +50,13 @@ BLOCK_COLORS = ((200, 40, 50), (30, 150, 90), (140, 60, 170))
 
 
 def record(out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
-    """Record the arm as `out/planar_arm.hdf5`.
+    """Record the arm as `out/planar_arm.hdf5`, or as the LeRobotDataset `out/planar_arm_lerobot`.
 
     Same arguments, same bytes. See `hma_data.lab.record`.
     """
-    from hma_data.lab.write_hdf5 import write_demos
-
-    if robot != ROBOT:
-        raise UsageError(robot, "is not this recorder's robot", f"known: {ROBOT}")
+    if robot not in _WRITERS:
+        raise UsageError(robot, "is not this recorder's robot", f"known: {', '.join(_WRITERS)}")
+    name, write = _WRITERS[robot]
 
     def demos() -> "Iterator[Demo]":
         for episode in range(episodes):
@@ -62,10 +64,36 @@ def record(out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Pro
             if on_progress:
                 on_progress(episode + 1, episodes)
 
-    final = Path(out) / f"{ROBOT}.hdf5"
-    with written_beside(final) as part:
-        write_demos(part, demos(), {"env_name": ROBOT, "type": 2, "env_kwargs": {"control_freq": HZ}})
-    return final
+    with written_beside(Path(out) / name) as part:
+        write(part, demos())
+    return Path(out) / name
+
+
+def _write_hdf5(part: Path, demos: "Iterator[Demo]") -> None:
+    from hma_data.lab.write_hdf5 import write_demos
+
+    write_demos(part, demos, {"env_name": "planar_arm", "type": 2, "env_kwargs": {"control_freq": HZ}})
+
+
+def _write_lerobot(part: Path, demos: "Iterator[Demo]") -> None:
+    from hma_data.embodiment import find
+    from hma_data.lab.write_lerobot import write_lerobot
+
+    write_lerobot(part, find("planar_arm_lerobot"), map(_as_lerobot, demos))
+
+
+def _as_lerobot(demo: "Demo") -> "LeRobotEpisode":
+    from hma_data.lab.write_lerobot import LeRobotEpisode
+
+    seen = demo.observations
+    state = np.concatenate([seen["joint_pos"], seen["joint_vel"]], axis=1).astype(np.float32)
+    return LeRobotEpisode({"observation.images.top": seen["image"]}, demo.actions, state, TASK)
+
+
+_WRITERS: dict[str, tuple[str, "Callable[[Path, Iterator[Demo]], None]"]] = {
+    "planar_arm": ("planar_arm.hdf5", _write_hdf5),
+    "planar_arm_lerobot": ("planar_arm_lerobot", _write_lerobot),
+}
 
 
 class Arm:

@@ -1,10 +1,17 @@
-"""The short recording of `bag_files` in every kind of bag, written once."""
+"""Fixtures of the data tests; the short recording of `bag_files` in every kind of bag, written once."""
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
 
 from tests.data.bag_files import KINDS, Recording, make_recording
+
+
+@pytest.fixture(scope="session", autouse=True)
+def preloaded() -> None:
+    """Let processes of a fork server fork from one that has torch and the loader already."""
+    multiprocessing.set_forkserver_preload(["hma_data.loader"])
 
 
 @pytest.fixture(scope="session")

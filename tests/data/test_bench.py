@@ -10,6 +10,7 @@ import pytest
 
 from hma_data import bench
 from hma_data.align import to_clip
+from hma_data.bench import lerobot as bench_lerobot
 from hma_data.bench import sources
 from hma_data.bench.recordings import CASES, actions
 from hma_data.bench.scenes import scene
@@ -73,3 +74,12 @@ def test_sources_are_measured_with_units() -> None:
 def test_a_format_that_is_not_there_is_refused() -> None:
     with pytest.raises(UsageError, match="known: rlds-jpeg-256"):
         sources.run(sources.DEFAULTS | {"formats": ["vhs"]})
+
+
+@pytest.mark.slow
+def test_our_reader_is_measured_beside_lerobots() -> None:
+    results = bench_lerobot.run({"episodes": 2, "frames": 8, "height": 48, "width": 64, "seed": 0})
+    assert [(one["reader"], one["order"], one["frames"]) for one in results] == [
+        ("hma", "in order", 8), ("hma", "random", 2), ("lerobot", "in order", 8), ("lerobot", "random", 2),
+    ]  # fmt: skip
+    assert all(one["frames_per_cpu_second"] > 0 and one["start_cpu_s"] > 0 for one in results)

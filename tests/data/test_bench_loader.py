@@ -10,6 +10,7 @@ from hma_data.shards.verify import verify
 from tests.data.test_pools import SMALL
 
 
+@pytest.mark.slow
 def test_every_case_reports_speed_opening_and_memory() -> None:
     settings = SMALL | {"embodiments": 2, "windows": 64, "runs": 1}
     results = loader.run(settings)

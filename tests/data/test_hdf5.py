@@ -19,6 +19,7 @@ from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources import hdf5_file
 from hma_data.sources.base import detect, open_source
 from hma_data.sources.hdf5_file import OPEN_FILES, rows
+from tests.data.fresh import run_fresh
 from tests.data.hdf5_files import H, T, W, embodiment, fill
 from tests.data.hub_cache import as_snapshot
 
@@ -237,15 +238,24 @@ def test_only_the_chunks_of_the_frames_asked_for_are_read(demos: Path) -> None:
         frames([13])
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+FORKING = """
+import os, sys
+import numpy as np
+from hma_data.sources.base import open_source
+from tests.data.test_hdf5 import embodiment
+
+stream = open_source("hdf5").read(sys.argv[1], "demo_3", embodiment()).streams["front"]
+first = stream.frames([1])
+child = os.fork()
+if child == 0:
+    os._exit(0 if np.array_equal(stream.frames([1]), first) else 1)
+assert np.array_equal(stream.frames([1]), first)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+"""
+
+
 def test_a_forked_child_reads_what_its_parent_opened(demos: Path) -> None:
-    stream = open_source("hdf5").read(str(demos), "demo_3", embodiment()).streams["front"]
-    first = stream.frames([1])
-    child = os.fork()
-    if child == 0:
-        os._exit(0 if np.array_equal(stream.frames([1]), first) else 1)
-    assert np.array_equal(stream.frames([1]), first)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    run_fresh(FORKING, demos)
 
 
 @pytest.mark.parametrize("locking", [None, True, False])

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -311,29 +312,49 @@ def workers_of(pid: int) -> list[int]:
     return [int(child) for child, name in names.items() if b"spawn_main" in name]
 
 
+def shards_in(out: Path) -> int:
+    return len(list(out.rglob("*.parquet")))
+
+
+def test_a_killed_job_is_continued_to_the_same_bytes(
+    script: Path, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble")
+    while process.poll() is None and not shards_in(tmp_path / "out"):
+        time.sleep(0.01)
+    process.kill()
+    _, errors = process.communicate()
+    assert process.returncode == -signal.SIGKILL, errors
+    assert run(toy_arm, toy_recording, tmp_path / "out").kept_shards >= 1
+    assert contents(tmp_path / "out") == whole
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_storm_of_kills_ends_with_the_same_bytes(
     seed: int, script: Path, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
 ) -> None:
-    draws = random.Random(seed)
-    for _ in range(30):
-        process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble")
-        end = time.monotonic() + draws.uniform(0.6, 2.5)
-        while process.poll() is None and time.monotonic() < end:
-            time.sleep(draws.uniform(0.05, 0.3))
+    """Each run loses two workers, then is killed, each at a drawn number of shards; the last one ends."""
+    draws, out = random.Random(seed), tmp_path / "out"
+    for last in (False, False, True):
+        process = job(script, toy_recording, out, tmp_path / "trouble")
+        for victim in ("worker", "worker", "job"):
+            wanted = shards_in(out) + draws.choice([0, 1])
+            while process.poll() is None and (shards_in(out) < wanted or not workers_of(process.pid)):
+                time.sleep(0.01)
             alive = workers_of(process.pid)
-            if alive and draws.random() < 0.5:
-                os.kill(draws.choice(alive), signal.SIGKILL)
-        if process.poll() is None and draws.random() < 0.7:
-            process.kill()
-        _, errors = process.communicate()
+            if victim == "worker" and alive:
+                with suppress(ProcessLookupError):
+                    os.kill(draws.choice(alive), signal.SIGKILL)
+            elif victim == "job" and not last:
+                process.kill()
+        _, errors = process.communicate(timeout=200)
         assert process.returncode in (0, -signal.SIGKILL), errors
-        if process.returncode == 0:
-            break
-    assert process.returncode == 0, "thirty runs were not enough"
-    assert contents(tmp_path / "out") == whole
+    assert process.returncode == 0, errors
+    assert contents(out) == whole
 
 
+@pytest.mark.slow  # test_engines has both, quickly, without a conversion around them
 @pytest.mark.parametrize("kind", ["SIGSEGV", "hang"])
 def test_an_episode_that_crashes_or_hangs_its_reader_is_refused_and_the_rest_kept(
     kind: str, script: Path, toy_recording: Path, tmp_path: Path

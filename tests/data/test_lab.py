@@ -52,7 +52,7 @@ def bag(path: Path) -> dict[str, list[tuple[int, int, Any]]]:
 
 
 def hashes(path: Path) -> list[str]:
-    files = [path] if path.is_file() else sorted(path.iterdir())
+    files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())
     return [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
 
 

@@ -1,10 +1,8 @@
-"""LeRobotDatasets written by lerobot itself, read natively and by lerobot's own reader.
+"""LeRobotDatasets written by lerobot itself (version 3.0), read by us and by lerobot's own reader.
 
-Written for lerobot 0.6 (version 3.0 of the format) and 0.3 (version 2.1); skipped without it. Numbers, texts
-and times are equal; pictures are equal to lerobot's PyAV backend, byte for byte.
+Numbers, texts and times are equal; pictures are equal to those of lerobot's PyAV backend, byte for byte.
 """
 
-import inspect
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,6 @@ from hma_data.embodiment import Embodiment
 from hma_data.errors import SourceError
 from hma_data.sources.base import open_source
 from hma_data.sources.video_file import frame_table
-
-pytest.importorskip("lerobot")
 
 FPS, HEIGHT, WIDTH = 10, 64, 96
 LENGTHS = (12, 9, 15, 2, 11)
@@ -81,22 +77,17 @@ def frame_of(episode: int, row: int, features: dict[str, Any]) -> dict[str, Any]
 def write(
     root: Path, features: dict[str, Any], settle: Callable[[Any], None] = lambda writer: None, **options: Any
 ) -> Path:
-    """A dataset by lerobot's own writer, of whichever version it writes."""
+    """Write a dataset with lerobot's own writer."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     writer = LeRobotDataset.create("team/arm", FPS, features, root=root, robot_type="testbot", **options)
     settle(writer)
-    said_apart = "task" in inspect.signature(writer.add_frame).parameters
     for episode, length in enumerate(LENGTHS):
         for row in range(length):
-            frame, task = frame_of(episode, row, features), TASKS[(episode + row // 8) % 2]
-            if said_apart:
-                writer.add_frame(frame, task)
-            else:
-                writer.add_frame(frame | {"task": task})
-        writer.save_episode()
-    if hasattr(writer, "finalize"):
-        writer.finalize()
+            task = TASKS[(episode + row // 8) % 2]
+            writer.add_frame(frame_of(episode, row, features) | {"task": task})
+        writer.save_episode(parallel_encoding=False)  # else it forks this process, which has threads
+    writer.finalize()
     return root
 
 
@@ -107,61 +98,60 @@ def many_files(writer: Any) -> None:
     writer.meta.info.video_files_size_in_mb = 1e-6
 
 
-def version() -> str:
-    from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
-
-    return str(CODEBASE_VERSION)
-
-
 def encoder(codec: str) -> dict[str, Any]:
-    """The options that make lerobot encode so; older versions know AV1 alone."""
-    try:
-        from lerobot.configs.video import RGBEncoderConfig
-    except ImportError:
-        if codec != "av1":
-            pytest.skip("this lerobot writes AV1 alone")
-        return {}
+    """Return the options that make lerobot encode so."""
+    from lerobot.configs.video import RGBEncoderConfig
+
     return {"rgb_encoder": RGBEncoderConfig(vcodec={"av1": "libsvtav1"}.get(codec, codec))}
 
 
-@pytest.fixture(scope="module", params=["av1 one file", "av1 many files", "h264 one file", "h264 many files"])
+SLOW = pytest.mark.slow
+WAYS = [
+    "av1 many files",
+    *(pytest.param(way, marks=SLOW) for way in ("av1 one file", "h264 one file", "h264 many files")),
+]
+
+
+@pytest.fixture(scope="module", params=WAYS)
 def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     codec, _, files = request.param.partition(" ")
-    if files == "many files" and version() != "v3.0":
-        pytest.skip("version 2 keeps a file an episode")
     settle = many_files if files == "many files" else lambda writer: None
     return write(tmp_path_factory.mktemp("own") / "set", FEATURES, settle, **encoder(codec))
 
 
+@pytest.fixture(scope="module")
+def items(written: Path) -> list[Any]:
+    """Each frame as lerobot reads it."""
+    return list(theirs(written))
+
+
 def theirs(root: Path) -> Any:
-    """lerobot's own reader over the dataset."""
+    """Return lerobot's own reader over the dataset."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    eight_bit = "return_uint8" in inspect.signature(LeRobotDataset.__init__).parameters
-    options = {"return_uint8": True} if eight_bit else {}
-    return LeRobotDataset("team/arm", root=root, video_backend="pyav", **options)
+    return LeRobotDataset("team/arm", root=root, video_backend="pyav", return_uint8=True)
 
 
 def as_picture(tensor: Any) -> np.ndarray:
-    """(C, H, W) of lerobot, bytes or parts of one -> (H, W, C) uint8."""
-    values = tensor.permute(1, 2, 0).numpy()
+    """Return (H, W, C) uint8 of lerobot's (C, H, W): bytes of a video, parts of one of a still picture."""
+    values: np.ndarray = tensor.permute(1, 2, 0).numpy()
     return values if values.dtype == np.uint8 else np.rint(values * 255).astype(np.uint8)
 
 
-def rows_of(dataset: Any, robot: Embodiment, root: Path) -> Iterator[tuple[Any, Any, int]]:
-    """Each frame as lerobot has it, the episode as we have it, and the row in it."""
+def rows_of(items: list[Any], robot: Embodiment, root: Path) -> Iterator[tuple[Any, Any, int]]:
+    """Yield each frame as lerobot has it, the episode as we have it, and the row in it."""
     source, at = open_source("lerobot"), 0
     for ref in source.index(str(root), robot):
         episode = source.read(str(root), ref.id, robot)
         for row in range(ref.frames):
-            yield dataset[at], episode, row
+            yield items[at], episode, row
             at += 1
-    assert at == len(dataset) == sum(LENGTHS)
+    assert at == len(items) == sum(LENGTHS)
 
 
-def test_numbers_times_and_words_are_equal(written: Path) -> None:
+def test_numbers_times_and_words_are_equal(written: Path, items: list[Any]) -> None:
     robot = arm(cameras=[{"name": "still", "key": STILL}])
-    for item, episode, row in rows_of(theirs(written), robot, written):
+    for item, episode, row in rows_of(items, robot, written):
         np.testing.assert_array_equal(episode.actions[0].values[row], item["action"].numpy())
         state = np.concatenate([np.atleast_1d(item[key].numpy()).reshape(-1) for key in NUMBERS[1:]])
         np.testing.assert_array_equal(episode.states[0].values[row], state.astype(np.float32))
@@ -169,10 +159,10 @@ def test_numbers_times_and_words_are_equal(written: Path) -> None:
         assert row or episode.instruction == item["task"]
 
 
-def test_every_picture_is_equal_byte_for_byte(written: Path) -> None:
+def test_every_picture_is_equal_byte_for_byte(written: Path, items: list[Any]) -> None:
     robot = arm()
     assert [camera.name for camera in robot.cameras] == ["cam", "side", "still"]
-    for item, episode, row in rows_of(theirs(written), robot, written):
+    for item, episode, row in rows_of(items, robot, written):
         for camera in robot.cameras:
             mine = episode.streams[camera.name].frames([row])[0]
             np.testing.assert_array_equal(mine, as_picture(item[camera.key]), str((episode.id, row)))
@@ -182,11 +172,8 @@ def test_files_are_laid_out_as_meant(written: Path, request: pytest.FixtureReque
     name = request.node.callspec.params["written"]
     files = [len(list(written.rglob(f"{CAM}/**/*.mp4"))), len(list((written / "data").rglob("*.parquet")))]
     assert frame_table(next(written.rglob("*.mp4"))).codec == name.partition(" ")[0]
-    if version() != "v3.0":
-        assert files == [len(LENGTHS)] * 2
-    else:
-        assert files == [1, 1] if "one" in name else min(files) > 1, str(files)
-        assert len(list((written / "data").iterdir())) == (files[1] + 1) // 2
+    assert files == [1, 1] if "one" in name else min(files) > 1, str(files)
+    assert len(list((written / "data").iterdir())) == (files[1] + 1) // 2
 
 
 def test_it_is_inspected_without_a_problem(written: Path) -> None:
@@ -207,21 +194,20 @@ def test_success_and_a_text_column_are_the_episodes(written: Path) -> None:
     assert read[0].metadata["tasks"] == list(TASKS)
 
 
+@SLOW
 def test_depth_is_a_feature_but_no_camera(tmp_path: Path) -> None:
-    if version() != "v3.0":
-        pytest.skip("no depth before version 3")
     depth = {"dtype": "video", "shape": (HEIGHT, WIDTH, 1), "names": SIDES, "info": {"is_depth_map": True}}
     still = depth | {"dtype": "image"}
     features = {key: FEATURES[key] for key in ("action", CAM)} | {"depth": depth, "still_depth": still}
-    root = tmp_path / "set"
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    root = tmp_path / "set"
     writer = LeRobotDataset.create("team/arm", FPS, features, root=root, **encoder("h264"))
     for row in range(6):
         metres = np.full((HEIGHT, WIDTH, 1), 400 + 100 * row, np.uint16)
         colour = frame_of(0, row, {key: FEATURES[key] for key in ("action", CAM)})
         writer.add_frame(colour | {"depth": metres, "still_depth": metres, "task": "look"})
-    writer.save_episode()
+    writer.save_episode(parallel_encoding=False)
     writer.finalize()
     kinds = {info.key: info.kind for info in open_source("lerobot").inspect(str(root)).keys}
     assert (kinds[CAM], kinds["depth"], kinds["still_depth"]) == ("camera", "other", "other")
@@ -233,33 +219,34 @@ def test_depth_is_a_feature_but_no_camera(tmp_path: Path) -> None:
             source.read(str(root), "episode_000000", arm(cameras=[{"name": "d", "key": key}], state=None))
 
 
+@SLOW
 def test_episodes_deleted_by_lerobot_leave_the_others_equal(tmp_path: Path) -> None:
-    tools = pytest.importorskip("lerobot.datasets.dataset_tools")
+    from lerobot.datasets.dataset_tools import delete_episodes
+
     features = {key: FEATURES[key] for key in ("action", CAM)}
     root = write(tmp_path / "set", features, **encoder("h264"))
-    tools.delete_episodes(theirs(root), [1, 3], output_dir=tmp_path / "less", repo_id="team/less")
+    delete_episodes(theirs(root), [1, 3], output_dir=tmp_path / "less", repo_id="team/less")
     robot, source = arm(cameras=[{"name": "cam", "key": CAM}], state=None), open_source("lerobot")
     refs = source.index(str(tmp_path / "less"), robot)
     assert [ref.frames for ref in refs] == [12, 15, 11]
-    dataset, at = theirs(tmp_path / "less"), 0
+    kept, at = list(theirs(tmp_path / "less")), 0
     for ref, original in zip(refs, (0, 2, 4), strict=True):
         episode = source.read(str(tmp_path / "less"), ref.id, robot)
         frames = episode.streams["cam"].frames(range(ref.frames))
         for row in range(ref.frames):
             wanted = frame_of(original, row, features)["action"]
             np.testing.assert_array_equal(episode.actions[0].values[row], wanted)
-            np.testing.assert_array_equal(frames[row], as_picture(dataset[at][CAM]))
+            np.testing.assert_array_equal(frames[row], as_picture(kept[at][CAM]))
             at += 1
 
 
+@SLOW
 def test_metadata_spread_over_many_row_groups_is_whole(tmp_path: Path) -> None:
-    if version() != "v3.0":
-        pytest.skip("version 2 keeps one list of lines")
     features = {"action": FEATURES["action"], STILL: FEATURES[STILL]}
     root = write(tmp_path / "set", features, many_files, metadata_buffer_size=1)
     groups = [pq.ParquetFile(path).num_row_groups for path in (root / "meta/episodes").rglob("*.parquet")]
     assert sum(groups) > 1
     robot = arm(cameras=[{"name": "still", "key": STILL}], state=None)
-    for item, episode, row in rows_of(theirs(root), robot, root):
+    for item, episode, row in rows_of(list(theirs(root)), robot, root):
         np.testing.assert_array_equal(episode.streams["still"].frames([row])[0], as_picture(item[STILL]))
         np.testing.assert_array_equal(episode.actions[0].values[row], item["action"].numpy())

@@ -149,7 +149,7 @@ def test_a_shard_that_goes_while_training_stops_it_with_its_name(
     sets: list[Path], damage: Callable[[Path], None], workers: int
 ) -> None:
     data = MixtureDataset(sets, 16, 6, pool=1, memory_mib=1)
-    batches = data.batches(workers, "fork")
+    batches = data.batches(workers, "forkserver")
     taken = len(list(islice(batches, 2)))
     for folder in sets:
         for shard in sorted((folder / "train").iterdir())[1:]:

@@ -14,9 +14,11 @@ from torch.utils.data import DataLoader
 from hma_data.bench.loader import make_set
 from hma_data.loader import Batch, MixtureDataset, WindowDataset, as_batch
 from hma_data.shards import writer
+from tests.data.fresh import run_fresh
 from tests.data.test_pools import SMALL
 
 FRAMES, SIZE = 6, 8
+WORKERS = "forkserver"  # forking this process, which has threads, may stop the child for ever
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +47,27 @@ def windows_of(batch: Batch) -> list[tuple[str, int, int]]:
     return list(zip(batch.embodiment, batch.episode.tolist(), batch.frame.tolist(), strict=True))
 
 
-@pytest.mark.parametrize(("workers", "context"), [(1, "fork"), (2, "spawn"), (3, "fork")])
+@pytest.mark.parametrize(
+    ("workers", "context"), [(1, WORKERS), pytest.param(2, "spawn", marks=pytest.mark.slow), (3, WORKERS)]
+)
 def test_any_number_of_workers_gives_the_same_batches(sets: list[Path], workers: int, context: str) -> None:
     data = dataset(sets)
     assert seen(data.batches(workers, context), 14) == seen(iter(dataset(sets)), 14)
     assert data.state_dict()["step"] == 14
+
+
+FORKING = """
+import sys
+from tests.data.test_loader_workers import dataset, seen
+
+sets = sys.argv[1:]
+data = dataset(sets)
+assert seen(data.batches(3, "fork"), 14) == seen(iter(dataset(sets)), 14)
+"""
+
+
+def test_forked_workers_give_the_same_batches(sets: list[Path]) -> None:
+    run_fresh(FORKING, *sets)
 
 
 def test_a_run_stopped_with_some_workers_goes_on_with_others(sets: list[Path]) -> None:
@@ -58,7 +76,7 @@ def test_a_run_stopped_with_some_workers_goes_on_with_others(sets: list[Path]) -
     for workers, count in ((2, 7), (0, 5), (3, 9), (1, 9)):
         data = dataset(sets)
         data.load_state_dict(copy.deepcopy(state))
-        found += seen(data.batches(workers, "fork"), count)
+        found += seen(data.batches(workers, WORKERS), count)
         state = data.state_dict()
     assert found == whole
 
@@ -88,7 +106,7 @@ def test_a_dataloader_gives_the_same_batches_after_some_were_taken_here(sets: li
     whole = seen(iter(dataset(sets)), 12)
     data = dataset(sets)
     list(islice(data, 3))
-    loader = DataLoader(data, batch_size=None, num_workers=2, multiprocessing_context="fork")
+    loader = DataLoader(data, batch_size=None, num_workers=2, multiprocessing_context=WORKERS)
     assert seen(iter(loader), 9) == whole[3:]
 
 
@@ -98,7 +116,7 @@ def test_workers_that_persist_go_on_with_new_windows(sets: list[Path]) -> None:
         batch_size=None,
         num_workers=2,
         persistent_workers=True,
-        multiprocessing_context="fork",
+        multiprocessing_context=WORKERS,
     )
     first = seen(iter(loader), 4)
     again = seen(iter(loader), 4)
@@ -115,7 +133,7 @@ def test_a_dataloader_shuffles_windows_by_number(sets: list[Path]) -> None:
         shuffle=True,
         generator=order,
         num_workers=1,
-        multiprocessing_context="fork",
+        multiprocessing_context=WORKERS,
         collate_fn=as_batch,
     )
     found = [window for batch in loader for window in windows_of(batch)]
@@ -174,9 +192,10 @@ def test_a_set_in_a_store_gives_the_same_batches_as_the_folder(sets: list[Path])
 
 
 def stateful(sets: list[Path], workers: int) -> Any:
-    torchdata = pytest.importorskip("torchdata.stateful_dataloader")
-    context = "fork" if workers else None
-    return torchdata.StatefulDataLoader(
+    from torchdata.stateful_dataloader import StatefulDataLoader
+
+    context = WORKERS if workers else None
+    return StatefulDataLoader(
         dataset(sets), batch_size=None, num_workers=workers, multiprocessing_context=context
     )
 

@@ -217,8 +217,9 @@ def test_lerobot_features_have_the_widths_names_and_picture_sizes() -> None:
 
 
 def test_lerobot_makes_a_dataset_of_the_features(tmp_path: Path) -> None:
-    lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot is not installed")
-    made = lerobot.LeRobotDataset.create(
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    made = LeRobotDataset.create(
         "here/arm", fps=10, features=lerobot_features(robot("hdf5")), root=tmp_path / "set", use_videos=True
     )
     assert made.meta.features["action"]["shape"] == (4,)

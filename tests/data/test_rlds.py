@@ -583,9 +583,9 @@ def test_the_real_bridge_recording_inspects_without_problems(real_data):
 
 
 @pytest.mark.real
+@pytest.mark.slow
 def test_the_real_bridge_recording_equals_tensorflow_datasets(real_data):
-    pytest.importorskip("tensorflow")
-    tfds = pytest.importorskip("tensorflow_datasets")
+    tfds = pytest.importorskip("tensorflow_datasets", reason="needs the dependency group tfds")
     folder = real_data / "rlds" / "bridge_dataset" / "1.0.0"
     truth = tfds.builder_from_directory(str(folder)).as_dataset(split="train", shuffle_files=False)
     robot = find("bridge_data_v2")

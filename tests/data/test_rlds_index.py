@@ -216,7 +216,6 @@ class Handler(SimpleHTTPRequestHandler):
 @pytest.fixture
 def served(tmp_path, monkeypatch):
     """(folder that is served, its URI, the handler)."""
-    pytest.importorskip("aiohttp")
     monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
 
     class Own(Handler):
@@ -277,7 +276,6 @@ def test_a_server_without_ranges_is_named(served):
 
 
 def test_a_server_that_is_not_there_is_one_error(monkeypatch):
-    pytest.importorskip("aiohttp")
     monkeypatch.setattr(fetching, "WAITS_S", (0.0, 0.0, 0.0))
     with pytest.raises(SourceError):
         RLDS.index("http://127.0.0.1:9/nothing")

@@ -1,26 +1,20 @@
-"""RLDS folders written by TensorFlow Datasets itself: what we read equals what it reads.
-
-Needs tensorflow and tensorflow-datasets, which are no dependencies; skips without.
-"""
+"""RLDS folders written by TensorFlow Datasets itself: what we read equals what it reads."""
 
 import json
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
-tfds = pytest.importorskip("tensorflow_datasets")
-tf = pytest.importorskip("tensorflow")
-ml_dtypes = pytest.importorskip("ml_dtypes")
+from hma_data.embodiment import Embodiment
+from hma_data.errors import EpisodeError
+from hma_data.sources.base import open_source
+from hma_data.sources.rlds_steps import Steps
+from hma_data.sources.tfds_folder import open_folder
 
-from hma_data.embodiment import Embodiment  # noqa: E402
-from hma_data.errors import EpisodeError  # noqa: E402
-from hma_data.sources.base import open_source  # noqa: E402
-from hma_data.sources.rlds_steps import Steps  # noqa: E402
-from hma_data.sources.tfds_folder import open_folder  # noqa: E402
-
-F = tfds.features
+pytestmark = pytest.mark.slow
 RLDS = open_source("rlds")
 EPISODES = {"train": 7, "val": 3, "test-hard": 3}
 DTYPES = (
@@ -39,132 +33,24 @@ NUMBERS = {
 }
 
 
-def features() -> Any:
-    numbers = {
-        key: F.Tensor(shape=shape, dtype=getattr(tf, dtype), encoding=encoding)
-        for key, (dtype, encoding, shape) in NUMBERS.items()
-    }
-    steps = {
-        "numbers": numbers,
-        "observation": {
-            "png": F.Image(shape=(20, 30, 3), encoding_format="png"),
-            "jpeg": F.Image(shape=(20, 30, 3), encoding_format="jpeg"),
-            "grey": F.Image(shape=(20, 30, 1), encoding_format="png"),
-            "depth": F.Image(shape=(20, 30, 1), dtype=np.uint16, encoding_format="png"),
-            "raw": F.Tensor(shape=(4, 5, 3), dtype=np.uint8, encoding="zlib"),
-            "any": F.Tensor(shape=(None, None, 3), dtype=np.uint8, encoding="bytes"),
-            "label": F.ClassLabel(names=["push", "pick", "place"]),
-            "box": F.BBoxFeature(),
-            "scalar": F.Scalar(dtype=np.float32),
-        },
-        "words": F.Text(),
-        "names": F.Tensor(shape=(2,), dtype=np.str_),
-        "pair": F.Sequence(F.Tensor(shape=(2,), dtype=np.float32)),
-        "ragged": F.Sequence(np.int32),
-        "deep": F.Sequence(F.Sequence(np.int64)),
-        "synonyms": F.Sequence(F.Text()),
-        "is_first": np.bool_,
-        "is_last": np.bool_,
-    }
-    metadata = {
-        "file": F.Text(), "success": F.Scalar(np.bool_), "number": F.Scalar(np.uint64), "weight": np.float64,
-    }  # fmt: skip
-    return F.FeaturesDict({"steps": F.Dataset(steps), "episode_metadata": metadata})
+@pytest.fixture(scope="module")
+def toy() -> ModuleType:
+    """The module that writes and reads the dataset with TensorFlow Datasets."""
+    pytest.importorskip("tensorflow_datasets", reason="needs the dependency group tfds")
+    from tests.data import tfds_toy
 
-
-def number(dtype: str, shape: tuple[int, ...], rng: np.random.Generator) -> Any:
-    if dtype == "bool":
-        values = rng.integers(0, 2, shape).astype(bool)
-    elif dtype == "bfloat16":
-        values = np.asarray(rng.standard_normal(shape)).astype(ml_dtypes.bfloat16)
-    elif np.dtype(dtype).kind == "f":
-        values = np.asarray(rng.standard_normal(shape)).astype(dtype)
-    else:
-        info = np.iinfo(dtype)
-        values = np.asarray(rng.integers(info.min, info.max, shape, dtype=dtype, endpoint=True))
-    return values if shape else values[()]
-
-
-def step(index: int, last: bool, rng: np.random.Generator) -> dict[str, Any]:
-    def picture(*shape: int, dtype: str = "uint8") -> np.ndarray:
-        return rng.integers(0, np.iinfo(dtype).max, shape, dtype)
-
-    smooth = np.linspace(0, 255, 30)[None, :, None] * np.linspace(0.2, 1, 20)[:, None, None]
-    return {
-        "numbers": {key: number(dtype, shape, rng) for key, (dtype, _, shape) in NUMBERS.items()},
-        "observation": {
-            "png": picture(20, 30, 3),
-            "jpeg": (smooth * rng.uniform(0.3, 1, 3)).astype(np.uint8),
-            "grey": picture(20, 30, 1),
-            "depth": picture(20, 30, 1, dtype="uint16"),
-            "raw": picture(4, 5, 3),
-            "any": picture(6, 7, 3),
-            "label": int(rng.integers(3)),
-            "box": F.BBox(0.1, 0.2, 0.5, 0.75),
-            "scalar": np.float32(rng.standard_normal()),
-        },
-        "words": f"hebe Größe {index} 手",
-        "names": ["arm", f"n{index}"],
-        "pair": rng.standard_normal((3, 2)).astype(np.float32),
-        "ragged": list(range(index % 3)),
-        "deep": rng.integers(-9, 9, (2, 2)),
-        "synonyms": ["push it", "shove it"][: 1 + index % 2],
-        "is_first": index == 0,
-        "is_last": last,
-    }
-
-
-class Toy(tfds.core.GeneratorBasedBuilder):
-    """Ten episodes over three splits."""
-
-    VERSION = tfds.core.Version("1.2.3")
-
-    def _info(self) -> Any:
-        return self.dataset_info_from_configs(features=features())
-
-    def _split_generators(self, dl_manager: Any) -> Any:
-        return {split: self._generate_examples(split) for split in EPISODES}
-
-    def _generate_examples(self, split: str) -> Any:
-        for episode in range(EPISODES[split]):
-            rng = np.random.default_rng([len(split), episode])
-            length = 1 + 2 * episode
-            steps = [step(i, i == length - 1, rng) for i in range(length)]
-            weight = {"file": f"/{split}/{episode}", "success": episode % 2 == 0, "weight": 1 / (episode + 1)}
-            yield (
-                f"{split}{episode}",
-                {
-                    "steps": steps,
-                    "episode_metadata": weight | {"number": np.uint64(2**64 - 1 - episode)},
-                },
-            )
-
-
-def build(folder: Path, shards: int = 3, file_format: str = "tfrecord") -> Path:
-    """Write the dataset; the version's folder."""
-    config = tfds.download.DownloadConfig(num_shards=shards)
-    builder = Toy(data_dir=folder, file_format=file_format)
-    builder.download_and_prepare(download_config=config)
-    return Path(builder.data_dir)
+    return tfds_toy
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build(tmp_path_factory.mktemp("tfds"))
-
-
-def theirs(folder: Path, split: str) -> list[dict[str, Any]]:
-    """Episodes as TFDS reads them, each with `steps` as a list."""
-    config = tfds.ReadConfig(interleave_cycle_length=1)
-    data = tfds.builder_from_directory(str(folder)).as_dataset(
-        split=split, shuffle_files=False, read_config=config
-    )
-    return [{**episode, "steps": list(episode["steps"])} for episode in data]
+def written(toy: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made: Path = toy.build(tmp_path_factory.mktemp("tfds"))
+    return made
 
 
 @pytest.fixture(scope="module")
-def truth(written: Path) -> dict[str, list[dict[str, Any]]]:
-    return {split: theirs(written, split) for split in EPISODES}
+def truth(toy: ModuleType, written: Path) -> dict[str, list[dict[str, Any]]]:
+    return {split: toy.episodes(written, split) for split in EPISODES}
 
 
 def ours(folder: Path, name: str) -> Steps:
@@ -206,12 +92,12 @@ def test_numbers_of_every_dtype_equal_bit_for_bit(written, truth, key):
     "key",
     ["observation/label", "observation/box", "observation/scalar", "pair", "deep", "is_first", "is_last"],
 )
-def test_other_numbers_equal_bit_for_bit(written, truth, key):
+def test_other_numbers_equal_bit_for_bit(toy, written, truth, key):
     for name, episode in each(truth):
         steps = episode["steps"]
         for part in key.split("/"):
             steps = [step[part] for step in steps]
-        dense = [value.to_tensor() if isinstance(value, tf.RaggedTensor) else value for value in steps]
+        dense = [value.to_tensor() if isinstance(value, toy.tf.RaggedTensor) else value for value in steps]
         expected = np.array([value.numpy() for value in dense])
         found = ours(written, name).numbers(key)
         assert found.dtype == expected.dtype
@@ -240,13 +126,15 @@ def test_pictures_without_loss_equal_bit_for_bit(written, truth):
                 )
 
 
-def test_jpeg_equals_the_accurate_inverse_dct_of_libjpeg(written, truth):
+def test_jpeg_equals_the_accurate_inverse_dct_of_libjpeg(toy, written, truth):
     worst = 0
     for name, episode in each(truth):
         steps = ours(written, name)
         blobs, decode = steps.blobs("observation/jpeg"), steps.decoder("observation/jpeg")
         for index, step in enumerate(episode["steps"]):
-            accurate = tf.image.decode_jpeg(bytes(blobs[index]), channels=3, dct_method="INTEGER_ACCURATE")
+            accurate = toy.tf.image.decode_jpeg(
+                bytes(blobs[index]), channels=3, dct_method="INTEGER_ACCURATE"
+            )
             np.testing.assert_array_equal(decode(index), accurate.numpy())
             off = decode(index).astype(int) - step["observation"]["jpeg"].numpy()  # TFDS: its default, fast
             worst = max(worst, int(np.abs(off).max()))
@@ -302,7 +190,7 @@ def test_an_episode_has_their_metadata_instruction_and_success(written, truth):
         "{DATASET}-{SPLIT}-{SHARD_X_OF_Y}.{FILEFORMAT}",
     ],
 )
-def test_every_template_of_shard_names(written, truth, tmp_path, template):
+def test_every_template_of_shard_names(toy, written, truth, tmp_path, template):
     folder = tmp_path / "toy" / "1.2.3"
     folder.mkdir(parents=True)
     info = json.loads((written / "dataset_info.json").read_text())
@@ -322,7 +210,7 @@ def test_every_template_of_shard_names(written, truth, tmp_path, template):
     (folder / "dataset_info.json").write_text(json.dumps(info))
     (folder / "features.json").write_text((written / "features.json").read_text())
     for split, episodes in truth.items():
-        again = theirs(folder, split)
+        again = toy.episodes(folder, split)
         assert len(again) == len(episodes)  # TFDS itself finds them so
     for name, episode in each(truth):
         np.testing.assert_array_equal(
@@ -330,9 +218,8 @@ def test_every_template_of_shard_names(written, truth, tmp_path, template):
         )
 
 
-def test_array_records_written_by_tfds_hold_the_same_bytes(written, tmp_path):
-    pytest.importorskip("array_record.python.array_record_module")
-    folder = open_folder(str(build(tmp_path, 2, "array_record")))
+def test_array_records_written_by_tfds_hold_the_same_bytes(toy, written, tmp_path):
+    folder = open_folder(str(toy.build(tmp_path, 2, "array_record")))
     same = open_folder(str(written))
     for split, count in EPISODES.items():
         mine = [folder.example(f"{split}/{index:06d}")[0] for index in range(count)]

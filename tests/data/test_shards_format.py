@@ -195,7 +195,8 @@ def first_tokens(made: Path) -> tuple[int, list[int]]:
 
 
 def test_duckdb_reads_it(made: Path) -> None:
-    duckdb = pytest.importorskip("duckdb")
+    import duckdb
+
     rows, episodes = counts(made)
     shards = f"'{made}/train/*.parquet'"
     found = duckdb.sql(f"SELECT count(*), count(DISTINCT episode_index) FROM {shards}").fetchall()[0]
@@ -213,7 +214,8 @@ def test_duckdb_reads_it(made: Path) -> None:
 
 
 def test_polars_reads_it(made: Path) -> None:
-    polars = pytest.importorskip("polars")
+    import polars
+
     table = polars.read_parquet(f"{made}/train/*.parquet")
     assert (len(table), table["episode_index"].n_unique()) == counts(made)
     index, tokens = first_tokens(made)
@@ -222,7 +224,8 @@ def test_polars_reads_it(made: Path) -> None:
 
 
 def test_hugging_face_datasets_reads_it(made: Path, tmp_path: Path) -> None:
-    datasets = pytest.importorskip("datasets")
+    import datasets
+
     files = {split: f"{made}/{split}/*.parquet" for split in ("train", "val")}
     loaded = datasets.load_dataset("parquet", data_files=files, cache_dir=str(tmp_path))
     assert loaded["train"].num_rows == counts(made)[0]

@@ -17,12 +17,9 @@ NAME = "diffusion_pytorch_model.safetensors"
 
 
 @pytest.fixture(scope="module")
-def diffusers():
-    return pytest.importorskip("diffusers")
+def theirs():
+    import diffusers
 
-
-@pytest.fixture(scope="module")
-def theirs(diffusers):
     torch.manual_seed(0)
     return diffusers.AutoencoderKLTemporalDecoder(
         down_block_types=("DownEncoderBlock2D",) * 4, block_out_channels=(32, 32, 64, 64), layers_per_block=1

@@ -69,6 +69,7 @@ def test_taef2_gives_a_robots_frames_back(real_data, taef2):
     assert psnr_db(true, taef2.decode(latents)).min() > 34
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_taef2_keeps_its_known_quality_on_a_whole_frame(real_data, taef2):
     import av
@@ -131,7 +132,8 @@ def test_the_network_is_the_one_written_out(tmp_path, pooled):
 
 
 def test_it_is_diffusers_autoencoder_tiny(tmp_path):
-    diffusers = pytest.importorskip("diffusers")
+    import diffusers
+
     torch.manual_seed(0)
     sizes = {"encoder_block_out_channels": (16,) * 4, "decoder_block_out_channels": (24,) * 4}
     theirs = diffusers.AutoencoderTiny(**sizes, num_encoder_blocks=(1, 2, 1, 1)).eval()
@@ -274,6 +276,7 @@ def test_latents_too_large_to_store_are_refused(tmp_path, weights):
 # -- in shards
 
 
+@pytest.mark.slow
 def test_it_makes_the_same_shards_with_any_number_of_workers(toy_arm: Embodiment, tmp_path, weights, tiny):
     write_toy(tmp_path / "toy.hdf5", [6, 5, 4])
     settings = Settings(val_fraction=0, cameras=("top",), shard_frames=6)

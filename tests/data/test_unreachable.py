@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import fsspec
 import pytest
+import s3fs
 
 from hma_data import fetching, store
 from hma_data.errors import StorageAwayError, StorageError
@@ -12,7 +13,6 @@ from hma_data.fetching import CONNECT_S, file_system
 from hma_data.sources.base import open_source
 from hma_data.store import place
 
-s3fs = pytest.importorskip("s3fs")
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
 
 
@@ -58,7 +58,6 @@ def test_what_the_user_configures_for_the_driver_wins(monkeypatch: pytest.Monkey
 
 
 def test_a_web_server_is_waited_for_for_seconds() -> None:
-    pytest.importorskip("aiohttp")
     files, _ = file_system("http://127.0.0.1:9/x")
     assert files.client_kwargs["timeout"].sock_connect == CONNECT_S
 
@@ -82,7 +81,6 @@ def test_a_recording_at_a_closed_port_is_one_error(closed: str, monkeypatch: pyt
 
 
 def test_a_web_server_that_is_not_there_is_one_error(closed: str) -> None:
-    pytest.importorskip("aiohttp")
     with pytest.raises(StorageAwayError, match=f"{closed}/toy.*check the network, and the address"):
         open_source("rlds").index(f"{closed}/toy/1.0.0")
 

@@ -1,6 +1,5 @@
 """Frames by index out of video files, against decoding the whole file in order; pictures made square."""
 
-import os
 import shutil
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.video_file import VideoFile, frame_table
 from hma_data.spec import Camera
 from hma_data.video import decode_image, prepare, prepared
+from tests.data.fresh import run_fresh
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
 
 LENGTH = 40
@@ -75,17 +75,25 @@ def test_a_far_jump_skips_to_its_keyframe(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(seen) <= 1 + 8
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+FORKING = """
+import os, sys
+from pathlib import Path
+from hma_data.sources.video_file import VideoFile
+from tests.data.videos import number_of
+
+file = VideoFile(Path(sys.argv[1]))
+file.frames([3])
+child = os.fork()
+if child == 0:
+    os._exit(0 if [number_of(frame) for frame in file.frames([4, 5, 30])] == [4, 5, 30] else 1)
+mine = [number_of(frame) for frame in file.frames([4, 5, 31])]
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+assert mine == [4, 5, 31]
+"""
+
+
 def test_a_forked_child_and_its_parent_read_the_same_file(video: Path) -> None:
-    file = VideoFile(video)
-    file.frames([3])
-    child = os.fork()
-    if child == 0:
-        right = [number_of(frame) for frame in file.frames([4, 5, 30])] == [4, 5, 30]
-        os._exit(0 if right else 1)
-    mine = [number_of(frame) for frame in file.frames([4, 5, 31])]
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-    assert mine == [4, 5, 31]
+    run_fresh(FORKING, video)
 
 
 def test_a_closed_file_opens_again(video: Path) -> None:

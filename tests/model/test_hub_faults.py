@@ -62,7 +62,6 @@ def test_hubs_of_other_habits_are_pushed_to_and_pulled_from(server, source, habi
 
 @pytest.mark.parametrize("status", [404, 501])
 def test_a_hub_without_xet_gets_the_files_by_lfs(server, source, monkeypatch, status):
-    pytest.importorskip("hf_xet")
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", False)
     server.fail("GET .*/xet-write-token", status)
     hub.push(source, REPO)
@@ -70,7 +69,6 @@ def test_a_hub_without_xet_gets_the_files_by_lfs(server, source, monkeypatch, st
 
 
 def test_a_failed_transfer_by_xet_goes_on_by_lfs(server, source, monkeypatch):
-    pytest.importorskip("hf_xet")
     from huggingface_hub import _commit_api
 
     def blocked(**asked):
@@ -447,7 +445,6 @@ def test_where_folders_cannot_change_places_files_do(folder, source, monkeypatch
 
 @pytest.mark.parametrize("address", ["s3://", "s3://bucket/hub", "nowhere://a/b"])
 def test_a_store_that_refuses_is_one_line(source, address, monkeypatch, tmp_path):
-    pytest.importorskip("s3fs")
     import s3fs
 
     monkeypatch.setattr(remote_lock, "SETTLE_S", 0.01)

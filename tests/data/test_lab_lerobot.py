@@ -1,0 +1,95 @@
+"""The laboratory's LeRobotDataset: what lerobot wrote of the planar arm, read by lerobot and by us."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.convert import convert
+from hma_data.embodiment import find
+from hma_data.episode import Episode
+from hma_data.errors import MissingDependencyError
+from hma_data.lab import record
+from hma_data.lab.planar_arm import STEPS, TASK
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from hma_data.sources.base import detect, open_source
+from tests.conftest import BlockTokenizer
+
+EPISODES, SEED = 2, 3
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record("planar_arm_lerobot", tmp_path_factory.mktemp("lab"), EPISODES, SEED)
+
+
+@pytest.fixture(scope="module")
+def theirs(recorded: Path) -> Any:
+    """The recording, opened by lerobot's own reader."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset("lab/arm", root=recorded, video_backend="pyav", return_uint8=True)
+
+
+def episodes_of(robot: str, recording: Path) -> list[Episode]:
+    embodiment = find(robot)
+    source = open_source(embodiment.source.format)
+    return [source.read(str(recording), name, embodiment) for name in source.episode_ids(str(recording))]
+
+
+def test_lerobot_reads_the_rows_and_pictures_that_we_read(recorded: Path, theirs: Any) -> None:
+    ours = episodes_of("planar_arm_lerobot", recorded)
+    assert len(theirs) == EPISODES * STEPS and len(ours) == EPISODES
+    for number, episode in enumerate(ours):
+        pictures = episode.streams["top"].frames(range(STEPS))
+        for row in range(STEPS):
+            item = theirs[number * STEPS + row]
+            np.testing.assert_array_equal(episode.actions[0].values[row], item["action"].numpy())
+            np.testing.assert_array_equal(episode.states[0].values[row], item["observation.state"].numpy())
+            assert episode.streams["top"].timestamps[row] == item["timestamp"].item()
+            picture = item["observation.images.top"].permute(1, 2, 0).numpy()
+            np.testing.assert_array_equal(pictures[row], picture)
+        assert episode.instruction == item["task"] == TASK
+
+
+def test_lerobot_finds_the_robot_and_its_names_in_the_metadata(theirs: Any) -> None:
+    robot = find("planar_arm_lerobot")
+    assert theirs.meta.info.codebase_version == "v3.0"
+    assert (theirs.fps, theirs.meta.robot_type) == (robot.frequency_hz, robot.robot)
+    assert theirs.features["action"]["names"] == list(robot.action.names())
+
+
+def test_the_episodes_are_those_of_the_recording_in_hdf5(recorded: Path, tmp_path: Path) -> None:
+    same = episodes_of("planar_arm", record("planar_arm", tmp_path, EPISODES, SEED))
+    for ours, original in zip(episodes_of("planar_arm_lerobot", recorded), same, strict=True):
+        np.testing.assert_array_equal(ours.actions[0].values, original.actions[0].values)
+        np.testing.assert_array_equal(ours.states[0].values, np.float32(original.states[0].values))
+        shown, drawn = (
+            episode.streams["top"].frames(range(0, STEPS, 5)).astype(float) for episode in (ours, original)
+        )
+        assert 10 * np.log10(255**2 / np.square(shown - drawn).mean()) > 30  # the video is lossy
+
+
+def test_it_is_found_to_be_lerobots_and_converts(
+    recorded: Path, block_tokenizer: BlockTokenizer, tmp_path: Path
+) -> None:
+    robot = find("planar_arm_lerobot")
+    assert detect(str(recorded)) == robot.source.format == "lerobot"
+    convert(robot, str(recorded), block_tokenizer, tmp_path / "shards")
+    assert verify(tmp_path / "shards") == []
+    shards = ShardSet(tmp_path / "shards")
+    kept = [shards.episode_rows(index)["action"] for index in range(EPISODES)]
+    for values, episode in zip(kept, episodes_of("planar_arm_lerobot", recorded), strict=True):
+        np.testing.assert_array_equal(values, episode.actions[0].values)
+
+
+def test_without_lerobot_one_line_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "lerobot.datasets.lerobot_dataset", None)
+    with pytest.raises(MissingDependencyError, match=r"lerobot: .*pip install 'lerobot\[dataset\]'") as found:
+        record("planar_arm_lerobot", tmp_path, 1)
+    assert "\n" not in str(found.value) and list(tmp_path.iterdir()) == []
