@@ -1,5 +1,5 @@
-"""Tests. Waiting threads sleep, as they do under the command: see hma_model.cli.main."""
+"""Tests. Threads wait for one another as they do under the command: see hma_data.threads."""
 
-import os
+from hma_data.threads import bound_spinning
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+bound_spinning()
