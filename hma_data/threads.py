@@ -13,6 +13,6 @@ SPINS = 10_000  # turns of the loop, some 0.1 to 0.4 ms
 
 
 def bound_spinning() -> None:
-    """Bound how long threads turn before they sleep, unless the environment says; before torch is imported."""
+    """Bound how long threads turn, unless the environment says; call before importing torch."""
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", str(SPINS))

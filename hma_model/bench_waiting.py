@@ -24,7 +24,7 @@ DEFAULTS: dict[str, Any] = {
     "rounds": 3,  # of all cases
     "steps": 6,  # of training, a round
     "frames": 10,  # generated, a round
-    "busy": "both",  # beside busy processes: yes | no | both
+    "beside": "both",  # nothing | busy (processes on every core) | both
     "layers": 4,
     "width": 128,
     "heads": 4,
@@ -45,8 +45,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     Raises:
         UsageError: a setting has a value that is not allowed.
     """
-    check("waiting", settings, kind=("discrete",), busy=("yes", "no", "both"))
-    beside = {"yes": (True,), "no": (False,), "both": (False, True)}[settings["busy"]]
+    check("waiting", settings, kind=("discrete",), beside=("nothing", "busy", "both"))
+    beside = {"busy": (True,), "nothing": (False,), "both": (False, True)}[settings["beside"]]
     cases = [(wait, busy) for busy in beside for wait in WAITS]
     rounds: dict[tuple[str, bool], list[dict[str, float]]] = {case: [] for case in cases}
     for _ in range(settings["rounds"]):

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 ROBOTS = ("pusht_fast", "pusht_slow")
 TOKENIZER = "fsq-8"
 TAU = 3.0
-TIMINGS = "timings.json"
+TIMINGS, RESULTS = "timings.json", "results.json"
 WINDOWS = 24  # held-out windows of each robot that figures are means of
 LONGEST = 24  # frames of the film
 
@@ -117,6 +117,7 @@ def demo(out: Path, *, episodes: int = 24, steps: int | None = None, seed: int =
         publish(made)
     with made.stage(5, "roll out"):
         roll_out(made)
+    write_results(made)
     from hma_model.demo_report import write_report
 
     return write_report(made)
@@ -266,6 +267,17 @@ def roll_out(made: Demo) -> None:
         )
 
 
+def write_results(made: Demo) -> None:
+    """Write results.json: the seconds in all, and what the actions are worth in each robot's last frames."""
+    names = {"true": "psnr_last", "shuffled": "psnr_last_shuffled", "copy": "psnr_last_copy"}
+    figures = {
+        robot: {name: found[key]["psnr_last"] for key, name in names.items()}
+        for robot, found in made.figures.items()
+    }
+    results = {"seconds": sum(made.seconds.values()), "embodiments": figures}
+    write_atomic(made.out / RESULTS, json.dumps(results, indent=1))
+
+
 def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "Film"]:
     from hma_data.shards.preview import tokenizer_of
     from hma_model.evaluate import default_prompt, evaluate
@@ -283,7 +295,7 @@ def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "Film"]:
 
 
 def _refuse_foreign(out: Path) -> None:
-    ours = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS}
+    ours = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, RESULTS}
     if out.is_dir():
         foreign = sorted(item.name for item in out.iterdir() if item.name not in ours)
         if foreign:
