@@ -1,4 +1,4 @@
-"""Tests. A thread each, since several workers of pytest share the cores; threads wait as under the command."""
+"""Tests. A thread each, since several workers share the cores; threads wait as they do under the command."""
 
 import os
 
