@@ -41,7 +41,9 @@ def lerobot_dataset(folder: Path) -> Path:
     return make_v3(folder, (40, 36, 44))
 
 
-@pytest.mark.parametrize("make", [hdf5_arm, ros2_bags, lerobot_dataset])
+@pytest.mark.parametrize(
+    "make", [hdf5_arm, *(pytest.param(make, marks=pytest.mark.slow) for make in (ros2_bags, lerobot_dataset))]
+)
 def test_a_robot_goes_from_a_recording_to_the_hub_by_its_yaml_alone(
     make: Callable[[Path], Path], tmp_path: Path
 ) -> None:

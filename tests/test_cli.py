@@ -83,6 +83,7 @@ def test_the_whole_data_road_on_a_toy_recording(arm: Path, tmp_path: Path) -> No
     assert (tmp_path / "seen" / "preview.mp4").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_same_bytes_as_one(arm: Path, tmp_path: Path) -> None:
     write_toy(tmp_path / "many.hdf5", [9] * 8)
     for workers in ("1", "2"):

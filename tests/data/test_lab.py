@@ -223,7 +223,9 @@ def test_episodes_end_well_and_badly(fast: h5py.File, slow: list[Path]) -> None:
 # -- recorders
 
 
-@pytest.mark.parametrize("robot", RECORDERS)
+@pytest.mark.parametrize(
+    "robot", [r if r == "pusht_fast" else pytest.param(r, marks=pytest.mark.slow) for r in RECORDERS]
+)
 def test_same_seed_gives_same_bytes(tmp_path: Path, robot: str) -> None:
     first, again, other = (record(robot, tmp_path / n, 2, s) for n, s in (("a", 1), ("b", 1), ("c", 2)))
     assert hashes(first) == hashes(again) != hashes(other)

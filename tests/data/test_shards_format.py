@@ -281,6 +281,7 @@ def test_row_groups_of_large_frames_hold_fewer_of_them(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stored.reshape(15, -1)[:, 0], np.arange(85, 100))
 
 
+@pytest.mark.slow
 def test_the_benchmark_of_shards_runs() -> None:
     from hma_data.bench import shards
 

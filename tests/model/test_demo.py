@@ -10,6 +10,7 @@ from hma_data.shards.verify import verify
 from hma_model import demo as demos
 
 
+@pytest.mark.slow
 def test_a_demo_that_was_cut_goes_on_by_the_same_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

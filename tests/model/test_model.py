@@ -128,12 +128,15 @@ def _overfit(objective: str, steps: int, **changes: Any) -> list[float]:
     return losses
 
 
-@pytest.mark.parametrize("objective", OBJECTIVES)
+@pytest.mark.parametrize(
+    "objective", [o if o == "forward" else pytest.param(o, marks=pytest.mark.slow) for o in OBJECTIVES]
+)
 def test_each_objective_overfits_a_handful_of_windows_to_near_nothing(objective: str) -> None:
     losses = _overfit(objective, 400 if objective in ("passive", "full") else 200)
     assert sum(losses[-20:]) / 20 < 0.06 * sum(losses[:5]) / 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("conditioning", [*CONDITIONINGS, CONDITIONINGS])
 def test_each_conditioning_overfits_what_follows_from_actions(conditioning: Any) -> None:
     together = (conditioning,) if isinstance(conditioning, str) else conditioning
