@@ -1,6 +1,36 @@
 """Recordings of any robot in, tokenized parquet shards out.
 
-Registry, sources, alignment, tokenizers, shards, mixtures, loader.
+Rooms in the road's order: storage, hub, registry, episodes, sources, tokenizers, shards, inspection,
+conversion, loading; beside them lab, bench and cli. A room imports only from rooms before it. The names
+below are imported on use, so that `import hma_data` costs nothing.
 """
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hma_data.conversion.job import convert as convert
+    from hma_data.loading.dataset import MixtureDataset as MixtureDataset
+    from hma_data.loading.dataset import open_sets as open_sets
+    from hma_data.registry.embodiment import find as find
+    from hma_data.sources.base import open_source as open_source
+    from hma_data.tokenizers.base import get_tokenizer as get_tokenizer
+
+_LAZY = {
+    "find": "hma_data.registry.embodiment",
+    "open_source": "hma_data.sources.base",
+    "get_tokenizer": "hma_data.tokenizers.base",
+    "convert": "hma_data.conversion.job",
+    "open_sets": "hma_data.loading.dataset",
+    "MixtureDataset": "hma_data.loading.dataset",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        from importlib import import_module
+
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 __version__ = "0.1.0"

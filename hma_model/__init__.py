@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hma_model.config import HMAConfig as HMAConfig
-    from hma_model.model import HMA as HMA
+    from hma_model.network.model import HMA as HMA
 
-_LAZY = {"HMA": "hma_model.model", "HMAConfig": "hma_model.config"}
+_LAZY = {"HMA": "hma_model.network.model", "HMAConfig": "hma_model.config"}
 
 
 def __getattr__(name: str) -> Any:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from hma_data.embodiment import Embodiment
 from hma_data.priority import ordinary_priority, take_ordinary_priority
+from hma_data.registry.embodiment import Embodiment
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
 # The same examples in every run, so that a red main means the change; HMA_FUZZ=1 draws new ones.

@@ -43,7 +43,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def published(server: Hub, source: Path) -> Hub:
     """The hub with that checkpoint in REPO."""
-    from hma_model import hub
+    from hma_model.hub import publish as hub
 
     hub.push(source, REPO)
     server.log.clear()

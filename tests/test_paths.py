@@ -14,47 +14,52 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data import loader, registry
-from hma_data.convert import convert, convert_share, plan_conversion
-from hma_data.convert_recipe import load_jobs
-from hma_data.doctor import examine
-from hma_data.embodiment import Embodiment, find
+from hma_data.conversion.estimate import estimate
+from hma_data.conversion.job import convert, convert_share, plan_conversion
+from hma_data.conversion.output import Share
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.recipe import load_jobs
+from hma_data.conversion.restat import restat
+from hma_data.conversion.rewrite import merge, split
 from hma_data.errors import HMAError, UsageError
-from hma_data.estimate import estimate
-from hma_data.files import file_sha256
-from hma_data.infer import infer
-from hma_data.inspect import inspect_recording
+from hma_data.inspection.doctor import examine
+from hma_data.inspection.infer import infer
+from hma_data.inspection.inspect import inspect_recording
 from hma_data.lab import record
-from hma_data.output import Share
-from hma_data.paths import StrPath, as_address, as_path, as_text
-from hma_data.plan import Settings
+from hma_data.loading import dataset as loader
+from hma_data.registry import catalog as registry
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.info import describe
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.memmap import export
 from hma_data.shards.preview import preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.remake import merge, split
-from hma_data.shards.restat import restat
 from hma_data.shards.verify import verify
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.hands_models import load_models
-from hma_data.sources.hands_scan import detect as detect_hands
-from hma_data.store import RemotePath, place
+from hma_data.sources.hands.models import load_models
+from hma_data.sources.hands.scan import detect as detect_hands
+from hma_data.storage.files import file_sha256
+from hma_data.storage.paths import StrPath, as_address, as_path, as_text
+from hma_data.storage.remote import RemotePath, place
 from hma_data.tokenizers import get_tokenizer
-from hma_data.tokenizers import recipe as tokenizer_recipe
-from hma_data.tokenizers import report as tokenizer_report
-from hma_data.tokenizers import train as tokenizer_train
 from hma_data.tokenizers.catalog import EMBEDDED
-from hma_data.tokenizers.frames import frames_of, read_frames, recording_frames
-from hma_model import checkpoint, hub, hub_data, hub_list, runlog
-from hma_model.checkpoint_folder import Checkpoint, resolve, training_checkpoints
-from hma_model.demo import demo
-from hma_model.evaluate import evaluate, unconditional_baseline, windows
-from hma_model.film import Film, write_film
-from hma_model.finetune import finetune
-from hma_model.model import HMA
-from hma_model.recipe import find_recipe, load_recipe, make_recipe
-from hma_model.train import train
+from hma_data.tokenizers.training import recipe as tokenizer_recipe
+from hma_data.tokenizers.training import report as tokenizer_report
+from hma_data.tokenizers.training import train as tokenizer_train
+from hma_data.tokenizers.training.frames import frames_of, read_frames, recording_frames
+from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.folder import Checkpoint, resolve, training_checkpoints
+from hma_model.demo.run import demo
+from hma_model.evaluation.evaluate import evaluate, unconditional_baseline, windows
+from hma_model.evaluation.rollout_video import Film, write_film
+from hma_model.hub import datasets as hub_data
+from hma_model.hub import listing as hub_list
+from hma_model.hub import publish as hub
+from hma_model.network.model import HMA
+from hma_model.training import logging as runlog
+from hma_model.training.finetune import finetune
+from hma_model.training.loop import train
+from hma_model.training.recipe import find_recipe, load_recipe, make_recipe
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 from tests.data.bag_files import make_recording, write_ros1
 from tests.data.hands_files import rows, write_table
@@ -381,25 +386,28 @@ def test_home_is_meant_by_a_tilde_in_any_form(tmp_path: Path, monkeypatch: pytes
 # -- the annotations of what is public
 
 PUBLIC = (
-    "hma_data.convert", "hma_data.convert_recipe", "hma_data.doctor", "hma_data.embodiment",
-    "hma_data.estimate", "hma_data.infer", "hma_data.inspect", "hma_data.lab", "hma_data.loader",
-    "hma_data.mixture", "hma_data.registry", "hma_data.shards.info", "hma_data.shards.manifest",
-    "hma_data.shards.memmap", "hma_data.shards.preview",
-    "hma_data.shards.reader", "hma_data.shards.remake", "hma_data.shards.restat", "hma_data.shards.verify",
-    "hma_data.sources.base", "hma_data.sources.hands", "hma_data.sources.hands_models",
-    "hma_data.sources.hands_preview", "hma_data.sources.hands_scan", "hma_data.sources.hdf5",
-    "hma_data.sources.lerobot", "hma_data.sources.rlds", "hma_data.sources.rosbag",
-    "hma_data.tokenizers.base", "hma_data.tokenizers.frames", "hma_data.tokenizers.recipe",
-    "hma_data.tokenizers.report", "hma_data.tokenizers.train", "hma_model.checkpoint",
-    "hma_model.checkpoint_folder", "hma_model.demo", "hma_model.evaluate", "hma_model.film",
-    "hma_model.finetune", "hma_model.hub", "hma_model.hub_data", "hma_model.hub_list",
-    "hma_model.hub_sample", "hma_model.model", "hma_model.recipe", "hma_model.released_export",
-    "hma_model.released_import", "hma_model.report", "hma_model.runlog", "hma_model.train",
+    "hma_data.conversion.estimate", "hma_data.conversion.job", "hma_data.conversion.recipe",
+    "hma_data.conversion.restat", "hma_data.conversion.rewrite", "hma_data.inspection.doctor",
+    "hma_data.inspection.infer", "hma_data.inspection.inspect", "hma_data.lab", "hma_data.loading.dataset",
+    "hma_data.loading.mixture", "hma_data.registry.catalog", "hma_data.registry.embodiment",
+    "hma_data.shards.info", "hma_data.shards.manifest", "hma_data.shards.memmap", "hma_data.shards.preview",
+    "hma_data.shards.reader", "hma_data.shards.verify", "hma_data.sources.bags.source",
+    "hma_data.sources.base", "hma_data.sources.hands.models", "hma_data.sources.hands.preview",
+    "hma_data.sources.hands.scan", "hma_data.sources.hands.source", "hma_data.sources.hdf5.source",
+    "hma_data.sources.lerobot.source", "hma_data.sources.rlds.source", "hma_data.tokenizers.base",
+    "hma_data.tokenizers.training.frames", "hma_data.tokenizers.training.recipe",
+    "hma_data.tokenizers.training.report", "hma_data.tokenizers.training.train",
+    "hma_model.checkpoint.folder", "hma_model.checkpoint.io", "hma_model.demo.run",
+    "hma_model.evaluation.evaluate", "hma_model.evaluation.rollout_video", "hma_model.hub.datasets",
+    "hma_model.hub.listing", "hma_model.hub.publish", "hma_model.hub.sample", "hma_model.network.model",
+    "hma_model.released.exporting", "hma_model.released.importing", "hma_model.training.finetune",
+    "hma_model.training.logging", "hma_model.training.loop", "hma_model.training.recipe",
+    "hma_model.training.report",
 )  # fmt: skip
 INNER = {  # take what a public function has made of a path already
-    "hma_data.embodiment": {"todos"},
+    "hma_data.registry.embodiment": {"todos"},
     "hma_data.lab": {"written_beside"},
-    "hma_data.registry": {"file_id"},
+    "hma_data.registry.catalog": {"file_id"},
     "hma_data.shards.manifest": {
         "damaged_files",
         "stored_embodiment",
@@ -410,14 +418,14 @@ INNER = {  # take what a public function has made of a path already
     },
     "hma_data.shards.verify": {"check_rows", "check_shard"},
     "hma_data.sources.base": {"of_another_format", "local_path", "leaves", "first_bytes", "file_fingerprint"},
-    "hma_data.sources.hands_scan": {"scan_cached"},
-    "hma_data.tokenizers.frames": {"read_pictures"},
-    "hma_data.tokenizers.train": {"Run"},
-    "hma_model.checkpoint_folder": {"inside"},
-    "hma_model.hub": {"Store", "embodiment_ids"},
-    "hma_model.hub_data": {"DataStore"},
-    "hma_model.recipe": {"differences"},
-    "hma_model.runlog": {"RunLog"},
+    "hma_data.sources.hands.scan": {"scan_cached"},
+    "hma_data.tokenizers.training.frames": {"read_pictures"},
+    "hma_data.tokenizers.training.train": {"Run"},
+    "hma_model.checkpoint.folder": {"inside"},
+    "hma_model.hub.publish": {"Store", "embodiment_ids"},
+    "hma_model.hub.datasets": {"DataStore"},
+    "hma_model.training.recipe": {"differences"},
+    "hma_model.training.logging": {"RunLog"},
 }
 NAMES = {
     "path", "paths", "uri", "uris", "folder", "folders", "out", "source", "target", "repo", "checkpoint",

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment, find
-from hma_data.inspect import inspect_recording
-from hma_data.plan import Settings
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.episodes.images import prepare
+from hma_data.inspection.inspect import inspect_recording
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
-from hma_data.video import prepare
 
 pytestmark = pytest.mark.real
 

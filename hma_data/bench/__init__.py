@@ -56,7 +56,7 @@ def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, 
     Raises:
         UsageError: no such setting, or a value that is not of its type.
     """
-    from hma_data.yaml_io import parse_yaml
+    from hma_data.storage.yaml_io import parse_yaml
 
     settings = dict(bench.DEFAULTS)
     for word in overrides:

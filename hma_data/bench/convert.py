@@ -32,10 +32,10 @@ source: {{format: hdf5, uri: {uri}}}
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """The tokenizer alone over as many frames, then the conversion, watched from outside."""
-    from hma_data.convert import convert
-    from hma_data.embodiment import Embodiment
-    from hma_data.engines.base import Limits
-    from hma_data.plan import Settings
+    from hma_data.conversion.engines.base import Limits
+    from hma_data.conversion.job import convert
+    from hma_data.conversion.plan import Settings
+    from hma_data.registry.embodiment import Embodiment
 
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "recording.hdf5"
@@ -111,8 +111,8 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]
     """Seconds and CPU seconds for `rows` frames in a worker's batches, measured on a part of them."""
     import sys
 
-    from hma_data.engines.local import usable_cores
-    from hma_data.shard_work import BATCH
+    from hma_data.conversion.worker import BATCH
+    from hma_data.threads import usable_cores
     from hma_data.tokenizers.base import get_tokenizer
 
     tokenizer = get_tokenizer(settings["tokenizer"])

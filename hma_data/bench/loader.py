@@ -59,10 +59,10 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
     """A shard set of random tokens and actions; only its first shard is a file of its own."""
-    from hma_data.embodiment import Embodiment
-    from hma_data.files import file_sha256
+    from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.manifest import Derived, Gathered, Manifest, ShardFile, plan_hash, split_totals
     from hma_data.shards.schema import Footer, read_footer
+    from hma_data.storage.files import file_sha256
     from hma_data.tokenizers.base import TokenizerSpec
 
     h, w = settings["grid"]
@@ -113,8 +113,8 @@ def _write_shard(
     path: Path, robot: Any, spec: Any, plan: dict[str, Any], episodes: int, length: int, seed: int
 ) -> None:
     from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema
+    from hma_data.shards.stats import Stats
     from hma_data.shards.writer import EpisodeRows, ShardWriter
-    from hma_data.stats import Stats
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
@@ -150,7 +150,7 @@ def _write_shard(
 
 
 def _mixture(sets: list[Path], settings: dict[str, Any]) -> dict[str, Any]:
-    from hma_data.loader import MixtureDataset
+    from hma_data.loading.dataset import MixtureDataset
 
     before = _memory()
     began = time.perf_counter()
@@ -169,7 +169,7 @@ def _mixture(sets: list[Path], settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _random(sets: list[Path], settings: dict[str, Any]) -> dict[str, Any]:
-    from hma_data.loader import WindowDataset
+    from hma_data.loading.dataset import WindowDataset
 
     before = _memory()
     began = time.perf_counter()

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.bench.scenes import encoded, scene
-from hma_data.embodiment import Embodiment
+from hma_data.episodes.images import Images
 from hma_data.priority import ordinary_priority
-from hma_data.video import Images
+from hma_data.registry.embodiment import Embodiment
 
 A, HZ = 7, 30
 VGA, SQUARE, HD = (480, 640), (256, 256), (720, 1280)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.video import Images
+from hma_data.episodes.images import Images
 
 NOISE = 2.0  # standard deviation of the sensor's noise, of 255
 QUALITY = 92  # of JPEG; 0.20 to 0.28 bytes a pixel, where photographs give 0.11 to 0.26

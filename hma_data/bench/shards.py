@@ -51,13 +51,13 @@ def _teleoperated(rng: np.random.Generator, length: int) -> NDArray[np.float32]:
 
 
 def _write(folder: Path, settings: dict[str, int]) -> dict[str, float]:
-    from hma_data.embodiment import Embodiment
-    from hma_data.plan import Settings, make_plan
+    from hma_data.conversion.plan import Settings, make_plan
+    from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.manifest import finish
     from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema
+    from hma_data.shards.stats import Stats
     from hma_data.shards.writer import EpisodeRows, ShardWriter
     from hma_data.sources.base import EpisodeRef
-    from hma_data.stats import Stats
     from hma_data.tokenizers.base import TokenizerSpec
 
     rng, length = np.random.default_rng(settings["seed"]), settings["episode"]

@@ -112,8 +112,8 @@ def _work(
 
 def _episode(source: Any, uri: str, name: str, robot: Any, limit: int | None = None) -> int:
     """Frames of one episode brought to the tokenizer's square."""
-    from hma_data.align import to_clip
-    from hma_data.video import prepared
+    from hma_data.episodes.align import to_clip
+    from hma_data.episodes.images import prepared
 
     clip = to_clip(source.read(uri, name, robot), robot)
     grid = np.arange(0, len(clip), robot.stride)[:limit]

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from hma_data.errors import HubError
-from hma_data.retry import causes
+from hma_data.storage.retry import causes
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"

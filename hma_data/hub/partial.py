@@ -8,8 +8,8 @@ import time
 import uuid
 from pathlib import Path
 
-from hma_data.files import PART
-from hma_data.remote_lock import Holder, is_running
+from hma_data.storage.files import PART
+from hma_data.storage.remote_lock import Holder, is_running
 
 STALE = 86_400.0  # seconds after which a file of another machine's process is nobody's
 _NAME = re.compile(r"\.partial-(?:([0-9a-f]{8})-(\d{1,10})-)?[0-9a-f]{12}")

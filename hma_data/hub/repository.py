@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 class Repository:
-    """See `hma_model.hub.Store`.
+    """See `hma_model.hub.publish.Store`.
 
     Args:
         repo: organisation/name.

@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
-from hma_data.paths import StrPath, as_path
+from hma_data.storage.paths import StrPath, as_path
 
 Progress = Callable[[int, int], None]
 

@@ -76,8 +76,8 @@ def _write_hdf5(part: Path, demos: "Iterator[Demo]") -> None:
 
 
 def _write_lerobot(part: Path, demos: "Iterator[Demo]") -> None:
-    from hma_data.embodiment import find
     from hma_data.lab.write_lerobot import write_lerobot
+    from hma_data.registry.embodiment import find
 
     write_lerobot(part, find("planar_arm_lerobot"), map(_as_lerobot, demos))
 

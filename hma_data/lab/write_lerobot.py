@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.embodiment import Embodiment
 from hma_data.lab import imported
-from hma_data.registry_export import lerobot_features
+from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.export import lerobot_features
 
 
 @dataclass(frozen=True)

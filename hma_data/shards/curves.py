@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.sheets import INK, PAPER, Images, write_text
-from hma_data.video import opencv
+from hma_data.episodes.images import opencv
+from hma_data.episodes.sheets import INK, PAPER, Images, write_text
 
 LINE, CURSOR, ZERO, UNKNOWN = (0, 114, 178), (213, 94, 0), (200, 200, 200), (225, 225, 225)
 MOST = 16  # strips; more values than these are counted

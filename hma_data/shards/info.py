@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 
-from hma_data.paths import StrPath
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_counts
-from hma_data.windows import WindowIndex
+from hma_data.shards.windows import WindowIndex
+from hma_data.storage.paths import StrPath
 
 WINDOW = 12  # frames, the model's
 

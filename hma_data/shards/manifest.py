@@ -16,17 +16,17 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
-from hma_data.files import atomic_path, file_sha256, write_atomic
-from hma_data.json_io import parse_json
-from hma_data.paths import StrPath
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.schema import SCHEMA_VERSION, EpisodeRow, Footer, Refused, read_footer
+from hma_data.shards.stats import Stats
 from hma_data.shards.wellformed import check_plan, check_spec, check_splits, check_stats, is_count
-from hma_data.stats import Stats
-from hma_data.store import is_remote, place
+from hma_data.storage.files import atomic_path, file_sha256, write_atomic
+from hma_data.storage.json_io import parse_json
+from hma_data.storage.paths import StrPath
+from hma_data.storage.remote import is_remote, place
+from hma_data.storage.yaml_io import decode_yaml, parse_yaml
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_data.yaml_io import decode_yaml, parse_yaml
 
 MANIFEST, EPISODES, QUARANTINE, EMBODIMENT = (
     "manifest.json",
@@ -35,6 +35,7 @@ MANIFEST, EPISODES, QUARANTINE, EMBODIMENT = (
     "embodiment.yaml",
 )
 SPLITS = ("train", "val")
+WORKING = (".lock", ".journal", ".plan")  # names of what a conversion keeps in the folder begin with these
 HASHERS = 4  # threads; hashing leaves the interpreter alone
 SHARD_NAME = re.compile(r"(train|val)/shard-([0-9]{5,9})\.parquet")
 _SEAL = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')

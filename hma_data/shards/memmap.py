@@ -23,10 +23,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from hma_data.errors import OutputError, UsageError
-from hma_data.files import sync_folder, write_atomic
-from hma_data.paths import StrPath, as_path
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import token_column
+from hma_data.storage.files import sync_folder, write_atomic
+from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 
 METADATA, VIDEO, ACTIONS, SEGMENTS = "metadata.json", "video.bin", "actions/actions.bin", "segment_ids.bin"

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episodes.images import opencv
+from hma_data.episodes.sheets import INK, PAPER, Images, write_mp4, write_png, write_text
 from hma_data.errors import ShardError, TokenizerError, UsageError
-from hma_data.paths import StrPath, as_path
 from hma_data.shards.curves import Curves
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns, token_column
-from hma_data.sheets import INK, PAPER, Images, write_mp4, write_png, write_text
+from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
-from hma_data.video import opencv
 
 THUMB, GAP, LABEL, STRIPS, FILM = 144, 4, 18, 22, 256  # pixels; a strip's height in the sheet
 DECODED = 16  # frames at a time

@@ -13,12 +13,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from hma_data.embodiment import Embodiment
 from hma_data.errors import ShardError
-from hma_data.json_io import parse_json
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.stats import Stats
 from hma_data.shards.wellformed import check_fields, check_numbers, check_plan
-from hma_data.stats import Stats
-from hma_data.store import parquet_input
+from hma_data.storage.json_io import parse_json
+from hma_data.storage.remote import parquet_input
 from hma_data.tokenizers.base import TokenizerSpec
 
 SCHEMA_VERSION = 1
@@ -47,7 +47,8 @@ class EpisodeRow:
         flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
         group: shared by episodes of one recording, which belong into one split; empty for one of its own.
         source: where it is another than the set's.
-        content: hash over what was read of it, see `hma_data.content`; empty where that was not noted.
+        content: hash over what was read of it (`hma_data.conversion.episode_hash`); empty where it was not
+            noted.
     """
 
     episode_index: int
@@ -85,7 +86,7 @@ class Footer:
     """What a shard says about itself; the manifest is made of these alone.
 
     Attributes:
-        plan: what the shard was made from, see `hma_data.convert.Plan.facts`.
+        plan: what the shard was made from, see `hma_data.conversion.job.Plan.facts`.
         name: its path below the shard set.
         split: train or val.
         episodes: its episodes, in row order.

@@ -20,17 +20,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from hma_data.engines.local import usable_cores
 from hma_data.errors import HMAError
-from hma_data.files import PART, file_sha256
-from hma_data.output import WORKING
-from hma_data.paths import StrPath
 from hma_data.shards.manifest import (
     EMBODIMENT,
     EPISODES,
     MANIFEST,
     QUARANTINE,
     SPLITS,
+    WORKING,
     Gathered,
     Manifest,
     ShardFile,
@@ -47,8 +44,11 @@ from hma_data.shards.schema import (
     to_numpy,
     token_column,
 )
-from hma_data.stats import Stats
-from hma_data.store import parquet_file, parquet_input, place
+from hma_data.shards.stats import Stats
+from hma_data.storage.files import PART, file_sha256
+from hma_data.storage.paths import StrPath
+from hma_data.storage.remote import parquet_file, parquet_input, place
+from hma_data.threads import usable_cores
 
 REMAKE = "delete it and run the same hma convert again"
 KNOWN = {"action": "action_known", "state": "state_known"}  # bool columns, where values can be missing

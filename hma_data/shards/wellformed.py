@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
-from hma_data.embodiment import Embodiment
+from hma_data.registry.embodiment import Embodiment
 from hma_data.tokenizers.base import TokenizerSpec
 
 DTYPES = {"discrete": ("uint16", "uint32"), "continuous": ("float16", "uint8")}

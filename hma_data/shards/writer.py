@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from hma_data.files import atomic_path, file_sha256
 from hma_data.shards.schema import GROUP_VALUES, ROW_GROUP, Footer, encodings, to_arrow, token_column
+from hma_data.storage.files import atomic_path, file_sha256
 from hma_data.tokenizers.base import TokenizerSpec
 
 

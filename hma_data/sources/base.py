@@ -17,20 +17,20 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.embodiment import Embodiment
-from hma_data.episode import Episode
+from hma_data.episodes.episode import Episode
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.paths import StrPath, as_text
-from hma_data.sources.findings import Finding
-from hma_data.sources.links import nothing_there
-from hma_data.spec import Vector
+from hma_data.registry.components import Vector
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.common.findings import Finding
+from hma_data.sources.common.links import nothing_there
+from hma_data.storage.paths import StrPath, as_text
 
 FORMATS = {
-    "rlds": "hma_data.sources.rlds",
-    "hdf5": "hma_data.sources.hdf5",
-    "rosbag": "hma_data.sources.rosbag",
-    "lerobot": "hma_data.sources.lerobot",
-    "hands": "hma_data.sources.hands",
+    "rlds": "hma_data.sources.rlds.source",
+    "hdf5": "hma_data.sources.hdf5.source",
+    "rosbag": "hma_data.sources.bags.source",
+    "lerobot": "hma_data.sources.lerobot.source",
+    "hands": "hma_data.sources.hands.source",
 }
 SAMPLE = 20  # episodes that inspect looks into
 VIDEO_SUFFIXES = (

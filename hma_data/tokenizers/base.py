@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import TokenizerError
-from hma_data.paths import StrPath, as_text
+from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.catalog import CATALOG
 
 # name -> (module, keyword arguments of its `load`)
@@ -114,7 +114,7 @@ def check_frames(frames: NDArray[Any], spec: TokenizerSpec) -> None:
         raise TokenizerError(
             spec.name,
             f"takes uint8 pictures (N, {size}, {size}, 3), was given {frames.dtype} {tuple(frames.shape)}",
-            "resize with hma_data.video.resize",
+            "resize with hma_data.episodes.images.resize",
         )
 
 

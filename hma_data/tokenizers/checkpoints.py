@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from hma_data.errors import TokenizerError
-from hma_data.files import file_sha256
+from hma_data.storage.files import file_sha256
 from hma_data.tokenizers.catalog import CATALOG, Entry
 
 FOLDER = "HMA_WEIGHTS"  # environment variable: a folder of weights, named as the tokenizers are

@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from hma_data.errors import TokenizerError
-from hma_data.files import write_atomic
+from hma_data.storage.files import write_atomic
 
 MAX_BYTES = 1 << 30
 REMEDY = "take the file that `hma tokenizer train` writes, or leave --weights out"

@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hma_data.sheets import grid
+from hma_data.episodes.images import resize
+from hma_data.episodes.sheets import grid
 from hma_data.tokenizers.base import get_tokenizer
-from hma_data.tokenizers.eval import psnr_db
-from hma_data.tokenizers.frames import read_frames
-from hma_data.video import resize
+from hma_data.tokenizers.training.eval import psnr_db
+from hma_data.tokenizers.training.frames import read_frames
 
 SIDE = 256
 

@@ -20,8 +20,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from hma_data.embodiment import Embodiment
-from hma_data.episode import Episode
+from hma_data.episodes.episode import Episode
+from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 
 START_NS = 1_700_000_000_000_000_000

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from hma_data.embodiment import Embodiment
+from hma_data.registry.embodiment import Embodiment
 from tests.data.bag_files import START_NS, arm
 
 LATE_NS = 5_000_000

@@ -11,7 +11,7 @@ from tests.data.bag_files import KINDS, Recording, make_recording
 @pytest.fixture(scope="session", autouse=True)
 def preloaded() -> None:
     """Let processes of a fork server fork from one that has torch and the loader already."""
-    multiprocessing.set_forkserver_preload(["hma_data.loader"])
+    multiprocessing.set_forkserver_preload(["hma_data.loading.dataset"])
 
 
 @pytest.fixture(scope="session")

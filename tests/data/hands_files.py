@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hma_data.embodiment import Embodiment
+from hma_data.registry.embodiment import Embodiment
 from tests.data.videos import HEIGHT, WIDTH
 
 JOINTS = ["wrist"] + [f"{f}_{i}" for f in ("thumb", "index", "middle", "ring", "pinky") for i in range(1, 5)]

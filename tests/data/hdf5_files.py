@@ -5,7 +5,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hma_data.embodiment import Embodiment
+from hma_data.registry.embodiment import Embodiment
 
 T, H, W = 9, 12, 16
 

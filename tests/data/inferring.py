@@ -10,12 +10,12 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from hma_data.align import to_clip
-from hma_data.embodiment import TODO, Embodiment, problems, todos
-from hma_data.episode import Clip
-from hma_data.infer import infer
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.episode import Clip
+from hma_data.inspection.infer import infer
+from hma_data.registry.embodiment import TODO, Embodiment, problems, todos
 from hma_data.sources.base import open_source
-from hma_data.yaml_io import parse_yaml
+from hma_data.storage.yaml_io import parse_yaml
 from tests.data.bag_files import START_NS
 from tests.data.rlds_files import png
 

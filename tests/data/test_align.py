@@ -7,10 +7,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from hma_data.align import hold, interpolate, nearest, to_clip
-from hma_data.embodiment import Embodiment
-from hma_data.episode import Clip, Episode, Pictures, Signal
+from hma_data.episodes.align import hold, interpolate, nearest, to_clip
+from hma_data.episodes.episode import Clip, Episode, Pictures, Signal
 from hma_data.errors import AlignmentError, EpisodeError, RegistryError
+from hma_data.registry.embodiment import Embodiment
 
 QUICK = settings(max_examples=150, deadline=None)
 TICK = 1 / 64  # a binary fraction: sums and differences of times are exact, ties are ties

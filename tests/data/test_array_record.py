@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
-from hma_data.sources import array_record
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.tfds_folder import open_folder
+from hma_data.sources.rlds import array_record
+from hma_data.sources.rlds.folder import open_folder
 from tests.data import rlds_files
 from tests.data.rlds_files import encode, tensor
 

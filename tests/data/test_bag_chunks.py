@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from hma_data.episode import OneByOne
+from hma_data.episodes.episode import OneByOne
+from hma_data.episodes.images import prepare, prepared
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags import container
 from hma_data.sources.bags import segments as segmenting
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import ChunkCache, decompress
 from hma_data.sources.bags.mcap import McapFile
-from hma_data.video import prepare, prepared
 from tests.data import bag_parts
 from tests.data.bag_files import CAMERA, KINDS, SOURCE, arm, make_recording, read, write_mcap
 from tests.data.bag_files import as_cdr as cdr

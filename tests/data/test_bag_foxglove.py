@@ -10,12 +10,12 @@ import pytest
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hma_data.doctor import examine
 from hma_data.errors import EpisodeError
-from hma_data.inspect import inspect_recording
+from hma_data.inspection.doctor import examine
+from hma_data.inspection.inspect import inspect_recording
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_data.tokenizers.frames import recording_frames
+from hma_data.tokenizers.training.frames import recording_frames
 from tests.data import bag_parts
 from tests.data.bag_files import CAMERA, SOURCE, arm, as_cdr, make_recording, read, ros_message, write_mcap
 from tests.data.test_bag_pictures import LOW_DELAY, VIDEO_YAML

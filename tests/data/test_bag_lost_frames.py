@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.pictures import H264Count, VideoDecoder, is_keyframe
-from hma_data.video import Images
+from hma_data.sources.bags.images import H264Count, VideoDecoder, is_keyframe
 
 GROUP, FRAMES = 9, 27
 QUIET = "log-level=none:keyint=9:min-keyint=9:scenecut=0"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.pictures import VideoDecoder, picture
+from hma_data.sources.bags.images import VideoDecoder, picture
 from tests.data.bag_files import SOURCE, arm, read
 from tests.data.test_video_kinds import make
 
@@ -222,8 +222,8 @@ def test_key_frames_of_every_codec_are_told(
     tmp_path: Path, codec: str, name: str, options: dict[str, str]
 ) -> None:
     from hma_data.sources.bags.bag import Bag
+    from hma_data.sources.bags.images import is_keyframe, payload
     from hma_data.sources.bags.messages import decode
-    from hma_data.sources.bags.pictures import is_keyframe, payload
 
     pictures = write_video(tmp_path / "v.mcap", codec, name, options)
     records = Bag(tmp_path / "v.mcap").records(frozenset({"/video"}))
@@ -280,7 +280,7 @@ def test_frames_made_from_a_damaged_message_are_refused_up_to_the_next_keyframe(
      ("libsvtav1", "av1"), ("mpeg4", "mpeg4")],
 )  # fmt: skip
 def test_the_codec_of_an_ffmpeg_packet_is_that_of_its_encoder(stated: str, codec: str) -> None:
-    from hma_data.sources.bags.pictures import picture_kind, video_codec
+    from hma_data.sources.bags.images import picture_kind, video_codec
 
     assert picture_kind("ffmpeg_image_transport_msgs/msg/FFMPEGPacket") == "video"
     assert video_codec({"encoding": stated, "data": b""}) == codec

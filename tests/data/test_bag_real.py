@@ -10,7 +10,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.typesys import Stores, get_typestore
 
-from hma_data.align import to_clip
+from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.messages import decode, numbers

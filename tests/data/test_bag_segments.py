@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hma_data.align import to_clip
-from hma_data.embodiment import Embodiment
+from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.registry.embodiment import Embodiment
 from tests.data.bag_files import SOURCE, START_NS
 from tests.data.bag_parts import KINDS, STATE, TASK, Said, make_run, mcap, parted, ros1
 

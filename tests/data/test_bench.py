@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from hma_data import bench
-from hma_data.align import to_clip
 from hma_data.bench import lerobot as bench_lerobot
 from hma_data.bench import sources
 from hma_data.bench.recordings import CASES, actions
 from hma_data.bench.scenes import scene
+from hma_data.episodes.align import to_clip
 from hma_data.errors import UsageError
 from hma_data.sources.base import open_source
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from hma_data.convert import convert
-from hma_data.engines.base import Limits, Retry
+from hma_data.conversion.engines.base import Limits, Retry
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, MissingDependencyError, TokenizerError
-from hma_data.plan import Settings
 from tests.data.test_engines import PLAIN, MakeWork, Unit
 
 on_a_cluster = pytest.mark.slow
@@ -40,7 +40,7 @@ def cluster():
 
 
 def do(units: list[Unit], notes: Path, workers: int = 2):
-    from hma_data.engines.ray import run
+    from hma_data.conversion.engines.ray import run
 
     events: list = []
     results = dict(run(units, MakeWork(notes), workers, lambda n, event: events.append((n, event)), LIMITS))
@@ -84,7 +84,7 @@ def test_an_actor_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
 def test_workers_that_cannot_be_made_are_one_error(
     cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hma_data.engines import ray as engine
+    from hma_data.conversion.engines import ray as engine
 
     monkeypatch.setattr(engine, "LOST_STARTS", (1, 1))
     with pytest.raises(HMAError, match=r"the Ray cluster: .*installed on every node"):
@@ -155,9 +155,9 @@ DRIVER = """
 import sys
 from pathlib import Path
 import ray
-import hma_data.convert as conversion
-from hma_data.embodiment import Embodiment
-from hma_data.engines.base import Limits
+import hma_data.conversion.job as conversion
+from hma_data.registry.embodiment import Embodiment
+from hma_data.conversion.engines.base import Limits
 from tests.conftest import ARM_YAML
 from tests.data.test_engine_ray import SETTINGS
 from tests.data.test_ray_actor import Slow
@@ -232,7 +232,7 @@ def actors_of(pid: int) -> list[int]:
 def test_a_cluster_that_does_not_answer_is_one_error(
     address: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from hma_data.engines import ray as engine
+    from hma_data.conversion.engines import ray as engine
 
     class NoRay:
         is_initialized = staticmethod(lambda: False)

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from hma_data.engines.base import Attempt, Ledger, Limits, Report, Retry, Step
-from hma_data.engines.local import run, serve
+from hma_data.conversion.engines.base import Attempt, Ledger, Limits, Report, Retry, Step
+from hma_data.conversion.engines.local import run, serve
 from hma_data.errors import HMAError, TokenizerError
 
 FAST = Limits(quiet_s=1.5, kills=3)

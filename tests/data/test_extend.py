@@ -9,14 +9,14 @@ import h5py
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.content import Content, content_of
-from hma_data.convert import Summary, convert
-from hma_data.doctor import examine
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.episode_hash import Content, content_of
+from hma_data.conversion.job import Summary, convert
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.restat import restat
 from hma_data.errors import OutputError
-from hma_data.plan import Settings
+from hma_data.inspection.doctor import examine
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, Manifest
-from hma_data.shards.restat import restat
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from tests.conftest import BlockTokenizer, write_toy

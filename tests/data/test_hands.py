@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.align import to_clip
-from hma_data.convert import convert
-from hma_data.embodiment import find
+from hma_data.conversion.job import convert
+from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
+from hma_data.registry.embodiment import find
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.hands_layout import HandsLayout, Header, layout_of
-from hma_data.sources.hands_runs import (
+from hma_data.sources.hands.layout import HandsLayout, Header, layout_of
+from hma_data.sources.hands.runs import (
     KEYS,
     POINTS,
     cut_into_runs,

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.align import to_clip
-from hma_data.embodiment import Embodiment, find
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.sheets import write_mp4
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
-from hma_data.sheets import write_mp4
-from hma_data.sources import hands_scan
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
-from hma_data.sources.hands import detect
-from hma_data.sources.hands_detect import (
+from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.hands import scan as hands_scan
+from hma_data.sources.hands.detect import (
     Hand,
     MediaPipeHands,
     Square,
@@ -29,9 +29,9 @@ from hma_data.sources.hands_detect import (
     square_of_palm,
     square_of_points,
 )
-from hma_data.sources.hands_models import Network, load_models, palm_network
-from hma_data.sources.hands_preview import COLOURS, preview
-from hma_data.sources.video_file import VideoFile
+from hma_data.sources.hands.models import Network, load_models, palm_network
+from hma_data.sources.hands.preview import COLOURS, preview
+from hma_data.sources.hands.source import detect
 from tests.data import hands_files as made
 from tests.data.videos import encode
 
@@ -300,7 +300,7 @@ class Blinking:
 def blinking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a video of 20 frames, looked at by that detector instead of a real one."""
     models = type("Models", (), {"digest": "made"})()
-    target = "hma_data.sources.hands.HandsSource._models"
+    target = "hma_data.sources.hands.source.HandsSource._models"
     monkeypatch.setattr(target, lambda self, layout: (Blinking(), models))
     encode(tmp_path / "set" / "a.mp4", range(20), fps=30)
     return tmp_path / "set"

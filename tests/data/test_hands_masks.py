@@ -8,21 +8,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.align import to_clip
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
-from hma_data.episode import Clip
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.episode import Clip
+from hma_data.episodes.sheets import write_mp4
 from hma_data.errors import RegistryError, SourceError
-from hma_data.infer import infer
-from hma_data.loader import WindowDataset
-from hma_data.plan import Settings
+from hma_data.inspection.infer import infer
+from hma_data.loading.dataset import WindowDataset
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from hma_data.sheets import write_mp4
 from hma_data.sources.base import open_source
-from hma_data.sources.hands_layout import HandsLayout, Header
-from hma_data.sources.hands_runs import cut_into_runs, labels_from_rows
-from hma_data.sources.video_file import VideoFile
+from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.hands.layout import HandsLayout, Header
+from hma_data.sources.hands.runs import cut_into_runs, labels_from_rows
 from tests.data import hands_files as made
 from tests.data.videos import encode, number_of
 

@@ -13,12 +13,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hma_data.align import to_clip
-from hma_data.embodiment import Embodiment
+from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.sources import hdf5_file
+from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.hdf5_file import OPEN_FILES, rows
+from hma_data.sources.hdf5 import file as hdf5_file
+from hma_data.sources.hdf5.file import OPEN_FILES, rows
 from tests.data.fresh import run_fresh
 from tests.data.hdf5_files import H, T, W, embodiment, fill
 from tests.data.hub_cache import as_snapshot
@@ -492,7 +492,7 @@ def test_inspect_tells_what_looks_wrong(demos: Path) -> None:
 
 @pytest.mark.real
 def test_the_rendered_lift_equals_h5py(real_data: Path) -> None:
-    from hma_data.embodiment import find
+    from hma_data.registry.embodiment import find
 
     path, arm = real_data / "hdf5" / "lift_rendered.hdf5", find("robosuite_lift")
     source = open_source("hdf5")

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from hma_data.align import to_clip
+from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.base import open_source
 from tests.data.hdf5_files import H, T, W, embodiment, fill, pictures
@@ -247,7 +247,7 @@ def test_batches_in_any_order_are_the_frames_whatever_the_chunks(
 def test_a_chunk_larger_than_the_usual_cache_is_read_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hma_data.sources import hdf5_file
+    from hma_data.sources.hdf5 import file as hdf5_file
 
     monkeypatch.setattr(hdf5_file, "CHUNK_CACHE", 1000)
     path = one(tmp_path, data=pictures(), chunks=(T, H, W, 3), compression="gzip")

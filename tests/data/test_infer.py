@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
-from hma_data.align import to_clip
-from hma_data.embodiment import Embodiment, find, problems
+from hma_data.episodes.align import to_clip
 from hma_data.errors import SourceError, UsageError
-from hma_data.infer import from_inspection, infer
+from hma_data.inspection.infer import from_inspection, infer
+from hma_data.registry.embodiment import Embodiment, find, problems
 from hma_data.sources.base import Inspection, KeyInfo, open_source
-from hma_data.yaml_io import parse_yaml
+from hma_data.storage.yaml_io import parse_yaml
 from tests.data import rlds_files
 from tests.data.inferring import H, T, W, answered, first_clip, inferred, keys, numbers, pictures, questions
 from tests.data.rlds_files import TEXT, features_dict, image, png, tensor

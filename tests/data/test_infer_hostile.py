@@ -3,11 +3,11 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.embodiment import problems
 from hma_data.errors import HMAError
-from hma_data.infer import from_inspection
+from hma_data.inspection.infer import from_inspection
+from hma_data.registry.embodiment import problems
 from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
-from hma_data.yaml_io import parse_yaml
+from hma_data.storage.yaml_io import parse_yaml
 
 HOSTILE = [
     "action", "a: b", "'", '"', "x\n---\ny", "#", "- ", "{a}", "[", "&x", "*x", "!!int 3", "null", "1e3",

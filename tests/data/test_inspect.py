@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from skimage import data
 
-from hma_data.inspect import inspect_recording
-from hma_data.sources import timestamp_checks
+from hma_data.inspection.inspect import inspect_recording
 from hma_data.sources.base import Inspection, open_source
-from hma_data.sources.image_checks import Look, choose, ycbcr_share
-from hma_data.sources.survey import CHECKS
-from hma_data.sources.timestamp_checks import clock_of
+from hma_data.sources.common import timestamp_checks
+from hma_data.sources.common.image_checks import Look, choose, ycbcr_share
+from hma_data.sources.common.survey import CHECKS
+from hma_data.sources.common.timestamp_checks import clock_of
 from tests.data.bag_files import make_recording, write_ros1, write_ros2
 from tests.data.rlds_files import TEXT, image, png, tensor, write
 from tests.data.videos import encode as encode_video

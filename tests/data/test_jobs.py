@@ -15,17 +15,17 @@ import h5py
 import numpy as np
 import pytest
 
-from hma_data import shard_work
-from hma_data.convert import convert, convert_share
-from hma_data.convert_recipe import load_jobs
-from hma_data.embodiment import Embodiment, find
-from hma_data.engines.base import Limits
+from hma_data.conversion import worker as shard_work
+from hma_data.conversion.engines.base import Limits
+from hma_data.conversion.job import convert, convert_share
+from hma_data.conversion.output import LOCK, Share, locked
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.recipe import load_jobs
 from hma_data.errors import HMAError, OutputError, RecipeError
-from hma_data.output import LOCK, Share, locked
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.verify import verify
-from hma_data.sources.hdf5 import Hdf5Source
+from hma_data.sources.hdf5.source import Hdf5Source
 from tests.conftest import BlockTokenizer, write_toy
 
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
@@ -251,11 +251,11 @@ COMMAND = """
 import os, signal, sys, time
 from pathlib import Path
 from hma_data import shard_work
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
-from hma_data.engines.base import Limits
-from hma_data.plan import Settings
-from hma_data.sources.hdf5 import Hdf5Source
+from hma_data.conversion.job import convert
+from hma_data.registry.embodiment import Embodiment
+from hma_data.conversion.engines.base import Limits
+from hma_data.conversion.plan import Settings
+from hma_data.sources.hdf5.source import Hdf5Source
 from hma_data.tokenizers import base
 from tests.conftest import ARM_YAML, BlockTokenizer
 
@@ -272,8 +272,8 @@ def troubled(self, uri, episode_id, embodiment):
     return read(self, uri, episode_id, embodiment)
 Hdf5Source.read = troubled
 shard_work.get_tokenizer = lambda *a, **k: BlockTokenizer()
-import hma_data.convert
-hma_data.convert.get_tokenizer = shard_work.get_tokenizer
+import hma_data.conversion.job
+hma_data.conversion.job.get_tokenizer = shard_work.get_tokenizer
 if __name__ == "__main__":
     summary = convert(
         Embodiment.from_yaml(ARM_YAML), sys.argv[1], "block", Path(sys.argv[2]), workers=2,

@@ -16,13 +16,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from hma_data.embodiment import Embodiment, find
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
 from hma_data.lab.pusht import SLOW_LOOK, Arena, record_pusht
-from hma_data.shipped import shipped
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
+from hma_data.storage.shipped import shipped
 
 EPISODES = 5
 

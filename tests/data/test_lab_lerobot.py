@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hma_data.convert import convert
-from hma_data.embodiment import find
-from hma_data.episode import Episode
+from hma_data.conversion.job import convert
+from hma_data.episodes.episode import Episode
 from hma_data.errors import MissingDependencyError
 from hma_data.lab import record
 from hma_data.lab.planar_arm import STEPS, TASK
+from hma_data.registry.embodiment import find
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import detect, open_source

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment, find
-from hma_data.episode import Episode
+from hma_data.conversion.job import convert
+from hma_data.episodes.episode import Episode
 from hma_data.errors import MissingDependencyError, UsageError
 from hma_data.lab import pendulum, planar_arm, record
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hma_data.align import to_clip
-from hma_data.embodiment import Embodiment, find
+from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.lerobot_meta import fill
+from hma_data.sources.lerobot.metadata import fill
 from tests.data.hub_cache import as_snapshot
 from tests.data.videos import (
     CAMERA,
@@ -114,7 +114,7 @@ def test_task_and_success_are_the_episodes_own(whole: Path) -> None:
 
 
 def test_the_index_needs_no_decoding(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hma_data.sources.lerobot.VideoFile", None)
+    monkeypatch.setattr("hma_data.sources.lerobot.source.VideoFile", None)
     refs = open_source("lerobot").index(str(whole), embodiment())
     assert [(ref.id, ref.frames) for ref in refs] == [(f"episode_{i:06d}", n) for i, n in enumerate(LENGTHS)]
     assert len({ref.fingerprint for ref in refs}) == 3
@@ -254,7 +254,7 @@ def test_a_run_of_more_rows_than_any_recording_is_refused(
     copy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = copy("v2")
-    monkeypatch.setattr("hma_data.sources.lerobot_rows.MAX_VALUES", 1000)
+    monkeypatch.setattr("hma_data.sources.lerobot.rows.MAX_VALUES", 1000)
     path = folder / "data/chunk-000/episode_000000.parquet"
     pq.write_table(pa.table({"episode_index": np.zeros(1001, np.int64)}), path)
     with pytest.raises(EpisodeError, match=r"'episode_index' claims 1,001 values of 1,001 rows"):

@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.embodiment import Embodiment
 from hma_data.errors import SourceError
+from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
-from hma_data.sources.video_file import frame_table
+from hma_data.sources.common.video_file import frame_table
 
 FPS, HEIGHT, WIDTH = 10, 64, 96
 LENGTHS = (12, 9, 15, 2, 11)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import ShardError, UsageError
-from hma_data.loader import Batch, MixtureDataset, WindowDataset
-from hma_data.mixture import probabilities
-from hma_data.plan import Settings
+from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset
+from hma_data.loading.mixture import probabilities
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy

@@ -15,7 +15,7 @@ import pytest
 
 from hma_data.bench.loader import make_set
 from hma_data.errors import ShardError, UsageError
-from hma_data.loader import MixtureDataset, WindowDataset
+from hma_data.loading.dataset import MixtureDataset, WindowDataset
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
 from tests.data.test_pools import SMALL

@@ -9,16 +9,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import SourceError
-from hma_data.files import file_sha256
-from hma_data.inspect import inspect_recording
-from hma_data.loader import MixtureDataset, WindowDataset
-from hma_data.plan import Settings
+from hma_data.inspection.inspect import inspect_recording
+from hma_data.loading.dataset import MixtureDataset, WindowDataset
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_counts, flags_text, mask_columns
 from hma_data.shards.verify import check_shard, verify
+from hma_data.storage.files import file_sha256
 from tests.conftest import BlockTokenizer
 from tests.data.bag_files import COMMAND, STATE, Recording, arm, as_json, make_recording, write_mcap
 

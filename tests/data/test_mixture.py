@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.errors import UsageError
-from hma_data.mixture import Mixture, epoch_caps, plot_mixture, probabilities
+from hma_data.loading.mixture import Mixture, epoch_caps, plot_mixture, probabilities
 
 COUNTS = [10**6, 10**5, 10**4, 10**3]
 

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.plan import Settings, choose_splits, make_plan, shard_size
 from hma_data.errors import RegistryError, SourceError
-from hma_data.plan import Settings, choose_splits, make_plan, shard_size
+from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import EpisodeRef
 from tests.conftest import BlockTokenizer
 

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hma_data.bench.loader import DEFAULTS, make_set
-from hma_data.pools import LARGEST_POOL, Deal, Stream, pool_size, spread
-from hma_data.row_groups import MIB, Decoder
+from hma_data.loading.pools import LARGEST_POOL, Deal, Stream, pool_size, spread
+from hma_data.loading.rows import MIB, Decoder
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
-from hma_data.windows import WindowIndex
+from hma_data.shards.windows import WindowIndex
 from tests.data.test_windows import fake
 
 SMALL = DEFAULTS | {

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from hma_data.engines.base import FIRST, Attempt, Report, Step, Work
-from hma_data.engines.ray_actor import Answer, Done, End, Failed, Lost, Opened, Worker
+from hma_data.conversion.engines.base import FIRST, Attempt, Report, Step, Work
+from hma_data.conversion.engines.ray_actor import Answer, Done, End, Failed, Lost, Opened, Worker
 from hma_data.errors import TokenizerError
 from tests.data.test_engines import PLAIN, MakeWork, Unit
 
@@ -175,8 +175,8 @@ def test_work_that_cannot_start_is_one_error(
 PARENT = """
 from pathlib import Path
 Path({started!r}).open("a").write("started\\n")
-from hma_data.engines.base import FIRST
-from hma_data.engines.ray_actor import Worker
+from hma_data.conversion.engines.base import FIRST
+from hma_data.conversion.engines.ray_actor import Worker
 from tests.data.test_engines import MakeWork, Unit
 worker = Worker(MakeWork(Path({notes!r})), 1, None, 0.2)
 worker.open()

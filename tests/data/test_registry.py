@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from hma_data.embodiment import Embodiment, find
-from hma_data.registry import entries
-from hma_data.registry_export import component_names, lerobot_features, modality
+from hma_data.registry.catalog import entries
+from hma_data.registry.embodiment import Embodiment, find
+from hma_data.registry.export import component_names, lerobot_features, modality
 
 YAML = """id: {id}
 kind: real

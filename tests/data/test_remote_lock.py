@@ -11,10 +11,10 @@ from datetime import timedelta
 
 import pytest
 
-from hma_data import remote_lock
 from hma_data.errors import OutputError
-from hma_data.remote_lock import Holder, RemoteLock
-from hma_data.store import RemotePath, place, put_bytes
+from hma_data.storage import remote_lock
+from hma_data.storage.remote import RemotePath, place, put_bytes
+from hma_data.storage.remote_lock import Holder, RemoteLock
 
 LOCK = ".lock"
 

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hma_data.align import to_clip
-from hma_data.embodiment import Embodiment, find
+from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, MissingDependencyError, SourceError
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.tf_example import Example, varints
+from hma_data.sources.rlds.tf_example import Example, varints
 from tests.data import rlds_files
 from tests.data.rlds_files import (
     PROTO,

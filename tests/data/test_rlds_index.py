@@ -15,12 +15,12 @@ from fsspec.implementations.memory import MemoryFileSystem
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hma_data import fetching
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
-from hma_data.sources import record_file
 from hma_data.sources.base import open_source
-from hma_data.sources.record_index import Framing, index_path, load_index, save_index
-from hma_data.sources.tfds_folder import open_folder
+from hma_data.sources.rlds import record_file
+from hma_data.sources.rlds.folder import open_folder
+from hma_data.sources.rlds.record_index import Framing, index_path, load_index, save_index
+from hma_data.storage import fetch as fetching
 from tests.data import rlds_files
 from tests.data.rlds_files import encode, frame, tensor
 
@@ -68,7 +68,7 @@ def test_a_second_process_reads_the_index_and_scans_nothing(tmp_path, cache, mon
     path = shard(dataset(tmp_path / "d"))
     first = reopened(path).framing()
     assert len(list(cache.iterdir())) == 1
-    monkeypatch.setattr("hma_data.sources.tfrecord._walk", None)
+    monkeypatch.setattr("hma_data.sources.rlds.tfrecord._walk", None)
     again = reopened(path)
     np.testing.assert_array_equal(again.framing().offsets, first.offsets)
     assert again.read(70, "e") == encode(record(70))

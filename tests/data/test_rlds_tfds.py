@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hma_data.embodiment import Embodiment
 from hma_data.errors import EpisodeError
+from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
-from hma_data.sources.rlds_steps import Steps
-from hma_data.sources.tfds_folder import open_folder
+from hma_data.sources.rlds.folder import open_folder
+from hma_data.sources.rlds.steps import Steps
 
 pytestmark = pytest.mark.slow
 RLDS = open_source("rlds")

@@ -11,9 +11,9 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
-from hma_data.align import to_clip
-from hma_data.embodiment import Embodiment
+from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.base import detect

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.align import to_clip
-from hma_data.embodiment import Embodiment
-from hma_data.episode import Episode, Pictures, Signal
-from hma_data.rotations import between
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.episode import Episode, Pictures, Signal
+from hma_data.episodes.rotations import between
+from hma_data.registry.embodiment import Embodiment
 
 QUICK = settings(max_examples=60, deadline=None)
 SAMPLES = np.arange(6, dtype=float)

@@ -37,7 +37,7 @@ def test_a_column_is_as_pyarrow_gives_it(column: pa.Array, part: slice) -> None:
 def test_windows_are_read_without_pandas(tmp_path: Path) -> None:
     make_set(tmp_path / "set", 0, SMALL | {"frames": 300})
     code = (
-        "import sys; from hma_data.loader import MixtureDataset; "
+        "import sys; from hma_data.loading.dataset import MixtureDataset; "
         f"next(iter(MixtureDataset([{str(tmp_path / 'set')!r}], 4, 6))); "
         "sys.exit('pandas' in sys.modules)"
     )

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from hma_data.cli_shards import shards_app
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.cli.shards import shards_app
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 

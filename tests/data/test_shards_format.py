@@ -13,15 +13,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
-from hma_data.plan import Settings
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import Footer, arrow_schema
+from hma_data.shards.stats import Stats
+from hma_data.shards.windows import WindowIndex
 from hma_data.shards.writer import EpisodeRows, ShardWriter
-from hma_data.stats import Stats
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_data.windows import WindowIndex
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 YAML = ARM_YAML.replace("cameras:", "state: {components: [{key: actions, dims: 2, slice: [0, 2]}]}\ncameras:")

@@ -8,10 +8,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, OutputError, UsageError
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.memmap import export, video_dtype
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import token_column

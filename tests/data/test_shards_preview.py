@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.curves import CURSOR, UNKNOWN, Curves
 from hma_data.shards.preview import preview
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy

@@ -11,17 +11,17 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.rewrite import merge, split
 from hma_data.errors import OutputError, ShardError, UsageError
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest, finish
 from hma_data.shards.memmap import export
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.remake import merge, split
 from hma_data.shards.schema import read_footer, to_arrow, to_numpy
+from hma_data.shards.stats import Stats
 from hma_data.shards.verify import verify
-from hma_data.stats import Stats
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.stats import QUANTILES, Stats
+from hma_data.shards.stats import QUANTILES, Stats
 
 RNG = np.random.default_rng(0)
 N = 200_000

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.restat import restat
 from hma_data.errors import ShardError
-from hma_data.files import file_sha256
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest, finish, plan_hash, seal_problem
-from hma_data.shards.restat import restat
 from hma_data.shards.verify import verify
+from hma_data.storage.files import file_sha256
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)

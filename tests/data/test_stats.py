@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.stats import Stats
+from hma_data.shards.stats import Stats
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=12), st.integers(0, 2**31))

@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data import shard_cache, store
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import ShardError, StorageAwayError, StorageError
-from hma_data.files import file_sha256
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.info import describe
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from hma_data.store import RangeFile, RemotePath, place, put_bytes, put_file
+from hma_data.storage import cache as shard_cache
+from hma_data.storage import remote as store
+from hma_data.storage.files import file_sha256
+from hma_data.storage.remote import RangeFile, RemotePath, place, put_bytes, put_file
 from tests.conftest import BlockTokenizer
 
 SMALL = Settings(val_fraction=0.2, shard_frames=60)

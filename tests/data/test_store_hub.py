@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hma_data import store
-from hma_data.convert import convert, convert_share
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.hub_output import HubOutput
+from hma_data.conversion.job import convert, convert_share
+from hma_data.conversion.output import Share
+from hma_data.conversion.plan import Settings
 from hma_data.errors import HubError, OutputError, ShardError
-from hma_data.files import cache_folder
-from hma_data.hub_output import HubOutput
-from hma_data.output import Share
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards import publish
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from hma_data.store import place
+from hma_data.storage import remote as store
+from hma_data.storage.files import cache_folder
+from hma_data.storage.remote import place
 from tests.conftest import BlockTokenizer
 from tests.hub_server import Hub, Repository
 from tests.hub_state import EVERY

@@ -12,17 +12,17 @@ from pathlib import Path
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data import store
-from hma_data.convert import Shared, convert, convert_share
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import Shared, convert, convert_share
+from hma_data.conversion.output import PLAN, Share
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.restat import restat
+from hma_data.conversion.rewrite import merge
 from hma_data.errors import MissingDependencyError, OutputError, ShardError, StorageAwayError, StorageError
-from hma_data.files import cache_folder, remove_parts, upload_folder
-from hma_data.output import PLAN, Share
-from hma_data.plan import Settings
-from hma_data.shards.remake import merge
-from hma_data.shards.restat import restat
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.verify import verify
-from hma_data.store import RemotePath, place, put_bytes
+from hma_data.storage import remote as store
+from hma_data.storage.files import cache_folder, remove_parts, upload_folder
+from hma_data.storage.remote import RemotePath, place, put_bytes
 from tests.conftest import BlockTokenizer, write_toy
 
 SMALL = Settings(val_fraction=0.2, shard_frames=60)

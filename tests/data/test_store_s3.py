@@ -19,15 +19,15 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data import store
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, OutputError, ShardError, StorageAwayError, StorageError
-from hma_data.files import cache_folder
-from hma_data.plan import Settings
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from hma_data.store import RemotePath, place, put_file
+from hma_data.storage import remote as store
+from hma_data.storage.files import cache_folder
+from hma_data.storage.remote import RemotePath, place, put_file
 from tests.conftest import ARM_YAML, BlockTokenizer
 
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
@@ -227,7 +227,7 @@ def test_a_large_shard_goes_up_in_parts_and_appears_whole(out, proxy, tmp_path) 
 def test_forked_readers_of_a_dataloader_see_the_same_batches(
     toy_arm, toy_recording, out, tmp_path, whole
 ) -> None:
-    from hma_data.loader import WindowDataset
+    from hma_data.loading.dataset import WindowDataset
 
     run(toy_arm, toy_recording, out)
     ours, theirs = WindowDataset(tmp_path / "whole", "train", 4), WindowDataset(str(out), "train", 4)
@@ -325,10 +325,10 @@ COMMAND = f"""
 import sys, time
 from pathlib import Path
 from hma_data import shard_work
-import hma_data.convert
-from hma_data.embodiment import Embodiment
-from hma_data.plan import Settings
-from hma_data.sources.hdf5 import Hdf5Source
+import hma_data.conversion.job
+from hma_data.registry.embodiment import Embodiment
+from hma_data.conversion.plan import Settings
+from hma_data.sources.hdf5.source import Hdf5Source
 from tests.conftest import BlockTokenizer
 
 read = Hdf5Source.read
@@ -337,9 +337,9 @@ def slowly(self, uri, episode_id, embodiment):
     return read(self, uri, episode_id, embodiment)
 Hdf5Source.read = slowly
 shard_work.get_tokenizer = lambda *a, **k: BlockTokenizer()
-hma_data.convert.get_tokenizer = shard_work.get_tokenizer
+hma_data.conversion.job.get_tokenizer = shard_work.get_tokenizer
 if __name__ == "__main__":
-    hma_data.convert.convert(
+    hma_data.conversion.job.convert(
         Embodiment.from_yaml({ARM_YAML!r}), sys.argv[1], "block", Path(sys.argv[2]),
         workers=int(sys.argv[3]), settings=Settings(val_fraction=0.2, shard_frames=60, seed=int(sys.argv[4])),
     )

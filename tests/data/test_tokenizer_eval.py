@@ -11,21 +11,21 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from hma_data.align import to_clip
-from hma_data.cli_tokenizer import tokenizer_app
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
+from hma_data.cli.tokenizer import tokenizer_app
+from hma_data.conversion.job import convert
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.images import prepare
+from hma_data.episodes.sheets import write_png
 from hma_data.errors import MissingDependencyError, SourceError, TokenizerError
-from hma_data.sheets import write_png
+from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
-from hma_data.tokenizers import perceptual
 from hma_data.tokenizers.base import TOKENIZERS, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED, Entry
-from hma_data.tokenizers.eval import LatentMoments, evaluate
-from hma_data.tokenizers.frames import frames_of, read_frames
-from hma_data.tokenizers.perceptual import open_lpips
-from hma_data.tokenizers.report import to_markdown, write_report
-from hma_data.video import prepare
+from hma_data.tokenizers.training import perceptual
+from hma_data.tokenizers.training.eval import LatentMoments, evaluate
+from hma_data.tokenizers.training.frames import frames_of, read_frames
+from hma_data.tokenizers.training.perceptual import open_lpips
+from hma_data.tokenizers.training.report import to_markdown, write_report
 from tests.conftest import ARM_YAML, write_toy
 from tests.data.tokenizer_files import draw_scene
 
@@ -110,7 +110,7 @@ def test_what_is_not_there_is_named(tmp_path):
 
 def test_an_episode_that_cannot_be_read_is_told_and_replaced(arm, block_tokenizer, monkeypatch):
     robot, path = arm
-    monkeypatch.setattr("hma_data.tokenizers.frames.EPISODES", 1)
+    monkeypatch.setattr("hma_data.tokenizers.training.frames.EPISODES", 1)
     source = open_source("hdf5")
     read = source.read
 

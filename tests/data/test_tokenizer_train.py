@@ -11,16 +11,16 @@ import torch
 from safetensors.torch import load_file
 
 from hma_data.errors import RecipeError, TokenizerError
-from hma_data.shipped import shipped
+from hma_data.storage.shipped import shipped
 from hma_data.tokenizers.base import get_tokenizer
-from hma_data.tokenizers.crops import draw_batch, load_pools
 from hma_data.tokenizers.embedded import read_weights
-from hma_data.tokenizers.eval import psnr_db
 from hma_data.tokenizers.fsq import WEIGHTS
 from hma_data.tokenizers.fsq_network import FORMAT, FsqConfig
-from hma_data.tokenizers.muon import Muon, orthogonal
-from hma_data.tokenizers.recipe import DrawnSource, load_recipe
-from hma_data.tokenizers.train import train
+from hma_data.tokenizers.training.crops import draw_batch, load_pools
+from hma_data.tokenizers.training.eval import psnr_db
+from hma_data.tokenizers.training.muon import Muon, orthogonal
+from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
+from hma_data.tokenizers.training.train import train
 from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"

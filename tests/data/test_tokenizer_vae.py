@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from hma_data.errors import TokenizerError
-from hma_data.shipped import shipped
+from hma_data.storage.shipped import shipped
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 from hma_data.tokenizers.embedded import read_weights, save_weights
-from hma_data.tokenizers.eval import evaluate, psnr_db
 from hma_data.tokenizers.fsq import WEIGHTS as FSQ_WEIGHTS
-from hma_data.tokenizers.recipe import load_recipe
-from hma_data.tokenizers.train import train
+from hma_data.tokenizers.training.eval import evaluate, psnr_db
+from hma_data.tokenizers.training.recipe import load_recipe
+from hma_data.tokenizers.training.train import train
 from hma_data.tokenizers.vae import WEIGHTS
 from hma_data.tokenizers.vae_network import FORMAT, VaeAutoencoder, VaeConfig
 from tests.data.tokenizer_files import draw_scene, drawn_corpus
@@ -157,7 +157,7 @@ def test_the_shipped_weights_are_of_the_shipped_recipe():
 
 @pytest.mark.real
 def test_real_robot_frames_come_back_as_promised(real_data, vae):
-    from hma_data.tokenizers.frames import read_frames
+    from hma_data.tokenizers.training.frames import read_frames
 
     video = sorted((real_data / "lerobot" / "g1_v21" / "videos").rglob("*.mp4"))[0]
     result = evaluate(vae, read_frames(video, 256, frames=4))

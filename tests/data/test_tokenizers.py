@@ -9,16 +9,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from hma_data.errors import TokenizerError
-from hma_data.shipped import shipped
+from hma_data.storage.shipped import shipped
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG
 from hma_data.tokenizers.embedded import read_weights, save_weights
-from hma_data.tokenizers.eval import CodebookUse, evaluate, psnr_db, ssim
-from hma_data.tokenizers.frames import read_frames
 from hma_data.tokenizers.fsq import WEIGHTS
 from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig, Quantizer
-from hma_data.tokenizers.recipe import load_recipe
-from hma_data.tokenizers.report import to_markdown
+from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ssim
+from hma_data.tokenizers.training.frames import read_frames
+from hma_data.tokenizers.training.recipe import load_recipe
+from hma_data.tokenizers.training.report import to_markdown
 from tests.data.tokenizer_files import draw_scene
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"

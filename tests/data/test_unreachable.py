@@ -7,11 +7,12 @@ import fsspec
 import pytest
 import s3fs
 
-from hma_data import fetching, store
 from hma_data.errors import StorageAwayError, StorageError
-from hma_data.fetching import CONNECT_S, file_system
 from hma_data.sources.base import open_source
-from hma_data.store import place
+from hma_data.storage import fetch as fetching
+from hma_data.storage import remote as store
+from hma_data.storage.fetch import CONNECT_S, file_system
+from hma_data.storage.remote import place
 
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
 

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hma_data.episode import Pictures
+from hma_data.episodes.episode import Pictures
+from hma_data.episodes.images import decode_image, prepare, prepared
 from hma_data.errors import EpisodeError
-from hma_data.sources.video_file import VideoFile, frame_table
-from hma_data.spec import Camera
-from hma_data.video import decode_image, prepare, prepared
+from hma_data.registry.components import Camera
+from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.fresh import run_fresh
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
 
@@ -78,7 +78,7 @@ def test_a_far_jump_skips_to_its_keyframe(tmp_path: Path, monkeypatch: pytest.Mo
 FORKING = """
 import os, sys
 from pathlib import Path
-from hma_data.sources.video_file import VideoFile
+from hma_data.sources.common.video_file import VideoFile
 from tests.data.videos import number_of
 
 file = VideoFile(Path(sys.argv[1]))
@@ -317,7 +317,9 @@ def test_a_huge_size_is_refused_wherever_it_is_claimed(suffix: str) -> None:
     else:
         data[16:24] = (30_000).to_bytes(4, "big") * 2
     code = (
-        "import sys; from hma_data.video import decode_image; from hma_data.errors import EpisodeError\n"
+        "import sys\n"
+        "from hma_data.episodes.images import decode_image\n"
+        "from hma_data.errors import EpisodeError\n"
         "try: decode_image(sys.stdin.buffer.read(), 'e')\n"
         "except EpisodeError: sys.exit(7)"
     )

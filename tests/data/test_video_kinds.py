@@ -12,7 +12,7 @@ import pytest
 
 from hma_data.errors import EpisodeError
 from hma_data.priority import ordinary_priority
-from hma_data.sources.video_file import VideoFile, frame_table
+from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
 
 N = 26
@@ -139,7 +139,7 @@ def test_a_lying_container_that_gives_fewer_frames_is_refused(
     path = without(b"ctts")(tmp_path)
     table = frame_table(path)
     longer = type(table)(**{**vars(table), "times": np.append(table.times, 99.0)})
-    monkeypatch.setattr("hma_data.sources.video_file.frame_table", lambda path: longer)
+    monkeypatch.setattr("hma_data.sources.common.video_file.frame_table", lambda path: longer)
     with pytest.raises(EpisodeError, match=r"gives \d+ frames, its packets tell of \d+"):
         VideoFile(path).frames([3])
 

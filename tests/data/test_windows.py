@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hma_data.errors import ShardError
 from hma_data.shards.reader import EpisodeIndex
-from hma_data.windows import WindowIndex
+from hma_data.shards.windows import WindowIndex
 
 
 def fake(lengths: list[int], stride: int = 1, cameras: int = 1, group: int = 7, shards: int = 1) -> Any:

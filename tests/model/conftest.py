@@ -6,7 +6,7 @@ from functools import partialmethod
 import pytest
 import torch
 
-from hma_data.loader import MixtureDataset
+from hma_data.loading.dataset import MixtureDataset
 from tests.model import processes
 
 

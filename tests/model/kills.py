@@ -13,9 +13,10 @@ from typing import Any
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from hma_data import remote_lock
-from hma_model import hub, hub_swap
-from hma_model.hub_data import push_data
+from hma_data.storage import remote_lock
+from hma_model.hub import publish as hub
+from hma_model.hub import swap as hub_swap
+from hma_model.hub.datasets import push_data
 
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 CHANGES = ("os.rename", "os.link", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "exchange")

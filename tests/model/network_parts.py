@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from hma_model.config import ActionSpace, HMAConfig
-from hma_model.model import HMA
+from hma_model.network.model import HMA
 
 ARM = ActionSpace("arm", 3, 2, (1.0, -2.0, 0.5), (2.0, 0.5, 1.0), (True, True, False))
 HAND = ActionSpace("hand.v1", 2, 1, (0.0, 3.0), (1.0, 0.0), (True, True))

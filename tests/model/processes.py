@@ -23,11 +23,17 @@ from torch.distributed import TCPStore
 
 from hma_data.errors import HMAError
 from hma_model.cli import main
-from hma_model.rank_errors import report_once
+from hma_model.training.rank_errors import report_once
 
 ROOT = Path(__file__).resolve().parents[2]
 SAFETY = 120.0  # seconds after which a process counts as hung
-PRELOAD = ["torch._dynamo", "torch.distributed.nn.functional", "hma_model.train", "hma_model.cli", "pytest"]
+PRELOAD = [
+    "torch._dynamo",
+    "torch.distributed.nn.functional",
+    "hma_model.training.loop",
+    "hma_model.cli",
+    "pytest",
+]
 ALONE = {  # no library of the server starts a thread
     "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JE_ARROW_MALLOC_CONF": "background_thread:false",
     "PYTHONPATH": str(ROOT),

@@ -5,11 +5,11 @@ from typing import Any
 
 import torch
 
-from hma_data.embodiment import Embodiment
+from hma_data.registry.embodiment import Embodiment
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model import checkpoint
+from hma_model.checkpoint import io as checkpoint
 from hma_model.config import HMAConfig
-from hma_model.model import HMA
+from hma_model.network.model import HMA
 
 SPEC = TokenizerSpec(
     name="raw", version=1, kind="discrete", image_size=16, grid=(2, 3), vocab_size=64, factored=(8, 8)

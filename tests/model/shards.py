@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hma_data.embodiment import Embodiment
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import finish
 from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema
+from hma_data.shards.stats import Stats
 from hma_data.shards.writer import EpisodeRows, ShardWriter
-from hma_data.stats import Stats
 from hma_data.tokenizers.base import TokenizerSpec
 from tests.model.robots import SPEC, yaml
 

@@ -9,7 +9,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
-from hma_model import bench_generate, bench_train, bench_waiting
+from hma_model.bench import generate as bench_generate
+from hma_model.bench import train as bench_train
+from hma_model.bench import waiting as bench_waiting
 from hma_model.cli import app
 from tests.model.network_parts import small_batch, small_model
 

@@ -12,9 +12,9 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError
-from hma_model import checkpoint
-from hma_model.checkpoint import Checkpoint
-from hma_model.files import read_metadata
+from hma_data.storage.folders import read_metadata
+from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.io import Checkpoint
 from tests.model.robots import CONFIG, SPEC, make_model, save, yaml
 from tests.model.robots import stats as stats_of
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from hma_data.errors import CheckpointError, UsageError
-from hma_data.loader import Batch, WindowDataset
+from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
-from hma_model.evaluate import (
+from hma_model.evaluation.evaluate import (
     digit_frequencies,
     evaluate,
     masked_val_loss,
@@ -22,9 +22,9 @@ from hma_model.evaluate import (
     validation_losses,
     windows,
 )
-from hma_model.metrics import token_hits, token_nats
-from hma_model.model import HMA
-from hma_model.teacher import teacher_forced
+from hma_model.evaluation.metrics import token_hits, token_nats
+from hma_model.evaluation.teacher_forcing import teacher_forced
+from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
 from tests.model.shards import make_shards
 

@@ -8,8 +8,8 @@ import torch
 
 from hma_data.errors import HMAError
 from hma_model.config import CONDITIONINGS
-from hma_model.generate import Rollout
-from hma_model.model import HMA
+from hma_model.generation.rollout import Rollout
+from hma_model.network.model import HMA
 from tests.model.network_parts import ARM, small_batch, small_model
 
 COMBINATIONS = [

@@ -9,10 +9,10 @@ import pytest
 
 from hma_data.errors import RecipeError, TrainingError
 from hma_data.shards.writer import EpisodeRows, ShardWriter
-from hma_model import checkpoint
-from hma_model.recipe import make_recipe
-from hma_model.runlog import read_metrics
-from hma_model.train import train
+from hma_model.checkpoint import io as checkpoint
+from hma_model.training.logging import read_metrics
+from hma_model.training.loop import train
+from hma_model.training.recipe import make_recipe
 from tests.model.processes import errors
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards

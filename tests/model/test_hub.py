@@ -10,12 +10,13 @@ import pytest
 import torch
 import yaml as plain_yaml
 
-from hma_data import remote_lock
 from hma_data.errors import CheckpointError, HubError
-from hma_model import checkpoint, hub
-from hma_model.checkpoint import Checkpoint
-from hma_model.hub_folder import FolderStore
-from hma_model.model import HMA
+from hma_data.storage import remote_lock
+from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.io import Checkpoint
+from hma_model.hub import publish as hub
+from hma_model.hub.folder import FolderStore
+from hma_model.network.model import HMA
 from tests.model.robots import make_model, save
 from tests.model.robots import yaml as robot_yaml
 

@@ -10,13 +10,15 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError, HMAError
-from hma_data.files import file_sha256
-from hma_model import checkpoint, hub, migrate, weights
-from hma_model.checkpoint import Checkpoint
-from hma_model.files import read_metadata
-from hma_model.hub_list import survey
-from hma_model.migrate import Step
-from hma_model.model import HMA
+from hma_data.storage.files import file_sha256
+from hma_data.storage.folders import read_metadata
+from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint import migrate, weights
+from hma_model.checkpoint.io import Checkpoint
+from hma_model.checkpoint.migrate import Step
+from hma_model.hub import publish as hub
+from hma_model.hub.listing import survey
+from hma_model.network.model import HMA
 from tests.model.robots import make_model, save
 
 ROBOTS = {"arm": 2, "hand": 3}

@@ -10,7 +10,7 @@ import yaml
 from hma_data.errors import HubError, ShardError
 from hma_data.shards import publish
 from hma_data.shards.reader import ShardSet
-from hma_model.hub_data import pull_data, push_data
+from hma_model.hub.datasets import pull_data, push_data
 from tests.hub_server import Hub
 from tests.hub_state import EVERY
 from tests.model.robots import yaml as yaml_of

@@ -12,12 +12,14 @@ from pathlib import Path
 import pytest
 from huggingface_hub import constants
 
-from hma_data import remote_lock
 from hma_data.errors import HubError
 from hma_data.hub import partial
 from hma_data.hub.download import Entry
-from hma_model import checkpoint, hub, hub_swap
-from hma_model.checkpoint import PARTS
+from hma_data.storage import remote_lock
+from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.io import PARTS
+from hma_model.hub import publish as hub
+from hma_model.hub import swap as hub_swap
 from tests.hub_server import Hub
 from tests.hub_state import EVERY, REPO, sha256
 from tests.model.robots import make_model, save

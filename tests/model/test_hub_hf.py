@@ -18,10 +18,11 @@ from typer.testing import CliRunner
 
 from hma_data.errors import CheckpointError, HubError
 from hma_data.hub import errors as hub_errors
-from hma_model import checkpoint, hub
-from hma_model.checkpoint import PARTS
+from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.io import PARTS
 from hma_model.cli import app
-from hma_model.model import HMA
+from hma_model.hub import publish as hub
+from hma_model.network.model import HMA
 from tests.hub_server import Hub
 from tests.hub_state import REPO, ROBOTS, TOKEN
 from tests.model.robots import save

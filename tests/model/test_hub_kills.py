@@ -15,9 +15,10 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from hma_data.errors import CheckpointError, HubError, ShardError
-from hma_model import checkpoint, hub
-from hma_model.checkpoint import PARTS
-from hma_model.hub_data import pull_data, push_data
+from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.io import PARTS
+from hma_model.hub import publish as hub
+from hma_model.hub.datasets import pull_data, push_data
 from tests.model.kills import FileStore, killed, make_quick
 from tests.model.robots import make_model, save
 from tests.model.shards import make_shards

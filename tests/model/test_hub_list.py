@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 
 from hma_data.errors import CheckpointError, HubError, UsageError
 from hma_data.shards.reader import ShardSet
-from hma_model import hub
-from hma_model.checkpoint import Checkpoint
+from hma_model.checkpoint.io import Checkpoint
 from hma_model.cli import app
-from hma_model.hub_list import survey
-from hma_model.hub_sample import add_samples, sample
+from hma_model.hub import publish as hub
+from hma_model.hub.listing import survey
+from hma_model.hub.sample import add_samples, sample
 from tests.hub_server import connect, serve
 from tests.model.robots import SPEC, make_model, save
 from tests.model.shards import make_shards

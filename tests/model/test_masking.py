@@ -4,8 +4,8 @@ import math
 
 import torch
 
-from hma_model.embed import to_digits
-from hma_model.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks, masked_after
+from hma_model.network.embed import to_digits
+from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks, masked_after
 from tests.model.network_parts import small_config
 
 

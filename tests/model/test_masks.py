@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.convert import convert
-from hma_data.embodiment import Embodiment
-from hma_data.loader import Batch, WindowDataset
+from hma_data.conversion.job import convert
+from hma_data.loading.dataset import Batch, WindowDataset
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
-from hma_model import checkpoint
+from hma_model.checkpoint import io as checkpoint
 from hma_model.config import HMAConfig
-from hma_model.model import HMA
+from hma_model.network.model import HMA
 from tests.conftest import BlockTokenizer
 from tests.data import hands_files as made
 from tests.data.videos import encode

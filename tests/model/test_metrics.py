@@ -8,7 +8,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from hma_data.errors import UsageError
-from hma_model.metrics import perplexity, psnr, ssim, token_hits, token_nats
+from hma_model.evaluation.metrics import perplexity, psnr, ssim, token_hits, token_nats
 
 
 @pytest.fixture

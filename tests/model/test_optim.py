@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from hma_data.errors import CheckpointError
-from hma_model.optim import (
+from hma_model.training.optim import (
     learning_rate,
     load_optimizer_state,
     lr_scale,
@@ -12,7 +12,7 @@ from hma_model.optim import (
     optimizer_state,
     parameter_groups,
 )
-from hma_model.recipe import make_recipe
+from hma_model.training.recipe import make_recipe
 from tests.model.robots import CONFIG, make_model
 
 ROBOTS = {"arm": 2, "hand": 3}

@@ -15,12 +15,12 @@ import torch
 import torch.distributed as dist
 
 from hma_data.errors import HMAError, ShardError, TrainingError
-from hma_model import checkpoint
-from hma_model.parallel import Spread, World, join
-from hma_model.rank_errors import read_error, report_once, write_error
-from hma_model.recipe import make_recipe
-from hma_model.runlog import read_metrics
-from hma_model.train import train
+from hma_model.checkpoint import io as checkpoint
+from hma_model.training.logging import read_metrics
+from hma_model.training.loop import train
+from hma_model.training.parallel import Spread, World, join
+from hma_model.training.rank_errors import read_error, report_once, write_error
+from hma_model.training.recipe import make_recipe
 from tests.model.processes import ROOT, errors, run_ranks
 from tests.model.runs import TINY, weights
 from tests.model.shards import make_shards
@@ -174,7 +174,7 @@ def test_a_full_disk_on_the_first_rank_ends_all(recipe, tmp_path):
 
 def train_on_a_full_disk(recipe, out: Path, rank: int) -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
-    with mock.patch("hma_model.trainer.write_atomic", side_effect=full):
+    with mock.patch("hma_model.training.run.write_atomic", side_effect=full):
         train(recipe, out=out)
 
 

@@ -12,10 +12,10 @@ import torch
 from safetensors.torch import load_file
 
 from hma_data.errors import CheckpointError
-from hma_model import hub
-from hma_model.model import HMA
-from hma_model.released import config_from_released
-from hma_model.released_state import state_from_released
+from hma_model.hub import publish as hub
+from hma_model.network.model import HMA
+from hma_model.released.config import config_from_released
+from hma_model.released.state import state_from_released
 
 pytestmark = pytest.mark.real
 
@@ -102,7 +102,7 @@ def test_an_imported_checkpoint_exports_to_the_same_tensors(
 
 
 def test_statistics_and_sizes_of_each_domain_are_carried(imported: dict[str, Path], real_data: Path) -> None:
-    from hma_model.checkpoint import Checkpoint
+    from hma_model.checkpoint.io import Checkpoint
 
     case = json.loads((real_data / "parity" / "discrete" / "case.json").read_text())
     state = load_file(real_data / "parity" / "discrete" / "model.safetensors")

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from hma_data.errors import RecipeError, UsageError
-from hma_data.shipped import shipped
+from hma_data.storage.shipped import shipped
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.recipe import differences, load_recipe, make_recipe, parse_overrides
+from hma_model.training.recipe import differences, load_recipe, make_recipe, parse_overrides
 from tests.model.robots import SPEC
 
 
@@ -240,7 +240,7 @@ def test_the_xl_model_has_the_papers_parameters_with_one_robot():
         factored=(512, 512),
     )  # fmt: skip
     from hma_model.config import ActionSpace
-    from hma_model.model import HMA
+    from hma_model.network.model import HMA
 
     for name, low, high in (("discrete_base", 40e6, 50e6), ("discrete_xl", 640e6, 720e6)):
         with torch.device("meta"):
@@ -250,7 +250,7 @@ def test_the_xl_model_has_the_papers_parameters_with_one_robot():
 
 
 def test_the_mixture_of_forty_names_forty_embodiments_of_the_registry():
-    from hma_data.embodiment import find
+    from hma_data.registry.embodiment import find
 
     names = [folder.removeprefix("shards/") for folder in load_recipe("pretrain40").data]
     assert len(set(names)) == 40

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from hma_data.errors import CheckpointError, RecipeError, UsageError
+from hma_data.storage.folders import read_metadata, read_tensors, write_tensors
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.files import read_metadata, read_tensors, write_tensors
-from hma_model.recipe import make_recipe
-from hma_model.train import train
+from hma_model.training.loop import train
+from hma_model.training.recipe import make_recipe
 from tests.model.robots import SPEC
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards

@@ -18,12 +18,13 @@ from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_
 
 from hma_data.errors import MissingDependencyError, OutputError
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model import checkpoint, runlog
-from hma_model.recipe import make_recipe
-from hma_model.report import write_report
-from hma_model.runlog import RunLog, read_metrics
-from hma_model.trackers import open_trackers
-from hma_model.train import train
+from hma_model.checkpoint import io as checkpoint
+from hma_model.training import logging as runlog
+from hma_model.training.logging import RunLog, read_metrics
+from hma_model.training.loop import train
+from hma_model.training.recipe import make_recipe
+from hma_model.training.report import write_report
+from hma_model.training.trackers import open_trackers
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
 

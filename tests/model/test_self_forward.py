@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from hma_data.errors import RecipeError
-from hma_data.loader import Batch
+from hma_data.loading.dataset import Batch
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.embed import to_digits
-from hma_model.parallel import World
-from hma_model.recipe import make_recipe
-from hma_model.self_forward import SAMPLE_STEPS, Forwarded, forwarded, share_at
-from hma_model.train import train
-from hma_model.trainer import Run
+from hma_model.network.embed import to_digits
+from hma_model.training.loop import train
+from hma_model.training.parallel import World
+from hma_model.training.recipe import make_recipe
+from hma_model.training.run import Run
+from hma_model.training.scheduled_sampling import SAMPLE_STEPS, Forwarded, forwarded, share_at
 from tests.model.robots import CONFIG, make_model
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
@@ -185,7 +185,7 @@ def test_a_past_of_its_own_is_what_generation_makes_of_the_same_prompt_and_actio
     with torch.no_grad():  # fresh gates, modulations and outputs are zero, so that actions would not matter
         for parameter in model.parameters():
             parameter.add_(0.2 * torch.randn_like(parameter))
-    monkeypatch.setattr("hma_model.diffusion.randn", lambda shape, *_: torch.full(tuple(shape), 0.3))
+    monkeypatch.setattr("hma_model.network.diffusion.randn", lambda shape, *_: torch.full(tuple(shape), 0.3))
     true, depth = batch(4, continuous), 1 + seed
     stored = true.latents if continuous else true.tokens
     given = forwarded(model, true, 1.0, depth, torch.Generator().manual_seed(seed))

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from hma_data.errors import CheckpointError, HMAError, OutputError, RecipeError, ShardError, TrainingError
-from hma_model import checkpoint
-from hma_model.recipe import make_recipe
-from hma_model.runlog import read_metrics
-from hma_model.train import train
+from hma_model.checkpoint import io as checkpoint
+from hma_model.training.logging import read_metrics
+from hma_model.training.loop import train
+from hma_model.training.recipe import make_recipe
 from tests.model.processes import command, end, kill_at_write, run, start
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards
@@ -79,7 +79,7 @@ def test_the_command_saves_on_sigterm_and_says_how_to_go_on(recipe, tmp_path):
 @pytest.fixture
 def full(monkeypatch):
     """The disk is full from the second checkpoint on."""
-    from hma_model import files
+    from hma_data.storage import folders as files
 
     plain, calls = files.write_tensors, []
 
@@ -89,7 +89,7 @@ def full(monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
         plain(path, tensors, metadata)
 
-    monkeypatch.setattr("hma_model.checkpoint.write_tensors", write)
+    monkeypatch.setattr("hma_model.checkpoint.io.write_tensors", write)
     return calls
 
 

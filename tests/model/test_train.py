@@ -20,13 +20,13 @@ from hma_data.errors import (
     UsageError,
 )
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model import checkpoint
-from hma_model.model import HMA
-from hma_model.recipe import Recipe, make_recipe
-from hma_model.resume import seed_for
-from hma_model.runlog import read_metrics
-from hma_model.runtime import own_folder
-from hma_model.train import train
+from hma_model.checkpoint import io as checkpoint
+from hma_model.network.model import HMA
+from hma_model.training.logging import read_metrics
+from hma_model.training.loop import train
+from hma_model.training.recipe import Recipe, make_recipe
+from hma_model.training.resume import seed_for
+from hma_model.training.runtime import own_folder
 from tests.model.processes import run
 from tests.model.runs import TINY, same
 from tests.model.shards import make_shards

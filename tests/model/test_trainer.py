@@ -5,16 +5,16 @@ import pytest
 import torch
 
 from hma_data.errors import RecipeError, TrainingError
-from hma_model import checkpoint
-from hma_model.ema import Average
-from hma_model.feed import Feed, share
-from hma_model.health import SETTLED, Pulse, listed
-from hma_model.model import HMA
-from hma_model.parallel import World
-from hma_model.recipe import make_recipe
-from hma_model.runlog import read_metrics
-from hma_model.train import train
-from hma_model.trainer import Run
+from hma_model.checkpoint import io as checkpoint
+from hma_model.network.model import HMA
+from hma_model.training.data import Feed, share
+from hma_model.training.ema import Average
+from hma_model.training.guards import SETTLED, Pulse, listed
+from hma_model.training.logging import read_metrics
+from hma_model.training.loop import train
+from hma_model.training.parallel import World
+from hma_model.training.recipe import make_recipe
+from hma_model.training.run import Run
 from tests.model.runs import TINY, same, weights
 from tests.model.shards import make_shards
 

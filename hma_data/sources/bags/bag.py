@@ -26,7 +26,7 @@ from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
 from hma_data.sources.bags.ros_files import SQLITE_MAGIC, Ros1File, SqliteFile
 from hma_data.sources.base import file_fingerprint, first_bytes, leaves
-from hma_data.yaml_io import read_yaml
+from hma_data.storage.yaml_io import read_yaml
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 MAX_EXPANSION = 200  # a file that unpacks to more than so many times its size is a bomb

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episode import Floats
+from hma_data.episodes.episode import Floats
 from hma_data.errors import EpisodeError
+from hma_data.registry.components import Component
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.messages import child, field_names, is_list, numbers, ros_store
-from hma_data.spec import Component
 
 STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\]")
 Step = str | int | slice

@@ -20,11 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.embodiment import Embodiment
 from hma_data.errors import EpisodeError
+from hma_data.registry.components import Marker, Segments
+from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, Place
 from hma_data.sources.bags.container import FAULTS, Channel, Record, Wanted
 from hma_data.sources.bags.fields import Field, missing_topic, parse_key
+from hma_data.sources.bags.images import VIDEO, picture_kind
 from hma_data.sources.bags.messages import (
     OF_A_CALL,
     child,
@@ -34,9 +36,7 @@ from hma_data.sources.bags.messages import (
     is_list,
     is_service_event,
 )
-from hma_data.sources.bags.pictures import VIDEO, picture_kind
 from hma_data.sources.bags.topic_track import TopicTrack
-from hma_data.spec import Marker, Segments
 
 SECOND_NS = 10**9
 SHOWN = 8  # values of a marker in an error

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episode import Floats, Stream
+from hma_data.episodes.episode import Floats, Stream
+from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag, Place
 from hma_data.sources.bags.container import Channel, Data
 from hma_data.sources.bags.fields import Column
-from hma_data.sources.bags.messages import decode, head_stamp, stamp_ns
-from hma_data.sources.bags.pictures import (
+from hma_data.sources.bags.images import (
     VIDEO,
     VideoDecoder,
     is_keyframe,
@@ -27,7 +27,7 @@ from hma_data.sources.bags.pictures import (
     picture_kind,
     video_codec,
 )
-from hma_data.video import Images
+from hma_data.sources.bags.messages import decode, head_stamp, stamp_ns
 
 INT64 = np.iinfo(np.int64)
 BLOCK = 64  # video messages fetched at a time

@@ -1,0 +1,131 @@
+"""`hma inspect` and `hma doctor`: what is in a recording, and what of it will hurt training."""
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+import typer
+
+from hma_data.console import human_number, print_json, print_lines, print_table
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Episodes = Annotated[int, typer.Option("--episodes", min=1, help="How many are looked into.")]
+COLUMNS = ["key", "shape", "dtype", "Hz", "jitter ms", "skew ms", "count", "values"]
+NO_JITTER_MS = 0.001  # less is the rounding of the stamps
+
+
+def inspect(
+    uri: Annotated[str, typer.Argument(help="A recording: file, folder or URI.")],
+    embodiment: Annotated[
+        str | None, typer.Option("--embodiment", "-e", help="Check against this embodiment.")
+    ] = None,
+    episodes: Episodes = 20,
+    json: Json = False,
+) -> None:
+    """What is in a recording.
+
+    Example: hma inspect ./demo.hdf5
+    """
+    from hma_data.inspection.inspect import inspect_recording
+
+    report = inspect_recording(uri, embodiment, episodes)
+    if json:
+        print_json(report)
+    else:
+        _print_inspection(report)
+    raise typer.Exit(1 if report["problems"] else 0)
+
+
+def _print_inspection(report: dict[str, Any]) -> None:
+    episodes = f"{report['episodes']:,} episode{'s' if report['episodes'] != 1 else ''}"
+    facts = [f"{report['format']}", episodes]
+    if report["frames"]:
+        facts.append(f"{report['frames']:,} frames")
+    if report["hz"]:
+        facts.append(f"{report['hz']:.4g} Hz")
+    if report["robot"]:
+        facts.append(report["robot"])
+    print(f"{report['uri']}: " + ", ".join(facts))
+    lengths = sorted(report["lengths"])
+    if lengths:
+        told = "" if len(lengths) == report["episodes"] else f" of the {len(lengths):,} counted"
+        middle = lengths[len(lengths) // 2]
+        print(f"episode lengths{told}: min {lengths[0]:,}, median {middle:,}, max {lengths[-1]:,} frames")
+    print(f"looked into: {report['looked_at']:,} of {episodes}")
+    print_table(COLUMNS, [_row(key) for key in report["keys"]])
+    named = {key["key"]: " ".join(key["names"]) for key in report["keys"] if key["names"]}
+    print_lines([(f"names of {key}", names) for key, names in named.items()])
+    print_lines([*report["facts"].items(), *report.get("embodiment", {}).items()])
+    print()
+    _print_checks(report)
+
+
+def _row(key: dict[str, Any]) -> list[Any]:
+    """One key: pictures with their codec, the skew as p50/p95/max."""
+    skew = "/".join(f"{part:.3g}" for part in key["skew_ms"]) if key["skew_ms"] else None
+    kind = {"camera": f"{key['dtype']} {key['codec'] or ''}", "text": "text"}.get(key["kind"], key["dtype"])
+    bounds = [human_number(key[side]) for side in ("low", "high")]
+    jitter = key["jitter_ms"]
+    return [
+        key["key"],
+        "×".join(map(str, key["shape"])) or "1",
+        kind.strip(),
+        human_number(key["hz"]),
+        human_number(0.0 if jitter is not None and jitter < NO_JITTER_MS else jitter),
+        skew,
+        key["count"],
+        None if bounds[0] is None else f"{bounds[0]} to {bounds[1]}",
+    ]
+
+
+def _print_checks(report: dict[str, Any]) -> None:
+    """Every check with its result; a line for each finding."""
+    from hma_data.sources.common.survey import CHECKS
+
+    findings: dict[str, list[str]] = {}
+    for finding in report["findings"]:
+        remedy = f" — {finding['remedy']}" if finding["remedy"] else ""
+        said = f"{finding['severity']}: {finding['message']}{remedy}"
+        findings.setdefault(finding["check"], []).append(said)
+    titles = {**CHECKS, "fits": "the embodiment fits", "usable": "episodes the embodiment can use"}
+    print_lines(
+        (titles.get(check, check), line)
+        for check, result in report["checks"].items()
+        for line in findings.get(check, [result])
+    )
+
+
+class Limit(StrEnum):
+    info = "info"
+    warn = "warn"
+    error = "error"
+    never = "never"
+
+
+def doctor(
+    target: Annotated[str, typer.Argument(help="A recording, or the folder of a shard set.")],
+    embodiment: Annotated[
+        str | None, typer.Option("--embodiment", "-e", help="Look into the episodes as this robot's.")
+    ] = None,
+    episodes: Episodes = 20,
+    fail_on: Annotated[
+        Limit, typer.Option("--fail-on", help="Exit with 1 from this severity on.")
+    ] = Limit.error,
+    json: Json = False,
+) -> None:
+    """Health checks: what of a recording or shard set will hurt training.
+
+    Example: hma doctor ./demo.hdf5 -e my_arm.yaml --fail-on warn
+    """
+    from hma_data.inspection.doctor import examine
+    from hma_data.sources.common.findings import SEVERITIES
+
+    found = examine(target, embodiment, episodes)
+    if json:
+        print_json({"target": target, "findings": [finding.to_json() for finding in found]})
+    else:
+        print_lines((f"{finding.severity:5} {finding.check}", str(finding)) for finding in found)
+        counts = [f"{sum(one.severity == level for one in found)} {level}" for level in reversed(SEVERITIES)]
+        print(f"{target}: {', '.join(counts)}" if found else f"{target}: sound")
+    worst = max((SEVERITIES.index(finding.severity) for finding in found), default=-1)
+    failed = fail_on is not Limit.never and worst >= SEVERITIES.index(fail_on.value)
+    raise typer.Exit(1 if failed else 0)

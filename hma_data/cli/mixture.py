@@ -1,0 +1,130 @@
+"""`hma mixture`: how often each embodiment is drawn, as a table and a plot."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hma_data.console import print_json, print_table
+
+if TYPE_CHECKING:
+    from hma_data.loading.mixture import Mixture
+    from hma_data.shards.windows import WindowIndex
+
+Pairs = list[str] | None
+
+
+def mixture(
+    folders: Annotated[list[str], typer.Argument(help="Shard sets.")],
+    temperature: Annotated[
+        float | None,
+        typer.Option("--temperature", help="τ: 1 proportional, large uniform; default 3, for val 4."),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="T of a window.")] = 12,
+    split: Annotated[str, typer.Option("--split", help="train or val.")] = "train",
+    short: Annotated[str, typer.Option("--short", help="Short episodes: drop or pad.")] = "drop",
+    weight: Annotated[
+        Pairs, typer.Option("--weight", metavar="NAME=FACTOR", help="Of an embodiment or group.")
+    ] = None,
+    group: Annotated[
+        Pairs, typer.Option("--group", metavar="ID=GROUP", help="Groups get equal shares.")
+    ] = None,
+    cap: Annotated[Pairs, typer.Option("--cap", metavar="ID=SHARE", help="Largest probability.")] = None,
+    max_epochs: Annotated[
+        float | None, typer.Option("--max-epochs", help="Passes over one set at most.")
+    ] = None,
+    samples: Annotated[
+        int | None, typer.Option("--samples", min=1, help="Planned draws; default: as many as windows.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="PNG, SVG or PDF to draw.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """How often each embodiment is drawn.
+
+    Example: hma mixture shards/a shards/b --temperature 3 --plot mixture.png
+    """
+    from hma_data.errors import UsageError
+    from hma_data.loading.dataset import open_sets
+    from hma_data.loading.mixture import TEMPERATURES, Mixture, plot_mixture
+    from hma_data.shards.manifest import SPLITS
+    from hma_data.shards.windows import WindowIndex
+
+    if split not in SPLITS:
+        raise UsageError("--split", f"must be train or val, is {split!r}")
+    if short not in ("drop", "pad"):
+        raise UsageError("--short", f"must be drop or pad, is {short!r}")
+    if plot and plot.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise UsageError("--plot", f"must end in .png, .svg or .pdf, is {plot}")
+    tau = TEMPERATURES[split] if temperature is None else temperature
+    sets = open_sets(folders)
+    indexes = {
+        name: WindowIndex.of(shards, split, frames, short="pad" if short == "pad" else "drop")
+        for name, shards in sets.items()
+    }
+    counts = {name: index.count for name, index in indexes.items()}
+    planned = samples or max(1, sum(counts.values()))
+    mix = Mixture.of(
+        counts,
+        tau,
+        weights=_numbers("--weight", weight),
+        groups=_pairs("--group", group),
+        caps=_numbers("--cap", cap),
+        max_epochs=max_epochs,
+        samples=planned,
+    )
+    totals = {name: shards.manifest.splits.get(split, {}) for name, shards in sets.items()}
+    rows = _rows(mix, indexes, totals, planned)
+    if plot:
+        plot_mixture(mix, tau, plot)
+    if json:
+        said = tau if tau != float("inf") else "inf"
+        facts = {"temperature": said, "frames": frames, "split": split, "samples": planned}
+        print_json({**facts, "embodiments": rows})
+        return
+    columns = ["windows", "episodes", "too short", "frames", "proportional", f"p at τ = {tau:g}"]
+    print_table(["embodiment", *columns, "p uniform", "epochs"], [list(row.values()) for row in rows])
+    print(f"epochs: passes over a set's windows while {planned:,} samples are drawn in all")
+
+
+def _rows(
+    mix: "Mixture", indexes: dict[str, "WindowIndex"], totals: dict[str, dict[str, int]], samples: int
+) -> list[dict[str, Any]]:
+    present = sum(count > 0 for count in mix.counts)
+    return [
+        {
+            "embodiment": name,
+            "windows": count,
+            "episodes": totals[name].get("episodes", 0),
+            "short_episodes": indexes[name].short_episodes,
+            "frames": totals[name].get("frames", 0),
+            "proportional": count / max(1, sum(mix.counts)),
+            "probability": float(p),
+            "uniform": 1 / present if count else 0.0,
+            "epochs": float(p) * samples / count if count else 0.0,
+        }
+        for name, count, p in zip(mix.names, mix.counts, mix.p, strict=True)
+    ]
+
+
+def _pairs(option: str, words: Pairs) -> dict[str, str]:
+    from hma_data.errors import UsageError
+
+    pairs = {}
+    for word in words or []:
+        name, given, value = word.partition("=")
+        if not given or not name or not value:
+            raise UsageError(option, f"must be like NAME=VALUE, is {word!r}")
+        pairs[name] = value
+    return pairs
+
+
+def _numbers(option: str, words: Pairs) -> dict[str, float]:
+    from hma_data.errors import UsageError
+
+    numbers = {}
+    for name, text in _pairs(option, words).items():
+        try:
+            numbers[name] = float(text)
+        except ValueError as fault:
+            raise UsageError(option, f"{name}={text}: {text!r} is not a number") from fault
+    return numbers

@@ -1,0 +1,250 @@
+"""`hma shards`: look at shard sets, verify them, and make others of them.
+
+Only what is light is imported here; each verb imports what it needs.
+"""
+
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hma_data.console import Update, human_bytes, print_json, print_table, progress
+
+if TYPE_CHECKING:
+    from hma_data.shards.manifest import Manifest
+
+shards_app = typer.Typer(
+    no_args_is_help=True, help="Look at shard sets, verify them, and make others of them."
+)
+
+Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; default: one a core.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder of the new shard set.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+class Layout(StrEnum):
+    memmap = "memmap"
+
+
+class Together(StrEnum):
+    episode = "episode"
+    instruction = "instruction"
+    source = "source"
+
+
+def _in(update: Update, unit: float = 1) -> Callable[[int, int], None]:
+    """A progress display that counts in `unit`."""
+    return lambda done, total: update(done / unit, total=total / unit)
+
+
+@shards_app.command("info")
+def shards_info(folder: Annotated[Path, typer.Argument(help="A shard set.")], json: Json = False) -> None:
+    """Totals of a shard set.
+
+    Example: hma shards info shards/my_arm
+    """
+    from hma_data.shards.info import describe
+
+    facts = describe(folder)
+    if json:
+        print_json(facts)
+    else:
+        _print_info(facts)
+
+
+def _print_info(facts: dict[str, Any]) -> None:
+    robot, totals, episodes = facts["embodiment"], facts["totals"], facts["episodes"]
+    print(f"{facts['folder']}: {robot['id']} × {facts['tokenizer']['name']}, from {facts['source']}")
+    print(
+        f"{totals['episodes']:,} episodes, {totals['frames']:,} frames at {robot['rows_hz']:g} Hz "
+        f"({totals['hours']:.2f} h), {human_bytes(totals['bytes'])} in {facts['shards']:,} shards "
+        f"({facts['bytes_per_frame']:.0f} bytes a frame)"
+    )
+    print(
+        f"cameras {', '.join(robot['cameras'])}; {robot['action_dim']} action and {robot['state_dim']} state "
+        f"values; stride {robot['stride']}, so the model sees {robot['effective_hz']:g} Hz"
+    )
+    print(
+        f"episodes of {episodes['shortest']:,} to {episodes['longest']:,} frames, median "
+        f"{episodes['median']:,.0f}; {episodes['instructions']:,} instructions; "
+        f"{episodes['success']:,} successes, {episodes['failure']:,} failures, "
+        f"{episodes['not_told']:,} not told; skew up to {episodes['worst_skew_ms']:.1f} ms"
+    )
+    for label in ("flags", "quarantine"):
+        for name, count in episodes[label].items():
+            print(f"{label}: {count:,} × {name}")
+    print_table(
+        ["split", "episodes", "frames", "rows", "shards", "windows of 12", "episodes too short"],
+        [
+            [name, *(split[key] for key in ("episodes", "frames", "rows", "shards")), *windows.values()]
+            for (name, split), windows in zip(facts["splits"].items(), facts["windows"].values())
+        ],
+    )
+    for vector, stats in facts["stats"].items():
+        names = facts["names"][vector]
+        ends = (stats["quantiles"][q] for q in ("q01", "q50", "q99"))
+        columns = [*(stats[key] for key in ("mean", "std", "min", "max")), *ends]
+        print_table(
+            [vector, "mean", "std", "min", "max", "q01", "q50", "q99"],
+            [[name, *(column[i] for column in columns)] for i, name in enumerate(names)],
+        )
+
+
+@shards_app.command("verify")
+def shards_verify(
+    folders: Annotated[list[Path], typer.Argument(help="Shard sets.")],
+    workers: Workers = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Sizes and footers only: no hashes, no rows.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Every hash, row count and invariant.
+
+    Example: hma shards verify shards/my_arm
+    """
+    from hma_data.shards.verify import verify
+    from hma_data.storage.remote import place
+
+    found = {}
+    with progress("verify", unit="MB") as update:
+        for folder in folders:
+            found[str(place(folder))] = verify(
+                folder, workers=workers, quick=quick, on_progress=_in(update, 1e6)
+            )
+    if json:
+        print_json(found)
+    else:
+        for folder_name, problems in found.items():
+            for problem in problems:
+                print(problem)
+            print(f"{folder_name}: {f'{len(problems)} problems' if problems else 'sound'}")
+    raise typer.Exit(1 if any(found.values()) else 0)
+
+
+@shards_app.command("preview")
+def shards_preview(
+    folder: Annotated[Path, typer.Argument(help="A shard set.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for sheet.png and preview.mp4.")] = None,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="How many to show.")] = 4,
+    camera: Annotated[str | None, typer.Option("--camera", help="Which; default: the first.")] = None,
+    weights: Annotated[
+        str | None, typer.Option("--weights", help="The tokenizer's weights, if not the usual.")
+    ] = None,
+) -> None:
+    """Contact sheet and video decoded from the tokens, with the actions drawn.
+
+    Example: hma shards preview shards/my_arm
+    """
+    from hma_data.shards.preview import preview
+
+    place = out or Path(f"{folder.resolve().name}-preview")
+    shown = preview(folder, place, episodes=episodes, weights=weights, camera=camera)
+    print(f"wrote {shown.sheet} and {shown.video} ({len(shown.episodes)} episodes)")
+
+
+def _report(out: Path, manifest: "Manifest", json: bool) -> None:
+    values = manifest.to_json()
+    if json:
+        print_json({"out": str(out), **values["totals"], "splits": values["splits"]})
+        return
+    splits = ", ".join(f"{name} {split['episodes']:,}" for name, split in manifest.splits.items())
+    totals = values["totals"]
+    print(
+        f"{out}: {totals['episodes']:,} episodes ({splits}), {totals['frames']:,} frames, "
+        f"{human_bytes(totals['bytes'])} in {len(manifest.shards)} shards"
+    )
+
+
+@shards_app.command("merge")
+def shards_merge(
+    folders: Annotated[list[Path], typer.Argument(help="Shard sets of one embodiment and tokenizer.")],
+    out: Out,
+    workers: Workers = None,
+    json: Json = False,
+) -> None:
+    """One set of several; every episode keeps its split.
+
+    Example: hma shards merge shards/monday shards/tuesday --out shards/week
+    """
+    from hma_data.conversion.rewrite import merge
+    from hma_data.threads import usable_cores
+
+    with progress("merge") as update:
+        manifest = merge(folders, out, workers or usable_cores(), _in(update))
+    _report(out, manifest, json)
+
+
+@shards_app.command("split")
+def shards_split(
+    folder: Annotated[Path, typer.Argument(help="A shard set.")],
+    out: Out,
+    val_fraction: Annotated[
+        float, typer.Option("--val-fraction", help="Share of episodes for validation.")
+    ] = 0.05,
+    seed: Annotated[int, typer.Option("--seed", help="Of the split.")] = 0,
+    by: Annotated[
+        Together, typer.Option("--by", help="What stays together in one split.")
+    ] = Together.episode,
+    workers: Workers = None,
+    json: Json = False,
+) -> None:
+    """The same episodes, divided anew into train and val.
+
+    Example: hma shards split shards/my_arm --val-fraction 0.1 --out shards/my_arm_10
+    """
+    from hma_data.conversion.rewrite import split
+    from hma_data.threads import usable_cores
+
+    with progress("split") as update:
+        manifest = split(
+            folder,
+            out,
+            val_fraction=val_fraction,
+            seed=seed,
+            by=by.value,
+            workers=workers or usable_cores(),
+            on_progress=_in(update),
+        )
+    _report(out, manifest, json)
+
+
+@shards_app.command("restat")
+def shards_restat(
+    folder: Annotated[Path, typer.Argument(help="A shard set.")], workers: Workers = None, json: Json = False
+) -> None:
+    """Compute the statistics again and write the manifest anew; the shards are not touched.
+
+    Example: hma shards restat shards/my_arm
+    """
+    from hma_data.conversion.restat import restat
+
+    with progress("restat", unit="MB") as update:
+        manifest = restat(folder, workers=workers, on_progress=_in(update, 1e6))
+    _report(folder, manifest, json)
+
+
+@shards_app.command("export")
+def shards_export(
+    folder: Annotated[Path, typer.Argument(help="A shard set.")],
+    out: Annotated[Path, typer.Option("--out", help="New folder; one for each split is made in it.")],
+    to: Annotated[
+        Layout, typer.Option("--to", help="memmap: the layout of the paper's code.")
+    ] = Layout.memmap,
+    split: Annotated[
+        str | None, typer.Option("--split", help="Only this split, straight into --out.")
+    ] = None,
+    camera: Annotated[str | None, typer.Option("--camera", help="Which; default: the first.")] = None,
+) -> None:
+    """Flat files as the paper's code reads them: video.bin, actions, segment_ids.bin, metadata.json.
+
+    Example: hma shards export shards/my_arm --to memmap --out flat/my_arm
+    """
+    from hma_data.shards.memmap import export
+
+    with progress(f"export to {to.value}") as update:
+        places = export(folder, out, split=split, camera=camera, on_progress=_in(update))
+    for place in places:
+        print(f"wrote {place}")

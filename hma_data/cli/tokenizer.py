@@ -1,0 +1,145 @@
+"""`hma tokenizer`: list, train and measure tokenizers."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hma_data.console import human_bytes, print_json, print_table
+
+tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+@tokenizer_app.command("list")
+def tokenizer_list(json: Json = False) -> None:
+    """Names that --tokenizer takes: what is usable here, what is downloaded, sizes, licences.
+
+    Example: hma tokenizer list
+    """
+    from hma_data.tokenizers.catalog import CATALOG
+
+    if json:
+        print_json([entry.to_json() for entry in CATALOG.values()])
+        return
+    rows = [
+        [
+            entry.name,
+            entry.kind,
+            f"{entry.image_size}²",
+            f"{entry.grid[0]}×{entry.grid[1]}",
+            entry.state(),
+            f"{entry.weights}, {human_bytes(entry.size())}" if entry.size() else entry.weights,
+            entry.licence,
+            entry.description,
+        ]
+        for entry in CATALOG.values()
+    ]
+    print_table(["name", "kind", "picture", "grid", "here", "weights", "licence", "what it is"], rows)
+
+
+@tokenizer_app.command("train")
+def tokenizer_train(
+    recipe: Annotated[Path, typer.Argument(help="A YAML of recipes/tokenizer.")],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Dotted overrides.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="The weights' file.")] = Path("tokenizer.safetensors"),
+    device: Annotated[str, typer.Option("--device", help="cpu, cuda, mps.")] = "cpu",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Threads that draw crops ahead.")] = 0,
+) -> None:
+    """Train a tokenizer; run it again to go on.
+
+    Example: hma tokenizer train recipes/tokenizer/fsq.yaml --out fsq.safetensors
+    """
+    from hma_data.errors import RecipeError, UsageError
+    from hma_data.storage.yaml_io import parse_yaml
+    from hma_data.tokenizers.training.train import train
+
+    changes = {}
+    for text in overrides or []:
+        key, equals, value = text.partition("=")
+        if not key or not equals:
+            raise UsageError(text, "is not key=value")
+        changes[key] = parse_yaml(value, text, RecipeError)
+    facts = train(
+        recipe,
+        out,
+        changes,
+        device=device,
+        workers=workers,
+        report=lambda line: typer.echo(line, err=True),
+    )
+    print(f"wrote {out}: " + ", ".join(f"{key} {value}" for key, value in facts.items()))
+
+
+@tokenizer_app.command("eval")
+def tokenizer_eval(
+    tokenizer: Annotated[str, typer.Argument(help="Name of the tokenizer.")],
+    data: Annotated[
+        list[str], typer.Argument(help="Pictures, videos, folders of them, recordings, shard sets.")
+    ],
+    embodiment: Annotated[
+        str | None, typer.Option("--embodiment", "-e", help="DATA are recordings of this robot: id or YAML.")
+    ] = None,
+    weights: Annotated[str | None, typer.Option("--weights", help="Its weights, if not the usual.")] = None,
+    frames: Annotated[
+        int, typer.Option("--frames", min=1, help="Taken from each video or episode, evenly.")
+    ] = 64,
+    lpips: Annotated[
+        bool | None,
+        typer.Option("--lpips/--no-lpips", help="LPIPS; default: where nothing needs downloading."),
+    ] = None,
+    worst: Annotated[int, typer.Option("--worst", min=0, help="Worst frames to draw with --out.")] = 6,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for eval.md, eval.json, worst.png.")
+    ] = None,
+    device: Annotated[str, typer.Option("--device", help="cpu, cuda, mps.")] = "cpu",
+    json: Json = False,
+) -> None:
+    """PSNR, SSIM, LPIPS, use of the vocabulary, bits, speed, and the worst frames.
+
+    Example: hma tokenizer eval fsq-16 ./videos --out eval
+    """
+    from hma_data.registry.embodiment import find
+    from hma_data.tokenizers.base import get_tokenizer
+    from hma_data.tokenizers.training.eval import evaluate
+    from hma_data.tokenizers.training.frames import frames_of
+    from hma_data.tokenizers.training.report import to_markdown, without_frames, write_report
+
+    robot = find(embodiment) if embodiment else None
+    opened = get_tokenizer(tokenizer, weights=weights, device=device)
+    perceptual, missing = _perceptual(lpips, device)
+    found, skipped = {}, list[str]()
+    for place in data:
+        chosen = frames_of(place, opened.spec, embodiment=robot, frames=frames, on_skip=skipped.append)
+        found[place] = evaluate(opened, chosen, worst=worst if out else 0, perceptual=perceptual)
+    notes = [missing] if missing else []
+    if skipped:
+        notes.append(f"{len(skipped)} files or episodes could not be read, the first: {skipped[0]}")
+    plain = {name: without_frames(result) for name, result in found.items()}
+    if json:
+        print_json(plain)
+    else:
+        print(to_markdown(plain), end="")
+    for note in notes:
+        typer.echo(note, err=True)
+    if out:
+        title = f"{tokenizer}, weights {opened.spec.weights_sha256[:12] or 'none'}"
+        paths = write_report(out, title, found, notes)
+        typer.echo(f"wrote {', '.join(map(str, paths))}", err=True)
+
+
+def _perceptual(wanted: bool | None, device: str) -> tuple[Any, str]:
+    """What measures LPIPS, or None and why not; what is asked for and missing is an error."""
+    from hma_data.errors import MissingDependencyError
+    from hma_data.tokenizers.training.perceptual import open_lpips
+
+    if wanted is False:
+        return None, ""
+    try:
+        return open_lpips(download=wanted is True, device=device), ""
+    except MissingDependencyError as fault:
+        if wanted:
+            raise
+        return None, f"not measured: {fault}"

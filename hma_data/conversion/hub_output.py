@@ -1,0 +1,116 @@
+"""Conversions that end in a dataset repository of the Hugging Face Hub: `hf://datasets/org/name[@branch]/path`.
+
+A repository takes commits, few of them, not files one by one. So the shard set is made in a staging
+folder of this machine ($HMA_CACHE/staging), where it is resumed as any other, and then published. What is
+there already with the same content is left out, so the same command also goes on with an upload that was
+cut off.
+"""
+
+import hashlib
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from hma_data.conversion.extend import hashes
+from hma_data.conversion.plan import differences
+from hma_data.errors import OutputError
+from hma_data.hub.repository import Repository
+from hma_data.shards.manifest import MANIFEST, Manifest
+from hma_data.shards.publish import publish
+from hma_data.storage.files import cache_folder
+from hma_data.storage.remote import RemotePath
+
+_URI = re.compile(r"hf://datasets/([^/@]+/[^/@]+)(?:@([^/]+))?(?:/(.+))?")
+
+
+@dataclass(frozen=True)
+class HubOutput:
+    """Where in a repository a shard set goes.
+
+    Attributes:
+        uri: as the user gave it.
+        repo: organisation/name of the dataset.
+        branch: None for the main one.
+        folder: in the repository; empty for its root.
+    """
+
+    uri: str
+    repo: str
+    branch: str | None
+    folder: str
+
+    @classmethod
+    def of(cls, out: Path) -> "HubOutput | None":
+        """Return that of an `hf://` path; None for any other.
+
+        Raises:
+            OutputError: it names no dataset repository.
+        """
+        if not isinstance(out, RemotePath) or out.scheme != "hf":
+            return None
+        found = _URI.fullmatch(str(out))
+        if not found:
+            raise OutputError(out, "names no dataset of the hub", "write hf://datasets/ORGANISATION/NAME")
+        return cls(str(out), found[1], found[2], found[3] or "")
+
+    @property
+    def staging(self) -> Path:
+        """The folder of this machine that is uploaded from."""
+        mark = hashlib.sha256(self.uri.encode()).hexdigest()[:8]
+        return cache_folder() / "staging" / f"{self.repo.replace('/', '--')}-{mark}"
+
+    def prepare(self) -> None:
+        """Make the repository and branch where they are not there, so that a lack of rights is known at once.
+
+        Raises:
+            HubError: there is no token, or it may not write there, or the hub is out of reach.
+        """
+        self._repository.prepare(self._name(MANIFEST))
+
+    def refuse_other(self, facts: dict[str, Any]) -> None:
+        """Raise OutputError where another plan's set is there than that of `facts` or one it extends."""
+        if self._name(MANIFEST) not in self._repository.files():
+            return
+        theirs = Manifest.load(RemotePath(self.uri)).plan
+        if theirs["hash"] not in hashes(facts):
+            words = differences(facts, theirs)
+            raise OutputError(
+                self.uri,
+                f"belongs to another conversion; different: {words}",
+                "choose another --out, or --overwrite to start anew",
+            )
+
+    def upload(self) -> None:
+        """Upload the staging folder's shard set.
+
+        Raises:
+            OutputError: another job writes something else there meanwhile.
+            HubError: the hub refuses it, or does not answer.
+        """
+        manifest, repository = Manifest.load(self.staging), self._repository
+        ours = {shard.path: shard.sha256 for shard in manifest.shards} | {MANIFEST: None}
+        repository.files()
+        before = {name: repository.stated(self._name(name)) for name in ours}
+
+        def refuse_foreign() -> dict[str, int]:
+            """Return what is there; raise where it is neither ours nor what was there when we began."""
+            files = repository.files()
+            for name, sha256 in ours.items():
+                now = repository.stated(self._name(name))
+                if now in (None, before[name]):
+                    continue
+                if not repository.has(self._name(name), self.staging / name, sha256):
+                    remedy = "choose another --out for one of the two"
+                    raise OutputError(self.uri, "another conversion is writing there", remedy)
+            return files
+
+        publish(repository, self.staging, refuse_foreign, self.folder)
+
+    @cached_property
+    def _repository(self) -> Repository:
+        return Repository(self.repo, self.branch, write=True, kind="dataset", name=self.uri)
+
+    def _name(self, name: str) -> str:
+        return f"{self.folder}/{name}" if self.folder else name

@@ -1,0 +1,388 @@
+"""Recordings to tokenized shards: plan, run, finish; run again to continue.
+
+A shard is made whole or not at all, and says in its footer what it was made from. So a job
+that was killed is continued by the same command: finished shards are recognised and kept, and
+the manifest is derived from footers at the end. An episode that cannot be used goes to
+quarantine with its reason; the rest goes on.
+"""
+
+import json
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pyarrow.parquet as pq
+
+from hma_data.conversion.engines.base import LIMITS, Limits, Retry
+from hma_data.conversion.engines.local import run as run_local
+from hma_data.conversion.episode_hash import content_of
+from hma_data.conversion.extend import extended
+from hma_data.conversion.hub_output import HubOutput
+from hma_data.conversion.output import (
+    Journal,
+    Made,
+    Share,
+    base_manifest,
+    clear,
+    finished_shards,
+    known_hashes,
+    locked,
+    remove_notes,
+    shard_names,
+)
+from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
+from hma_data.conversion.worker import Job, MakeWork, Tick
+from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, damaged_files, finish
+from hma_data.shards.schema import flag_counts
+from hma_data.sources.base import EpisodeRef, of_another_format, open_source
+from hma_data.storage.files import remove_parts
+from hma_data.storage.paths import StrPath, as_text
+from hma_data.storage.remote import parquet_input, place
+from hma_data.tokenizers.base import Tokenizer, get_tokenizer
+
+
+@dataclass
+class Progress:
+    """Where a conversion stands; what the console shows."""
+
+    episodes: int = 0
+    frames: int = 0
+    bytes: int = 0
+    quarantined: int = 0
+    kept_shards: int = 0
+    total_episodes: int = 0
+    total_frames: int = 0
+    retries: list[str] = field(default_factory=list)
+    started: float = field(default_factory=time.monotonic)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a conversion did.
+
+    Attributes:
+        reasons: error type and message (without the ids where there are several) -> episodes refused for it.
+        flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
+        too_many: more than `max_quarantine` was refused; the command ends with exit code 1.
+    """
+
+    out: Path
+    manifest: Manifest
+    kept_shards: int
+    made_shards: int
+    seconds: float
+    reasons: dict[str, int]
+    flags: dict[str, int]
+    too_many: bool
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What one share of a conversion did; the shard set is finished by whoever comes last.
+
+    Attributes:
+        missing: shards that other shares have still to make.
+    """
+
+    out: Path
+    kept_shards: int
+    made_shards: int
+    missing: int
+    seconds: float
+
+
+def plan_conversion(
+    embodiment: Embodiment, source: StrPath | None, tokenizer: Tokenizer, settings: Settings
+) -> tuple[Plan, str]:
+    """The plan of a conversion and the URI it reads; see `convert`."""
+    uri = embodiment.source.uri if source is None else as_text(source)
+    if source is not None and not (uri or "").strip():
+        raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
+    if not uri:
+        raise RegistryError(f"embodiment {embodiment.id}", "names no source.uri", "give --source URI")
+    if embodiment.frequency_hz == "unknown":
+        _ = embodiment.rate_hz  # raises, and says what to do
+    form = embodiment.source.format
+    try:
+        refs = open_source(form).index(uri, embodiment)
+    except StorageAwayError:
+        raise
+    except SourceError as fault:
+        raise of_another_format(uri, form, fault) from fault
+    return make_plan(refs, embodiment, tokenizer.spec, settings, uri), uri
+
+
+def convert(
+    embodiment: Embodiment,
+    source: StrPath | None,
+    tokenizer: str | Tokenizer,
+    out: StrPath,
+    *,
+    settings: Settings | None = None,
+    workers: int = 0,
+    engine: Literal["local", "ray"] = "local",
+    weights: StrPath | None = None,
+    device: str = "cpu",
+    limits: Limits = LIMITS,
+    max_quarantine: float = 0.01,
+    overwrite: bool = False,
+    extend: bool = False,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> Summary:
+    """Convert a recording into the shard set `out`; running it again continues.
+
+    Args:
+        embodiment: the robot.
+        source: str or path of the recording, or its URI; None takes the one in the embodiment's YAML.
+        tokenizer: name, see `get_tokenizer`; or one that is open already, for work in this process.
+        workers: processes, which may crash or hang without ending the job; 0 works in this one.
+        out: str or path of the folder, or its URI.
+        engine: what runs the workers: this machine, or a Ray cluster.
+        weights, device: of the tokenizer; the weights as str or path.
+        limits: when a worker counts as hanging, and how often it may be lost.
+        max_quarantine: fraction of episodes that may be refused.
+        overwrite: throw away what `out` holds, if it is a shard set.
+        extend: add the episodes that a finished set in `out` does not have yet.
+        on_progress: called after every batch of frames or so.
+
+    Raises:
+        OutputError: `out` holds something else, or another job is writing it.
+        SourceError: the recording cannot be read, or not one of its episodes can be used.
+        HMAError: the embodiment or the tokenizer cannot be used.
+    """
+    begun, out = time.monotonic(), place(out)
+    hub = HubOutput.of(out)
+    folder = hub.staging if hub else out
+    conversion = _Conversion(
+        embodiment,
+        source,
+        tokenizer,
+        folder,
+        settings or Settings(),
+        workers,
+        engine,
+        weights,
+        device,
+        limits,
+    )
+    with locked(folder):
+        if overwrite:
+            clear(folder)
+        plan, base = conversion.plan(extend)
+        if hub:
+            hub.prepare()
+            if not overwrite:
+                hub.refuse_other(plan.facts)
+        done, made = conversion.make(plan, base, None, on_progress)
+        manifest = conversion.finish(plan, base, bool(made))
+        reasons, flags = _reasons(folder), _flags(folder)
+        if not any(split["episodes"] for split in manifest.splits.values()):
+            clear(folder)
+            worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
+            told = "; ".join(f"{count} × {reason}" for reason, count in worst)
+            raise SourceError(conversion.uri, f"gave no usable episode, so nothing was written: {told}")
+        if hub:
+            hub.upload()
+    episodes = sum(split["episodes"] for split in manifest.splits.values())
+    too_many = manifest.quarantined > max_quarantine * (episodes + manifest.quarantined)
+    seconds = time.monotonic() - begun
+    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many)
+
+
+def convert_share(
+    embodiment: Embodiment,
+    source: StrPath | None,
+    tokenizer: str | Tokenizer,
+    out: StrPath,
+    share: Share,
+    *,
+    settings: Settings | None = None,
+    workers: int = 0,
+    weights: StrPath | None = None,
+    device: str = "cpu",
+    limits: Limits = LIMITS,
+    extend: bool = False,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> Shared:
+    """One share of a conversion, for an array of jobs over one folder that all of them see.
+
+    The bytes are those that `convert` alone would make. Arguments as there.
+    """
+    begun, out = time.monotonic(), place(out)
+    conversion = _Conversion(
+        embodiment, source, tokenizer, out, settings or Settings(), workers, "local", weights, device, limits
+    )
+    with locked(out, share):
+        plan, base = conversion.plan(extend)
+        done, made = conversion.make(plan, base, share, on_progress)
+    missing = len({unit.name for unit in plan.units} - shard_names(out))
+    if not missing:
+        with suppress(OutputError), locked(out):  # others are still writing: the last of them comes here
+            missing = len(plan.units) - len(finished_shards(out, plan, base, shared=False))
+            if not missing:
+                conversion.finish(plan, base, True)
+    return Shared(out, done, made, missing, time.monotonic() - begun)
+
+
+class _Conversion:
+    """What `convert` and `convert_share` have in common."""
+
+    def __init__(
+        self,
+        embodiment: Embodiment,
+        source: StrPath | None,
+        tokenizer: str | Tokenizer,
+        out: Path,
+        settings: Settings,
+        workers: int,
+        engine: str,
+        weights: StrPath | None,
+        device: str,
+        limits: Limits,
+    ) -> None:
+        self._embodiment, self._out, self._settings = embodiment, out, settings
+        self._named = isinstance(tokenizer, str)
+        alone = not self._named or str(out).startswith("memory:")  # which no other process would see
+        self._workers, self._engine, self._limits = 0 if alone else workers, engine, limits
+        self._weights, self._device = None if weights is None else as_text(weights), device
+        self._tokenizer = (
+            get_tokenizer(tokenizer, weights=weights, device=device)
+            if isinstance(tokenizer, str)
+            else tokenizer
+        )
+        self._whole, self.uri = plan_conversion(embodiment, source, self._tokenizer, settings)
+
+    def plan(self, extend: bool) -> tuple[Plan, Manifest | None]:
+        """What is to be made, and the set it extends; a set that was extended before may be continued."""
+        base = base_manifest(self._out)
+        if base is None or not (extend or "extends" in base.plan):
+            return self._whole, None
+        source = open_source(self._embodiment.source.format)
+
+        def content(ref: EpisodeRef) -> str:
+            return content_of(source, self.uri, ref.id, self._embodiment, self._whole.facts)
+
+        plan = extended(self._out, base, self._whole, self._settings.shard_frames, content)
+        if plan.units and not extend:
+            raise OutputError(
+                self._out,
+                f"lacks {plan.episodes:,} episodes that the recording has now",
+                "--extend adds them",
+            )
+        return plan, base
+
+    def make(
+        self,
+        plan: Plan,
+        base: Manifest | None,
+        share: Share | None,
+        on_progress: Callable[[Progress], None],
+    ) -> tuple[int, int]:
+        """Make the shards that are not there; how many were, and how many are made."""
+        mine = plan.units[share.index :: share.count] if share else plan.units
+        there = finished_shards(self._out, plan, base, share is not None)
+        todo = [unit for unit in mine if unit.name not in there]
+        kept = [unit for unit in mine if unit.name in there]
+        progress = Progress(
+            episodes=sum(len(unit.episodes) for unit in kept),
+            frames=sum(unit.frames for unit in kept),
+            kept_shards=len(kept) + (len(base.shards) if base else 0),
+            total_episodes=sum(len(unit.episodes) for unit in mine),
+            total_frames=sum(unit.frames for unit in mine),
+        )
+        on_progress(progress)
+        if todo:
+            with Journal(self._out, share) as journal:
+                for made in self._run(todo, plan, _Counter(progress, on_progress)):
+                    journal.add(made)
+                    on_progress(progress)
+        return progress.kept_shards, len(todo)
+
+    def _run(self, todo: list[ShardUnit], plan: Plan, on_event: "_Counter") -> Iterator[Made]:
+        name = self._tokenizer.spec.name
+        job = Job(
+            self.uri, self._embodiment, name, self._weights, self._device, self._out.absolute(), plan.facts
+        )
+        if self._engine == "ray":
+            from hma_data.conversion.engines.ray import run as run_ray
+
+            gpus = 1.0 if self._device.startswith("cuda") else 0.0
+            return run_ray(todo, MakeWork(job), self._workers, on_event, self._limits, gpus)
+        make_work = MakeWork(job, None if self._workers else self._tokenizer)
+        return run_local(todo, make_work, self._workers, on_event, self._limits)
+
+    def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
+        """The manifest and what else is derived from footers; nothing where nothing changed."""
+        out = self._out
+        remove_parts(out)  # of workers that died
+        if not changed and (out / MANIFEST).is_file():
+            manifest = Manifest.load(out)
+            if not damaged_files(out, manifest):
+                remove_notes(out)
+                return manifest
+        kept = base.shards if base else ()
+        names = [*(shard.path for shard in kept), *(unit.name for unit in plan.units)]
+        manifest = finish(
+            out,
+            names,
+            self._embodiment,
+            self._tokenizer.spec,
+            plan.facts,
+            self.uri,
+            hashes={**{shard.path: shard.sha256 for shard in kept}, **known_hashes(out)},
+        )
+        remove_notes(out)
+        return manifest
+
+
+def _reasons(out: Path) -> dict[str, int]:
+    """Reason -> episodes refused for it; reasons that differ in the episode's id alone are one."""
+    told: dict[str, list[str]] = {}
+    for line in (out / QUARANTINE).read_text(encoding="utf-8").splitlines():
+        item = json.loads(line)
+        text = plain = f"{item['type']}: {item['message']}"
+        if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
+            text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
+        told.setdefault(text, []).append(plain)
+    return {text if len(plain) > 1 else plain[0]: len(plain) for text, plain in told.items()}
+
+
+def _flags(out: Path) -> dict[str, int]:
+    """Counts of the episodes' flags, added up."""
+    totals: Counter[str] = Counter()
+    for item in (
+        pq.read_table(parquet_input(out / EPISODES), columns=["flags"])["flags"].value_counts().to_pylist()
+    ):
+        for name, count in flag_counts(item["values"] or "").items():
+            totals[name] += count * item["counts"]
+    return dict(sorted(totals.items()))
+
+
+_COUNTED = ("frames", "episodes", "quarantined", "bytes")
+
+
+class _Counter:
+    """Adds up what units report; what a unit had counted is taken back when it is done again."""
+
+    def __init__(self, progress: Progress, on_progress: Callable[[Progress], None]) -> None:
+        self._progress, self._on_progress = progress, on_progress
+        self._by_unit: dict[int, list[int]] = {}
+
+    def __call__(self, unit: int, event: Tick | Retry) -> None:
+        mine = self._by_unit.setdefault(unit, [0] * len(_COUNTED))
+        if isinstance(event, Retry):
+            self._progress.retries.append(event.reason)
+            change = [-count for count in mine]
+        else:
+            change = [getattr(event, name) for name in _COUNTED]
+        for i, name in enumerate(_COUNTED):
+            mine[i] += change[i]
+            setattr(self._progress, name, getattr(self._progress, name) + change[i])
+        self._on_progress(self._progress)

@@ -1,0 +1,295 @@
+"""The folder a conversion writes: locked while it runs (in a store, claimed for its plan), never mixed
+with anything else.
+"""
+
+import errno
+import fcntl
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hma_data.conversion.extend import hashes, ways
+from hma_data.conversion.plan import Plan, differences
+from hma_data.errors import HMAError, OutputError, StorageAwayError
+from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SPLITS, WORKING, Manifest
+from hma_data.shards.schema import Footer, read_footer
+from hma_data.storage.files import PART, remove_parts
+from hma_data.storage.remote import RemotePath, create_bytes, is_remote, put_bytes
+
+LOCK, JOURNAL, PLAN = WORKING
+READERS, JOURNAL_S = 16, 20.0  # footers asked for at a time, and seconds between two writes, in a store
+OURS = {"train", "val", MANIFEST, EPISODES, EMBODIMENT, QUARANTINE}
+
+
+@dataclass(frozen=True)
+class Share:
+    """This job does every `count`-th shard from `index` on; others, on any machine, do the rest."""
+
+    index: int
+    count: int
+
+    @property
+    def name(self) -> str:
+        """For files that each share has of its own."""
+        return f"{self.index}-of-{self.count}"
+
+
+# -- locks
+
+
+@contextmanager
+def locked(out: Path, share: Share | None = None) -> Iterator[None]:
+    """Let one job alone write a folder, or a share of it; the kernel's lock goes with the process.
+
+    A store has no such lock. Jobs of one plan write the same bytes there; another plan is refused by
+    `finished_shards`.
+
+    Raises:
+        OutputError: another job is writing, or the folder cannot be written.
+    """
+    if not isinstance(out, RemotePath):
+        with _locked_here(out, share):
+            yield
+        return
+    if out.scheme == "hf":
+        raise OutputError(
+            out,
+            "a hub's repository is written by one whole hma convert only",
+            "write a folder, then upload it",
+        )
+    yield
+
+
+@contextmanager
+def _locked_here(out: Path, share: Share | None) -> Iterator[None]:
+    made = False
+    with ExitStack() as held:
+        try:
+            made = not out.exists()
+            out.mkdir(parents=True, exist_ok=True)
+            held.enter_context(_lock(out / LOCK, fcntl.LOCK_SH if share else fcntl.LOCK_EX))
+            if share:
+                held.enter_context(_lock(out / f"{LOCK}-{share.name}", fcntl.LOCK_EX))
+        except OSError as fault:
+            if fault.errno not in (errno.EACCES, errno.EAGAIN) or not (out / LOCK).exists():
+                reason = fault.strerror or str(fault)
+                raise OutputError(out, f"cannot be written: {reason}", "choose another --out") from fault
+            what = f"share {share.name} of it" if share else "it"
+            raise OutputError(
+                out, f"another job is writing {what}", "wait for it, or choose another --out"
+            ) from fault
+        try:
+            yield
+        finally:
+            if made and all(item.name.startswith(LOCK) for item in out.iterdir()):
+                shutil.rmtree(out, ignore_errors=True)
+
+
+@contextmanager
+def _lock(path: Path, kind: int) -> Iterator[None]:
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+        if not path.exists():  # its last owner deleted it between our two calls
+            raise OSError(errno.EAGAIN, "")
+        try:
+            yield
+        finally:
+            if kind == fcntl.LOCK_EX or _nobody_else(handle):
+                path.unlink(missing_ok=True)
+    finally:
+        os.close(handle)
+
+
+def _nobody_else(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+# -- what is there
+
+
+def clear(out: Path) -> None:
+    """Empty a folder that holds a shard set.
+
+    Raises:
+        OutputError: it holds something else.
+    """
+    _refuse_foreign(out)
+    if isinstance(out, RemotePath):
+        out.delete_tree()
+        return
+    for item in out.iterdir():
+        if not item.name.startswith(LOCK):
+            shutil.rmtree(item) if item.is_dir() else item.unlink()
+
+
+def _refuse_foreign(out: Path) -> None:
+    foreign = [item.name for item in out.iterdir() if item.name not in OURS and not _working(item.name)]
+    if foreign:
+        raise OutputError(
+            out,
+            f"is not a shard set: it holds {', '.join(sorted(foreign)[:3])}",
+            "choose an empty or new --out",
+        )
+
+
+def _working(name: str) -> bool:
+    return name.endswith(PART) or name.startswith(WORKING)
+
+
+def base_manifest(out: Path) -> Manifest | None:
+    """The manifest of the set that is there, when there is one."""
+    _refuse_foreign(out)
+    return Manifest.load(out) if (out / MANIFEST).is_file() else None
+
+
+def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
+    """Return the names of the plan's shards that are there and whole; in a store, claim it for the plan.
+
+    Args:
+        base: the set the plan extends; its shards belong.
+        shared: others may be writing, so what is unfinished is left alone.
+
+    Raises:
+        OutputError: the folder holds another conversion's shards, or something else.
+    """
+    _refuse_foreign(out)
+    if isinstance(out, RemotePath):
+        _refuse_claimed(out, plan)
+    if not shared:
+        remove_parts(out)
+    kept = {shard.path for shard in base.shards} if base else set()
+    planned = {unit.name for unit in plan.units}
+    done: set[str] = set()
+    for name, footer in _footers(out, sorted(shard_names(out) - kept)):
+        if footer.plan["hash"] == plan.facts["hash"] and name in planned:
+            done.add(name)
+        elif base and footer.plan.get("extends") and hashes(base.plan) & hashes(footer.plan):
+            (out / name).unlink()  # of an extension that was not finished, and differs from this one
+        else:
+            raise _other(out, plan, footer.plan)
+    if not done and base is None and (out / MANIFEST).is_file():
+        theirs = Manifest.load(out).plan
+        if theirs["hash"] != plan.facts["hash"]:
+            raise _other(out, plan, theirs)
+    if isinstance(out, RemotePath) and done != planned:
+        create_bytes(json.dumps(plan.facts).encode(), out / PLAN)
+        _refuse_claimed(out, plan)  # of two that came at once
+    return done
+
+
+def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
+    """Raise OutputError where another plan is being written into a store."""
+    try:
+        theirs = json.loads((out / PLAN).read_bytes())
+    except FileNotFoundError:
+        return
+    if theirs["hash"] != plan.facts["hash"]:
+        raise OutputError(
+            out,
+            f"another conversion is being written there; different: {differences(plan.facts, theirs)}",
+            f"wait for it, or choose another --out; where no such job runs any more, delete {out / PLAN}",
+        )
+
+
+def shard_names(out: Path) -> set[str]:
+    """What is in the folders of the splits."""
+    return {path.relative_to(out).as_posix() for split in SPLITS for path in out.glob(f"{split}/[!.]*")}
+
+
+def _footers(out: Path, names: list[str]) -> Iterator[tuple[str, Footer]]:
+    """Of each shard; many are asked for at a time in a store, where each takes a while."""
+    readers = READERS if is_remote(out) else 1
+    with ThreadPoolExecutor(readers) as pool:
+        for start in range(0, len(names), 4 * readers):
+            some = names[start : start + 4 * readers]
+            yield from zip(some, pool.map(lambda name: read_footer(out / name, str(out / name))[0], some))
+
+
+def _other(out: Path, plan: Plan, theirs: dict[str, Any]) -> OutputError:
+    words = differences(plan.facts, theirs)
+    remedy = "choose another --out, or --overwrite to start anew"
+    if ways(plan.facts) == ways(theirs):
+        remedy = "--extend adds the episodes that are new, --overwrite starts anew"
+    return OutputError(out, f"belongs to another conversion; different: {words}", remedy)
+
+
+# -- the journal
+
+
+@dataclass(frozen=True)
+class Made:
+    """A shard that was made: what the manifest needs and the footer cannot hold."""
+
+    name: str
+    bytes: int
+    sha256: str
+
+
+class Journal:
+    """What this job's shards hash to, so that finishing reads none of them again; lines are only appended.
+
+    A store cannot append: there the whole is written now and then, and when the block ends.
+    """
+
+    def __init__(self, out: Path, share: Share | None) -> None:
+        self._path = out / (f"{JOURNAL}-{share.name}" if share else JOURNAL)
+        self._lines: list[str] = []
+        self._due = time.monotonic() + JOURNAL_S
+
+    def __enter__(self) -> "Journal":
+        if is_remote(self._path) and self._path.is_file():
+            self._lines = self._path.read_text(encoding="utf-8").splitlines(keepends=True)
+        return self
+
+    def __exit__(self, kind: object, fault: BaseException | None, trace: object) -> None:
+        if not isinstance(fault, StorageAwayError):  # else it would only wait for the store once more
+            self._put()
+
+    def add(self, made: Made) -> None:
+        """Note a shard."""
+        line = json.dumps(asdict(made)) + "\n"
+        if not is_remote(self._path):
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(line)
+            return
+        self._lines.append(line)
+        if time.monotonic() > self._due:
+            self._put()
+
+    def _put(self) -> None:
+        if isinstance(self._path, RemotePath) and self._lines:
+            with suppress(HMAError, OSError):  # without it, finishing reads the shards again
+                put_bytes("".join(self._lines).encode(), self._path)
+        self._due = time.monotonic() + JOURNAL_S
+
+
+def known_hashes(out: Path) -> dict[str, str]:
+    """Shard -> sha256, of every journal's shards whose size still is what it was; the rest must be read."""
+    found: dict[str, str] = {}
+    sizes = out.listing() if isinstance(out, RemotePath) else None
+    for path in sorted(out.glob(f"{JOURNAL}*")):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError, TypeError, OSError):  # a line cut short by a kill
+                made = Made(**json.loads(line))
+                size = (out / made.name).stat().st_size if sizes is None else sizes.get(made.name)
+                if size == made.bytes:
+                    found[made.name] = made.sha256
+    return found
+
+
+def remove_notes(out: Path) -> None:
+    """Delete the journals and the claim of a set whose manifest is there."""
+    for path in [*out.glob(f"{JOURNAL}*"), out / PLAN]:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,200 @@
+"""Which episode goes into which shard: decided before anything is decoded.
+
+The plan depends on the recording, the embodiment, the tokenizer and the settings alone, never
+on the number of workers, so that every run and every machine makes the same files.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from hma_data.errors import SourceError, UsageError
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.base import EpisodeRef
+from hma_data.tokenizers.base import TokenizerSpec
+
+SMALLEST_SHARD, LARGEST_SHARD, SHARDS_WANTED = 4_096, 170_000, 32  # frames; 170,000 are about 100 MB
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the user chose about a conversion.
+
+    Attributes:
+        frames: all rows at the recording's rate, or only the model's grid with whole action chunks.
+        cameras: names, the first by default.
+        val_fraction: of episodes, by hash of their id.
+        seed: of that hash.
+        limit: first episodes only.
+        shard_frames: about how many a shard; None lets the size of the recording decide.
+    """
+
+    frames: Literal["all", "strided"] = "all"
+    cameras: tuple[str, ...] = ()
+    val_fraction: float = 0.05
+    seed: int = 0
+    limit: int | None = None
+    shard_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.val_fraction < 1:
+            raise UsageError("--val-fraction", f"must lie in 0..1, is {self.val_fraction}")
+        if self.limit is not None and self.limit < 1:
+            raise UsageError("--limit", f"must be at least 1, is {self.limit}")
+        if self.shard_frames is not None and self.shard_frames < 1:
+            raise UsageError("--shard-frames", f"must be at least 1, is {self.shard_frames}")
+
+
+@dataclass(frozen=True)
+class ShardUnit:
+    """A shard to make: the unit of work and of commit."""
+
+    name: str
+    split: str
+    episodes: tuple[tuple[int, EpisodeRef], ...]
+
+    @property
+    def frames(self) -> int:
+        """As the source estimates them."""
+        return sum(ref.frames for _, ref in self.episodes)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All shards, and the facts that tell this conversion from another."""
+
+    units: tuple[ShardUnit, ...]
+    facts: dict[str, Any]
+
+    @property
+    def episodes(self) -> int:
+        """In all."""
+        return sum(len(unit.episodes) for unit in self.units)
+
+    @property
+    def frames(self) -> int:
+        """In all, as the source estimates them."""
+        return sum(unit.frames for unit in self.units)
+
+
+def make_plan(
+    refs: Sequence[EpisodeRef],
+    embodiment: Embodiment,
+    tokenizer: TokenizerSpec,
+    settings: Settings,
+    source: str,
+) -> Plan:
+    """Shards of whole episodes, train and val apart.
+
+    Args:
+        refs: every episode of the source, in its order.
+        source: URI, for errors.
+
+    Raises:
+        SourceError: no episodes, or two with one id.
+        RegistryError: a camera the embodiment does not have, or a stride that is needed and unknown.
+    """
+    if not refs:
+        raise SourceError(source, "has no episodes")
+    refs = list(refs)[: settings.limit]
+    seen: set[str] = set()
+    for ref in refs:
+        if ref.id in seen:
+            raise SourceError(source, f"has two episodes with id {ref.id!r}")
+        seen.add(ref.id)
+    cameras = [embodiment.camera(name).name for name in settings.cameras] or [embodiment.primary_camera.name]
+
+    splits = choose_splits(refs, settings.val_fraction, settings.seed)
+    target = settings.shard_frames or shard_size(sum(ref.frames for ref in refs))
+    units = [
+        unit
+        for split in ("train", "val")
+        for unit in pack(split, [(i, ref) for i, ref in enumerate(refs) if splits[i] == split], target)
+    ]
+    facts: dict[str, Any] = {
+        "embodiment": embodiment.id,
+        "embodiment_hash": embodiment.digest,
+        "tokenizer": tokenizer.to_json(),
+        "cameras": cameras,
+        "frames": settings.frames,
+        "frame_stride": embodiment.stride if settings.frames == "strided" else 1,
+        "settings": {**asdict(settings), "cameras": cameras},
+        "recording": digest([(ref.id, ref.fingerprint) for ref in refs]),
+        "shards": digest([(unit.name, [i for i, _ in unit.episodes]) for unit in units]),
+    }
+    facts = json.loads(json.dumps(facts))  # the plain form, as a footer gives it back
+    return Plan(tuple(units), {**facts, "hash": digest(facts)})
+
+
+def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) -> list[str]:
+    """train or val for each episode: the source's own where it has one, else by hash of its group's id.
+
+    An episode without a group is one of its own. With two or more groups and a fraction above zero,
+    at least one is val and at least one train.
+    """
+    if any(ref.split for ref in refs):
+        return [ref.split or "train" for ref in refs]
+    draws = {ref.group or ref.id: _unit_interval(f"{seed}/{ref.group or ref.id}") for ref in refs}
+    held = {group for group, draw in draws.items() if draw < val_fraction}
+    if len(draws) >= 2 and val_fraction > 0:
+        held = held or {min(draws, key=lambda group: draws[group])}
+        if len(held) == len(draws):
+            held.remove(max(draws, key=lambda group: draws[group]))
+    return ["val" if (ref.group or ref.id) in held else "train" for ref in refs]
+
+
+def shard_size(frames: int) -> int:
+    """Frames a shard: enough shards to share out, none larger than about 100 MB."""
+    return min(LARGEST_SHARD, max(SMALLEST_SHARD, frames // SHARDS_WANTED))
+
+
+def pack(split: str, episodes: list[tuple[int, EpisodeRef]], target: int, begun: int = 0) -> list[ShardUnit]:
+    """Episodes into shards of about `target` frames; `begun` shards of the split are there already."""
+    groups: list[list[tuple[int, EpisodeRef]]] = []
+    filled = target
+    for item in episodes:
+        if filled >= target:
+            groups.append([])
+            filled = 0
+        groups[-1].append(item)
+        filled += max(item[1].frames, 1)
+    return [
+        ShardUnit(f"{split}/shard-{i:05d}.parquet", split, tuple(group))
+        for i, group in enumerate(groups, start=begun)
+    ]
+
+
+def _unit_interval(text: str) -> float:
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") / 2**64
+
+
+def digest(value: Any) -> str:
+    """Sixteen hex digits over plain values."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
+    """What tells two plans apart, in words."""
+    words = {
+        "embodiment": "embodiment",
+        "embodiment_hash": "content of the embodiment's YAML",
+        "tokenizer": "tokenizer",
+        "cameras": "cameras",
+        "frames": "--frames",
+        "recording": "recordings",
+        "settings": "settings",
+    }
+    found = []
+    for key, word in words.items():
+        if mine.get(key) != theirs.get(key):
+            ours, other = _short(mine.get(key)), _short(theirs.get(key))
+            found.append(f"{word} ({other} there, {ours} now)" if ours != other else word)
+    return ", ".join(found) or "the cut into shards"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{value['name']} {value.get('weights_sha256', '')[:8]}".strip() if "name" in value else ""
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,313 @@
+"""Put the streams of a recording on one clock.
+
+Cameras, actions and states tick at their own rates. Here they are brought onto the times of
+the embodiment's primary camera, or onto a fixed grid; how far each had to be moved is the skew.
+
+Times that differ by rounding alone are one time (see `rounding`). Samples may bear equal stamps: `hold` and
+`interpolate` take the last of them, which is in force from there on, `nearest` the first; a primary camera's
+frames of one stamp are one frame of the grid. Stamps that go back are refused.
+
+Times are float64 seconds. T target times, S source times, A values a sample.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Clip, Episode, Floats, Known, Signal
+from hma_data.episodes.rotations import between
+from hma_data.errors import AlignmentError, EpisodeError
+from hma_data.registry.components import Component, Sync, Vector
+from hma_data.registry.embodiment import Embodiment
+
+Moved = tuple[NDArray[np.int64], Floats]
+ROUNDING_S = 1e-7  # what hours of added periods gather, and far below any sensor's interval
+
+
+def rounding(*clocks: Floats) -> float:
+    """Seconds by which equal times may differ: 100 ns, and 4 units in the last place of the largest.
+
+    A float64 of seconds since 1970 is exact to 0.24 µs, so that there it is 1.1 µs.
+    """
+    largest = max((float(np.abs(times[[0, -1]]).max()) for times in clocks if len(times)), default=0.0)
+    return ROUNDING_S + 4 * float(np.spacing(largest))
+
+
+def nearest(source_times: Floats, target_times: Floats) -> Moved:
+    """Index (T,) of the sample nearest to each target time, and skew_ms (T,).
+
+    Of two equally near the earlier, of equal stamps the first.
+    """
+    after = np.clip(
+        np.searchsorted(source_times, target_times, side="left"), 1, max(len(source_times) - 1, 1)
+    )
+    before = after - 1
+    after = np.minimum(after, len(source_times) - 1)
+    farther = np.abs(source_times[before] - target_times) - np.abs(source_times[after] - target_times)
+    chosen = np.where(farther > rounding(source_times, target_times), after, before)
+    index: NDArray[np.int64] = np.searchsorted(source_times, source_times[chosen], side="left")
+    return index, np.abs(source_times[index] - target_times) * 1e3
+
+
+def hold(source_times: Floats, target_times: Floats) -> Moved:
+    """Index (T,) of the sample in force at each target time, the last stamped at or before it; its age in ms.
+
+    Target times before the first sample get index 0 and a negative age; `to_clip` trims them.
+    """
+    close = rounding(source_times, target_times)
+    found = np.searchsorted(source_times, target_times + close, side="right") - 1
+    index = np.maximum(found, 0)
+    age = target_times - source_times[index]
+    return index, np.where(found < 0, age, np.maximum(age, 0)) * 1e3
+
+
+def interpolate(
+    source_times: Floats, values: NDArray[np.float32], target_times: Floats
+) -> tuple[NDArray[np.float32], Floats]:
+    """Values (T, A) linear between neighbours, and skew_ms (T,): the distance to the nearest sample."""
+    columns = [np.interp(target_times, source_times, column) for column in values.T.astype(np.float64)]
+    return np.stack(columns, axis=1).astype(np.float32), nearest(source_times, target_times)[1]
+
+
+_INDEX: dict[str, Callable[[Floats, Floats], Moved]] = {
+    "nearest": nearest,
+    "hold": hold,
+    "interpolate": nearest,
+}
+
+
+def to_clip(episode: Episode, embodiment: Embodiment) -> Clip:
+    """The episode on the embodiment's grid.
+
+    Raises:
+        EpisodeError: no frames, no actions or none that is known, values that are not finite.
+        AlignmentError: times that go back, streams that do not overlap, or one that is further off than
+            `sync.max_skew_ms` and may not be masked.
+    """
+    if not episode.actions:
+        raise EpisodeError(episode.id, "has no actions")
+    clip = _shared_index(episode, embodiment) if episode.rate_stamped else _aligned(episode, embodiment)
+    if clip.action_known is not None and not clip.action_known.any():
+        raise EpisodeError(episode.id, f"not one of its {len(clip)} actions is known: all would be masked")
+    for name, values in (("actions", clip.actions), ("states", clip.states)):
+        if values is not None and not np.isfinite(values).all():
+            frame = int(np.argwhere(~np.isfinite(values).all(axis=1))[0, 0])
+            raise EpisodeError(episode.id, f"{name} are not finite at frame {frame}")
+    return clip
+
+
+# -- streams of one index
+
+
+def _shared_index(episode: Episode, embodiment: Embodiment) -> Clip:
+    """RLDS, HDF5, LeRobot: frame i, action i and state i belong together."""
+    lengths = [(name, len(stream.timestamps)) for name, stream in episode.streams.items()]
+    lengths += [(name, len(signal.values)) for name, signal, _, _ in _signals(episode, embodiment)]
+    if len({length for _, length in lengths}) != 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths)
+        raise EpisodeError(episode.id, f"its streams differ in length: {told}")
+    times = episode.streams[embodiment.primary_camera.name].timestamps
+    _check_times(episode.id, embodiment.primary_camera.name, times)
+    shift = embodiment.sync.action_shift
+    index = np.arange(max(0, -shift), len(times) - max(0, shift))
+    if not len(index):
+        raise EpisodeError(episode.id, f"has {len(times)} frames, sync.action_shift is {shift}")
+    actions, action_known = _join(episode.actions, index + shift)
+    states, state_known = _join(episode.states, index) if episode.states else (None, None)
+    return Clip(
+        episode=episode,
+        timestamps=times[index] - times[index[0]],
+        actions=actions,
+        states=states,
+        frame_indices=dict.fromkeys(episode.streams, index),
+        skew_ms={
+            name: np.abs(stream.timestamps - times)[index] * 1e3 for name, stream in episode.streams.items()
+        },
+        trimmed=abs(shift),
+        action_known=action_known,
+        state_known=state_known,
+    )
+
+
+def _join(signals: Sequence[Signal], index: NDArray[np.int64]) -> tuple[NDArray[np.float32], Known]:
+    values = np.concatenate([signal.values for signal in signals], axis=1)[index]
+    return _masked(values, [signal.known[index] for signal in signals if signal.known is not None])
+
+
+def _masked(
+    values: NDArray[np.float32], marks: Sequence[NDArray[np.bool_]]
+) -> tuple[NDArray[np.float32], Known]:
+    """Values with zeros where a mark says that one is unknown, and where all are known."""
+    if not marks:
+        return values, None
+    known: NDArray[np.bool_] = np.logical_and.reduce(list(marks))
+    return np.where(known[:, None], values, np.float32(0)), known
+
+
+def _signals(
+    episode: Episode, embodiment: Embodiment
+) -> list[tuple[str, Signal, tuple[Component, ...], str]]:
+    """Each signal of actions, then states: a name, the signal, its components, its method.
+
+    The name is the component's key, as the YAML has it; before a key that cameras or actions have, what it
+    is of. Components of one key share a name.
+    """
+    sync, taken = embodiment.sync, {*episode.streams}
+    vectors: tuple[tuple[str, tuple[Signal, ...], Vector | None, str], ...] = (
+        ("action", episode.actions, embodiment.action, sync.actions),
+        ("state", episode.states, embodiment.state, sync.states),
+    )
+    found: list[tuple[str, Signal, tuple[Component, ...], str]] = []
+    for kind, signals, vector, method in vectors:
+        parts = vector.components if vector else ()
+        apart = len(signals) == len(parts)
+        for i, signal in enumerate(signals):
+            own = parts[i : i + 1] if apart else parts
+            key = own[0].key if apart else kind
+            found.append((f"{kind} {key}" if key in taken else key, signal, own, method))
+        taken |= {name for name, *_ in found}
+    return found
+
+
+# -- streams of their own clocks
+
+
+def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
+    """Bags: every stream is moved onto the grid by the method the embodiment names."""
+    sync, primary = embodiment.sync, embodiment.primary_camera.name
+    signals = _signals(episode, embodiment)
+    clocks: list[tuple[str, Floats, str]] = [
+        *((name, stream.timestamps, sync.images) for name, stream in episode.streams.items()),
+        *((name, signal.timestamps, method) for name, signal, _, method in signals),
+    ]
+    for name, times, _ in clocks:
+        _check_times(episode.id, name, times)
+    frames = np.unique(episode.streams[primary].timestamps)
+    repeated = len(episode.streams[primary].timestamps) - len(frames)
+    if repeated > len(frames):
+        fault = f"{repeated} of {repeated + len(frames)} frames of {primary} bear the stamp of the one before"
+        raise AlignmentError(episode.id, fault, "try stamp: receive")
+    grid, trimmed = _grid(episode.id, frames, embodiment, clocks)
+
+    skew: dict[str, Floats] = {}
+    indices: dict[str, NDArray[np.int64]] = {}
+    for name, stream in episode.streams.items():
+        indices[name], skew[name] = _INDEX[sync.images](stream.timestamps, grid)
+    limit = sync.max_skew_ms and sync.max_skew_ms + 1e3 * rounding(grid, frames)
+    pieces, marks = [], []
+    for name, signal, parts, method in signals:
+        values, known, off = _moved(signal, parts, method, grid)
+        skew[name] = np.maximum(skew.get(name, off), off)
+        if limit and sync.beyond == "mask":
+            near = off <= limit
+            known = near if known is None else known & near
+        pieces.append(values)
+        marks.append(known)
+    _check_skew(
+        episode.id, skew if sync.beyond == "refuse" else {k: skew[k] for k in indices}, limit, sync, grid
+    )
+
+    def vector(chosen: slice) -> tuple[NDArray[np.float32], Known]:
+        values = np.concatenate(pieces[chosen], axis=1)
+        return _masked(values, [known for known in marks[chosen] if known is not None])
+
+    count = len(episode.actions)
+    actions, action_known = vector(slice(None, count))
+    states, state_known = vector(slice(count, None)) if episode.states else (None, None)
+    times = grid - grid[0]
+    return Clip(
+        episode, times, actions, states, indices, skew, trimmed,
+        0 if sync.rate_hz else repeated, action_known, state_known,
+    )  # fmt: skip
+
+
+def _moved(
+    signal: Signal, parts: tuple[Component, ...], method: str, grid: Floats
+) -> tuple[NDArray[np.float32], Known, Floats]:
+    """Values (T, A) of a signal on the grid, which of them are known, and skew_ms (T,)."""
+    if method != "interpolate":
+        index, skew = _INDEX[method](signal.timestamps, grid)
+        return signal.values[index], None if signal.known is None else signal.known[index], skew
+    values, skew = interpolate(signal.timestamps, signal.values, grid)
+    start = 0
+    for part in parts:
+        span = slice(start, start := start + part.dims)
+        if part.representation:
+            values[:, span] = between(
+                signal.timestamps, signal.values[:, span], grid, part.representation, part.unit
+            )
+    if signal.known is None:
+        return values, None, skew
+    before, age_ms = hold(signal.timestamps, grid)
+    exact = age_ms <= 1e3 * rounding(signal.timestamps, grid)
+    after = np.minimum(before + ~exact, len(signal.values) - 1)
+    return values, signal.known[before] & signal.known[after], skew
+
+
+def _grid(
+    episode_id: str, frames: Floats, embodiment: Embodiment, clocks: list[tuple[str, Floats, str]]
+) -> tuple[Floats, int]:
+    """Target times where every stream is running, and how many frames lie outside.
+
+    A held value stays in force after its last sample; anything else ends with it. Edges may reach
+    `max_skew_ms` (half a period without one) beyond a stream's samples.
+    """
+    sync = embodiment.sync
+    close = rounding(*(times for _, times, _ in clocks))
+    start, stop = -np.inf, np.inf
+    for name, times, method in clocks:
+        if name == embodiment.primary_camera.name and not sync.rate_hz:
+            continue
+        period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        reach = sync.max_skew_ms / 1e3 if sync.max_skew_ms else period / 2
+        start = max(start, float(times[0]) - (reach if method == "nearest" else 0.0))
+        if method == "nearest":
+            stop = min(stop, float(times[-1]) + reach)
+        elif method == "interpolate":
+            stop = min(stop, float(times[-1]))
+        elif sync.max_skew_ms:  # hold
+            stop = min(stop, float(times[-1]) + max(reach, period))
+    if sync.rate_hz:
+        first, last = max(float(frames[0]), start), min(float(frames[-1]), stop)
+        count = max(0, int(np.floor((last - first + close) * sync.rate_hz)) + 1)
+        grid, total = first + np.arange(count) / sync.rate_hz, count
+    else:
+        grid, total = frames[(frames >= start - close) & (frames <= stop + close)], len(frames)
+    if not len(grid):
+        spans = ", ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times, _ in clocks)
+        raise AlignmentError(
+            episode_id, f"its streams never run together: {spans}", "check the topics, or stamp: receive"
+        )
+    return grid, total - len(grid)
+
+
+def _check_times(episode_id: str, name: str, times: Floats) -> None:
+    if not len(times):
+        raise EpisodeError(episode_id, f"{name} has no samples")
+    if not np.isfinite(times).all():
+        raise EpisodeError(episode_id, f"{name} has times that are not finite")
+    backwards = np.flatnonzero(np.diff(times) < 0)
+    if len(backwards):
+        i = int(backwards[0])
+        raise AlignmentError(
+            episode_id,
+            f"{name} goes back in time at sample {i + 1}: {times[i]:.6f} then {times[i + 1]:.6f} s",
+            "try stamp: receive",
+        )
+
+
+def _check_skew(
+    episode_id: str, skew: dict[str, Floats], limit_ms: float | None, sync: Sync, grid: Floats
+) -> None:
+    if not limit_ms:
+        return
+    for name, values in skew.items():
+        worst = int(np.argmax(values))
+        if values[worst] > limit_ms:
+            raise AlignmentError(
+                episode_id,
+                f"{name} is {values[worst]:.1f} ms off at {grid[worst] - grid[0]:.3f} s, "
+                f"sync.max_skew_ms is {sync.max_skew_ms:g}",
+                "raise max_skew_ms, or leave the episode in quarantine",
+            )

@@ -1,0 +1,177 @@
+"""Pictures: decode, rotate, crop, and bring to the tokenizer's square.
+
+N pictures, H×W pixels; uint8 RGB everywhere. Resizing happens here and nowhere else; its filter
+is part of the tokenizer's spec because it changes the tokens.
+"""
+
+import os
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import OneByOne, Stream
+from hma_data.errors import EpisodeError, MissingDependencyError
+from hma_data.registry.components import Camera
+
+Images = NDArray[np.uint8]
+Filter = Literal["area", "linear"]
+MAX_PIXELS = 64_000_000  # a picture that claims more is a bomb or an error
+
+
+def opencv() -> Any:
+    """The cv2 module.
+
+    Raises:
+        MissingDependencyError: it cannot be imported, usually because a build
+            for displays replaced the headless one.
+    """
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read once, when it is loaded
+    try:
+        import cv2
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "opencv",
+            str(fault),
+            "pip uninstall opencv-python && pip install --force-reinstall opencv-python-headless",
+        ) from fault
+    return cv2
+
+
+def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
+    """A JPEG, PNG or other still picture -> (H, W, 3) RGB.
+
+    Raises:
+        EpisodeError: the bytes are not a picture.
+    """
+    cv2 = opencv()
+    buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
+    head = buffer[:65536].tobytes()
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:26] in (b"\x10\0", b"\x10\4"):
+        raise EpisodeError(where, "a picture is grey of 16 bits, so depth, not colour", "name another camera")
+    width, height = claimed_size(head)
+    if width * height > MAX_PIXELS:
+        raise EpisodeError(where, f"a picture claims {width}×{height} pixels, more than {MAX_PIXELS:,}")
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        picture = cv2.imdecode(buffer, flags) if len(buffer) else None
+    except cv2.error as fault:
+        raise EpisodeError(
+            where, f"a picture of {len(buffer)} bytes cannot be decoded: {fault.err}"
+        ) from fault
+    if picture is None:
+        raise EpisodeError(where, f"a picture of {len(buffer)} bytes cannot be decoded")
+    return picture
+
+
+def claimed_size(head: bytes) -> tuple[int, int]:
+    """Width and height that a PNG's or JPEG's first bytes claim; (0, 0) for anything else."""
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
+        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    at = 2
+    while head[:2] == b"\xff\xd8" and at + 9 <= len(head) and head[at] == 0xFF:
+        marker = head[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            return int.from_bytes(head[at + 7 : at + 9], "big"), int.from_bytes(head[at + 5 : at + 7], "big")
+        at += 2 + (0 if marker == 0xFF else int.from_bytes(head[at + 2 : at + 4], "big"))
+    return 0, 0
+
+
+def prepare(
+    frames: Images, camera: Camera, size: int, resize_filter: Filter = "area", out: Images | None = None
+) -> Images:
+    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, flip, rotation, crop, resize by its YAML.
+
+    Args:
+        out: (N, size, size, 3) where they are put; new memory by default.
+    """
+    if camera.color == "bgr":
+        frames = frames[..., ::-1]
+    if camera.flip:
+        frames = np.flip(frames, axis=1 if camera.flip == "vertical" else 2)
+    if camera.rotate:
+        frames = np.rot90(frames, k=-camera.rotate // 90, axes=(1, 2))
+    if camera.crop:
+        x, y, width, height = camera.crop
+        if y + height > frames.shape[1] or x + width > frames.shape[2]:
+            raise EpisodeError(
+                f"camera {camera.name}",
+                f"crop {list(camera.crop)} leaves the picture of {frames.shape[2]}×{frames.shape[1]}",
+            )
+        frames = frames[:, y : y + height, x : x + width]
+    return resize(frames, size, camera.resize, resize_filter, out)
+
+
+def prepared(
+    stream: Stream,
+    indices: Sequence[int] | NDArray[np.int64],
+    camera: Camera,
+    size: int,
+    resize_filter: Filter = "area",
+) -> Images:
+    """Pictures of a stream -> (n, size, size, 3) RGB, as `prepare` makes them of `stream.frames`.
+
+    Pictures that can be had one by one are made square one by one: large ones are never held together.
+    """
+    if not isinstance(stream, OneByOne) or not len(indices):
+        return prepare(stream.frames(indices), camera, size, resize_filter)
+    distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
+    squares = _empty(len(distinct), size)
+    for place, picture in enumerate(stream.each(distinct)):
+        prepare(picture[None], camera, size, resize_filter, squares[place : place + 1])
+    return squares if np.array_equal(inverse, np.arange(len(squares))) else squares[inverse]
+
+
+def resize(
+    frames: Images,
+    size: int,
+    rule: str = "short_side_crop",
+    resize_filter: Filter = "area",
+    out: Images | None = None,
+) -> Images:
+    """(N, H, W, 3) -> (N, size, size, 3).
+
+    Args:
+        rule: short_side_crop (short side to `size`, centre crop), letterbox (long
+            side to `size`, black borders) or stretch.
+        resize_filter: area averages when shrinking and is linear when enlarging; linear is always linear.
+        out: (N, size, size, 3) where they are put; new memory by default.
+    """
+    cv2 = opencv()
+    height, width = frames.shape[1:3]
+    if rule == "short_side_crop" and height != width:
+        side = min(height, width)
+        top, left = (height - side) // 2, (width - side) // 2
+        frames = frames[:, top : top + side, left : left + side]
+        height = width = side
+    if (height, width) == (size, size):
+        if out is None:
+            return np.ascontiguousarray(frames)
+        out[:] = frames
+        return out
+    out = _empty(len(frames), size) if out is None else out
+    if rule == "letterbox":
+        scale = size / max(height, width)
+        inner_h, inner_w = max(1, round(height * scale)), max(1, round(width * scale))
+    else:
+        inner_h = inner_w = size
+    shrinks = inner_h < height or inner_w < width
+    interpolation = cv2.INTER_AREA if resize_filter == "area" and shrinks else cv2.INTER_LINEAR
+    if (inner_h, inner_w) != (size, size):
+        out[:] = 0
+    top, left = (size - inner_h) // 2, (size - inner_w) // 2
+    for frame, square in zip(frames, out):
+        inner = square[top : top + inner_h, left : left + inner_w]
+        cv2.resize(_packed(frame), (inner_w, inner_h), dst=inner, interpolation=interpolation)
+    return out
+
+
+def _packed(frame: Images) -> Images:
+    """The picture as OpenCV takes it: rows may lie apart, pixels may not."""
+    rows, *pixel = frame.strides
+    return frame if rows > 0 and pixel == [3, 1] else np.ascontiguousarray(frame)
+
+
+def _empty(count: int, size: int) -> Images:
+    return np.empty((count, size, size, 3), np.uint8)

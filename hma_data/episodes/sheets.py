@@ -1,0 +1,121 @@
+"""What a person looks at: contact sheets, action bars, PNG, MP4 and animated WebP.
+
+N pictures, H×W pixels, A action dims; pictures are uint8 RGB.
+"""
+
+import io
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import opencv
+from hma_data.storage.files import atomic_path
+
+Images = NDArray[np.uint8]
+INK, PAPER, BAR, NEGATIVE = (
+    (30, 30, 30),
+    (250, 250, 250),
+    (0, 114, 178),
+    (213, 94, 0),
+)  # safe without colour vision
+
+
+def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = (), gap: int = 4) -> Images:
+    """Pictures of one size in rows, with a label above each row -> (H, W, 3)."""
+    label_height = 18 if labels else 0
+    height, width = rows[0][0].shape[:2]
+    columns = max(map(len, rows))
+    sheet = np.full(
+        (len(rows) * (height + gap + label_height) + gap, columns * (width + gap) + gap, 3), PAPER, np.uint8
+    )
+    for i, row in enumerate(rows):
+        top = gap + i * (height + gap + label_height)
+        if labels:
+            write_text(sheet, labels[i], (gap, top + 13))
+        for j, picture in enumerate(row):
+            left = gap + j * (width + gap)
+            sheet[top + label_height : top + label_height + height, left : left + width] = picture
+    return sheet
+
+
+def write_text(picture: Images, text: str, at: tuple[int, int], scale: float = 0.42) -> None:
+    """Text in place, its lower left corner at (x, y)."""
+    cv2 = opencv()
+    plain = text.encode("ascii", "replace").decode()
+    cv2.putText(picture, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, INK, 1, cv2.LINE_AA)
+
+
+def with_actions(
+    frames: Images, actions: NDArray[np.float32], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> Images:
+    """Frames (N, H, W, 3) with a bar for each action dim below it, from `low` to `high` (A,)."""
+    count, height, width = frames.shape[:3]
+    dims = actions.shape[1]
+    line = max(3, min(8, 96 // max(dims, 1)))
+    out = np.full((count, height + dims * line + 4, width, 3), PAPER, np.uint8)
+    out[:, :height] = frames
+    span = np.where(high > low, high - low, 1.0)
+    place = np.clip((actions - low) / span, 0, 1)
+    zero = np.clip((0 - low) / span, 0, 1)
+    for t in range(count):
+        for d in range(dims):
+            top = height + 2 + d * line
+            a, b = sorted((round(zero[d] * (width - 1)), round(place[t, d] * (width - 1))))
+            out[t, top : top + line - 1, a : b + 1] = BAR if actions[t, d] >= 0 else NEGATIVE
+    return out
+
+
+def png_bytes(picture: Images) -> bytes:
+    """(H, W, 3) -> PNG."""
+    cv2 = opencv()
+    return cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def webp_bytes(frames: Images, fps: float) -> bytes:
+    """(N, H, W, 3) -> an animated WebP that loops."""
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame) for frame in frames]
+    buffer = io.BytesIO()
+    pictures[0].save(
+        buffer,
+        "WEBP",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=round(1000 / fps),
+        loop=0,
+        quality=85,
+        method=4,
+    )
+    return buffer.getvalue()
+
+
+def write_png(path: Path, picture: Images) -> None:
+    """A PNG file, whole or absent."""
+    with atomic_path(path) as part:
+        part.write_bytes(png_bytes(picture))
+
+
+def write_mp4(path: Path, frames: Iterable[Images], fps: float) -> None:
+    """An H.264 file of frames (H, W, 3) of one size, whole or absent; odd sides are padded by a pixel.
+
+    Frames are taken one by one, so that a generator of any length may give them; there is at least one.
+    """
+    import av
+
+    rest = iter(frames)
+    first = next(rest)
+    height, width = (side + side % 2 for side in first.shape[:2])
+    with atomic_path(path) as part, av.open(str(part), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
+        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+        stream.options = {"crf": "18", "preset": "fast"}
+        for frame in chain([first], rest):
+            odd = ((0, height - frame.shape[0]), (0, width - frame.shape[1]), (0, 0))
+            padded = np.ascontiguousarray(np.pad(frame, odd, mode="edge"))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(padded, format="rgb24")))
+        container.mux(stream.encode(None))

@@ -1,0 +1,377 @@
+"""Write the YAML of a new robot from one of its recordings.
+
+What the recording states is filled in; what it cannot know stands as `TODO: question`, and
+`hma registry validate` lists those until they are answered. Which keys are taken is decided in
+`infer_choices` and, for bags, in `infer_topics`. In the YAML's text, components and cameras stand
+in braces on a line each.
+"""
+
+import math
+import re
+from dataclasses import replace
+from typing import Any, get_args
+
+import yaml
+
+from hma_data.errors import SourceError, UsageError
+from hma_data.inspection import infer_topics
+from hma_data.inspection.infer_choices import (
+    Choice,
+    actions,
+    camera_names,
+    cameras,
+    dims,
+    instruction,
+    is_gripper,
+    likely,
+    names_of,
+    shown,
+    space_of,
+    states,
+    vectors,
+)
+from hma_data.registry.components import Space
+from hma_data.registry.embodiment import ID_PATTERN, TODO, find
+from hma_data.sources.base import Inspection, KeyInfo, detect, open_source
+from hma_data.storage.paths import StrPath
+
+LINE = 110
+_HALVES = re.compile(r"[\ud800-\udfff]")
+_BREAKS = re.compile(r"[\n\r\x85\u2028\u2029]")
+
+
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        """The parser accepts none."""
+        return True
+
+
+def _text(dumper: _Dumper, value: str) -> yaml.Node:
+    """On one line, whatever it holds."""
+    value = _HALVES.sub("?", value)  # of surrogate pairs: no text
+    style = '"' if _BREAKS.search(value) else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
+
+
+_Dumper.add_representer(str, _text)
+
+
+def yaml_text(values: dict[str, Any]) -> str:
+    """Plain values as YAML, in the order given; it parses back to the same."""
+    return "".join(_entry(name, value, "") for name, value in values.items())
+
+
+def _entry(name: str, value: Any, indent: str) -> str:
+    if isinstance(value, dict):
+        braced = f"{indent}{_dump({name: value}, True)[1:-1]}"
+        if len(braced) <= LINE and all(not isinstance(item, dict | list) for item in value.values()):
+            return braced + "\n"
+        inner = "".join(_entry(key, item, indent + "  ") for key, item in value.items())
+        return f"{indent}{name}:\n{inner}"
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return f"{indent}{name}:\n" + "".join(_item(item, indent + "  ") for item in value)
+    if isinstance(value, list):
+        return _names(name, value, indent)
+    return _indented(_dump({name: value}, False), indent)
+
+
+def _item(value: dict[str, Any], indent: str) -> str:
+    braced = f"{indent}- {_dump(value, True)}"
+    if len(braced) <= LINE:
+        return braced + "\n"
+    block = "".join(_entry(key, item, indent + "  ") for key, item in value.items())
+    return f"{indent}- {block[len(indent) + 2 :]}"
+
+
+def _names(name: str, value: list[Any], indent: str) -> str:
+    """A list in brackets, broken where it is long."""
+    whole = f"{indent}{_dump({name: value}, True)[1:-1]}"
+    if len(whole) <= LINE:
+        return whole + "\n"
+    lines, line = [], f"{indent}  "
+    for item in [_dump([item], True)[1:-1] for item in value]:
+        if len(line) + len(item) + 2 > LINE and line.strip():
+            lines.append(line.rstrip())
+            line = f"{indent}  "
+        line += f"{item}, "
+    return "\n".join([f"{indent}{name}: [", *lines, line.rstrip()[:-1] + "]"]) + "\n"
+
+
+def _dump(value: Any, flow: bool) -> str:
+    return yaml.dump(
+        value,
+        Dumper=_Dumper,
+        default_flow_style=flow,
+        allow_unicode=True,
+        width=float("inf"),
+        sort_keys=False,
+    ).rstrip("\n")
+
+
+def _indented(text: str, indent: str) -> str:
+    return "".join(f"{indent}{line}\n" if line else "\n" for line in text.split("\n"))
+
+
+HIGHEST_HZ = 100_000  # of a rate in a YAML
+MEASURED_TO = 5e-4  # of a rate; what time stamps leave open comes on top
+
+
+def infer(uri: StrPath, embodiment_id: str) -> str:
+    """The YAML of an embodiment that reads `uri`.
+
+    Args:
+        uri: str or path of the recording, or its URI.
+        embodiment_id: of the new embodiment.
+
+    Raises:
+        UsageError: not an id.
+        SourceError: the recording cannot be read, or has no camera or nothing that could be an action.
+    """
+    if not ID_PATTERN.fullmatch(embodiment_id) or ".." in embodiment_id:
+        raise UsageError(
+            "--id", f"{embodiment_id!r} is not an id", "use a-z 0-9 _ - . and begin with a letter or digit"
+        )
+    return from_inspection(open_source(detect(uri)).inspect(uri), embodiment_id)
+
+
+def from_inspection(found: Inspection, embodiment_id: str) -> str:
+    """See `infer`."""
+    if found.format == "hands":
+        return _of_hands(found, embodiment_id)
+    readable = replace(found, keys=tuple(key for key in found.keys if _is_text(key.key)))
+    text = yaml_text(_Draft(readable).values(embodiment_id))
+    where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
+    return f"# Inferred from {where}; answer every {TODO}, then: hma registry validate FILE\n{text}"
+
+
+def _of_hands(found: Inspection, embodiment_id: str) -> str:
+    """Videos have nothing of their own that could be an action: what comes along for them is copied."""
+    where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
+    values = find("hand_video").to_dict() | {"id": embodiment_id}
+    head = "a copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
+    return f"# For the videos of {where}: {head}\n{yaml_text(values)}"
+
+
+def _is_text(text: str) -> bool:
+    """False for bytes that no YAML can hold, as file formats let them through."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
+class _Draft:
+    """What is taken from one inspection.
+
+    Raises:
+        SourceError: no camera, or nothing that could be an action.
+    """
+
+    def __init__(self, found: Inspection) -> None:
+        self.found = found
+        self.bag = found.format == "rosbag"
+        self.seen = cameras(found.keys)
+        if not self.seen.keys:
+            raise _no_camera(found)
+        numbers = vectors(found.keys)
+        if found.format == "hdf5":
+            numbers = self._of_one_length(numbers)
+        self.action, self.states = self._bag_choice(numbers) if self.bag else self._step_choice(numbers)
+        if not self.action.keys:
+            raise _no_action(found, self.seen.keys)
+        self.hz = self.seen.keys[0].hz if self.bag else found.hz
+        if self.hz is not None and not 0 < self.hz <= HIGHEST_HZ:
+            self.hz = None
+
+    def _of_one_length(self, numbers: list[KeyInfo]) -> list[KeyInfo]:
+        """Rows that go with the pictures, one by one: HDF5 has also other arrays."""
+        lengths = [key.count for key in self.seen.keys]
+        length = max(set(lengths), key=lengths.count)
+        self.seen = Choice(tuple(key for key in self.seen.keys if key.count == length), self.seen.question)
+        return [key for key in numbers if key.count == length]
+
+    @staticmethod
+    def _step_choice(numbers: list[KeyInfo]) -> tuple[Choice, tuple[KeyInfo, ...]]:
+        action = actions(numbers)
+        action = action if action.keys else likely(numbers)
+        return action, states(numbers, action.keys)
+
+    def _bag_choice(self, numbers: list[KeyInfo]) -> tuple[Choice, tuple[KeyInfo, ...]]:
+        running = tuple(key for key in self.seen.keys if infer_topics.runs(key))
+        self.seen = Choice(running or self.seen.keys, self.seen.question)
+        action = infer_topics.actions(numbers)
+        return action, infer_topics.states(numbers, action.keys)
+
+    # -- the YAML
+
+    def values(self, embodiment_id: str) -> dict[str, Any]:
+        """Plain values in the order of the registry's YAMLs."""
+        found = self.found
+        name = found.facts.get("dataset") or found.uri.rstrip("/").rsplit("/", 1)[-1]
+        values: dict[str, Any] = {
+            "id": embodiment_id,
+            "description": f"{found.robot or 'robot'} as recorded in {name}",
+            "robot": found.robot or f"{TODO}: which robot is it?",
+            "kind": "simulation" if found.facts.get("simulator") else f"{TODO}: real, simulation or human?",
+            "frequency_hz": self._rate() or f"{TODO}: at how many Hz were actions recorded?",
+            "target_hz": 2,
+            "action": {
+                "space": space_of(self.action.keys, found.facts)
+                or f"{TODO}: one of {_listed(get_args(Space))}?",
+                "components": [self._component(key) for key in self.action.keys],
+            },
+        }
+        if self.states:
+            values["state"] = {"components": [_named(key, key.names) for key in self.states]}
+        values["cameras"] = self._cameras()
+        if self.bag:
+            values["sync"] = self._sync(values["cameras"][0]["name"])
+        elif self.action.measured:
+            values["sync"] = {"action_shift": 1}
+        values["source"] = self._source()
+        values["provenance"] = self._provenance()
+        unused = self._unused()
+        return values | ({"notes": f"recorded and not used: {unused}"} if unused else {})
+
+    def _rate(self) -> float | int | None:
+        """29.97 stays; 9.97 of stamps that jitter so much that it may be 10 becomes 10."""
+        if self.hz is None:
+            return None
+        camera = self.seen.keys[0]
+        doubt = 0.0  # of the median interval of jittering stamps, relative
+        if self.bag and camera.jitter_ms and camera.count:
+            doubt = 2.5 * camera.jitter_ms * self.hz / 1e3 / math.sqrt(camera.count)
+        whole = round(self.hz)
+        tolerance = MEASURED_TO + (min(doubt, 0.02) if doubt == doubt else 0.0)
+        return whole if whole and abs(self.hz / whole - 1) < tolerance else round(self.hz, 3) or None
+
+    def _component(self, key: KeyInfo) -> dict[str, Any]:
+        component = _named(key, key.names or names_of(key, self.found.facts))
+        switch = key.dtype == "bool" or (is_gripper(key.key) and not self.bag)  # bags: in metres, or 0 to 255
+        return component | ({"normalize": False} if component["dims"] == 1 and switch else {})
+
+    def _cameras(self) -> list[dict[str, Any]]:
+        doubtful = "layout" in self.found.facts and "simulator" not in self.found.facts
+        listed = []
+        for name, key in zip(camera_names(self.seen.keys), self.seen.keys, strict=True):
+            camera: dict[str, Any] = {
+                "name": name,
+                "key": key.key,
+                "size": [int(side) for side in key.shape[:2]],
+            }
+            if doubtful:
+                camera["color"] = f"{TODO}: rgb or bgr? arrays that went through OpenCV are often bgr"
+            listed.append(camera)
+        return listed
+
+    def _sync(self, primary: str) -> dict[str, Any]:
+        sync = {"primary": primary, "images": "nearest", "actions": "hold", "states": "interpolate"}
+        skew = infer_topics.max_skew_ms(list(self.seen.keys[1:]), self.action.keys, self.states)
+        late = infer_topics.needs_receive_times(self._used())
+        return sync | ({"max_skew_ms": skew} if skew else {}) | ({"stamp": "receive"} if late else {})
+
+    def _used(self) -> list[KeyInfo]:
+        return [*self.seen.keys, *self.action.keys, *self.states]
+
+    def _source(self) -> dict[str, Any]:
+        found = self.found
+        source: dict[str, Any] = {
+            "format": found.format,
+            "uri": found.uri,
+            "episodes": max(found.episodes, 1),
+        }
+        said = self._instruction()
+        times = found.facts.get("timestamps")
+        source |= {"instruction": said} if said else {}
+        return source | ({"layout": {"timestamps": times}} if times else {})
+
+    def _instruction(self) -> str | None:
+        facts = self.found.facts
+        if self.found.format == "lerobot":
+            return "task" if facts.get("tasks", "0") != "0" else None
+        outside = [
+            key
+            for key in facts.get("episode keys", "").split(", ")
+            if re.search(r"(^|/)(natural_)?language_instruction$", key)
+        ]
+        return instruction(self.found.keys) or facts.get("instruction") or next(iter(outside), None)
+
+    def _provenance(self) -> dict[str, str]:
+        said = {"frequency_hz": self._rate_from() if self.hz else f"{TODO}: who says so?"}
+        if self.action.question:
+            said["action"] = f"{TODO}: {self.action.question}"
+        if self.seen.question:
+            said["cameras"] = f"{TODO}: {self.seen.question}"
+        if self.bag:
+            said |= self._clocks()
+        return said
+
+    def _clocks(self) -> dict[str, str]:
+        """Where a bag's max_skew_ms and stamp are from."""
+        topics = infer_topics.about(self._used())
+        gaps = shown(f"{topic.name} {topic.gap_ms:.0f} ms" for topic in topics if topic.gap_ms)
+        late = infer_topics.needs_receive_times(self._used())
+        skew = f"{infer_topics.MARGIN:g} times the longest interval held; intervals, measured: {gaps}"
+        return ({"max_skew_ms": skew} if gaps else {}) | ({"stamp": late} if late else {})
+
+    def _rate_from(self) -> str:
+        found = self.found
+        if found.format == "lerobot":
+            return "fps of the recording's meta/info.json"
+        if not self.bag:
+            return found.facts.get("rate") or "the recording"
+        camera = self.seen.keys[0]
+        moved = [key for key in (*self.action.keys, *self.states) if key.hz]
+        rates = dict.fromkeys(f"{key.topic.name if key.topic else key.key} {_hz(key)}" for key in moved)
+        beside = f"; beside it {shown(rates)}" if rates else ""
+        return f"measured: {camera.key} {_hz(camera)}{beside}"
+
+    def _unused(self) -> str:
+        used = {key.key for key in self._used()} | {self._instruction()}
+        left = [
+            key
+            for key in self.found.keys
+            if key.key not in used and key.kind != "text" and not key.key.endswith(".layout.data_offset")
+        ]
+        return shown([key.key for key in left if key.key], 20)
+
+
+def _hz(key: KeyInfo) -> str:
+    jitter = f" with a jitter of {key.jitter_ms:.1f} ms" if key.jitter_ms is not None else ""
+    return f"{key.hz:.4g} Hz{jitter}"
+
+
+def _named(key: KeyInfo, names: tuple[str, ...] | None) -> dict[str, Any]:
+    """A component; names where there is one for each value."""
+    count = dims(key)
+    told = names if names and len(names) == count and len(set(names)) == count else None
+    return {"key": key.key, "dims": count} | ({"names": list(told)} if told else {})
+
+
+def _listed(allowed: tuple[str, ...]) -> str:
+    return f"{', '.join(allowed[:-1])} or {allowed[-1]}"
+
+
+def _no_camera(found: Inspection) -> SourceError:
+    pictures = [f"{key.key} {key.shape}" for key in found.keys if key.kind == "camera"]
+    others = [key.key for key in found.keys if key.kind != "camera"]
+    there = f"; its pictures, {shown(pictures)}, look like depth, masks or features" if pictures else ""
+    return SourceError(
+        shown([found.uri]),
+        f"has no colour camera{there}; it has {shown(others) or 'no other keys'}",
+        "record a camera with it, or render one; hma inspect lists every key",
+    )
+
+
+def _no_action(found: Inspection, pictures: tuple[KeyInfo, ...]) -> SourceError:
+    length = pictures[0].count if pictures else None
+    numbers = [
+        f"{key.key} ({key.count} rows)" if found.format == "hdf5" and key.count != length else key.key
+        for key in found.keys
+        if key.kind == "vector"
+    ]
+    camera = shown((key.key for key in pictures), 4) + (
+        f" of {length} rows" if found.format == "hdf5" else ""
+    )
+    return SourceError(
+        shown([found.uri]),
+        f"has the camera {camera} but nothing that could be an action; numbers: {shown(numbers) or 'none'}",
+        "record the robot's commands or joint states with it; hma inspect lists every key",
+    )

@@ -1,0 +1,170 @@
+"""Which topics of a bag command the robot, which measure it, and how far apart their messages are."""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+
+from hma_data.inspection.infer_choices import (
+    JOINT,
+    MEASURED,
+    MOTION,
+    PLACE,
+    SIDES,
+    STATES,
+    Choice,
+    is_gripper,
+    likely,
+    question,
+    shown,
+    strength,
+    words,
+)
+from hma_data.sources.base import KeyInfo, TopicInfo
+
+_COMMAND_TYPE = re.compile(r"(Twist|JointTrajectory|Command|Cmd|Ackermann|Joy)[A-Za-z]*$")
+_NEVER = re.compile(r"(^|/)(rosout|parameter_events|clock|diagnostics|_action)(/|$)|_service_event$")
+SLOWEST_HZ = 1.0  # a topic that ticks slower is no stream of commands or states
+CLOCKS_APART_MS = 1000.0  # header stamps that differ so much between topics are not of one clock
+WEAK = 1  # how clearly a topic called goal, control or joy commands
+MARGIN = 1.5  # over the longest interval measured
+
+Topic = tuple[KeyInfo, ...]
+
+
+def topics(found: Iterable[KeyInfo]) -> list[Topic]:
+    """The vectors of each topic that ticks."""
+    groups: dict[str, list[KeyInfo]] = defaultdict(list)
+    for key in found:
+        if key.topic and not _NEVER.search(key.topic.name) and (key.hz is None or runs(key)):
+            groups[key.topic.name].append(key)
+    return [tuple(group) for group in groups.values()]
+
+
+def runs(key: KeyInfo) -> bool:
+    """Whether its topic is a stream, not a message now and then."""
+    return key.hz is not None and key.hz >= SLOWEST_HZ
+
+
+def actions(found: list[KeyInfo]) -> Choice:
+    """The topics that command the robot; what it measures, with a question, where none does."""
+    ranked = [(_rank(topic), topic) for topic in topics(found)]
+    commanding = sorted((pair for pair in ranked if pair[0][0] > 0), key=lambda pair: pair[0], reverse=True)
+    if not commanding:
+        return _measured(found)
+    best = commanding[0][1]
+    chosen = [topic for _, topic in commanding if _other_side(topic, best)] + [
+        topic for _, topic in commanding if is_gripper(_name(topic)) and not is_gripper(_name(best))
+    ]
+    distinct = list(dict.fromkeys([best, *chosen]))
+    ordered = sorted(distinct, key=lambda topic: (is_gripper(_name(topic)), _name(topic)))
+    keys = tuple(key for topic in ordered for key in commanded_fields(topic))
+    others = [topic[0] for _, topic in commanding if topic not in distinct]
+    (clear, ticks, *_), _ = commanding[0]
+    if clear <= WEAK or not ticks:
+        others += [key for key in found if key not in keys and key not in others]
+        return Choice(keys, question(keys, others))
+    return Choice(keys, question(keys, others) if others else "")
+
+
+def _measured(found: list[KeyInfo]) -> Choice:
+    """The robot's own state as its action, one topic or the same of both arms."""
+    own = states(found, ())
+    joints = [key for key in own if JOINT & set(words(key.key))] or list(own)
+    if not joints:
+        return likely(found)
+    named = {_name((key,)): key for key in joints}
+    first = joints[0]
+    chosen = tuple(key for key in named.values() if key == first or _other_side((key,), (first,)))
+    others = shown(key.key for key in found if key not in chosen)
+    asked = f"no topic commands the robot; may {shown(key.key for key in chosen)}, as measured, stand for it"
+    return Choice(chosen, asked + (f", or which of {others} is it?" if others else "?"))
+
+
+def _name(topic: Topic) -> str:
+    return topic[0].topic.name if topic[0].topic else topic[0].key
+
+
+def _path(key: KeyInfo) -> str:
+    """What follows the topic in a key."""
+    return key.key[len(key.topic.name) :] if key.topic else key.key
+
+
+def _rank(topic: Topic) -> tuple[int, bool, float, int]:
+    """(how clearly it commands, whether it ticks, rate, messages); the first is 0 where it does not."""
+    said, first = set(words(_name(topic))), topic[0]
+    inside = {word for key in topic for word in words(_path(key))}
+    clear = strength(said)
+    if clear < 3 and said & MEASURED:
+        clear = 0
+    if "desired" in inside:
+        clear = max(clear, 4)
+    elif _COMMAND_TYPE.search(first.topic.type if first.topic else "") and not said & MEASURED:
+        clear = max(clear, 2)
+    return clear, first.hz is not None, first.hz or 0.0, first.count or 0
+
+
+def _other_side(topic: Topic, best: Topic) -> bool:
+    """Whether it is the same topic of the other arm."""
+    names = [re.findall(r"[a-z]+|\d+", _name(item).lower()) for item in (topic, best)]
+    sides = [SIDES & set(name) for name in names]
+    rests = [[word for word in name if word not in SIDES] for name in names]
+    return topic != best and rests[0] == rests[1] and bool(sides[0] and sides[1]) and sides[0] != sides[1]
+
+
+def commanded_fields(topic: Topic) -> list[KeyInfo]:
+    """The fields of a topic that are the command: positions where there are any, what is desired."""
+    desired = [key for key in topic if {"desired", "reference"} & set(words(_path(key)))]
+    return _positions(desired or list(topic))
+
+
+def _positions(fields: list[KeyInfo]) -> list[KeyInfo]:
+    """Without velocities where the same message has positions."""
+    where = [key for key in fields if PLACE & set(words(_path(key)))]
+    return [key for key in fields if not MOTION & set(words(_path(key)))] if where else fields
+
+
+def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
+    """What topics measure of the robot: joints and poses, not what moves them."""
+    used = {_name((key,)) for key in taken}
+    own = [topic for topic in topics(found) if _name(topic) not in used and not _rank(topic)[0]]
+    keys: list[KeyInfo] = []
+    for topic in own:
+        fields = [key for key in topic if not {"desired", "reference", "error"} & set(words(_path(key)))]
+        fields = [key for key in _positions(fields) if not MOTION & set(words(key.key))]
+        keys += [key for key in fields if STATES & set(words(key.key))]
+    return tuple(key for key in keys if key.hz is not None)
+
+
+# -- clocks
+
+
+def about(keys: Iterable[KeyInfo]) -> list[TopicInfo]:
+    """The topics of those keys, once each."""
+    return list(dict.fromkeys(key.topic for key in keys if key.topic))
+
+
+def needs_receive_times(keys: Iterable[KeyInfo]) -> str:
+    """Why header stamps cannot be the clock of all these topics; empty where they can."""
+    used = about(keys)
+    back = [topic.name for topic in used if topic.goes_back]
+    if back:
+        return f"header stamps of {shown(back)} go back in time"
+    delays = [topic.delay_ms or 0.0 for topic in used]
+    if delays and max(delays) - min(delays) > CLOCKS_APART_MS:
+        return f"header stamps are up to {(max(delays) - min(delays)) / 1e3:.3g} s apart between topics"
+    return ""
+
+
+def max_skew_ms(cameras: list[KeyInfo], actions: Iterable[KeyInfo], states: Iterable[KeyInfo]) -> int | None:
+    """How far values may be moved: the longest intervals measured, with a margin; None without any.
+
+    A held command is as old as an interval, what is nearest or interpolated half as far.
+    """
+    held = [topic.gap_ms for topic in about(actions)]
+    near = [topic.gap_ms for topic in about([*cameras, *states])]
+    gaps = [gap for gap in held if gap and gap > 0] + [gap / 2 for gap in near if gap and gap > 0]
+    if not gaps or not max(gaps) < 1e9:
+        return None
+    wanted = max(gaps) * MARGIN - 0.01  # 40 ms by differences of large stamps is 40.0001
+    step = 5 if wanted < 100 else 50 if wanted < 1000 else 500
+    return max(int(-(-wanted // step) * step), step)

@@ -1,0 +1,258 @@
+"""How often each embodiment is drawn: the paper's inverse-exponential mixture.
+
+p_i = n_i^(1/τ) / Σ_j n_j^(1/τ), n the number of training windows (paper section 3.2; the
+released code draws with τ = 3 in training, 4 in validation). τ = 1 is proportional, τ → ∞
+uniform. Draws are a pure function of (seed, step), so every rank and worker knows them all.
+
+E embodiments, B samples a batch.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import UsageError
+from hma_data.storage.files import atomic_path
+from hma_data.storage.paths import StrPath, as_path
+
+Floats = NDArray[np.float64]
+Draw = Literal["per_sample", "per_batch"]
+BLUE, ORANGE, GREY = "#0072b2", "#e69f00", "#666666"  # told apart without colour vision
+LONGEST_NAME = 34
+TEMPERATURES = {"train": 3.0, "val": 4.0}  # τ of the paper's code, by split
+
+
+def probabilities(
+    counts: Sequence[int] | NDArray[np.int64],
+    temperature: float = 3.0,
+    *,
+    weights: Sequence[float] | None = None,
+    groups: Sequence[str] | None = None,
+    caps: Sequence[float] | None = None,
+    group_weights: Mapping[str, float] | None = None,
+) -> Floats:
+    """The probability (E,) of each embodiment; they sum to one.
+
+    Args:
+        counts: training windows of each.
+        temperature: τ above; math.inf is uniform.
+        weights: multiply the probabilities before they are normalized; within a group, where there are.
+        groups: names; each group gets an equal share, shared inside it by the rule above.
+        caps: no probability exceeds its cap; what is cut goes to the others in proportion.
+        group_weights: multiply the shares of groups.
+
+    Raises:
+        UsageError: a value out of range, no windows at all, or caps that leave less than one.
+    """
+    n = np.asarray(counts, np.float64)
+    if not len(n) or n.max() <= 0 or n.min() < 0:
+        raise UsageError("mixture", f"needs windows to draw from, has {[int(c) for c in n]}")
+    if not temperature > 0:
+        raise UsageError("mixture temperature", f"must be above 0, is {temperature}")
+    share = np.zeros_like(n)
+    present = n > 0
+    share[present] = np.exp((np.log(n[present]) - np.log(n.max())) / temperature)  # no overflow at any count
+    if weights is not None:
+        share *= _factors("weights", weights, len(n))
+    if groups is not None:
+        factors = _factors("weights", list((group_weights or {}).values()), len(group_weights or {}))
+        factor = dict(zip(group_weights or {}, factors))
+        for name in dict.fromkeys(groups):
+            members = np.array([group == name for group in groups])
+            if share[members].sum() > 0:
+                share[members] *= factor.get(name, 1.0) / share[members].sum()
+    if share.sum() <= 0:
+        raise UsageError("mixture weights", "leave nothing to draw")
+    share /= share.sum()
+    return share if caps is None else _capped(share, _factors("caps", caps, len(n)))
+
+
+def epoch_caps(counts: Sequence[int], max_epochs: float, samples: int) -> Floats:
+    """The largest probabilities (E,) at which `samples` draws pass over no set more than `max_epochs` times.
+
+    Raises:
+        UsageError: so many samples cannot be drawn.
+    """
+    if not max_epochs > 0 or samples < 1:
+        raise UsageError(
+            "mixture max_epochs", f"must be above 0 and of at least 1 sample, is {max_epochs} of {samples}"
+        )
+    most = max_epochs * sum(counts)
+    if samples > most:
+        raise UsageError(
+            "mixture max_epochs",
+            f"{max_epochs:g} passes over {sum(counts):,} windows are fewer than {samples:,} planned samples",
+            f"allow {samples / max(1, sum(counts)):.3g} passes, or plan {int(most):,} samples",
+        )
+    return np.minimum(1.0, max_epochs * np.asarray(counts, np.float64) / samples)
+
+
+def _factors(name: str, values: Sequence[float], count: int) -> Floats:
+    factors = np.asarray(values, np.float64)
+    if len(factors) != count or not np.isfinite(factors).all() or (factors < 0).any():
+        raise UsageError(f"mixture {name}", f"must be {count} numbers of at least 0, are {list(values)}")
+    return factors
+
+
+def _capped(share: Floats, limit: Floats) -> Floats:
+    if limit[share > 0].sum() < 1 - 1e-12:
+        raise UsageError("mixture caps", f"sum to {limit[share > 0].sum():g}, so not everything can be drawn")
+    fixed = np.zeros(len(share), bool)
+    while True:
+        over = ~fixed & (share > limit + 1e-15)
+        if not over.any():
+            return share
+        fixed |= over
+        share = np.where(fixed, limit, share)
+        free = ~fixed
+        if share[free].sum() > 0:
+            share[free] *= (1 - limit[fixed].sum()) / share[free].sum()
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Named embodiments with their probabilities, and the draw.
+
+    Attributes:
+        names: of the E embodiments.
+        counts: (E,) training windows.
+        p: (E,) probabilities.
+        draw: per sample (the paper's text) or per batch (its code).
+        seed: of the draw.
+    """
+
+    names: tuple[str, ...]
+    counts: tuple[int, ...]
+    p: Floats
+    draw: Draw = "per_sample"
+    seed: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        counts: Mapping[str, int],
+        temperature: float = 3.0,
+        *,
+        weights: Mapping[str, float] | None = None,
+        groups: Mapping[str, str] | None = None,
+        caps: Mapping[str, float] | None = None,
+        max_epochs: float | None = None,
+        samples: int | None = None,
+        draw: Draw = "per_sample",
+        seed: int = 0,
+    ) -> "Mixture":
+        """The mixture over named counts; see `probabilities`.
+
+        Args:
+            counts: embodiment -> training windows.
+            weights: embodiment or group -> factor on its probability; 1 where not named.
+            groups: embodiment -> group; one that is not named is a group of its own.
+            caps: embodiment -> its largest probability.
+            max_epochs: passes over any one embodiment at most, while `samples` are drawn in all.
+
+        Raises:
+            UsageError: a name that is not there, or values that cannot be met.
+        """
+        group = {name: (groups or {}).get(name, name) for name in counts}
+        _known("groups", groups, counts)
+        _known("weights", weights, [*counts, *(group.values() if groups else [])])
+        _known("caps", caps, counts)
+        if seed < 0:
+            raise UsageError("mixture seed", f"must be at least 0, is {seed}")
+        shared = {name for name in group.values() if name not in counts}
+        size = list(counts.values())
+        limits: Floats | None = None
+        if caps or max_epochs is not None:
+            limits = np.array([(caps or {}).get(name, 1.0) for name in counts])
+        if limits is not None and max_epochs is not None:
+            limits = np.minimum(limits, epoch_caps(size, max_epochs, samples or 0))
+        p = probabilities(
+            size,
+            temperature,
+            weights=[(weights or {}).get(name, 1.0) for name in counts],
+            groups=list(group.values()) if groups else None,
+            caps=None if limits is None else limits.tolist(),
+            group_weights={name: w for name, w in (weights or {}).items() if name in shared},
+        )
+        return cls(tuple(counts), tuple(size), p, draw, seed)
+
+    def batch(self, step: int, size: int) -> NDArray[np.int64]:
+        """(B,) which embodiment each sample of batch `step` comes from; the same wherever it is asked."""
+        rng = np.random.Generator(np.random.Philox(key=[self.seed, step]))
+        edges = np.cumsum(self.p)
+        edges[-1] = 1.0
+        draws = np.searchsorted(edges, rng.random(1 if self.draw == "per_batch" else size), side="right")
+        return np.broadcast_to(draws, (size,)).astype(np.int64)
+
+    def table(self, drawn: Sequence[int] | NDArray[np.int64]) -> list[dict[str, float | str | int]]:
+        """What was drawn beside what was intended.
+
+        Args:
+            drawn: (E,) samples of each embodiment.
+
+        Returns:
+            One row an embodiment: intended and realised share, samples, passes over its windows.
+        """
+        total = max(1, int(np.sum(drawn)))
+        return [
+            {
+                "embodiment": name,
+                "windows": count,
+                "intended": float(p),
+                "realised": int(samples) / total,
+                "samples": int(samples),
+                "passes": int(samples) / max(1, count),
+            }
+            for name, count, p, samples in zip(self.names, self.counts, self.p, drawn, strict=True)
+        ]
+
+
+def _known(what: str, named: Mapping[str, object] | None, known: Iterable[str]) -> None:
+    unknown = set(named or {}) - set(known)
+    if unknown:
+        raise UsageError(f"mixture {what}", f"name {', '.join(sorted(unknown))}, which is not in the mixture")
+
+
+def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:
+    """Bars of the probabilities beside what proportional sampling would give; the largest set on top.
+
+    Args:
+        path: str or path of the file to write; its suffix decides the format: .png, .svg, .pdf.
+    """
+    from matplotlib.figure import Figure
+
+    path = as_path(path)
+    order = np.argsort(-np.array(mixture.counts), kind="stable")
+    counts, p = np.array(mixture.counts)[order], mixture.p[order]
+    proportional = counts / max(1, counts.sum())
+    place, few = np.arange(len(order)), len(order) <= 12
+    figure = Figure(figsize=(8, 1.2 + (0.42 if few else 0.27) * len(order)), layout="constrained")
+    axes = figure.subplots()
+    axes.barh(place - 0.2, p, 0.4, color=BLUE, label=f"drawn, τ = {temperature:g}")
+    style: dict[str, Any] = {"color": ORANGE, "hatch": "////", "edgecolor": "white", "linewidth": 0}
+    axes.barh(place + 0.2, proportional, 0.4, label="share of windows", **style)
+    largest = np.maximum(p, proportional)
+    for i, count in enumerate(counts):
+        text = f"{p[i]:.3f}; {count:,} windows"
+        place_of = (float(largest[i]), i)
+        axes.annotate(text, place_of, (4, 0), textcoords="offset points", va="center", fontsize=7, color=GREY)
+    axes.set_yticks(place, [_short(mixture.names[i]) for i in order], fontsize=9 if few else 7)
+    axes.set_ylim(len(order) - 0.4, -0.6)
+    axes.set_xlim(0, 1.45 * largest.max())
+    axes.set_xticks([tick for tick in axes.get_xticks() if tick <= min(1.0, 1.45 * largest.max())])
+    axes.set_xlabel("probability of a sample")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
+    with atomic_path(path) as part:
+        figure.savefig(part, format=path.suffix.lstrip(".").lower() or "png", dpi=150)
+
+
+def _short(name: str) -> str:
+    """The name, its middle left out where it is long: both ends tell robots apart."""
+    if len(name) <= LONGEST_NAME:
+        return name
+    half = LONGEST_NAME // 2
+    return f"{name[:half]}…{name[1 - half :]}"

@@ -1,0 +1,171 @@
+"""An endless, shuffled sequence of a shard set's windows for each of several readers.
+
+Row groups, or parts of them where there are few, are dealt out among the readers so that each has about
+as many windows. A reader decodes a pool of row groups at a time and puts the windows of a pool in an order
+in which windows that share a row come far apart (`spread`). Everything is a pure function of (seed, set,
+reader, place in the sequence), so going on from a place costs one pool, whatever came before.
+"""
+
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.loading.rows import Decoder, Rows
+from hma_data.shards.windows import Ints, WindowIndex
+
+UNITS = 8  # at least so many for a reader: the fewer, the less equal its share
+LARGEST_POOL = 8  # row groups
+
+
+def pool_size(decoder: Decoder, budget: float) -> int:
+    """Row groups decoded together where `budget` bytes are to hold them: 1 to LARGEST_POOL."""
+    return int(np.clip(budget // max(1, decoder.group_bytes), 1, LARGEST_POOL))
+
+
+def spread(rows: Ints, span: int, rng: np.random.Generator) -> tuple[Ints, int]:
+    """A random order of windows in which those that share a row are far apart.
+
+    The windows are laid in a table of `m` columns, m so large that all of a column are at least `span` rows
+    apart. Columns come one after another, each in random order; windows too near to the end of the column
+    before come late in theirs.
+
+    Args:
+        rows: (n,) first row of each window, ascending.
+        span: rows a window covers.
+
+    Returns:
+        the order (n,), and `apart`: any 1 + apart windows in a row share no row.
+    """
+    count = len(rows)
+    m = int((np.searchsorted(rows, rows + span) - np.arange(count)).max(initial=1))
+    lines = -(-count // m)
+    apart = max(0, (lines - 1) // 3)
+    columns: list[Ints] = []
+    for b in rng.permutation(m):
+        column = rng.permutation(np.arange(b, count, m))
+        if columns and apart:
+            near = np.zeros(lines + 2, np.bool_)  # by line, one more at either end
+            line = (columns[-1][-apart:] - b) // m + 1
+            near[line] = near[line + 1] = True
+            late = near[column // m + 1]
+            column = np.concatenate([column[~late], column[late]])
+        columns.append(column)
+    return np.concatenate(columns), apart
+
+
+@dataclass(frozen=True)
+class Deal:
+    """Who reads what: units are (row group, part), the part's windows every `parts`-th of the group.
+
+    Attributes:
+        units: (U, 2).
+        sizes: (U,) windows of each.
+        owner: (U,) the reader.
+        parts: of a row group.
+    """
+
+    units: Ints
+    sizes: Ints
+    owner: Ints
+    parts: int
+
+    @classmethod
+    def of(cls, index: WindowIndex, readers: int) -> "Deal":
+        """Every window to one reader; all of them to each where there are fewer windows than readers."""
+        groups = index.units()
+        if index.count < readers:
+            units = np.stack([groups, np.zeros_like(groups)], axis=1)
+            return cls(units, np.diff(index.unit_first)[groups], np.full(len(groups), -1), 1)
+        parts = -(-UNITS * readers // len(groups)) if readers > 1 and len(groups) < UNITS * readers else 1
+        units = np.stack([np.repeat(groups, parts), np.tile(np.arange(parts), len(groups))], axis=1)
+        windows = np.diff(index.unit_first)[units[:, 0]]
+        sizes = np.maximum(0, windows - units[:, 1] + parts - 1) // parts
+        units, sizes = units[sizes > 0], sizes[sizes > 0]
+        order = np.argsort(-sizes, kind="stable")  # the largest first, to and fro: sums come out even
+        turn, place = np.divmod(np.arange(len(units)), readers)
+        owner = np.empty(len(units), np.int64)
+        owner[order] = np.where(turn % 2, readers - 1 - place, place)
+        return cls(units, sizes, owner, parts)
+
+    def of_reader(self, reader: int) -> tuple[Ints, Ints]:
+        """Its units and their sizes."""
+        mine = (self.owner == reader) | (self.owner < 0)
+        return self.units[mine], self.sizes[mine]
+
+
+class Stream:
+    """The sequence of one reader.
+
+    Args:
+        decoder: of the shard set.
+        deal: who reads what.
+        seed: of the order.
+        reader: which of the deal's.
+        pool: row groups decoded together.
+    """
+
+    def __init__(self, decoder: Decoder, deal: Deal, seed: int, reader: int, pool: int) -> None:
+        self._decoder, self._pool, self._parts = decoder, pool, deal.parts
+        self._entropy = [seed, zlib.crc32(decoder.shards.embodiment.id.encode()), reader]
+        self._units, self._sizes = deal.of_reader(reader)
+        self.length = int(self._sizes.sum())
+        self._epoch: tuple[int, Ints, Ints] | None = None
+        self._at: tuple[int, int] | None = None
+        self._rows: Rows | None = None
+
+    def take(self, start: int, count: int) -> dict[str, NDArray[Any]]:
+        """Windows start to start + count of the sequence; see `Rows.cut`, and camera (n,)."""
+        parts = []
+        while count:
+            epoch, offset = divmod(start, self.length)
+            order, ends = self._rounds(epoch)
+            number = int(np.searchsorted(ends, offset, side="right"))
+            rows = self._load(epoch, number, order)
+            inside = offset - (int(ends[number - 1]) if number else 0)
+            some = min(count, int(ends[number]) - offset)
+            chosen = slice(inside, inside + some)
+            last = None if self._last is None else self._last[chosen]
+            cut = rows.cut(self._first[chosen], last, self._decoder.index)
+            parts.append(cut | {"camera": self._camera[chosen]})
+            start, count = start + some, count - some
+        if len(parts) == 1:
+            return parts[0]
+        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+    def _rounds(self, epoch: int) -> tuple[Ints, Ints]:
+        """Order of the units in an epoch, and the number of windows up to the end of each pool."""
+        if self._epoch is None or self._epoch[0] != epoch:
+            order = np.random.default_rng([*self._entropy, epoch]).permutation(len(self._units))
+            firsts = np.arange(0, len(order), self._pool)
+            self._epoch = (epoch, order, np.cumsum(np.add.reduceat(self._sizes[order], firsts)))
+        return self._epoch[1:]
+
+    def _load(self, epoch: int, number: int, order: Ints) -> Rows:
+        if self._rows is not None and self._at == (epoch, number):
+            return self._rows
+        self._rows = None  # the last pool goes before the next comes
+        index = self._decoder.index
+        units = self._units[order[number * self._pool : (number + 1) * self._pool]]
+        loaded, firsts, lasts, cameras, offset = [], [], [], [], 0
+        for group in np.unique(units[:, 0]).tolist():
+            rows = self._decoder.rows(group)
+            chosen = np.zeros(self._parts, np.bool_)
+            chosen[units[units[:, 0] == group, 1]] = True
+            windows = np.arange(index.unit_first[group], index.unit_first[group + 1])
+            windows = windows[chosen[(windows - windows[0]) % self._parts]]
+            shift = offset - index.edges[group]
+            firsts.append(index.first_rows(windows) + shift)
+            lasts.append(index.last_rows(windows) + shift)
+            cameras.append(index.cameras(windows))
+            loaded.append(rows)
+            offset += len(rows)
+        first = np.concatenate(firsts)
+        mixed, _ = spread(first, index.span, np.random.default_rng([*self._entropy, epoch, number]))
+        self._first = first[mixed]
+        self._last = np.concatenate(lasts)[mixed] if index.padded_episodes else None
+        self._camera = np.concatenate(cameras)[mixed]
+        self._at, self._rows = (epoch, number), Rows.join(loaded)
+        return self._rows

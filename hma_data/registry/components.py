@@ -1,0 +1,222 @@
+"""The parts of a registry YAML: components of a vector, cameras, clocks, where the data is.
+
+Frozen and validated when made; `hma_data.registry.embodiment` puts them together.
+"""
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
+
+Space = Literal[
+    "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",
+    "hand_2d", "hand_3d", "mixed",
+]  # fmt: skip
+Representation = Literal[
+    "euler_xyz", "quaternion_xyzw", "quaternion_wxyz", "axis_angle", "rotation_6d", "rotation_matrix"
+]
+Gripper = Literal["open_is_high", "open_is_low", "opening_is_high", "closing_is_high"]
+Method = Literal["nearest", "hold", "interpolate"]
+Format = Literal["rlds", "hdf5", "rosbag", "lerobot", "hands"]
+
+
+def _no_bool(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+def _no_minus_zero(value: float) -> float:
+    return value + 0.0  # -0.0 equals 0.0 but prints and hashes apart
+
+
+Number = Annotated[
+    float, BeforeValidator(_no_bool), Field(allow_inf_nan=False), AfterValidator(_no_minus_zero)
+]
+Count = Annotated[int, BeforeValidator(_no_bool)]
+
+
+class SpecModel(BaseModel):
+    """What all of them share: unknown keys are errors, nothing changes afterwards."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, arbitrary_types_allowed=False)
+
+
+class Component(SpecModel):
+    """A piece of the action (or state) vector.
+
+    `sign` and `offset` change values (value * sign + offset); `range` and `representation`
+    state conventions and change nothing.
+    """
+
+    key: str = Field(min_length=1, description="where the values are: a path or a topic field, by format")
+    dims: Count = Field(ge=1, le=4096, description="how many values it gives")
+    slice: tuple[Count, Count] | None = Field(None, description="[from, to) of the vector found at key")
+    names: tuple[str, ...] | None = Field(
+        None, description="one a value; selects by name where messages have names"
+    )
+    unit: str | None = None
+    normalize: bool = True
+    sign: Number | tuple[Number, ...] = 1.0
+    offset: Number | tuple[Number, ...] = 0.0
+    range: tuple[Number, Number] | None = None
+    representation: Representation | None = None
+    gripper: Gripper | None = Field(
+        None,
+        description="which way it opens; opening_ and closing_is_high are of commands that move it a bit",
+    )
+    stamp: Literal["header", "receive"] | None = None
+
+    @model_validator(mode="after")
+    def _widths(self) -> Self:
+        if self.slice and not 0 <= self.slice[0] < self.slice[1]:
+            raise ValueError(f"slice {list(self.slice)} must be [from, to) with 0 <= from < to")
+        if self.slice and self.slice[1] - self.slice[0] != self.dims:
+            raise ValueError(
+                f"slice {list(self.slice)} has {self.slice[1] - self.slice[0]} values, dims says {self.dims}"
+            )
+        if self.names and len(self.names) != self.dims:
+            raise ValueError(f"{len(self.names)} names for {self.dims} dims")
+        for label in ("sign", "offset"):
+            value = getattr(self, label)
+            if isinstance(value, tuple) and len(value) != self.dims:
+                raise ValueError(f"{label} has {len(value)} values for {self.dims} dims")
+        if self.range and self.range[0] >= self.range[1]:
+            raise ValueError(f"range {list(self.range)} must rise")
+        return self
+
+
+class Vector(SpecModel):
+    """The components of an action or state, in the vector's order."""
+
+    components: tuple[Component, ...] = Field(min_length=1)
+
+    @property
+    def dims(self) -> int:
+        """Width of the whole vector."""
+        return sum(component.dims for component in self.components)
+
+    def names(self) -> list[str]:
+        """A name for each value; made from the key where the YAML gives none."""
+        return [
+            name
+            for part in self.components
+            for name in (part.names or [f"{part.key}.{i}" for i in range(part.dims)])
+        ]
+
+
+class Action(Vector):
+    """What the robot is told to do at each step."""
+
+    space: Space
+
+
+class Camera(SpecModel):
+    """A camera stream and how its pictures are brought to a square."""
+
+    name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.-]+$")
+    key: str = Field(min_length=1)
+    size: tuple[Count, Count] | None = Field(
+        None, description="[height, width] of the recorded picture in pixels; states a fact, changes nothing"
+    )
+    color: Literal["rgb", "bgr"] = "rgb"
+    resize: Literal["short_side_crop", "letterbox", "stretch"] = "short_side_crop"
+    rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
+    flip: Literal["vertical", "horizontal"] | None = Field(
+        None, description="vertical: rows are stored bottom to top; before rotate"
+    )
+    crop: tuple[Count, Count, Count, Count] | None = Field(
+        None, description="[x, y, width, height] in source pixels"
+    )
+    stamp: Literal["header", "receive"] | None = None
+
+    @field_validator("size")
+    @classmethod
+    def _size_positive(cls, size: tuple[int, int] | None) -> tuple[int, int] | None:
+        if size and min(size) < 1:
+            raise ValueError(f"size {list(size)} must be [height >= 1, width >= 1]")
+        return size
+
+    @field_validator("crop")
+    @classmethod
+    def _crop_positive(cls, crop: tuple[int, int, int, int] | None) -> tuple[int, int, int, int] | None:
+        if crop and (min(crop[:2]) < 0 or min(crop[2:]) < 1):
+            raise ValueError(f"crop {list(crop)} must be [x >= 0, y >= 0, width >= 1, height >= 1]")
+        return crop
+
+
+class Sync(SpecModel):
+    """How streams of different rates meet: on the primary camera's frames, or on a fixed grid."""
+
+    primary: str | None = Field(None, description="the camera whose frames are the grid; default the first")
+    rate_hz: Number | None = Field(
+        None, gt=0, le=100_000, description="a fixed grid instead of a camera's frames"
+    )
+    images: Method = "nearest"
+    actions: Method = "hold"
+    states: Method = "interpolate"
+    max_skew_ms: Number | None = Field(None, gt=0, description="furthest that a sample may be moved")
+    beyond: Literal["refuse", "mask"] = Field(
+        "refuse",
+        description="further than max_skew_ms: refuse the episode, or mask the numbers; pictures refuse",
+    )
+    action_shift: Count = Field(
+        0,
+        ge=-100,
+        le=100,
+        description="steps: the command of frame t is recorded at t + action_shift; not in bags",
+    )
+    stamp: Literal["header", "receive"] = "header"
+
+
+class Marker(SpecModel):
+    """Messages of a bag that begin or end an episode.
+
+    With `equals`, the moments at which the value becomes that one; without, every message.
+    """
+
+    key: str = Field(min_length=1, description="/topic, or /topic.field.path; of a service, its event topic")
+    equals: bool | Number | str | None = None
+
+    @model_validator(mode="after")
+    def _field_of_topic(self) -> Self:
+        if not self.key.startswith("/"):
+            raise ValueError(f"key {self.key!r} must begin with a topic, /topic or /topic.field.path")
+        if self.equals is not None and "." not in self.key:
+            raise ValueError(f"equals needs a field to compare, {self.key} names only a topic")
+        return self
+
+
+class Segments(SpecModel):
+    """Where one bag holds several episodes: what parts them. Several conditions may be given together."""
+
+    gap_s: Number | None = Field(
+        None, gt=0, description="a longer pause of the primary camera parts episodes"
+    )
+    start: Marker | None = Field(None, description="begins an episode, and ends one that runs")
+    stop: Marker | None = Field(None, description="ends an episode; without start, the next begins there")
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if self.gap_s is None and self.start is None and self.stop is None:
+            raise ValueError("says nothing: give gap_s, start or stop")
+        return self
+
+
+class SourceSpec(SpecModel):
+    """Where the recordings are and how they are laid out."""
+
+    format: Format
+    uri: str | None = None
+    split: str | None = Field(None, description="the source's own split to read")
+    episodes: Count | None = Field(None, ge=1, description="how many there are, as published")
+    instruction: str | None = Field(None, description="key of the language instruction")
+    layout: dict[str, str] | None = Field(None, description="by format: keys of a generic layout")
+    segments: Segments | None = Field(None, description="of bags: what parts a bag into episodes")

@@ -1,0 +1,394 @@
+"""An embodiment: one robot as one dataset recorded it, stated by one YAML of the registry.
+
+The YAML drives everything else: which keys a converter reads, the stride, the width of stem
+and head, what is published under which name. Nothing is guessed; what is unknown says so.
+
+A action dims, K = stride * A values of an action chunk.
+"""
+
+import hashlib
+import json
+import math
+import os
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from hma_data.errors import RegistryError
+from hma_data.registry.catalog import file_id, registry_files, registry_folders
+from hma_data.registry.components import (
+    Action,
+    Camera,
+    Component,
+    Count,
+    Marker,
+    Number,
+    Segments,
+    SourceSpec,
+    SpecModel,
+    Sync,
+    Vector,
+)
+from hma_data.storage.paths import StrPath, as_path, as_text
+from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
+TODO = "TODO"
+# What decides the content of shards. target_hz and stride act later, when windows are drawn.
+_DECIDES: Any = {
+    "id": True,
+    "kind": True,
+    "frequency_hz": True,
+    "action": True,
+    "state": True,
+    "cameras": {"__all__": {"name", "key", "color", "resize", "rotate", "flip", "crop", "stamp"}},
+    "sync": True,
+    "source": {"format", "instruction", "layout", "segments"},
+}
+
+
+class Embodiment(SpecModel):
+    """A robot as one dataset recorded it. Frozen; made from YAML by `load` or `find`."""
+
+    id: str
+    description: str = ""
+    robot: str | None = None
+    kind: Literal["real", "simulation", "human"]
+    frequency_hz: Number | Literal["unknown"] | None = Field(
+        description="control rate of the recording; null only with per-recording timestamps"
+    )
+    target_hz: Number = Field(2.0, ge=0.001, le=100_000)
+    stride_override: Count | None = Field(None, alias="stride", ge=1)
+    action: Action
+    state: Vector | None = None
+    cameras: tuple[Camera, ...] = Field(min_length=1)
+    sync: Sync = Sync()
+    source: SourceSpec
+    stats_key: str | None = None
+    license: str | None = None
+    provenance: dict[str, str] = Field(default_factory=dict)
+    notes: str | None = None
+
+    @field_validator("id")
+    @classmethod
+    def _id_is_a_name(cls, value: str) -> str:
+        if not ID_PATTERN.fullmatch(value) or ".." in value:
+            raise ValueError("an id is 1 to 100 of a-z 0-9 _ - . beginning with a letter or digit")
+        return value
+
+    @field_validator("frequency_hz")
+    @classmethod
+    def _rate_positive(cls, value: float | str | None) -> float | str | None:
+        if isinstance(value, float) and not 0 < value <= 100_000:
+            raise ValueError("must lie between 0 and 100000 Hz")
+        return value
+
+    @model_validator(mode="after")
+    def _names_agree(self) -> Self:
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) != len(names):
+            raise ValueError(f"cameras have one name twice: {', '.join(names)}")
+        if self.sync.primary and self.sync.primary not in names:
+            raise ValueError(
+                f"sync.primary {self.sync.primary!r} is not a camera; cameras: {', '.join(names)}"
+            )
+        if self.source.segments and self.source.format != "rosbag":
+            raise ValueError(f"source.segments is of bags, not of {self.source.format}")
+        if self.sync.beyond == "mask" and self.sync.max_skew_ms is None:
+            raise ValueError("sync.beyond: mask needs sync.max_skew_ms, beyond which is masked")
+        if self.sync.action_shift and self.source.format == "rosbag":
+            raise ValueError(
+                "sync.action_shift counts steps, and messages of a bag have times instead of steps"
+            )
+        return self
+
+    # -- derived facts
+
+    @property
+    def action_dim(self) -> int:
+        """A, the width of one action."""
+        return self.action.dims
+
+    @property
+    def rate_hz(self) -> float:
+        """Rate of the grid in Hz.
+
+        Raises:
+            RegistryError: nobody has stated it.
+        """
+        if self.sync.rate_hz:
+            return self.sync.rate_hz
+        if isinstance(self.frequency_hz, float):
+            return self.frequency_hz
+        said = self.provenance.get("frequency_hz")
+        raise RegistryError(
+            f"embodiment {self.id}: frequency_hz",
+            "is unknown: nobody states the rate of this recording" + (f" ({said})" if said else "")
+            if self.frequency_hz == "unknown"
+            else "is null and sync.rate_hz is not set, so there is no rate of the grid",
+            f"set frequency_hz in a copy of the YAML (hma registry show {self.id} > {self.id}.yaml), "
+            "or give hma convert --frequency-hz HZ",
+        )
+
+    def with_rate(self, hz: float) -> "Embodiment":
+        """The same with its unknown rate filled in, as a shard set made so will state it.
+
+        Raises:
+            RegistryError: the YAML states another rate, or `hz` is none.
+        """
+        where = f"embodiment {self.id}: frequency_hz"
+        if self.frequency_hz not in ("unknown", hz):
+            raise RegistryError(
+                where, f"is {self.frequency_hz}, not {hz:g}", "correct it in a copy of the YAML"
+            )
+        provenance = self.provenance | {"frequency_hz": "given at the conversion"}
+        return Embodiment.from_values(self.to_dict() | {"frequency_hz": hz, "provenance": provenance}, where)
+
+    @property
+    def stride(self) -> int:
+        """Recorded steps a frame of the model's grid: max(1, round half up of rate / target)."""
+        if self.stride_override:
+            return self.stride_override
+        return max(1, math.floor(self.rate_hz / self.target_hz + 0.5))
+
+    @property
+    def effective_hz(self) -> float:
+        """Rate of the model's frames."""
+        return self.rate_hz / self.stride
+
+    @property
+    def chunk_dim(self) -> int:
+        """K = stride * A, the width of an action chunk."""
+        return self.stride * self.action_dim
+
+    @property
+    def primary_camera(self) -> Camera:
+        """The camera whose frames are the grid."""
+        return self.camera(self.sync.primary or self.cameras[0].name)
+
+    def camera(self, name: str) -> Camera:
+        """The camera of that name.
+
+        Raises:
+            RegistryError: there is none.
+        """
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        known = ", ".join(camera.name for camera in self.cameras)
+        raise RegistryError(f"embodiment {self.id}", f"has no camera {name!r}", f"its cameras: {known}")
+
+    @property
+    def normalize_mask(self) -> "NDArray[np.bool_]":
+        """(A,) bool, True where the model normalizes the value."""
+        import numpy as np
+
+        return np.array([part.normalize for part in self.action.components for _ in range(part.dims)])
+
+    @cached_property
+    def digest(self) -> str:
+        """Sixteen hex digits over what decides the shards' content (not texts, nor the place of the data)."""
+        content = self.model_dump(mode="json", exclude_defaults=True, include=_DECIDES)
+        hashed = json.dumps(content, sort_keys=True)
+        return hashlib.sha256(hashed.encode()).hexdigest()[:16]
+
+    # -- YAML
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values in the YAML's form, without what was left at its default."""
+        return self.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+
+    def to_yaml(self) -> str:
+        """The YAML that gives this embodiment back."""
+        return write_yaml(self.to_dict())
+
+    @classmethod
+    def from_yaml(cls, text: str, where: str = "embodiment.yaml") -> "Embodiment":
+        """See `load`."""
+        return cls.from_values(parse_yaml(text, where), where)
+
+    @classmethod
+    def load(cls, path: StrPath) -> "Embodiment":
+        """The embodiment of a YAML file.
+
+        Args:
+            path: str or path of the YAML.
+
+        Raises:
+            RegistryError: all the file's problems, each with YAML path, value and what is allowed.
+        """
+        file = as_path(path)
+        return cls.from_values(read_yaml(file), str(file))
+
+    @classmethod
+    def from_values(cls, values: Any, where: str) -> "Embodiment":
+        """See `load`."""
+        found = problems(values)
+        if found:
+            raise RegistryError(where, "; ".join(found), "hma registry schema prints what is allowed")
+        return cls.model_validate(values)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong with a YAML: where in it, what, the value met, and what is allowed there."""
+
+    path: str
+    fault: str
+    value: str | None = None
+    allowed: str | None = None
+
+    def __str__(self) -> str:
+        text = f"{self.path}: {self.fault}" if self.path else self.fault
+        if self.value is not None:
+            text += f" (is {self.value})"
+        return text + (f"; allowed: {self.allowed}" if self.allowed else "")
+
+
+def problems(values: Any) -> list[str]:
+    """Everything wrong with the plain values of a YAML, one line each; empty when it is valid."""
+    return [str(problem) for problem in find_problems(values)]
+
+
+def find_problems(values: Any) -> list[Problem]:
+    """Everything wrong with the plain values of a YAML."""
+    if not isinstance(values, dict):
+        return [Problem("", f"must be a mapping, is {type(values).__name__}")]
+    questions = todos(values)
+    found = [Problem(path, f"still {TODO}: {text}") for path, text in questions]
+    try:
+        Embodiment.model_validate(values)
+    except ValidationError as fault:
+        asked = {path for path, _ in questions}
+        for item in fault.errors(include_url=False):
+            path = _yaml_path(item["loc"], values, missing=item["type"] == "missing")
+            if path not in asked and not _follows_from_another(item):
+                found.append(_problem(path, item))
+    return list(dict.fromkeys(found))
+
+
+def todos(values: Any, path: str = "") -> list[tuple[str, str]]:
+    """Every value that still begins with TODO: (YAML path, the question)."""
+    if isinstance(values, dict):
+        return [
+            item
+            for key, value in values.items()
+            for item in todos(value, f"{path}.{key}" if path else str(key))
+        ]
+    if isinstance(values, list):
+        return [item for i, value in enumerate(values) for item in todos(value, f"{path}[{i}]")]
+    if isinstance(values, str) and values.startswith(TODO):
+        return [(path, values[len(TODO) :].lstrip(": "))]
+    return []
+
+
+def _yaml_path(location: tuple[int | str, ...], values: Any, missing: bool) -> str:
+    """The place as the YAML has it; pydantic also names the branch of a union, which is no key."""
+    path, here = "", values
+    for i, part in enumerate(location):
+        if isinstance(here, dict) and (part in here or (missing and i == len(location) - 1)):
+            path += f".{part}" if path else str(part)
+            here = here.get(part)
+        elif isinstance(here, list | tuple) and isinstance(part, int):
+            path += f"[{part}]"
+            here = here[part] if part < len(here) else None
+    return path
+
+
+def _follows_from_another(item: Any) -> bool:
+    """A list whose items are all wrong is also too short, says pydantic."""
+    return item["type"] == "too_short" and bool(item["input"])
+
+
+def _problem(path: str, item: Any) -> Problem:
+    value = item.get("input")
+    kind, context = item["type"], item.get("ctx", {})
+    if kind == "missing":
+        return Problem(path, "is missing")
+    if kind == "extra_forbidden":
+        return _unknown_key(path)
+    shown = None if isinstance(value, dict) else repr(value)
+    if shown and len(shown) > 60:
+        shown = shown[:57] + "..."
+    if kind == "literal_error":
+        return Problem(path, "is not one of the words that are allowed", shown, context["expected"])
+    return Problem(path, item["msg"].removeprefix("Value error, "), shown)
+
+
+def _unknown_key(path: str) -> Problem:
+    from difflib import get_close_matches
+
+    place = re.sub(r"\[\d+\]", "", path).split(".")
+    known = _KEYS_AT.get(".".join(place[:-1]), Embodiment)
+    keys = [field.alias or name for name, field in known.model_fields.items()]
+    near = get_close_matches(place[-1], keys, n=1)
+    hint = f", did you mean {near[0]!r}?" if near else ""
+    return Problem(path, f"unknown key{hint}", allowed=", ".join(keys))
+
+
+_KEYS_AT: dict[str, type[SpecModel]] = {
+    "action": Action,
+    "action.components": Component,
+    "state": Vector,
+    "state.components": Component,
+    "cameras": Camera,
+    "sync": Sync,
+    "source": SourceSpec,
+    "source.segments": Segments,
+    "source.segments.start": Marker,
+    "source.segments.stop": Marker,
+}
+
+
+def schema() -> dict[str, Any]:
+    """JSON Schema of a registry YAML, for editors."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **Embodiment.model_json_schema(by_alias=True),
+    }
+
+
+# -- where embodiments are found
+
+
+def find(name_or_path: StrPath, beside: StrPath | None = None) -> Embodiment:
+    """The embodiment of that id, or of that YAML file.
+
+    Args:
+        name_or_path: id, or str or path of a YAML.
+        beside: str or path of a checkpoint whose embodiments are searched too.
+
+    Raises:
+        RegistryError: there is none, with the nearest ids; or its YAML is not valid.
+    """
+    name_or_path = as_text(name_or_path)
+    if name_or_path.endswith((".yaml", ".yml")) or os.sep in name_or_path:
+        return Embodiment.load(name_or_path)
+    folders = registry_folders(beside)
+    for folder in folders:
+        paths = [path for path in registry_files([folder]) if file_id(path) == name_or_path]
+        if len(paths) > 1:
+            raise RegistryError(paths[1], f"has the id of {paths[0]}", "remove or rename one")
+        if paths:
+            embodiment = Embodiment.load(paths[0])
+            if embodiment.id != name_or_path:
+                raise RegistryError(
+                    paths[0], f"has id {embodiment.id!r}", "file name and id must be the same"
+                )
+            return embodiment
+    from difflib import get_close_matches
+
+    near = get_close_matches(name_or_path, [file_id(path) for path in registry_files(folders)], n=3)
+    hint = f"did you mean {', '.join(near)}? " if near else ""
+    raise RegistryError(
+        f"embodiment {name_or_path!r}",
+        f"is not in {', '.join(map(str, folders)) or 'any registry folder'}",
+        f"{hint}give a YAML file's path, or set HMA_REGISTRY; hma registry list shows all",
+    )

@@ -1,0 +1,114 @@
+"""An embodiment in the words of other projects: GR00T's modality.json, LeRobotDataset's features.
+
+Of a LeRobot recording the export speaks of its own features and the places in them. Of any other it
+speaks of the LeRobotDataset that a conversion makes: one `action`, one `observation.state`, in the
+order of our components, and `observation.images.<camera>`.
+"""
+
+from typing import Any
+
+from hma_data.registry.components import Component, Vector
+from hma_data.registry.embodiment import Embodiment
+
+DELTA_SPACES = ("eef_delta", "joint_delta")
+PICTURE = (256, 256)  # of a camera whose recorded size is not stated: what a shard decodes to
+_ROTATIONS = {
+    "euler_xyz": "euler_angles_rpy",
+    "quaternion_xyzw": "quaternion",
+    "quaternion_wxyz": "quaternion",
+    "axis_angle": "axis_angle",
+    "rotation_6d": "rotation_6d",
+    "rotation_matrix": "matrix",
+}
+
+
+def modality(embodiment: Embodiment) -> dict[str, Any]:
+    """The content of GR00T's meta/modality.json.
+
+    Returns:
+        `state` and `action`: name -> start and end in the feature `original_key`, with rotation_type,
+        absolute, dtype and range; `video`: name -> original_key; `annotation`.
+    """
+    own = embodiment.source.format == "lerobot"
+    delta = embodiment.action.space in DELTA_SPACES
+    values: dict[str, Any] = {
+        "state": _places(embodiment.state, "observation.state", own, delta=False),
+        "action": _places(embodiment.action, "action", own, delta=delta),
+        "video": {
+            camera.name: {"original_key": camera.key if own else f"observation.images.{camera.name}"}
+            for camera in embodiment.cameras
+        },
+    }
+    if own or embodiment.source.instruction:
+        values["annotation"] = {"human.task_description": {"original_key": "task_index"}}
+    return values
+
+
+def _places(vector: Vector | None, feature: str, own: bool, delta: bool) -> dict[str, dict[str, Any]]:
+    if vector is None:
+        return {}
+    found: dict[str, dict[str, Any]] = {}
+    names = component_names(vector)
+    offset = 0
+    for name, part in zip(names, vector.components, strict=True):
+        start = (part.slice[0] if part.slice else 0) if own else offset
+        offset += part.dims
+        moves = delta if part.gripper is None else part.gripper in ("opening_is_high", "closing_is_high")
+        place: dict[str, Any] = {
+            "start": start,
+            "end": start + part.dims,
+            "original_key": part.key if own else feature,
+            "absolute": not moves,
+            "dtype": "float32",
+        }
+        if part.representation:
+            place["rotation_type"] = _ROTATIONS[part.representation]
+        if part.range:
+            place["range"] = list(part.range)
+        found[name] = place
+    return found
+
+
+def component_names(vector: Vector) -> list[str]:
+    """A short name for each component: what it moves where the YAML tells, else the end of its key."""
+    plain = [_component_name(part) for part in vector.components]
+    return [
+        name if plain.count(name) == 1 else f"{name}_{plain[: i + 1].count(name)}"
+        for i, name in enumerate(plain)
+    ]
+
+
+def _component_name(part: Component) -> str:
+    if part.gripper or part.names == ("gripper",):
+        return "gripper" if part.dims == 1 else "hand"
+    if part.representation:
+        return "rotation"
+    if part.unit == "m":
+        return "position"
+    if part.unit == "rad":
+        return "joints"
+    return "".join(c if c.isalnum() else "_" for c in part.key.replace(".", "/").rsplit("/", 1)[-1])
+
+
+def lerobot_features(embodiment: Embodiment) -> dict[str, dict[str, Any]]:
+    """The `features` of a LeRobotDataset (v2.1 and v3.0) that holds this embodiment's episodes.
+
+    Returns:
+        feature -> dtype, shape and names, as `LeRobotDataset.create(features=…)` takes it.
+    """
+    own = embodiment.source.format == "lerobot"
+    features = {"action": _vector_feature(embodiment.action)}
+    if embodiment.state:
+        features["observation.state"] = _vector_feature(embodiment.state)
+    for camera in embodiment.cameras:
+        key = camera.key if own else f"observation.images.{camera.name}"
+        features[key] = {
+            "dtype": "video",
+            "shape": (*(camera.size or PICTURE), 3),
+            "names": ["height", "width", "channels"],
+        }
+    return features
+
+
+def _vector_feature(vector: Vector) -> dict[str, Any]:
+    return {"dtype": "float32", "shape": (vector.dims,), "names": vector.names()}

@@ -1,0 +1,373 @@
+"""Inspect bags: topics with rates and jitter, keys as a YAML would name them.
+
+Every bag is counted by its index. A sample of them is read message by message, up to a limit over
+all: the first that can be read tells the keys, each adds its times and numbers.
+"""
+
+from array import array
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_data.episodes.episode import Floats
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.sources.bags.bag import Bag
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.fields import Field, parse_key, stated_dtype
+from hma_data.sources.bags.images import VIDEO, codec, is_grey, picture_kind
+from hma_data.sources.bags.messages import child, decode, field_names, is_list, is_message, numbers
+from hma_data.sources.bags.topic_track import TopicTrack, camera_stream
+from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
+from hma_data.sources.common import image_checks
+from hma_data.sources.common.findings import Finding
+from hma_data.sources.common.links import unfollowed
+from hma_data.sources.common.survey import Survey, sampled
+from hma_data.sources.common.timestamp_checks import Clock, clock_of, skew
+
+MAX_BYTES = 1 << 30  # of messages measured, over all bags
+MAX_MESSAGES = 300_000
+MAX_LENGTHS = 1000
+MAX_FIELDS = 64  # numeric keys of a topic whose values are looked at
+MAX_HELD = 1 << 16  # numbers of a key in memory
+MAX_WIDTH = 4096  # wider than this is a map or a cloud, no action or state
+LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # no streams
+APART_S = 1.0  # header stamps further than this from receive times are worth a word
+
+
+@dataclass
+class _Values:
+    """Gather the numbers at one key, message by message; leave out those of another width than the first."""
+
+    place: Field
+    width: int = 0
+    taken: int = 0  # rows handed on
+    held: array[float] = field(default_factory=lambda: array("d"))
+
+    def add(self, message: Any, where: str) -> None:
+        try:
+            found = numbers(self.place.value(message, where))
+        except (EpisodeError, TypeError):
+            return  # a list that is empty or shorter in this message
+        self.width = self.width or len(found)
+        if found and len(found) == self.width:
+            self.held.extend(found)
+
+    def hand_on(self, survey: Survey, episode: str) -> None:
+        """Hand what is held to the survey."""
+        if self.held:
+            read = np.array(self.held).reshape(-1, self.width)
+            survey.numbers(episode, self.place.key, read, self.taken)
+            self.taken, self.held = self.taken + len(read), array("d")
+
+
+@dataclass
+class _Topic:
+    """Hold a topic while it is measured; `sample` is its first message, or that which names most joints."""
+
+    track: TopicTrack
+    count: int = 0
+    sample: Any = None
+    named: int = 0
+    fault: str = ""
+    values: list[_Values] = field(default_factory=list)
+
+    def look_at(self, message: Any, where: str) -> None:
+        """Take a message's values; two publishers of one JointState topic name different joints."""
+        named = child(message, "name") if "name" in field_names(message) else ""
+        count = len(named) if is_list(named) else 0
+        first = self.sample is None
+        if first or count > self.named:
+            self.sample, self.named = message, count
+        if first and not picture_kind(self.track.channels[0].type):
+            topic = self.track.topic
+            keys = [key for key in _values(topic, message) if key.kind == "vector"][:MAX_FIELDS]
+            narrow = [key.key for key in keys if key.shape[0] <= MAX_WIDTH]
+            self.values = [_Values(parse_key(key, (topic,), where)) for key in narrow]
+        for value in self.values:
+            value.add(message, where)
+
+
+@dataclass
+class _Budget:
+    """Count what may still be read."""
+
+    bytes: int = MAX_BYTES
+    messages: int = MAX_MESSAGES
+
+    @property
+    def spent(self) -> bool:
+        return self.bytes < 0 or self.messages < 0
+
+
+def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspection:
+    """Return the inspection of those bags.
+
+    Raises:
+        SourceError: none of them can be read.
+    """
+    survey = Survey(len(bags), alone=len(bags) == 1, by_field=True)
+    for link in unfollowed(root, set(bags.values())):
+        survey.note(link)
+    counted: dict[str, Counter[Channel]] = {}
+    opened: dict[str, Bag] = {}
+    for name, path in bags.items():
+        try:
+            opened[name] = Bag(path, root)
+            counted[name] = opened[name].counts()
+        except EpisodeError as fault:
+            survey.fault(name, fault)
+    full = [name for name in counted if counted[name].total()]
+    for name in set(counted) - set(full):
+        survey.note(Finding("readable", "info", f"{opened[name].path}: holds no messages"))
+    telling: _Telling | None = None
+    budget = _Budget()
+    for name in [full[i] for i in sampled(len(full), episodes)] if full else []:
+        try:
+            looked = _Telling(name, opened[name], counted[name], survey, budget)
+        except EpisodeError as fault:
+            survey.fault(name, fault)
+            continue
+        survey.episode(name)
+        telling = telling or looked
+        if budget.spent:
+            break
+    if telling is None:
+        faults = [str(one) for one in survey.findings(()) if one.severity != "info"]
+        raise SourceError(uri, f"nothing to inspect: {faults[0] if faults else 'no bag holds a message'}")
+    return _inspection(uri, telling, counted, survey, len(bags), budget)
+
+
+def _inspection(
+    uri: str,
+    telling: "_Telling",
+    counted: dict[str, Counter[Channel]],
+    survey: Survey,
+    episodes: int,
+    budget: _Budget,
+) -> Inspection:
+    keys = tuple(survey.key(key) for key in telling.keys)
+    cameras = [key for key in keys if key.kind == "camera"]
+    lengths = tuple(_length(counts, cameras) for counts in counted.values()) if cameras else ()
+    facts = {"keys and rates of": str(telling.bag.path)}
+    if budget.spent:
+        facts["measured up to"] = f"{MAX_MESSAGES:,} messages or {MAX_BYTES >> 20:,} MiB; counts are whole"
+    return Inspection(
+        format="rosbag",
+        uri=uri,
+        episodes=episodes,
+        keys=keys,
+        frames=sum(lengths) if cameras and len(counted) == episodes else None,
+        lengths=lengths[:MAX_LENGTHS],
+        hz=cameras[0].hz if cameras else None,
+        robot=telling.bag.notes().get("robot") or None,
+        facts=facts,
+        looked_at=len(survey.looked),
+        findings=survey.findings(keys),
+        checks=survey.checks(),
+    )
+
+
+def _length(counts: Counter[Channel], cameras: list[KeyInfo]) -> int:
+    return sum(count for channel, count in counts.items() if channel.topic == cameras[0].key)
+
+
+class _Telling:
+    """Read one bag once: its keys, and into the survey its numbers, times, skew and some pictures.
+
+    Raises:
+        EpisodeError: the bag is damaged.
+    """
+
+    def __init__(
+        self, name: str, bag: Bag, counts: Counter[Channel], survey: Survey, budget: _Budget
+    ) -> None:
+        self.bag, self._name, self._survey = bag, name, survey
+        self._frozen: list[str] = []
+        self._topics = {topic: _Topic(TopicTrack(topic)) for topic in sorted({at.topic for at in counts})}
+        for channel, count in counts.items():
+            self._topics[channel.topic].count += count
+        self._measure(budget)
+        self.keys = [key for topic in self._topics.values() for key in self._keys(topic)]
+        if self._frozen:
+            said = f"{', '.join(self._frozen[:8])}: header stamps never move; receive times are used"
+            survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
+        self._skew()
+
+    def _measure(self, budget: _Budget) -> None:
+        where = str(self.bag.path)
+        for place, record in self.bag.records():
+            budget.bytes, budget.messages = budget.bytes - len(record.data), budget.messages - 1
+            if budget.spent:
+                return
+            topic = self._topics.setdefault(record.channel.topic, _Topic(TopicTrack(record.channel.topic)))
+            try:
+                message = None if topic.fault else decode(record.channel, record.data, where)
+                topic.track.add(record.channel, record.log_ns, place, message)
+                if message is not None:
+                    topic.look_at(message, where)
+                for value in topic.values:
+                    if len(value.held) > MAX_HELD:
+                        value.hand_on(self._survey, self._name)
+            except EpisodeError as fault:
+                topic.fault = fault.fault
+                topic.track.add(record.channel, record.log_ns, place, None)
+
+    def _keys(self, topic: _Topic) -> list[KeyInfo]:
+        if not len(topic.track):
+            return [KeyInfo(topic.track.topic, "other", (), "", count=0)]
+        if topic.fault:
+            self._survey.note(Finding("readable", "warn", topic.fault, key=topic.track.topic))
+        stated = topic.track.channels[0]
+        kind = picture_kind(stated.type)
+        times = topic.track.seconds("header")[topic.track.order()]
+        clock = clock_of(times) if topic.track.topic in LOGS else self._times(topic, times, bool(kind))
+        found: list[KeyInfo] = []
+        if not topic.fault:
+            found = [self._camera(topic, kind)] if kind else _recorded(topic)
+        found = found or [KeyInfo(topic.track.topic, "other", (), stated.type or stated.encoding)]
+        for value in topic.values:
+            value.hand_on(self._survey, self._name)
+        about = _about(topic, times, stated.type or stated.encoding)
+        return [
+            replace(key, hz=clock.hz, count=topic.count, jitter_ms=clock.jitter_ms, topic=about)
+            for key in found
+        ]
+
+    def _times(self, topic: _Topic, times: Floats, camera: bool) -> Clock:
+        """Hand the times to the survey, with what only messages with two times can show."""
+        track, name = topic.track, topic.track.topic
+        self._survey.made.add("stamps")
+        self._frozen += [name] if track.frozen else []
+        if track.stamped:
+            apart = float(np.median(np.abs(track.seconds("header") - track.seconds("receive"))))
+            if apart > APART_S:
+                said = f"{name}: header stamps are {apart:.3g} s from receive times"
+                self._survey.note(Finding("stamps", "warn", said, key=name, numbers={"seconds": apart}))
+        return self._survey.times(self._name, name, times, camera)
+
+    def _camera(self, topic: _Topic, kind: str) -> KeyInfo:
+        name = topic.track.topic
+        stored = topic.track.codec if kind == VIDEO else codec(topic.sample, kind)
+        try:
+            stream = camera_stream(self.bag, topic.track, "receive")
+            keyframes = topic.track.keyframes() if kind == VIDEO else None
+            indices = image_checks.choose(len(stream.timestamps), _PAIRS, _starts(keyframes))
+            for run in image_checks.runs(indices):
+                frames = stream.frames(run)
+                self._survey.pictures(self._name, name, frames, run, stored)
+        except EpisodeError as fault:
+            self._survey.note(Finding("readable", "warn", f"{name}: {fault.fault}", key=name))
+            return KeyInfo(name, "other", (), topic.track.channels[0].type)
+        channels = 1 if is_grey(topic.sample, kind) else 3
+        return KeyInfo(name, "camera", (*frames.shape[1:3], channels), "uint8", codec=stored)
+
+    def _skew(self) -> None:
+        """Measure the skew of each stream that a YAML could name from the frames of the first camera."""
+        topics = {key.topic.name: key.kind for key in self.keys if key.topic and key.kind in _STREAMS}
+        cameras = [name for name, kind in topics.items() if kind == "camera"]
+        if not cameras:
+            return
+        primary = self._topics[cameras[0]].track.seconds("header")
+        period_s = float(np.median(np.diff(np.sort(primary)))) if len(primary) > 1 else 0.0
+        for name in topics:
+            if name != cameras[0]:
+                found = skew(self._topics[name].track.seconds("header"), primary)
+                self._survey.skew(name, found, period_s)
+
+
+_STREAMS, _PAIRS = ("camera", "vector"), 4
+
+
+def _starts(keyframes: Any) -> Any:
+    """Return for each frame the keyframe before it, counted from the first; None where it is not known."""
+    if keyframes is None or not keyframes.any():
+        return None
+    shown = keyframes[int(np.argmax(keyframes)) :]
+    return np.maximum.accumulate(np.where(shown, np.arange(len(shown)), 0))
+
+
+# -- keys
+
+
+def _about(topic: _Topic, times: Floats, kind: str) -> TopicInfo:
+    track, steps = topic.track, np.diff(times)
+    delay_ms = None
+    if track.stamped and not topic.fault:
+        delay_ms = float(np.median(track.seconds("receive") - track.seconds("header")) * 1e3)
+    return TopicInfo(
+        track.topic,
+        kind,
+        gap_ms=float(steps.max() * 1e3) if len(steps) else None,
+        delay_ms=delay_ms,
+        goes_back=bool(len(steps) and steps.min() < 0),
+    )
+
+
+def _recorded(topic: _Topic) -> list[KeyInfo]:
+    """Return the keys of a topic without pictures, with the dtypes their definition states."""
+    name, channel = topic.track.topic, topic.track.channels[0]
+    found = _values(name, topic.sample)
+    if channel.encoding == "json":
+        return found
+    steps = [parse_key(key.key, (name,), name).steps for key in found]
+    stated = [stated_dtype(channel, topic.sample, path) for path in steps]
+    return [
+        replace(key, dtype=dtype) if dtype and key.kind == "vector" else key
+        for key, dtype in zip(found, stated, strict=True)
+    ]
+
+
+def _values(key: str, value: Any) -> list[KeyInfo]:
+    """Return what a YAML could name at or below that key."""
+    if isinstance(value, str):
+        return [KeyInfo(key, "text", (), "string")]
+    if not is_message(value):
+        return _vector(key, value)
+    names = field_names(value)
+    if names and all(_is_number(child(value, name)) for name in names):
+        return [KeyInfo(key, "vector", (len(names),), "float64", names=tuple(names))]
+    trajectory = _trajectory(key, value, names)
+    return trajectory + [
+        found
+        for name in names
+        if name not in ("header", "stamp", "timestamp") and not (trajectory and name == "points")
+        for found in _named(_values(f"{key}.{name}", child(value, name)), value, name)
+    ]
+
+
+def _trajectory(key: str, value: Any, names: list[str]) -> list[KeyInfo]:
+    """Return the first point of a JointTrajectory, the one in force when it is sent."""
+    points: Any = child(value, "points") if {"points", "joint_names"} <= set(names) else ()
+    if not is_list(points) or not len(points) or not is_message(points[0]):
+        return []
+    stated = child(value, "joint_names")
+    labels = tuple(map(str, stated)) if is_list(stated) else ()
+    found = _values(f"{key}.points[0]", points[0])
+    fits = [bool(labels) and item.shape == (len(labels),) for item in found]
+    return [replace(item, names=labels) if fit else item for item, fit in zip(found, fits, strict=True)]
+
+
+def _named(found: list[KeyInfo], owner: Any, name: str) -> list[KeyInfo]:
+    """Add the names of the owner's list `name`, where it has one of that length (JointState)."""
+    labels = child(owner, "name") if "name" in field_names(owner) and name != "name" else ()
+    if len(found) != 1 or not is_list(labels) or found[0].shape != (len(labels),) or not len(labels):
+        return found
+    return [replace(found[0], names=tuple(map(str, labels)))]
+
+
+def _vector(key: str, value: Any) -> list[KeyInfo]:
+    try:
+        count = len(numbers(value))
+    except TypeError:
+        return []
+    dtype = "bool" if isinstance(value, bool) else "float64"
+    if isinstance(value, np.ndarray | np.generic):
+        dtype = str(value.dtype)
+    return [KeyInfo(key, "vector", (count,), dtype)] if count else []
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, bool | int | float | np.number | np.bool_)

@@ -1,0 +1,340 @@
+"""Read bags as a source: ROS 1, ROS 2 (sqlite3, MCAP) and plain MCAP, without ROS.
+
+A bag is an episode, or with `source.segments` several; a folder of bags holds many. One pass over
+an episode gathers times and numbers of the topics the embodiment names; pictures are read again when
+asked for, so memory does not grow with the size of a bag. Streams keep their own clocks; `align`
+brings them together. An episode inside a bag is read with what was said before it and is still in force.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Episode, Floats, Signal, Stream
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.registry.components import Camera, Component, Segments
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.bags.bag import Bag, Place, find_bags
+from hma_data.sources.bags.container import Channel, Record, Wanted, damaged
+from hma_data.sources.bags.fields import Column, Field, missing_topic, parse_key
+from hma_data.sources.bags.images import picture_kind
+from hma_data.sources.bags.inspect import report
+from hma_data.sources.bags.messages import decode
+from hma_data.sources.bags.segments import Segment, Table, heads, parted
+from hma_data.sources.bags.topic_track import TopicTrack, camera_stream
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values, local_path
+from hma_data.sources.common.links import nothing_there
+from hma_data.storage.paths import StrPath, as_text
+
+PART = re.compile(r"[0-9]{4,9}")
+Rows = NDArray[np.int64]
+
+
+def open() -> "RosbagSource":
+    """Return the source of bags."""
+    return RosbagSource()
+
+
+class RosbagSource:
+    """See sources.base.Source."""
+
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
+        """See Source."""
+        uri = as_text(uri)
+        return report(uri, local_path(uri), _bags(uri), episodes)
+
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+        """See Source. A bag that cannot be read has no frames here; `read` says why.
+
+        With an embodiment that parts bags, an episode of the bag `run` is `run/0000`, `run/0001` …
+        """
+        uri = as_text(uri)
+        root = local_path(uri)
+        found: list[EpisodeRef] = []
+        for name, path in _bags(uri).items():
+            if embodiment and embodiment.source.segments:
+                found += _part_refs(name, path, root, embodiment, embodiment.source.segments)
+            else:
+                found.append(_ref(name, path, root, embodiment))
+        return found
+
+    def episode_ids(self, uri: StrPath) -> list[str]:
+        """See Source: whole bags, whatever an embodiment may part them into."""
+        return list(_bags(as_text(uri)))
+
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
+        """See Source. A bag's own id reads the whole of it, also where the embodiment parts bags.
+
+        Raises:
+            SourceError: no such bag, or no such episode in it.
+            EpisodeError: the bag is damaged, holds no episode, or lacks what the embodiment names.
+        """
+        uri = as_text(uri)
+        bags, root, segments = _bags(uri), local_path(uri), embodiment.source.segments
+        if episode_id in bags:
+            path = bags[episode_id]
+            bag = parted(path, root, embodiment, segments)[0] if segments else Bag(path, root)
+            return _EpisodeReading(bag, episode_id, embodiment).episode()
+        name, number = _part_of(episode_id)
+        if not segments or name not in bags:
+            raise SourceError(uri, f"has no bag {episode_id!r}", f"it has {', '.join(list(bags)[:10])}")
+        bag, table = parted(bags[name], root, embodiment, segments)
+        if not 0 <= number < len(table.segments):
+            held = f"{name} holds {_part_id(name, 0)} to {_part_id(name, len(table.segments) - 1)}"
+            raise SourceError(uri, f"has no episode {episode_id!r}", held)
+        return _EpisodeReading(bag, episode_id, embodiment, table, number).episode()
+
+
+def _bags(uri: str) -> dict[str, Path]:
+    path = local_path(uri)
+    if path.is_file() and path.name == "metadata.yaml":
+        raise SourceError(uri, "only describes a bag", f"give the bag's folder, {path.parent}")
+    bags = find_bags(path)
+    if not bags:
+        remedy = "expected .bag, .mcap, .db3, or folders with a metadata.yaml"
+        raise nothing_there(uri, path, "holds no bags", remedy)
+    return bags
+
+
+def _ref(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> EpisodeRef:
+    frames, fingerprint = 0, ""
+    try:
+        bag = Bag(path, root)
+        fingerprint = bag.fingerprint()
+        frames = _frames(bag.counts(), embodiment)
+    except (EpisodeError, OSError):
+        pass  # `read` meets it again and says what it is
+    return EpisodeRef(name, frames, fingerprint=fingerprint)
+
+
+def _part_id(name: str, number: int) -> str:
+    return f"{name}/{number:04d}"
+
+
+def _part_of(episode_id: str) -> tuple[str, int]:
+    """Return the bag of that episode, and its number; -1 where it names none."""
+    name, _, digits = episode_id.rpartition("/")
+    return name, int(digits) if PART.fullmatch(digits) else -1
+
+
+def _part_refs(
+    name: str, path: Path, root: Path, embodiment: Embodiment, segments: Segments
+) -> list[EpisodeRef]:
+    """List the episodes of one bag; one without frames where none can be told, of which `read` says why."""
+    try:
+        bag, table = parted(path, root, embodiment, segments)
+        fingerprint = bag.fingerprint()
+    except (EpisodeError, OSError):
+        return [replace(_ref(name, path, root, embodiment), frames=0)]
+    return [
+        EpisodeRef(_part_id(name, i), len(segment), None, fingerprint, group=name, left_out=table.left_out)
+        for i, segment in enumerate(table.segments)
+    ]
+
+
+def _frames(counts: Counter[Channel], embodiment: Embodiment | None) -> int:
+    """Count the pictures of the primary camera; without an embodiment, of the camera that has most."""
+    topics: Counter[str] = Counter()
+    for channel, count in counts.items():
+        if embodiment or picture_kind(channel.type):
+            topics[channel.topic] += count
+    return topics[embodiment.primary_camera.key] if embodiment else max(topics.values(), default=0)
+
+
+# -- one episode
+
+
+class _EpisodeReading:
+    """Pass once over a bag, or over one episode of it by its part of the recording's time.
+
+    Args:
+        table, number: which of the bag's episodes; the whole bag without.
+    """
+
+    def __init__(
+        self, bag: Bag, episode_id: str, embodiment: Embodiment, table: Table | None = None, number: int = 0
+    ) -> None:
+        self._bag, self._id, self._embodiment = bag, episode_id, embodiment
+        self._table, self._number = table, number
+        self._segment: Segment | None = table.segments[number] if table else None
+        self._where = str(bag.path) if table is None else f"{bag.path}, episode {number}"
+        self._counts: Counter[str] = Counter()
+        self._heads = heads(list(bag.counts()))
+        for channel, count in bag.counts().items():
+            self._counts[channel.topic] += count
+        self._tracks: dict[str, TopicTrack] = {}
+        self._said: list[tuple[int, str]] = []  # instructions and when they were received
+
+    def episode(self) -> Episode:
+        """Make the pass; return what came of it.
+
+        Raises:
+            EpisodeError: the bag is damaged, or lacks what the embodiment names.
+        """
+        embodiment = self._embodiment
+        for camera in embodiment.cameras:
+            if camera.key not in self._counts:
+                raise missing_topic(camera.key, self._counts, self._where)
+            self._track(camera.key)
+        actions = self._columns(embodiment.action.components)
+        states = self._columns(embodiment.state.components if embodiment.state else ())
+        self._scan(self._instruction_field())
+        notes = self._bag.notes()
+        primary = self._stream(embodiment.primary_camera)
+        streams: dict[str, Stream] = {}
+        for camera in embodiment.cameras:
+            same = camera is embodiment.primary_camera
+            streams[camera.name] = primary if same else self._stream(camera, primary.timestamps)
+        parted = self._table is not None and len(self._table.segments) > 1
+        return Episode(
+            id=self._id,
+            streams=streams,
+            actions=tuple(self._signal(column, primary.timestamps) for column in actions),
+            states=tuple(self._signal(column, primary.timestamps) for column in states),
+            rate_stamped=False,
+            instruction=self._instruction() or notes.get("instruction", ""),
+            success=None if parted else {"true": True, "false": False}.get(notes.get("success", "").lower()),
+            source=str(self._bag.path),
+            metadata={"clocks": self._clocks(), "notes": notes} | self._about(),
+        )
+
+    # -- the pass
+
+    def _track(self, topic: str) -> TopicTrack:
+        return self._tracks.setdefault(topic, TopicTrack(topic))
+
+    def _columns(self, components: tuple[Component, ...]) -> list[Column]:
+        columns = []
+        for component in components:
+            field = parse_key(component.key, self._counts, self._where)
+            column = Column(component, field, self._where)
+            self._track(field.topic).columns.append(column)
+            columns.append(column)
+        return columns
+
+    def _instruction_field(self) -> Field | None:
+        key = self._embodiment.source.instruction
+        return parse_key(key, self._counts, self._where) if key else None
+
+    def _scan(self, instruction: Field | None) -> None:
+        read = {topic for topic, track in self._tracks.items() if track.columns}
+        read |= {instruction.topic} if instruction else set()
+        for place, record in self._records(frozenset(self._tracks) | read, self._heads - read):
+            topic = record.channel.topic
+            if topic in self._tracks and topic in self._heads - read:
+                self._tracks[topic].add_head(record.channel, record.log_ns, place, record.data)
+                continue
+            message = decode(record.channel, record.data, self._where)
+            if instruction and topic == instruction.topic:
+                self._hear(record.log_ns, str(instruction.value(message, self._where)))
+            if topic in self._tracks:
+                self._tracks[topic].add(record.channel, record.log_ns, place, message)
+        self._check()
+
+    def _records(self, topics: frozenset[str], short: frozenset[str]) -> Iterator[tuple[Place, Record]]:
+        segment, table = self._segment, self._table
+        if segment is None or table is None:
+            return self._bag.wanted(Wanted(topics, heads=short))
+        first_ns, last_ns = segment.first_ns - table.reach_ns, segment.last_ns + table.reach_ns
+        first_ns = max(first_ns, 0)
+        videos = topics & table.keyframes.keys()
+        plain = topics - videos
+        held = plain - {self._embodiment.primary_camera.key}
+        within = Wanted(plain, first_ns, last_ns, short)
+        parts = [iter(self._bag.before(held, first_ns)), self._bag.wanted(within)]
+        for topic in sorted(videos):
+            keyframes = table.keyframes[topic]
+            at = int(np.searchsorted(keyframes, first_ns, side="right")) - 1
+            begin = int(keyframes[at]) if at >= 0 else 0
+            parts.append(self._bag.wanted(Wanted(frozenset({topic}), begin, last_ns)))
+        return chain.from_iterable(parts)
+
+    def _hear(self, log_ns: int, text: str) -> None:
+        if self._segment is None:
+            self._said = self._said or [(log_ns, text)]
+        elif text and log_ns <= self._segment.last_ns:
+            self._said.append((log_ns, text))
+
+    def _instruction(self) -> str:
+        """Return the first said; in an episode of a bag, what was said nearest to its beginning."""
+        begins = self._segment.first_ns if self._segment else 0
+        nearest = min(self._said, key=lambda said: abs(said[0] - begins), default=(0, ""))
+        return nearest[1]
+
+    def _check(self) -> None:
+        for topic, track in self._tracks.items():
+            if not len(track):
+                raise EpisodeError(self._where, f"{topic} has no messages")
+            if self._segment is None and len(track) != self._counts[topic]:
+                fault = f"its index counts {self._counts[topic]} messages of {topic}, it holds {len(track)}"
+                raise damaged(self._bag.path, fault)
+
+    # -- what came of it
+
+    def _stream(self, camera: Camera, shown: Floats | None = None) -> Stream:
+        """Return a camera; of an episode in a bag its own pictures, or those around the times `shown`."""
+        track, clock = self._tracks[camera.key], camera.stamp or self._embodiment.sync.stamp
+        if self._segment is None or self._table is None:
+            return camera_stream(self._bag, track, clock)
+        if shown is not None:
+            order = track.order()
+            begin, stop = self._around(track.received()[order], track.seconds(clock)[order], shown)
+            return camera_stream(self._bag, track, clock, (begin, stop))
+        begin = int(np.searchsorted(track.received()[track.order()], self._segment.first_ns))
+        begin += self._segment.skip
+        stop = begin + len(self._segment)
+        if stop > len(track):
+            fault = f"the episode had {len(self._segment)} pictures, now {len(track) - begin}"
+            raise damaged(self._bag.path, fault)
+        return camera_stream(self._bag, track, self._table.clock, (begin, stop))
+
+    def _signal(self, column: Column, shown: Floats) -> Signal:
+        track, rows = self._tracks[column.field.topic], column.rows()
+        order = track.order(rows)
+        clock = column.component.stamp or self._embodiment.sync.stamp
+        times = track.seconds(clock)[rows[order]]
+        if self._segment:
+            begin, stop = self._around(track.received()[rows[order]], times, shown)
+            order, times = order[begin:stop], times[begin:stop]
+        return Signal(times, component_values(column.component, column.values()[order], self._where))
+
+    def _around(self, received: Rows, times: Floats, shown: Floats) -> tuple[int, int]:
+        """Return which samples in order of receipt: that in force at the first picture to one after the last.
+
+        Where a clock begins anew between two episodes, only the samples on this episode's side count.
+        """
+        assert self._segment
+        inside = np.searchsorted(received, [self._segment.first_ns, self._segment.last_ns + 1])
+        breaks = np.flatnonzero(np.diff(times) < 0) + 1
+        earlier, later = breaks[breaks <= inside[0]], breaks[breaks >= max(inside[1], 1)]
+        low = int(earlier[-1]) if len(earlier) else 0
+        high = int(later[0]) if len(later) else len(times)
+        if np.any(np.diff(times[low:high]) < 0):
+            return low, high  # `align` says where
+        begin = low + max(0, int(np.searchsorted(times[low:high], shown[0], side="right")) - 1)
+        stop = low + int(np.searchsorted(times[low:high], shown[-1], side="left")) + 1
+        return begin, min(max(stop, begin + 1), high)
+
+    def _clocks(self) -> dict[str, str]:
+        """Return topic -> header or receive: whose times it has where none are forced."""
+        return {topic: "header" if track.stamped else "receive" for topic, track in self._tracks.items()}
+
+    def _about(self) -> dict[str, dict[str, int]]:
+        if self._segment is None or self._table is None:
+            return {}
+        facts = {
+            "number": self._number,
+            "of": len(self._table.segments),
+            "first_frame": self._segment.first,
+            "frames": len(self._segment),
+            "frames_in_bag": self._table.frames,
+            "frames_left_out": self._table.left_out,
+            "parts_without_frames": self._table.empty,
+        }
+        return {"segment": facts}

@@ -1,0 +1,327 @@
+"""What a sample of episodes shows, the same for every format: a source hands in what it has read.
+
+A source gives, episode by episode, the lengths of its keys, their numbers, a few pictures, and times
+where there are any; each defect becomes one finding a key, however many episodes have it.
+
+T samples of a key in an episode, A values a sample.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Floats
+from hma_data.episodes.images import Images
+from hma_data.errors import HMAError
+from hma_data.sources.base import KeyInfo
+from hma_data.sources.common import image_checks, timestamp_checks
+from hma_data.sources.common.findings import Finding, Severity
+from hma_data.sources.common.image_checks import Look
+from hma_data.sources.common.timestamp_checks import Clock
+
+CHECKS = {  # what a look at a recording can check, in the order it is printed
+    "readable": "episodes that can be read",
+    "files": "files and metadata",
+    "keys": "the same keys in every episode",
+    "rows": "keys of one length",
+    "frames": "frames missing or too many",
+    "repeated": "stamps that repeat",
+    "back": "stamps that go back",
+    "stamps": "stamps that are no clock",
+    "gaps": "pauses",
+    "rate": "rate as stated",
+    "skew": "skew between streams",
+    "finite": "NaN and infinity",
+    "constant": "values that never change",
+    "size": "pictures of one size",
+    "blank": "pictures of one colour",
+    "still": "pictures that repeat",
+    "colour": "red and blue in order",
+    "hands": "hands in the pictures",
+}
+LOSSY = ("jpeg", "h264", "av1", "hevc", "vp8", "vp9", "mpeg4", "mjpeg")
+SHOWN = 5  # faults and episodes named
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+MAX_VALUES = 20_000_000  # numbers of one key of an episode
+_COMMANDS = re.compile(r"(^|[^a-z])(actions?|commands?|cmd|ctrl|control|targets?)([^a-z]|$)")
+
+
+@dataclass
+class _Numbers:
+    """One vector over the episodes; (A,) arrays."""
+
+    low: NDArray[Any]
+    high: NDArray[Any]
+    rows: int = 0
+    infinite: int = 0
+    values: int = 0
+    episodes: int = 0
+    first: str = ""  # where one that is not finite was met
+    last: str = ""  # the episode in which one was met last
+
+
+@dataclass
+class _Times:
+    """The clock of one key over the episodes."""
+
+    met: dict[str, Clock] = field(default_factory=dict)
+    camera: bool = False
+    skew: tuple[float, float, float] | None = None
+
+
+class Survey:
+    """Gathers what episodes show.
+
+    Args:
+        episodes: how many the recording has.
+        alone: whether it is told without the episodes' names (a bag that is one episode).
+        by_field: whether a YAML takes single fields of a message, so that still ones do no harm.
+    """
+
+    def __init__(self, episodes: int, alone: bool = False, by_field: bool = False) -> None:
+        self.episodes, self.alone, self.by_field = episodes, alone, by_field
+        self.looked: list[str] = []
+        self.looks: dict[str, Look] = {}
+        self.made: set[str] = {"readable"}
+        self._faults: dict[str, str] = {}
+        self._numbers: dict[str, _Numbers] = {}
+        self._times: dict[str, _Times] = {}
+        self._absent: dict[str, list[str]] = {}
+        self._odd: list[tuple[str, int, dict[str, int]]] = []
+        self._extra: list[Finding] = []
+        self._shown: dict[str, str] = {}  # camera -> the episode last looked at
+
+    # -- what sources hand in
+
+    def episode(self, name: str) -> None:
+        """That episode is looked at."""
+        self.looked.append(name)
+
+    def fault(self, name: str, fault: HMAError | str) -> None:
+        """An episode, or a key of it, that cannot be read."""
+        self._faults.setdefault(name, str(fault))
+
+    def note(self, finding: Finding) -> None:
+        """Something only this format can know."""
+        self.made.add(finding.check)
+        self._extra.append(finding)
+
+    def lengths(self, name: str, length: int, sizes: Mapping[str, int], wanted: Sequence[str]) -> None:
+        """The rows of an episode's keys, and the keys it should have."""
+        self.made |= {"keys", "rows"}
+        absent = [key for key in wanted if key not in sizes]
+        for key in absent:
+            self._absent.setdefault(key, []).append(name)
+        odd = {key: sizes[key] for key in wanted if key in sizes and sizes[key] != length}
+        if odd:
+            self._odd.append((name, length, odd))
+
+    def numbers(self, name: str, key: str, values: NDArray[Any], begin: int = 0) -> None:
+        """A vector (T, …) of an episode, or the part of it that begins at step `begin`."""
+        if values.dtype.kind not in "fiub" or not len(values):
+            return
+        self.made |= {"finite", "constant"}
+        flat: NDArray[Any] = values.reshape(len(values), -1)
+        infinite = 0
+        if flat.dtype.kind == "f":
+            finite = np.isfinite(flat)
+            infinite = int(finite.size - np.count_nonzero(finite))
+        held = self._numbers.get(key)
+        if held is None or held.low.shape[0] != flat.shape[1]:
+            if held is not None:
+                return  # of another width than before; a source says so
+            blank = np.full(flat.shape[1], np.nan)
+            held = self._numbers[key] = _Numbers(blank, blank.copy())
+        if infinite and not held.infinite:
+            held.first = f"{name}: {key} is not finite at step {begin + int(np.argwhere(~finite)[0, 0])}"
+        if infinite:
+            flat = np.where(finite, flat, np.nan)
+        held.low = np.fmin(held.low, np.fmin.reduce(flat, axis=0))
+        held.high = np.fmax(held.high, np.fmax.reduce(flat, axis=0))
+        held.rows += len(flat)
+        held.values += flat.size
+        held.infinite += infinite
+        held.episodes += bool(infinite) and held.last != name
+        held.last = name if infinite else held.last
+
+    def pictures(
+        self, name: str, key: str, frames: Images, indices: NDArray[np.int64], codec: str | None
+    ) -> None:
+        """Some pictures (n, H, W, 3) of an episode's camera, and which of its frames they are."""
+        self.made |= {"size", "blank", "colour"} | ({"still"} if (np.diff(indices) == 1).any() else set())
+        look = self.looks.setdefault(key, Look(lossless=codec not in LOSSY))
+        look.add(frames, indices, again=self._shown.get(key) == name)
+        self._shown[key] = name
+
+    def times(self, name: str, key: str, seconds: Floats, camera: bool = False) -> Clock:
+        """The times (T,) of one key of an episode, in the order of receipt."""
+        self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
+        held = self._times.setdefault(key, _Times(camera=camera))
+        held.met[name] = timestamp_checks.clock_of(seconds)
+        return held.met[name]
+
+    def skew(self, key: str, found: tuple[float, float, float] | None, period_s: float) -> None:
+        """How far a stream is from the primary one's frames, whose median interval is `period_s`."""
+        self.made.add("skew")
+        held = self._times[key]
+        held.skew = found
+        own = max((clock.period_s for clock in held.met.values()), default=0.0)
+        if found and found[1] > 1e3 * max(period_s, own):
+            said = f"{key}: p95 {found[1]:.1f} ms from the first camera's frames, max {found[2]:.1f} ms"
+            numbers = dict(zip(("p50_ms", "p95_ms", "max_ms"), found, strict=True))
+            self._extra.append(Finding("skew", "warn", said, "it pauses, or loses messages", key, numbers))
+
+    # -- what comes of it
+
+    def key(self, info: KeyInfo) -> KeyInfo:
+        """The key with what was measured of it."""
+        held, look = self._numbers.get(info.key), self.looks.get(info.key)
+        times = self._times.get(info.topic.name if info.topic else info.key)
+        if held is not None:
+            still = self._still(held)
+            low, high = held.low[np.isfinite(held.low)], held.high[np.isfinite(held.high)]
+            info = replace(
+                info,
+                constant=bool(still) and len(still) == len(held.low) and not held.infinite,
+                still=tuple(still),
+                low=float(low.min()) if len(low) else None,
+                high=float(high.max()) if len(high) else None,
+            )
+        if times is not None and times.met:
+            rates = [clock.hz for clock in times.met.values() if clock.hz]
+            jitters = [clock.jitter_ms for clock in times.met.values() if clock.jitter_ms is not None]
+            measured = float(np.median(rates)) if rates else None
+            stated = info.hz and any(abs(one / info.hz - 1) <= timestamp_checks.DRIFT for one in rates)
+            info = replace(
+                info,
+                hz=info.hz if stated or not measured else measured,
+                jitter_ms=float(np.median(jitters)) if jitters else info.jitter_ms,
+                skew_ms=times.skew,
+            )
+        if look is not None and look.swapped()[0]:
+            info = replace(info, swapped=look.swapped()[0])
+        return info
+
+    def findings(self, keys: Sequence[KeyInfo]) -> tuple[Finding, ...]:
+        """Everything that was found, check by check."""
+        found = [
+            *self._readable(), *_merged(self._extra), *self._keys(), *self._rows(), *self._clocks(),
+            *self._finite(), *self._constant(keys), *image_checks.findings(self.looks),
+        ]  # fmt: skip
+        order = list(CHECKS)
+        return tuple(sorted(found, key=lambda one: order.index(one.check) if one.check in order else 99))
+
+    def checks(self) -> tuple[str, ...]:
+        """The checks that could be made, in their order."""
+        return tuple(check for check in CHECKS if check in self.made)
+
+    def _readable(self) -> Iterator[Finding]:
+        count = len(self._faults)
+        severity: Severity = "error" if count and count >= max(self.episodes, len(self.looked)) else "warn"
+        together = Counter(self._faults.values())
+        for fault, episodes in list(together.items())[:SHOWN]:
+            more = f" (and {episodes - 1:,} more episodes)" if episodes > 1 else ""
+            yield Finding("readable", severity, fault + more)
+        rest = sum(list(together.values())[SHOWN:])
+        if rest:
+            said = f"{rest:,} more of {self.episodes:,} episodes cannot be read"
+            yield Finding("readable", severity, said, numbers={"episodes": count})
+
+    def _keys(self) -> Iterator[Finding]:
+        together: dict[tuple[str, ...], list[str]] = {}
+        for key, names in self._absent.items():
+            together.setdefault(tuple(names), []).append(key)
+        for episodes, keys in together.items():
+            more = f" (and {len(episodes) - 1:,} more episodes)" if len(episodes) > 1 else ""
+            said = f"{episodes[0]}: has no {listed(keys)}{more}"
+            yield Finding("keys", "warn", said, numbers={"keys": keys, "episodes": len(episodes)})
+
+    def _rows(self) -> Iterator[Finding]:
+        for name, length, odd in self._odd[:SHOWN]:
+            said = listed([f"{key} has {size}" for key, size in odd.items()])
+            yield Finding("rows", "warn", f"{name}: of {length} frames, {said}", numbers=odd)
+        if len(self._odd) > SHOWN:
+            said = f"{len(self._odd) - SHOWN} more episodes have keys of different length"
+            yield Finding("rows", "warn", said, numbers={"episodes": len(self._odd)})
+
+    def _clocks(self) -> Iterator[Finding]:
+        for key, held in self._times.items():
+            worst: dict[str, Finding] = {}
+            counts: Counter[str] = Counter()
+            for name, clock in held.met.items():
+                for one in timestamp_checks.findings(key, clock, held.camera, "" if self.alone else name):
+                    worst.setdefault(one.check, one)
+                    counts[one.check] += 1
+            for check, one in worst.items():
+                more = f" (and in {counts[check] - 1} more episodes)" if counts[check] > 1 else ""
+                yield replace(one, message=one.message + more)
+
+    def _finite(self) -> Iterator[Finding]:
+        for key, held in self._numbers.items():
+            if held.infinite:
+                said = f"{held.first} ({held.infinite:,} of {held.values:,} values looked at"
+                said += f", in {held.episodes} episodes)" if held.episodes > 1 else ")"
+                yield Finding("finite", "warn", said, key=key,
+                              numbers={"count": held.infinite, "values": held.values})  # fmt: skip
+            ends = np.array([*held.low, *held.high])
+            ends = ends[np.isfinite(ends)]
+            furthest = float(ends[np.argmax(np.abs(ends))]) if len(ends) else 0.0
+            if abs(furthest) > FLOAT32_MAX:
+                said = f"{key} reaches {furthest:.3g}, float32 holds up to {FLOAT32_MAX:.3g}"
+                numbers = {"value": furthest}
+                yield Finding(
+                    "finite", "warn", said, "as an action or state its episode is refused", key, numbers
+                )
+
+    def _constant(self, keys: Sequence[KeyInfo]) -> Iterator[Finding]:
+        names = {info.key: info.names for info in keys}
+        whole: list[str] = []
+        for key, held in self._numbers.items():
+            still = self._still(held)
+            if not still or held.rows < 2:
+                continue
+            command = bool(_COMMANDS.search(key.lower()))
+            if len(still) == len(held.low) and not command:
+                whole.append(key)
+                continue
+            stated = names.get(key)
+            said = "" if len(held.low) == 1 else f" in dims {', '.join(map(str, still))}"
+            if stated and len(stated) == len(held.low):
+                said = f" in {listed([stated[i] for i in still])}"
+            severity: Severity = "warn" if command and not self.by_field else "info"
+            numbers = {"dims": still, "rows": held.rows}
+            yield Finding("constant", severity, f"{key} never changes{said}", key=key, numbers=numbers)
+        if whole:
+            yield Finding(
+                "constant", "info", f"never change at all: {listed(whole)}", numbers={"keys": whole}
+            )
+
+    @staticmethod
+    def _still(held: _Numbers) -> list[int]:
+        return [int(i) for i in np.flatnonzero(held.low == held.high)] if held.rows > 1 else []
+
+
+def _merged(found: list[Finding]) -> Iterator[Finding]:
+    """One finding for each check and key: the first, and how many more there are."""
+    together: dict[tuple[str, str, str], list[Finding]] = {}
+    for one in found:
+        together.setdefault((one.check, one.severity, one.key or one.message), []).append(one)
+    for first, *more in together.values():
+        said = f"{first.message} (and {len(more)} more like it)" if more else first.message
+        yield replace(first, message=said)
+
+
+def sampled(count: int, wanted: int) -> list[int]:
+    """Places of so many episodes, spread evenly over all."""
+    return [int(i) for i in np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(np.int64))]
+
+
+def listed(words: Sequence[str], limit: int = 8) -> str:
+    """The first of the words, and how many more there are."""
+    more = f" and {len(words) - limit} more" if len(words) > limit else ""
+    return ", ".join(words[:limit]) + more

@@ -1,0 +1,325 @@
+"""Pictures out of a video file, by index, decoding only what is asked for.
+
+A first pass over the packets (nothing is decoded) gives the exact time of every frame and where
+the keyframes are. Reading then keeps one decoder positioned: it decodes on when the next frame
+asked for is ahead within its group, and seeks when it lies behind or past another keyframe. A file
+whose keyframes or times are not what the container says is decoded from its beginning.
+
+PyAV's wheel brings its codecs, AV1 among them. OpenCV is not used here: it returns no frames
+for AV1 and no error.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Floats
+from hma_data.episodes.images import MAX_PIXELS, Images
+from hma_data.errors import EpisodeError
+
+THREADS = 1  # of FFmpeg, for each decoder: the work is spread over episodes, not within one
+# A file is only itself: no playlist or list of files may pass for a video and open others.
+_OPTIONS = {
+    "protocol_whitelist": "file",
+    "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,gif,mpeg,mpegts,flv,ogg,asf",
+}
+
+_REFRESHED = ("h264", "hevc")  # codecs whose "keyframe" may be a frame from which a refresh begins
+_INTRA = 1  # FFmpeg's AV_PICTURE_TYPE_I
+
+
+@dataclass(frozen=True)
+class FrameTable:
+    """What the packets of a video say about its frames; N frames in the order they are shown.
+
+    Attributes:
+        times: (N,) seconds, rising.
+        stamps: (N,) the same in ticks of the stream.
+        keys: (N,) for each frame the index of the keyframe its decoding starts from.
+        seek_stamps: (N,) ticks to seek to for that keyframe; may differ from when it is shown.
+        width, height: pixels, as stored.
+        codec: h264, av1, hevc, vp9, …
+        hz: rate the file states; None when it states none.
+        counted: the container's times are those of packets, not of frames (B-frames in AVI), so that
+            frames are known by the order they are decoded in alone.
+    """
+
+    times: Floats
+    stamps: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    seek_stamps: NDArray[np.int64]
+    width: int
+    height: int
+    codec: str
+    hz: float | None
+    counted: bool = False
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+
+def frame_table(path: Path) -> FrameTable:
+    """The frames of a video file, without decoding any.
+
+    Raises:
+        EpisodeError: there is no such file, no video in it, or it is damaged.
+    """
+    try:
+        state = path.stat()
+    except OSError as fault:
+        raise EpisodeError(path, "no such video file") from fault
+    return _cached_table(str(path), state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=64)  # LeRobotDataset v3 keeps hundreds of episodes in one file
+def _cached_table(path: str, size: int, changed: int) -> FrameTable:
+    with opened(path) as (container, stream):
+        shown: list[int] = []
+        keyframes: list[tuple[int, int]] = []
+        delays: set[int | None] = set()
+        for packet in container.demux(stream):
+            if packet.size == 0:
+                continue
+            stamp = packet.dts if packet.pts is None else packet.pts
+            if stamp is None:
+                raise EpisodeError(path, "its frames carry no times", "rewrite it as MP4")
+            if packet.is_corrupt:
+                raise EpisodeError(path, f"is damaged or cut off at frame {len(shown)}")
+            delays.add(None if packet.pts is None or packet.dts is None else packet.pts - packet.dts)
+            if packet.is_keyframe:
+                keyframes.append((stamp, stamp if packet.dts is None else packet.dts))
+            if not packet.is_discard:  # an edit list may hide frames, which are decoded but not shown
+                shown.append(stamp)
+        timeless = "avi" in container.format.name or delays <= {0, None}
+        counted = bool(stream.codec_context.has_b_frames) and timeless and len(delays) == 1
+        return _table(path, stream, shown, keyframes, counted)
+
+
+def _table(
+    path: str, stream: Any, shown: list[int], keyframes: list[tuple[int, int]], counted: bool
+) -> FrameTable:
+    stamps = np.sort(np.array(shown, np.int64))
+    if not len(stamps) or not keyframes:
+        raise EpisodeError(path, "has no frames")
+    if (np.diff(stamps) == 0).any():
+        raise EpisodeError(path, f"shows two frames at {stamps[np.diff(stamps, append=-1) == 0][0]} ticks")
+    starts = np.array(sorted(keyframes), np.int64)  # (K, 2): shown at, seek to
+    order = np.maximum(np.searchsorted(starts[:, 0], stamps, side="right") - 1, 0)
+    rate = stream.average_rate
+    return FrameTable(
+        times=stamps.astype(np.float64) * np.float64(stream.time_base),
+        stamps=stamps,
+        keys=np.searchsorted(stamps, starts[order, 0]),
+        seek_stamps=starts[order, 1],
+        width=stream.width,
+        height=stream.height,
+        codec=stream.codec.canonical_name,
+        hz=float(rate) if rate else None,
+        counted=counted,
+    )
+
+
+class VideoFile:
+    """A video file as an array of frames. Opens on first use, and again after a fork.
+
+    Args:
+        path: of the file.
+        threads: of FFmpeg.
+    """
+
+    def __init__(self, path: Path, threads: int = THREADS) -> None:
+        self.path = path
+        self.table = frame_table(path)
+        self._threads = threads
+        self._process = 0
+        self._container: Any = None
+        self._decoder: Iterator[Any] = iter(())
+        self._next = 0  # index of the frame the decoder gives next
+        self._entry = -1  # index of the keyframe that was last sought
+        self._counts, self._seeks = False, True  # whether frames are counted; whether keyframes are sought
+        self._spoilt = False  # whether the last frame, or one it may be made from, is damaged
+        self._reformatter: Any = None
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @property
+    def timestamps(self) -> Floats:
+        """(N,) seconds by the file's own clock."""
+        return self.table.times
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """Pictures (n, H, W, 3) RGB uint8 of those frames; quickest when the indices rise.
+
+        Raises:
+            EpisodeError: a frame cannot be decoded, or the pictures change size.
+            IndexError: an index outside the video.
+        """
+        wanted = np.asarray(indices, np.int64).reshape(-1)
+        if len(wanted) and not 0 <= wanted.min() <= wanted.max() < len(self):
+            raise IndexError(
+                f"{self.path} has {len(self)} frames, asked for {wanted.min()} to {wanted.max()}"
+            )
+        pictures: dict[int, Images] = {}
+        with _explained(str(self.path)):
+            for index in np.unique(wanted):
+                pictures[int(index)] = self._picture(int(index))
+        if len({picture.shape for picture in pictures.values()}) > 1:
+            raise EpisodeError(self.path, "its pictures change size")
+        if not pictures:
+            return np.zeros((0, self.table.height, self.table.width, 3), np.uint8)
+        return np.stack([pictures[int(index)] for index in wanted])
+
+    def close(self) -> None:
+        """Close the file; the next `frames` opens it again."""
+        if self._container is not None:
+            self._container.close()
+        self._container, self._decoder = None, iter(())
+
+    def __del__(self) -> None:
+        if getattr(self, "_process", 0) == os.getpid():
+            self.close()
+
+    def _picture(self, index: int) -> Images:
+        try:
+            frame = self._frame(index)
+        except EpisodeError:
+            if self._counts:
+                raise
+            self._count()
+            frame = self._frame(index)
+        if self._spoilt:
+            raise EpisodeError(self.path, f"frame {index} is damaged, or one before it that it is made from")
+        return self._to_rgb(frame)
+
+    def _count(self) -> None:
+        """From here on know frames by their order alone, the file having as many as its packets tell."""
+        self._reopen()
+        given = sum(1 for _ in self._decoder)
+        if given != len(self):
+            raise EpisodeError(self.path, f"gives {given} frames, its packets tell of {len(self)}")
+        self._counts, self._seeks = True, False
+        self._reopen()
+
+    def _frame(self, index: int) -> Any:
+        if self.table.counted and not self._counts:
+            self._count()
+        self._position(index)
+        frame = self._decode_up_to(index)
+        if frame is None:  # the file's seek went past it: once more from the beginning
+            self._reopen()
+            frame = self._decode_up_to(index)
+        if frame is None:
+            raise EpisodeError(self.path, f"frame {index} of {len(self)} cannot be decoded")
+        return frame
+
+    def _decode_up_to(self, index: int) -> Any:
+        for frame in self._decoder:
+            self._spoilt = is_spoilt(frame, self._spoilt)
+            found = self._next if self._counts else self._index_of(frame)
+            if found == self._entry and self.table.codec in _REFRESHED and frame.pict_type != _INTRA:
+                self._seeks = False  # a refresh spread over many frames: what follows is not whole
+                return None
+            self._next = found + 1
+            if found >= index:
+                return frame if found == index else None
+        return None
+
+    def _position(self, index: int) -> None:
+        """Bring the decoder before that frame."""
+        if self._container is None or self._process != os.getpid():
+            self._reopen()
+        if not self._seeks:
+            if index < self._next:
+                self._reopen()
+        elif index < self._next or self.table.keys[index] > self._next:
+            stream = self._container.streams.best("video")
+            self._container.seek(int(self.table.seek_stamps[index]), stream=stream, backward=True)
+            self._decoder, self._spoilt = self._container.decode(stream), False
+            self._next = self._entry = int(self.table.keys[index])
+
+    def _reopen(self) -> None:
+        from av.video.reformatter import VideoReformatter
+
+        # A parent's decoder is let go unclosed: after a fork the two share the file's position.
+        self._container, self._process = _open(str(self.path)), os.getpid()
+        stream = _video_stream(self._container, str(self.path))
+        stream.codec_context.thread_count = self._threads
+        stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+        self._decoder, self._next, self._entry = self._container.decode(stream), 0, -1
+        self._spoilt = False
+        self._reformatter = VideoReformatter()  # one for all frames: making it costs a third of the time
+
+    def _index_of(self, frame: Any) -> int:
+        """The frame's index; one that comes before the first shown is -1."""
+        if frame.pts is None:
+            raise EpisodeError(self.path, f"frame {self._next} comes without a time")
+        index = int(np.searchsorted(self.table.stamps, frame.pts))
+        if index < len(self) and self.table.stamps[index] == frame.pts:
+            return index
+        if index == 0:
+            return -1
+        raise EpisodeError(self.path, f"gives a frame at {frame.pts} ticks that its packets do not name")
+
+    def _to_rgb(self, frame: Any) -> Images:
+        picture: Images = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
+        quarters = round(frame.rotation / 90) % 4  # a telephone's way to say it was held upright
+        return np.ascontiguousarray(np.rot90(picture, quarters)) if quarters else picture
+
+
+def is_spoilt(frame: Any, before: bool) -> bool:
+    """Whether a decoded frame is damaged, or may be made from one that is.
+
+    Args:
+        frame: PyAV's.
+        before: the same of the frame that was decoded before it.
+    """
+    return bool(frame.is_corrupt or (before and not frame.key_frame))
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
+    """A video file's container and its video stream; FFmpeg's errors become ours.
+
+    Raises:
+        EpisodeError: it is no video, or damaged.
+    """
+    with _explained(str(path)), _open(str(path)) as container:
+        yield container, _video_stream(container, str(path))
+
+
+def _open(path: str) -> Any:
+    import av
+
+    return av.open(path, container_options=_OPTIONS)  # given to streams too, PyAV crashes on FLV
+
+
+def _video_stream(container: Any, path: str) -> Any:
+    stream = container.streams.best("video")
+    if stream is None:
+        raise EpisodeError(path, "has no video in it")
+    if stream.codec_context is None or not stream.width:
+        raise EpisodeError(path, "holds video of a kind that is not known", "the file may be damaged")
+    if stream.width * stream.height > MAX_PIXELS:
+        raise EpisodeError(path, f"claims {stream.width}×{stream.height} pixels")
+    return stream
+
+
+@contextmanager
+def _explained(path: str) -> Iterator[None]:
+    """Turns FFmpeg's errors into ours."""
+    from av.error import FFmpegError
+
+    try:
+        yield
+    except (FFmpegError, MemoryError, OverflowError, UnicodeDecodeError) as fault:
+        said = getattr(fault, "strerror", None) or fault
+        remedy = "the file may be cut off or damaged"
+        raise EpisodeError(path, f"cannot be decoded as video: {said}", remedy) from fault

@@ -1,0 +1,312 @@
+"""Find hands in pictures: the detector's contract, and MediaPipe's pipeline over LiteRT.
+
+Palms are found in the whole picture; each gives a turned square that the landmark model looks
+at; its points give the square of the next picture, so that palms are looked for only while
+fewer than two hands are followed. Constants are those of MediaPipe's published graphs
+(palm_detection_cpu, palm_detection_detection_to_roi, hand_landmark_cpu,
+hand_landmark_landmarks_to_roi, hand_landmark_tracking_cpu).
+
+Left and right are the person's own hands in a picture that is not mirrored. MediaPipe's graph
+takes pictures for mirrored, as front cameras show them, and so calls a right hand in a plain
+picture "Left"; the model's number itself is the chance of a right hand in a plain picture.
+
+Geometry is in pixels, angles in radians, x to the right and y down.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import Images, opencv
+from hma_data.sources.hands.models import (
+    ANCHORS,
+    HAND_SIDE,
+    PALM_SIDE,
+    HandModels,
+    hand_network,
+    load_models,
+    palm_network,
+)
+
+Floats = NDArray[np.float64]
+
+HANDS = 2  # that are followed
+PALM_SCORE, SUPPRESSION, PRESENCE, SAME = 0.5, 0.3, 0.5, 0.5
+VERSION = 1  # rises when the same picture may give other points; part of the key of cached detections
+_KNUCKLES = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # the points that say where the hand will be next
+_SURE = 0.8  # of a side; a second hand that claims it with less is taken for the other hand
+
+
+@dataclass(frozen=True)
+class Hand:
+    """One hand in one picture.
+
+    Attributes:
+        side: left or right, the person's own.
+        score: how sure it is that there is a hand, 0..1.
+        points: (21, 2) x and y as fractions of the picture's width and height; may lie outside it.
+            Point 0 is the wrist, then four of each finger from the thumb on, tips at 4, 8, 12, 16, 20.
+    """
+
+    side: str
+    score: float
+    points: Floats
+
+
+class Detector(Protocol):
+    """Finds at most one left and one right hand in each picture of a video, in order."""
+
+    def reset(self) -> None:
+        """Forget the pictures before: the next one is of another video."""
+        ...
+
+    def detect(self, picture: Images) -> list[Hand]:
+        """The hands in a picture (H, W, 3) RGB."""
+        ...
+
+
+@dataclass(frozen=True)
+class Square:
+    """A turned square of a picture: centre, side and clockwise angle."""
+
+    x: float
+    y: float
+    side: float
+    angle: float
+
+    def to_picture(self, size: int) -> Floats:
+        """(2, 3) affine map from a picture of the square, `size` pixels wide, to the whole picture."""
+        scale = self.side / size
+        cos, sin = math.cos(self.angle) * scale, math.sin(self.angle) * scale
+        half = size / 2
+        return np.array(
+            [
+                [cos, -sin, self.x - half * (cos - sin)],
+                [sin, cos, self.y - half * (sin + cos)],
+            ]
+        )
+
+
+@dataclass
+class Track:
+    """A hand that is followed.
+
+    Attributes:
+        square: where to look for it.
+        right: sum of P(right) over the pictures it was seen in.
+        seen: number of them.
+    """
+
+    square: Square
+    right: float = 0.0
+    seen: int = 0
+
+    @property
+    def p_right(self) -> float:
+        """Its handedness over all pictures so far: single ones flicker."""
+        return self.right / self.seen if self.seen else 0.5
+
+
+class MediaPipeHands:
+    """MediaPipe's palm and landmark models.
+
+    Args:
+        models: their files; None takes $HMA_HAND_MODELS.
+        presence: scores below are no hand.
+        mirrored: the pictures are mirrored, as front cameras show them.
+
+    Raises:
+        SourceError: no models, or other ones.
+        MissingDependencyError: LiteRT is not installed.
+    """
+
+    def __init__(
+        self, models: HandModels | None = None, presence: float = PRESENCE, mirrored: bool = False
+    ) -> None:
+        models = models or load_models()
+        self._palm, self._hand = palm_network(models), hand_network(models)
+        self._presence, self._mirrored = presence, mirrored
+        self._anchors = palm_anchors()
+        self._tracks: list[Track] = []
+
+    def reset(self) -> None:
+        """See Detector."""
+        self._tracks = []
+
+    def detect(self, picture: Images) -> list[Hand]:
+        """See Detector."""
+        height, width = picture.shape[:2]
+        tracks = list(self._tracks)
+        if len(tracks) < HANDS:
+            tracks += self._new_tracks(picture, [track.square for track in tracks])
+        found: list[tuple[Track, float, Floats]] = []
+        for track in tracks:
+            score, points, p_right = self._look(picture, track.square)
+            if score < self._presence or any(_same(points, other) for _, _, other in found):
+                continue
+            square = square_of_points(points)
+            found.append((Track(square, track.right + p_right, track.seen + 1), score, points))
+        found = found[:HANDS]
+        self._tracks = [track for track, _, _ in found]
+        sides = choose_sides([track.p_right for track in self._tracks])
+        return [
+            Hand(side, score, points / (width, height))
+            for side, (_, score, points) in zip(sides, found)
+            if side
+        ]
+
+    def _new_tracks(self, picture: Images, known: list[Square]) -> list[Track]:
+        squares = [square_of_palm(palm) for palm in self.palms(picture)[:HANDS]]
+        return [Track(square) for square in squares if not any(_overlap(square, old) > SAME for old in known)]
+
+    def palms(self, picture: Images) -> list[Floats]:
+        """Palms in a picture, the surest first: (9, 2) corner, corner and seven points in pixels."""
+        height, width = picture.shape[:2]
+        whole = Square(width / 2, height / 2, max(width, height), 0.0)
+        values, scores = self._palm(cut(picture, whole, PALM_SIDE))
+        found = decode_palms(values.reshape(ANCHORS, 18), scores, self._anchors)
+        matrix = whole.to_picture(PALM_SIDE)
+        return [palm * PALM_SIDE @ matrix[:, :2].T + matrix[:, 2] for palm in found]
+
+    def _look(self, picture: Images, square: Square) -> tuple[float, Floats, float]:
+        """Presence, points (21, 2) in pixels of the whole picture, and P(right)."""
+        values, presence, handedness = self._hand(cut(picture, square, HAND_SIDE))
+        matrix = square.to_picture(HAND_SIDE)
+        points = values.reshape(21, 3)[:, :2].astype(np.float64) @ matrix[:, :2].T + matrix[:, 2]
+        plain = float(handedness[0])
+        return float(presence[0]), points, 1 - plain if self._mirrored else plain
+
+
+def choose_sides(p_right: Sequence[float]) -> list[str | None]:
+    """A side for each hand, at most one hand a side; None for a hand that is one too many.
+
+    Args:
+        p_right: of at most two hands.
+    """
+    sides: list[str | None] = ["right" if p >= 0.5 else "left" for p in p_right]
+    if len(sides) == 2 and sides[0] == sides[1]:
+        doubtful = int(abs(p_right[1] - 0.5) <= abs(p_right[0] - 0.5))
+        other = "left" if sides[0] == "right" else "right"
+        sides[doubtful] = other if max(p_right[doubtful], 1 - p_right[doubtful]) < _SURE else None
+    return sides
+
+
+def cut(picture: Images, square: Square, size: int) -> NDArray[np.float32]:
+    """A square of a picture as (size, size, 3) float32 in 0..1; black beyond the edge."""
+    cv2: Any = opencv()
+    matrix = square.to_picture(size)
+    # Pixel i covers i to i+1, and OpenCV counts from pixels' middles.
+    matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    shown = cv2.warpAffine(picture, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_CONSTANT)
+    return np.multiply(shown, np.float32(1 / 255), dtype=np.float32)
+
+
+def palm_anchors() -> Floats:
+    """(2016, 2) x and y, 0..1, of the palm model's anchors: two a cell of 24×24, six a cell of 12×12."""
+    found = []
+    for stride, copies in ((8, 2), (16, 6)):
+        cells = PALM_SIDE // stride
+        y, x = np.mgrid[:cells, :cells]
+        centres = (np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / cells
+        found.append(np.repeat(centres, copies, axis=0))
+    return np.concatenate(found)
+
+
+def decode_palms(values: NDArray[Any], scores: NDArray[Any], anchors: Floats) -> list[Floats]:
+    """What the palm model found, overlapping finds merged, the surest first.
+
+    Args:
+        values: (2016, 18) x, y, width, height and seven points, in pixels from the anchor.
+        scores: (2016,) logits.
+        anchors: (2016, 2).
+
+    Returns:
+        for each palm (9, 2): upper left, lower right and seven points, as fractions of the model's picture.
+    """
+    chance = 1 / (1 + np.exp(-np.clip(scores.astype(np.float64), -100, 100)))
+    order = np.flatnonzero(chance >= PALM_SCORE)
+    order = order[np.argsort(-chance[order], kind="stable")]
+    pairs = values[order].astype(np.float64).reshape(-1, 9, 2) / PALM_SIDE
+    centre, half = pairs[:, 0] + anchors[order], pairs[:, 1] / 2
+    points = pairs[:, 2:] + anchors[order][:, None]
+    shapes = np.concatenate([(centre - half)[:, None], (centre + half)[:, None], points], axis=1)
+    return merge_overlapping(shapes, chance[order])
+
+
+def merge_overlapping(shapes: Floats, chances: Floats) -> list[Floats]:
+    """Weighted non-maximum suppression: a find takes in what overlaps it, each by its chance.
+
+    Args:
+        shapes: (n, 9, 2), the first two rows corners of a box; the surest first.
+        chances: (n,).
+    """
+    merged = []
+    while len(shapes):
+        together = box_overlap(shapes[0, :2], shapes[:, :2]) > SUPPRESSION
+        together[0] = True
+        merged.append(np.average(shapes[together], axis=0, weights=chances[together]))
+        shapes, chances = shapes[~together], chances[~together]
+    return merged
+
+
+def box_overlap(box: Floats, others: Floats) -> Floats:
+    """Intersection over union of a box (2, 2) of corners with others (n, 2, 2)."""
+    low, high = np.maximum(box[0], others[:, 0]), np.minimum(box[1], others[:, 1])
+    shared = np.prod(np.maximum(high - low, 0), axis=1)
+    areas = np.prod(others[:, 1] - others[:, 0], axis=1) + np.prod(box[1] - box[0])
+    return shared / np.maximum(areas - shared, 1e-12)
+
+
+def square_of_palm(palm: Floats) -> Square:
+    """Where the whole hand of a palm (9, 2) is: from wrist to middle knuckle is upwards."""
+    centre, (width, height) = (palm[0] + palm[1]) / 2, palm[1] - palm[0]
+    angle = _upright(palm[2], palm[4])
+    return _grown(centre, width, height, angle, scale=2.6, up=0.5)
+
+
+def square_of_points(points: Floats) -> Square:
+    """Where the hand of those points (21, 2) will be in the next picture."""
+    ahead = ((points[5] + points[13]) / 2 + points[9]) / 2
+    angle = _upright(points[0], ahead)
+    known = points[_KNUCKLES]
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = np.array([[cos, -sin], [sin, cos]])  # from the hand's own axes to the picture's
+    own = known @ turn
+    low, high = own.min(axis=0), own.max(axis=0)
+    width, height = high - low
+    return _grown(turn @ ((low + high) / 2), width, height, angle, scale=2.0, up=0.1)
+
+
+def _upright(start: Floats, end: Floats) -> float:
+    """The clockwise angle by which a hand that points from `start` to `end` is turned from upright."""
+    dx, dy = end - start
+    return math.remainder(math.pi / 2 - math.atan2(-dy, dx), 2 * math.pi)
+
+
+def _grown(centre: Floats, width: float, height: float, angle: float, scale: float, up: float) -> Square:
+    """The square round a turned box, moved `up` of its height along the hand and made larger."""
+    return Square(
+        float(centre[0] + height * up * math.sin(angle)),
+        float(centre[1] - height * up * math.cos(angle)),
+        float(max(width, height, 1.0) * scale),
+        angle,
+    )
+
+
+def _overlap(one: Square, other: Square) -> float:
+    corners = [
+        np.array([[s.x - s.side / 2, s.y - s.side / 2], [s.x + s.side / 2, s.y + s.side / 2]])
+        for s in (one, other)
+    ]
+    return float(box_overlap(corners[0], corners[1][None])[0])
+
+
+def _same(points: Floats, others: Floats) -> bool:
+    """Whether two sets of points are of one hand: no further apart than a third of its length."""
+    apart = float(np.linalg.norm(points - others, axis=1).mean())
+    return apart < float(np.linalg.norm(np.ptp(points, axis=0))) / 3

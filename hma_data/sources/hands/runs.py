@@ -1,0 +1,271 @@
+"""Labelled hands of a video, and the runs of frames in which the needed hands are there.
+
+A point is a side and a part of the hand: `left/center`, `right/wrist`, `left/landmarks`. A key
+of a component is a point, with `/next` for its value at the next labelled frame of the run, or
+`/delta` for next minus current.
+
+N labelled frames of a video, n of a run, w values of a point (2, or 42 for landmarks).
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.sources.hands.layout import HandsLayout, Header
+
+Floats = NDArray[np.float64]
+Frames = NDArray[np.int64]
+
+SIDES = ("left", "right")
+PARTS = {"center": 2, "wrist": 2, "landmarks": 42}
+POINTS = {f"{side}/{part}": width for side in SIDES for part, width in PARTS.items()}
+KEYS = tuple(point + suffix for point in POINTS for suffix in ("", "/next", "/delta"))
+BEYOND = 0.05  # of the picture's side, by which a label may leave it and is put on its edge
+LATE = 0.01  # of a video's frames, by which labels may go on after its end
+
+
+def point_of(key: str, where: str) -> str:
+    """The point a component's key is about.
+
+    Raises:
+        SourceError: it is no key of hand videos.
+    """
+    if key not in KEYS:
+        near = get_close_matches(key, KEYS, n=3, cutoff=0.4)
+        hint = f"did you mean {', '.join(near)}?" if near else "keys are such as left/center/next"
+        raise SourceError(where, f"{key!r} is not a key of hand videos", hint)
+    return key.removesuffix("/next").removesuffix("/delta")
+
+
+@dataclass(frozen=True)
+class HandLabels:
+    """Where the hands of one video are.
+
+    Attributes:
+        frames: (N,) indices of the video's frames that were labelled, rising.
+        points: point -> (N, w); NaN where there is no such hand. Every point is there.
+        pixels: values are pixels, not fractions.
+        irregular: labels are few, at any spacing; otherwise a frame that is left out has no hand.
+        texts: (frame, what is done from there on).
+    """
+
+    frames: Frames
+    points: dict[str, Floats]
+    pixels: bool = False
+    irregular: bool = False
+    texts: tuple[tuple[int, str], ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+def labels_from_rows(
+    frames: NDArray[Any],
+    sides: NDArray[Any],
+    scores: NDArray[Any],
+    parts: dict[str, NDArray[Any]],
+    looked_at: Iterable[int] = (),
+    **facts: Any,
+) -> HandLabels:
+    """Labels from a row a hand; of two left hands in a frame the higher score counts.
+
+    Args:
+        frames: (R,) index of the frame.
+        sides: (R,) 0 left, 1 right.
+        scores: (R,).
+        parts: center, wrist or landmarks -> (R, w); landmarks alone, as fractions, give all three.
+        looked_at: frames that were labelled, with or without a hand.
+        facts: further attributes of HandLabels.
+    """
+    if set(parts) == {"landmarks"}:
+        parts = parts_of_landmarks(parts["landmarks"])
+    order = np.argsort(scores, kind="stable")
+    every = np.unique(np.concatenate([frames, np.fromiter(looked_at, np.int64)]).astype(np.int64))
+    row = np.searchsorted(every, frames[order])
+    points: dict[str, Floats] = {}
+    for number, side in enumerate(SIDES):
+        mine = sides[order] == number
+        for part, width in PARTS.items():
+            values = np.full((len(every), width), np.nan)
+            if part in parts:
+                values[row[mine]] = parts[part][order][mine]
+            values[~np.isfinite(values).all(axis=1)] = np.nan
+            points[f"{side}/{part}"] = values
+    return HandLabels(every, points, **facts)
+
+
+def parts_of_landmarks(landmarks: NDArray[Any]) -> dict[str, Floats]:
+    """Landmarks (R, 42), put on the picture's edge where they lie outside; their box's centre; the wrist."""
+    inside = np.clip(landmarks.astype(np.float64).reshape(-1, 21, 2), 0, 1)
+    return {
+        "center": (inside.min(axis=1) + inside.max(axis=1)) / 2,
+        "wrist": inside[:, 0],
+        "landmarks": inside.reshape(-1, 42),
+    }
+
+
+@dataclass(frozen=True)
+class Runs:
+    """A video's labels cut into runs.
+
+    Attributes:
+        labels: as fractions, gaps of regular labels filled in, hands held.
+        spans: [from, to) into the labels, one a run; the last frame of a run only ends it.
+        missing: (N,) labels that lack a needed hand, held ones not among them.
+        held: (N,) labels in which a needed hand keeps its last place.
+        counts: labelled, without_hands, outside, held, dropped: frames.
+    """
+
+    labels: HandLabels
+    spans: tuple[tuple[int, int], ...]
+    missing: NDArray[np.bool_]
+    held: NDArray[np.bool_]
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def longest(self) -> int:
+        """Number of the longest run, the first of equals."""
+        lengths = [stop - start for start, stop in self.spans]
+        return lengths.index(max(lengths))
+
+
+def cut_into_runs(
+    labels: HandLabels, needed: Sequence[str], layout: HandsLayout, video: Header, where: str
+) -> Runs:
+    """The runs of a video.
+
+    Args:
+        needed: points that must be there.
+        video: number, rate and size of its pictures.
+        where: the video, for errors.
+
+    Raises:
+        EpisodeError: labels that do not fit the video, or have none of a needed point.
+    """
+    labels = _within(labels, video.frames, where)
+    size = (video.width, video.height)
+    labels, outside = _as_fractions(labels, needed, layout.label_size or size, where)
+    for point in needed:
+        if not np.isfinite(labels.points[point]).any():
+            have = [name for name, values in labels.points.items() if np.isfinite(values).any()]
+            raise EpisodeError(where, f"no label has {point}", f"labels have {', '.join(have) or 'no hands'}")
+    labels, step = _gaps_filled(labels)
+    there = np.all([np.isfinite(labels.points[point]).all(axis=1) for point in needed], axis=0)
+    without = ~there
+    if layout.missing != "split":
+        limit = 0 if layout.missing == "mask" and layout.max_hold is None else layout.max_hold
+        kept = {point: _held(labels.points[point], limit) for point in needed}
+        labels = replace(labels, points=labels.points | kept)
+        there = np.all([np.isfinite(values).all(axis=1) for values in kept.values()], axis=0)
+    widest = max(1, round(layout.max_gap_s * video.hz)) if labels.irregular else step
+    usable = np.ones_like(there) if layout.missing == "mask" else there
+    least = max(1, layout.min_frames)
+    long = [
+        (start, stop)
+        for start, stop in find_spans(labels.frames, usable, widest)
+        if episode_frames(labels, (start, stop), layout) - int((~there[start:stop]).sum()) >= least
+    ]
+    counts = {
+        "labelled": len(labels),
+        "without_hands": int(without.sum()),
+        "outside": outside,
+        "held": int((without & there).sum()),
+        "dropped": len(labels) - sum(stop - start - 1 for start, stop in long),
+    }
+    return Runs(labels, tuple(long), ~there, without & there, counts)
+
+
+def episode_frames(labels: HandLabels, span: tuple[int, int], layout: HandsLayout) -> int:
+    """Pictures of the episode a run gives."""
+    start, stop = span
+    every = layout.pictures == "every"
+    return int(labels.frames[stop - 1] - labels.frames[start]) if every else stop - start - 1
+
+
+def find_spans(frames: Frames, there: NDArray[np.bool_], widest: int) -> list[tuple[int, int]]:
+    """Longest stretches [from, to) of labels that are there and no further apart than `widest` frames."""
+    joined = there[1:] & there[:-1] & (np.diff(frames) <= widest)
+    starts = np.flatnonzero(there & ~np.concatenate([[False], joined]))
+    stops = np.flatnonzero(there & ~np.concatenate([joined, [False]])) + 1
+    return list(zip(starts.tolist(), stops.tolist()))
+
+
+def values_of(key: str, points: dict[str, Floats], span: tuple[int, int]) -> Floats:
+    """(n - 1, w) values of a key over a run of n labels, NaN where a hand is missing that it needs.
+
+    The last label is only a next one.
+    """
+    start, stop = span
+    values = points[point_of(key, key)][start:stop]
+    if key.endswith("/next"):
+        return values[1:]
+    return np.diff(values, axis=0) if key.endswith("/delta") else values[:-1]
+
+
+def _within(labels: HandLabels, frames: int, where: str) -> HandLabels:
+    """Labels of frames that the video has; a few may lie beyond its end."""
+    inside = (labels.frames >= 0) & (labels.frames < frames)
+    beyond = labels.frames[~inside]
+    if len(beyond) and (beyond.min() < 0 or beyond.max() > frames * (1 + LATE) + 2 or not inside.any()):
+        worst = int(beyond.min() if beyond.min() < 0 else beyond.max())
+        fault = f"is labelled at frame {worst:,}, and has {frames:,} frames"
+        raise EpisodeError(where, fault, "are the labels of another video, or is first_frame another?")
+    points = {point: values[inside] for point, values in labels.points.items()}
+    return replace(labels, frames=labels.frames[inside], points=points)
+
+
+def _as_fractions(
+    labels: HandLabels, needed: Sequence[str], size: tuple[int, int], where: str
+) -> tuple[HandLabels, int]:
+    """Fractions of the picture; hands outside it are taken as missing, and counted."""
+    points, lost = {}, np.zeros(len(labels), bool)
+    for point, raw in labels.points.items():
+        values = raw / np.tile(size, raw.shape[1] // 2) if labels.pixels else raw
+        with np.errstate(invalid="ignore"):
+            beyond = np.any((values < -BEYOND) | (values > 1 + BEYOND), axis=1)
+        seen = int(np.isfinite(values).all(axis=1).sum())
+        if point in needed:
+            lost |= beyond
+            if beyond.sum() > seen / 2:
+                worst = raw[beyond][0, :2]
+                unit = "pixels" if labels.pixels else "of the picture's sides"
+                fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the picture, "
+                fault += f"{worst[0]:.4g}, {worst[1]:.4g} {unit} first; the picture has {size[0]}×{size[1]}"
+                raise EpisodeError(
+                    where, fault, "are they of another video, or of another size (label_size)?"
+                )
+        points[point] = np.where(beyond[:, None], np.nan, np.clip(values, 0, 1))
+    return replace(labels, points=points, pixels=False), int(lost.sum())
+
+
+def _gaps_filled(labels: HandLabels) -> tuple[HandLabels, int]:
+    """Regular labels with every frame of their rhythm, NaN where there was none; and the rhythm in frames.
+
+    Labels whose spacings are not multiples of the commonest one are irregular.
+    """
+    spacing = np.diff(labels.frames)
+    if labels.irregular or not len(spacing):
+        return labels, 1
+    step = int(np.bincount(spacing).argmax())
+    if (spacing % step).any():
+        return replace(labels, irregular=True), 1
+    every = np.arange(labels.frames[0], labels.frames[-1] + 1, step)
+    row = (labels.frames - labels.frames[0]) // step
+    points: dict[str, Floats] = {}
+    for point, values in labels.points.items():
+        points[point] = np.full((len(every), values.shape[1]), np.nan)
+        points[point][row] = values
+    return replace(labels, frames=every, points=points), step
+
+
+def _held(values: Floats, limit: int | None) -> Floats:
+    """Missing values replaced by the last ones there, for at most `limit` labels in a row."""
+    there = np.isfinite(values).all(axis=1)
+    last = np.maximum.accumulate(np.where(there, np.arange(len(values)), -1))
+    age = np.arange(len(values)) - last
+    kept = (last >= 0) & (age <= (len(values) if limit is None else limit))
+    return np.where(kept[:, None], values[np.maximum(last, 0)], np.nan)

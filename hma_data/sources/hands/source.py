@@ -1,0 +1,347 @@
+"""Videos of human hands: where both hands are in the picture stands for the action.
+
+A uri is a video file or a folder of videos. An episode has the camera `video` and as values the
+places of the hands, as fractions of the picture's width and height (0..1, x to the right, y
+down), of the picture as it is decoded, before any flip, rotation or crop of the YAML:
+
+    left/center, right/center        centre of the hand's box
+    left/wrist, right/wrist
+    left/landmarks, right/landmarks  42: x, y of 21 points, the wrist first
+
+with `/next` for the value at the next labelled frame, `/delta` for next minus current, and
+nothing for the current one. Left and right are the person's own.
+
+Labels come from a detector or from annotations (`source.layout.labels`, see hands_layout). A
+frame without a needed hand ends a run, or its last place is held, or the run goes on and the values that
+need the hand are not known (`source.layout.missing`: split, hold, mask). With annotations each run of
+at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain name `clip.mp4` is
+the longest. Runs of one video share a group, so that they come into one split. The detector runs while an
+episode is read, not while episodes are counted, so there a video is one episode, `clip.mp4`: its longest
+run. What is held, masked and left out is counted in the episode's metadata and flags; `detect` writes a table
+with which all runs become episodes.
+
+T frames of an episode.
+"""
+
+import hashlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Episode, Floats, Signal
+from hma_data.episodes.images import Images
+from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.registry.components import Vector
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.common.video_file import FrameTable, VideoFile
+from hma_data.sources.hands.inspect import inspect_videos
+from hma_data.sources.hands.labels import LabelSet, open_labels
+from hma_data.sources.hands.layout import HandsLayout, Header, Video, header_of, layout_of, videos_of
+from hma_data.sources.hands.models import HandModels, load_models
+from hma_data.sources.hands.runs import (
+    POINTS,
+    HandLabels,
+    Runs,
+    cut_into_runs,
+    episode_frames,
+    point_of,
+    values_of,
+)
+from hma_data.sources.hands.scan import detect, scan_cached
+from hma_data.storage.paths import StrPath, as_text
+
+__all__ = ["CAMERA", "HandsSource", "detect", "open"]
+
+CAMERA = "video"
+RATE_TOLERANCE = 0.01  # of the rate
+REGULAR = 0.1  # of the median interval, by which the others of a regular video may differ
+
+
+class HandsSource:
+    """See the module."""
+
+    def __init__(self) -> None:
+        self._videos: dict[str, dict[str, Video]] = {}
+        self._labels: dict[tuple[str, HandsLayout], LabelSet] = {}
+        self._detector: tuple[int, HandsLayout, Any, HandModels] | None = None
+
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
+        """The videos, and the hands in a small sample of frames where there are models."""
+        return inspect_videos(as_text(uri), episodes)
+
+    def episode_ids(self, uri: StrPath) -> list[str]:
+        """The videos' names; each is the longest run of its video."""
+        return list(self._find(as_text(uri), again=True))
+
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+        """Videos, or runs of them where there are annotations; no picture is decoded.
+
+        Raises:
+            SourceError: no videos, no models or labels, none that fit, or no run that is long enough.
+            RegistryError: the YAML's layout is wrong.
+        """
+        uri, layout = as_text(uri), layout_of(embodiment)
+        videos = self._find(uri, again=True)
+        needed = _needed(embodiment) if embodiment else ("left/center", "right/center")
+        if layout.labels == "detector":
+            digest = self._models(layout)[1].digest if embodiment else ""
+            return [_whole(video, digest) for video in videos.values()]
+        self._labels.clear()
+        labels = self._open_labels(uri, layout)
+        found = [ref for video in videos.values() for ref in _runs_of(video, labels, needed, layout)]
+        if not found:
+            raise SourceError(uri, *_nothing(videos, labels, layout))
+        return found
+
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
+        """One run of a video; its pictures are decoded when asked for.
+
+        Raises:
+            EpisodeError: the video or its labels are damaged, or no run is long enough.
+            SourceError: no such episode, or a key that is none of hand videos.
+            RegistryError: the YAML's layout is wrong.
+        """
+        uri, layout = as_text(uri), layout_of(embodiment)
+        video, number = self._place(uri, episode_id)
+        file, runs = self.runs(uri, video.name, embodiment)
+        if not runs.spans:
+            raise EpisodeError(video.path, *_no_run(runs, _needed(embodiment), layout))
+        alone = number is None
+        number = runs.longest() if number is None else number
+        if number >= len(runs.spans):
+            raise EpisodeError(video.path, f"has {len(runs.spans)} runs, no run {number}")
+        return _episode(episode_id, file, runs, number, embodiment, alone)
+
+    def runs(self, uri: StrPath, name: str, embodiment: Embodiment) -> tuple[VideoFile, Runs]:
+        """A video and all its runs; see read."""
+        uri, layout, needed = as_text(uri), layout_of(embodiment), _needed(embodiment)
+        video = self._place(uri, name)[0]
+        if layout.labels == "detector":
+            self._models(layout)  # what is missing is said before the video is opened
+        file = VideoFile(video.path)
+        labels = self._labels_of(uri, video, layout)
+        return file, cut_into_runs(labels, needed, layout, _header(file.table), str(video.path))
+
+    def _find(self, uri: str, again: bool = False) -> dict[str, Video]:
+        if again or uri not in self._videos:
+            self._videos[uri] = videos_of(uri)
+        return self._videos[uri]
+
+    def _place(self, uri: str, episode_id: str) -> tuple[Video, int | None]:
+        videos = self._find(uri)
+        if episode_id in videos:
+            return videos[episode_id], None
+        name, _, number = episode_id.rpartition("#")
+        if name not in videos or not number.isdecimal():
+            raise SourceError(uri, f"has no episode {episode_id!r}", "hma inspect lists what it has")
+        return videos[name], int(number)
+
+    def _open_labels(self, uri: str, layout: HandsLayout) -> LabelSet:
+        if (uri, layout) not in self._labels:
+            self._labels[uri, layout] = open_labels(layout, uri)
+        return self._labels[uri, layout]
+
+    def _labels_of(self, uri: str, video: Video, layout: HandsLayout) -> HandLabels:
+        if layout.labels == "detector":
+            detector, models = self._models(layout)
+            return scan_cached(video.path, detector, models, layout).labels(layout.min_score)
+        labels = self._open_labels(uri, layout)
+        found = labels.of(video)
+        if found is None:
+            raise EpisodeError(video.path, "has no labels", f"there are labels of {_some(labels.known())}")
+        return found
+
+    def _models(self, layout: HandsLayout) -> tuple[Any, HandModels]:
+        """The detector, made once in each process."""
+        from hma_data.sources.hands.detect import MediaPipeHands
+
+        if self._detector is None or self._detector[:2] != (os.getpid(), layout):
+            models = load_models(layout.models)
+            made = MediaPipeHands(models, mirrored=layout.mirrored)
+            self._detector = (os.getpid(), layout, made, models)
+        return self._detector[2:]
+
+
+class _Pictures:
+    """The Stream of a run: chosen frames of a video.
+
+    Args:
+        file: the video.
+        indices: (T,) of its frames.
+    """
+
+    def __init__(self, file: VideoFile, indices: NDArray[np.int64]) -> None:
+        self.timestamps = file.timestamps[indices]
+        self._file, self._indices = file, indices
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        return self._file.frames(self._indices[np.asarray(indices, np.int64)])
+
+
+def open() -> HandsSource:
+    """The source."""
+    return HandsSource()
+
+
+def _needed(embodiment: Embodiment) -> tuple[str, ...]:
+    """The points its vectors are made of; and its cameras are checked."""
+    where = f"embodiment {embodiment.id}"
+    for camera in embodiment.cameras:
+        if camera.key != CAMERA:
+            raise SourceError(where, f"camera key {camera.key!r} is none of hand videos", f"it is {CAMERA!r}")
+    vectors = [embodiment.action, *([embodiment.state] if embodiment.state else [])]
+    keys = [part.key for vector in vectors for part in vector.components]
+    return tuple(dict.fromkeys(point_of(key, where) for key in keys))
+
+
+def _whole(video: Video, digest: str) -> EpisodeRef:
+    try:
+        frames = header_of(video.path).frames
+        mark = f"{file_fingerprint(video.path)} {digest}"
+    except (HMAError, OSError) as fault:  # read will say the same
+        frames, mark = 1, str(fault)
+    return EpisodeRef(video.name, max(1, frames), None, _digest(mark))
+
+
+def _runs_of(
+    video: Video, labels: LabelSet, needed: tuple[str, ...], layout: HandsLayout
+) -> list[EpisodeRef]:
+    """A ref a run; a video with damaged labels is one ref, which reading refuses."""
+    try:
+        found = labels.of(video)
+        if found is None:
+            return []
+        runs = cut_into_runs(found, needed, layout, header_of(video.path), str(video.path))
+        mark = file_fingerprint(video.path)
+    except EpisodeError as fault:
+        return [EpisodeRef(video.name, 1, None, _digest(str(fault)))]
+    refs = []
+    for number, span in enumerate(runs.spans):
+        values = [runs.labels.points[point][slice(*span)].tobytes() for point in needed]
+        content = [mark.encode(), runs.labels.frames[slice(*span)].tobytes(), *values]
+        frames = episode_frames(runs.labels, span, layout)
+        refs.append(EpisodeRef(f"{video.name}#{number}", frames, None, _digest(*content), group=video.name))
+    return refs
+
+
+def _digest(*parts: str | bytes) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part.encode() if isinstance(part, str) else part)
+    return digest.hexdigest()[:16]
+
+
+def _header(table: FrameTable) -> Header:
+    return Header(len(table), table.hz or _measured_hz(table.times), table.width, table.height, table.codec)
+
+
+def _measured_hz(times: Floats) -> float:
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    return 1 / step if step > 0 else 0.0
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3:,} more" if len(names) > 3 else "")
+
+
+def _nothing(videos: dict[str, Video], labels: LabelSet, layout: HandsLayout) -> tuple[str, str]:
+    """Why no video gave an episode, and what to do."""
+    labelled = 0
+    for video in videos.values():
+        labelled += labels.of(video) is not None
+    if not labelled:
+        fault = f"has no video that the labels know: videos {_some(list(videos))}"
+        return fault, f"labels are of {_some(labels.known())}"
+    fault = f"has no run of {layout.min_frames} frames with the needed hands in {labelled} labelled videos"
+    return fault, "lower source.layout.min_frames, or set source.layout.missing: hold"
+
+
+def _no_run(runs: Runs, needed: tuple[str, ...], layout: HandsLayout) -> tuple[str, str]:
+    without, labelled = runs.counts["without_hands"], runs.counts["labelled"]
+    fault = f"has no run of {layout.min_frames} frames with {', '.join(needed)}: "
+    fault += f"{without:,} of {labelled:,} frames lack one"
+    return fault, "lower source.layout.min_frames, or set source.layout.missing: hold"
+
+
+def _episode(
+    episode_id: str, file: VideoFile, runs: Runs, number: int, embodiment: Embodiment, alone: bool
+) -> Episode:
+    """Run `number` of a video, which is all there is of it where it is `alone`."""
+    span, labels, layout = runs.spans[number], runs.labels, layout_of(embodiment)
+    marks = labels.frames[span[0] : span[1]]
+    every = layout.pictures == "every"
+    shown = np.arange(marks[0], marks[-1]) if every else marks[:-1]
+    stream = _Pictures(file, shown)
+    at = file.timestamps[marks[:-1]]
+    steady = not every and embodiment.sync.rate_hz is None and _regular(at)
+    if steady and not labels.irregular:
+        _check_rate(file.path, at, embodiment)
+    text = "; ".join(dict.fromkeys(words for frame, words in labels.texts if marks[0] <= frame < marks[-1]))
+    state: tuple[Signal, ...] = ()
+    if embodiment.state:
+        state = (_signal(embodiment.state, file, labels, span, to_last=not steady),)
+    return Episode(
+        id=episode_id,
+        streams={camera.name: stream for camera in embodiment.cameras},
+        actions=(_signal(embodiment.action, file, labels, span),),
+        states=state,
+        rate_stamped=steady,
+        instruction=text,
+        source=str(file.path),
+        metadata={"labels": layout.labels, "run": number, "runs": len(runs.spans)}
+        | {"first_frame": int(marks[0]), "video_frames": len(file), **runs.counts}
+        | {"flags": _flags(runs, number, alone)},
+    )
+
+
+def _flags(runs: Runs, number: int, alone: bool) -> dict[str, int]:
+    """What is counted over episodes; what no run takes counts in the first, or in the one that is alone."""
+    start, stop = runs.spans[number]
+    own = slice(start, stop - 1)
+    dropped = 0 if number else runs.counts["dropped"]
+    if alone:
+        dropped = len(runs.labels) - (stop - start - 1)
+    counts = {
+        "held_frames": int(runs.held[own].sum()),
+        "masked_frames": int(runs.missing[own].sum()),
+        "dropped_frames": dropped,
+    }
+    return {name: count for name, count in counts.items() if count}
+
+
+def _signal(
+    vector: Vector, file: VideoFile, labels: HandLabels, span: tuple[int, int], to_last: bool = False
+) -> Signal:
+    """A vector over a run of n labels: n - 1 values; n to the last, where all are current ones."""
+    keys = [part.key for part in vector.components]
+    if to_last and all(key in POINTS for key in keys):
+        pieces = [labels.points[key][slice(*span)] for key in keys]
+    else:
+        pieces = [values_of(key, labels.points, span) for key in keys]
+    values = compose(vector, pieces, str(file.path))
+    times = file.timestamps[labels.frames[span[0] :][: len(values)]]
+    known = np.all([np.isfinite(piece).all(axis=1) for piece in pieces], axis=0)
+    if known.all():
+        return Signal(times, values)
+    return Signal(times, np.where(known[:, None], values, np.float32(0)), known)
+
+
+def _regular(times: Floats) -> bool:
+    steps = np.diff(times)
+    return len(steps) == 0 or bool((np.abs(steps - np.median(steps)) <= REGULAR * np.median(steps)).all())
+
+
+def _check_rate(path: Path, times: Floats, embodiment: Embodiment) -> None:
+    stated, measured = embodiment.frequency_hz, _measured_hz(times)
+    if isinstance(stated, float) and measured and abs(stated - measured) > RATE_TOLERANCE * measured:
+        raise EpisodeError(
+            path,
+            f"is labelled at {measured:.4g} Hz, embodiment {embodiment.id} says frequency_hz {stated:g}",
+            "correct frequency_hz, or set frequency_hz: null and sync.rate_hz to bring videos onto one rate",
+        )

@@ -1,0 +1,1 @@
+"""Read HDF5 recordings: robomimic, LIBERO, ALOHA and layouts that a YAML describes."""

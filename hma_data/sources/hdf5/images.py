@@ -1,0 +1,165 @@
+"""Pictures in HDF5: raw arrays of several shapes and number types, or a JPEG or PNG a row.
+
+Colour pictures of 8 bits are taken as they lie, with their axes seen from the shape. Others are
+taken only where `source.layout` says what their numbers mean:
+
+    layout: {axes: TCHW, pixels: 0-1}
+
+T frames, n of them asked for, H×W pixels, C channels.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Floats
+from hma_data.episodes.images import MAX_PIXELS, Images, decode_image
+from hma_data.errors import EpisodeError
+from hma_data.sources.hdf5.file import OpenFiles, dataset, explained, rows
+from hma_data.sources.hdf5.layout import PIXELS, Layout, Place, Places
+
+_CHANNELS = (1, 3, 4)
+_SLACK = 1e-3  # of the range, by which resizing may have left it
+
+
+class PictureRows:
+    """A camera's Stream: pictures of one dataset.
+
+    Args:
+        places, files: of the source; the dataset is kept open in `files`.
+        place, key: the episode, and the dataset in it.
+        layout: what the YAML says of pictures.
+        times: (T,) seconds of the frames; rows after them are not shown.
+
+    Raises:
+        EpisodeError: the dataset is missing, or holds no colour pictures.
+    """
+
+    def __init__(
+        self, places: Places, files: OpenFiles, place: Place, key: str, layout: Layout, times: Floats
+    ) -> None:
+        self.timestamps = times
+        self._places, self._files, self._place = places, files, place
+        self._key, self._layout = key, layout
+        self._raw = self._check(dataset(places.group(place), key, str(place)))
+
+    def _check(self, found: h5py.Dataset) -> bool:
+        """Whether they are raw."""
+        kind = picture_kind(found, self._layout)
+        if kind == "raw" and np.prod(found.shape[1:], dtype=float) <= 4 * MAX_PIXELS:
+            axes_of(found.shape, self._layout, f"{self._place} {self._key}")
+            return True
+        if kind == "encoded":
+            return False
+        fault = f"{self._key!r} holds {found.shape} {found.dtype}, not colour pictures"
+        raise EpisodeError(self._place, fault, _remedy(found, self._layout))
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        with explained(self._place):
+            group = self._places.group(self._place)
+            found = rows(self._files.cached(self._place.file, group, self._key, str(self._place)), indices)
+        where = f"{self._place} {self._key}"
+        if self._raw:
+            return as_rgb(as_bytes(found, self._layout, where), axes_of(found.shape, self._layout, where))
+        if not len(found):
+            return np.zeros((0, 1, 1, 3), np.uint8)
+        pictures = [
+            decode_image(encoded(row, f"{where}[{index}]"), f"{where}[{index}]")
+            for row, index in zip(found, indices, strict=True)
+        ]
+        if len({picture.shape for picture in pictures}) > 1:
+            raise EpisodeError(self._place, f"{self._key!r} has pictures of several sizes")
+        return np.stack(pictures)
+
+
+def picture_kind(found: h5py.Dataset, layout: Layout | None = None) -> str | None:
+    """`raw`, `encoded`, or None for what cannot be pictures, by dtype and shape."""
+    shape: tuple[int, ...] = found.shape or ()
+    if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
+        channels_first = layout.axes == "TCHW" if layout and layout.axes else shape[1:2] in ((1,), (3,))
+        if len(shape) == 3 or (len(shape) == 4 and (shape[3] in _CHANNELS or channels_first)):
+            return "raw"
+    padded = found.dtype == np.uint8 and len(shape) == 2
+    one_a_row = len(shape) == 1 and (found.dtype.kind in "SV" or _is_bytes(found.dtype))
+    return "encoded" if padded or one_a_row else None
+
+
+def axes_of(shape: tuple[int, ...], layout: Layout, where: str) -> str:
+    """THW, THWC or TCHW: as the YAML says, else by where a number of channels stands.
+
+    Raises:
+        EpisodeError: both could be, or what the YAML says does not fit.
+    """
+    if len(shape) == 3:
+        return "THW"
+    last, first = shape[3] in _CHANNELS, shape[1] in _CHANNELS
+    if layout.axes:
+        if not (first if layout.axes == "TCHW" else last):
+            fault = f"holds pictures {shape[1:]}, source.layout.axes says {layout.axes}"
+            raise EpisodeError(where, fault, "correct it")
+        return layout.axes
+    if last and first:
+        fault = f"holds pictures {shape[1:]}, whose channels may be first or last"
+        raise EpisodeError(where, fault, "set source.layout.axes to TCHW or THWC")
+    return "THWC" if last else "TCHW"
+
+
+def as_bytes(pictures: NDArray[Any], layout: Layout, where: str) -> NDArray[np.uint8]:
+    """Pictures of other numbers as uint8, by the range `layout.pixels` names.
+
+    Raises:
+        EpisodeError: values outside the range, or not finite.
+    """
+    if pictures.dtype == np.uint8:
+        return pictures
+    highest = PIXELS[layout.pixels or "0-255"]
+    values = pictures.astype(np.float32)
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    if not (-_SLACK * highest <= low and high <= highest * (1 + _SLACK)):  # false for NaN too
+        fault = f"holds values from {low:g} to {high:g}, source.layout.pixels says {layout.pixels}"
+        raise EpisodeError(where, fault, f"one of {', '.join(PIXELS)}")
+    return np.rint(np.clip(values, 0, highest) * (255 / highest)).astype(np.uint8)
+
+
+def as_rgb(pictures: NDArray[np.uint8], axes: str | None = None) -> Images:
+    """(n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) -> (n, H, W, 3)."""
+    if pictures.ndim == 3:
+        pictures = pictures[..., None]
+    elif axes == "TCHW" or (axes is None and pictures.shape[3] not in _CHANNELS):
+        pictures = pictures.transpose(0, 2, 3, 1)
+    if pictures.shape[3] == 1:
+        pictures = np.repeat(pictures, 3, axis=3)
+    return np.ascontiguousarray(pictures[..., :3])
+
+
+def encoded(row: Any, where: str = "a picture") -> NDArray[np.uint8]:
+    """One encoded picture's bytes; zeros after its end are harmless.
+
+    Raises:
+        EpisodeError: the row is something else.
+    """
+    if isinstance(row, np.ndarray) and row.dtype.kind in "iu" and row.dtype.itemsize == 1:
+        return row.view(np.uint8).reshape(-1)
+    if isinstance(row, np.void | bytes):
+        return np.frombuffer(row.tobytes() if isinstance(row, np.void) else row, np.uint8)
+    raise EpisodeError(where, f"holds {type(row).__name__}, not the bytes of a picture")
+
+
+def _is_bytes(dtype: np.dtype[Any]) -> bool:
+    """Whether rows of varying length are bytes or text, not references or numbers."""
+    inner = h5py.check_vlen_dtype(dtype)
+    if inner is None:
+        return h5py.check_string_dtype(dtype) is not None
+    return np.dtype(inner).kind in "iu" and np.dtype(inner).itemsize == 1
+
+
+def _remedy(found: h5py.Dataset, layout: Layout) -> str:
+    shape: tuple[int, ...] = found.shape or ()
+    numbers = found.dtype.kind in "fiu" and found.dtype != np.uint8
+    if numbers and len(shape) == 4 and 3 in (shape[1], shape[3]) and not layout.pixels:
+        return f"if they are colours, set source.layout.pixels to their range: {', '.join(PIXELS)}"
+    return "expected (T, H, W, 3) uint8, or encoded pictures"

@@ -1,0 +1,269 @@
+"""What is in HDF5 recordings, without an embodiment: keys, lengths, what looks wrong."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import h5py
+import numpy as np
+
+from hma_data.episodes.images import decode_image
+from hma_data.errors import EpisodeError, HMAError
+from hma_data.sources.base import Inspection, KeyInfo, local_path
+from hma_data.sources.common import image_checks, timestamp_checks
+from hma_data.sources.common.dtype_hints import is_times, one_channel, seconds_a_unit, seconds_of
+from hma_data.sources.common.findings import Finding
+from hma_data.sources.common.links import unfollowed
+from hma_data.sources.common.survey import MAX_VALUES, Survey, listed, sampled
+from hma_data.sources.hdf5.file import (
+    MAX_BYTES,
+    MAX_ROW,
+    OpenFiles,
+    child,
+    chunk_bytes,
+    explained,
+    numbers,
+    rows,
+    text,
+    walk,
+)
+from hma_data.sources.hdf5.layout import WHOLE_FILE, Place, Places
+from hma_data.sources.hdf5.source import TEXT_KEYS, as_rgb, encoded, environment, picture_kind
+
+LENGTHS = 1_000  # episodes whose length is told and whose keys are compared
+_RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
+_BESIDE = ("compress_len",)  # no rows over time: bytes of ALOHA's JPEGs, (cameras, T)
+_MEASURED = "measured from"
+_SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
+
+
+@dataclass
+class _First:
+    """What the first episode that can be read says of all."""
+
+    name: str = ""
+    keys: dict[str, KeyInfo] = field(default_factory=dict)
+    facts: dict[str, str] = field(default_factory=dict)
+    rate: float | None = None
+    robots: Any = None
+
+
+def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspection:
+    """See Source.inspect.
+
+    Raises:
+        SourceError: nothing that can be read.
+    """
+    found = places.all(uri)
+    order = list(found)
+    chosen = {order[i] for i in sampled(len(order), episodes)}
+    survey, first = Survey(len(order)), _First()
+    for link in unfollowed(local_path(uri)):
+        survey.note(link)
+    lengths: dict[str, int] = {}
+    held: Counter[str] = Counter()
+    pairs = max(1, image_checks.PAIRS // len(chosen))
+    for name in [*order[:LENGTHS], *(name for name in order[LENGTHS:] if name in chosen)]:
+        place = found[name]
+        try:
+            with explained(place):
+                group = places.group(place)
+                sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
+                lengths[name] = _length(sizes)
+                if not lengths[name]:
+                    raise EpisodeError(name, "has no frames")
+                if not first.keys:
+                    first.name = name
+                    _tell(first, group, files, place)
+                held.update(sizes)
+                series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
+                survey.lengths(name, lengths[name], sizes, series)
+                if name in chosen:
+                    survey.episode(name)
+                    _look(name, group, first, survey, pairs)
+        except HMAError as fault:
+            survey.fault(name, fault)
+    lacking = [key for key, count in held.items() if key not in first.keys and 2 * count >= len(lengths)]
+    if lacking:
+        survey.note(Finding("keys", "warn", f"{first.name}: has no {listed(lacking)}, which others have"))
+    keys = tuple(
+        survey.key(replace(info, hz=first.rate if info.count else None)) for info in first.keys.values()
+    )
+    robots = first.robots
+    return Inspection(
+        format="hdf5",
+        uri=uri,
+        episodes=len(found),
+        keys=keys,
+        frames=sum(lengths.values()) if len(lengths) == len(found) else None,
+        lengths=tuple(lengths[name] for name in order[:LENGTHS] if name in lengths),
+        hz=first.rate,
+        robot=robots if isinstance(robots, str) else ", ".join(map(str, robots)) if robots else None,
+        facts={name: fact for name, fact in first.facts.items() if fact},
+        looked_at=len(survey.looked),
+        findings=survey.findings(keys),
+        checks=survey.checks(),
+    )
+
+
+def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: Place) -> None:
+    said = environment(files.get(place.file))
+    first.robots = said.get("robots")
+    first.keys = {info.key: info for info in _keys(group, place)}
+    first.facts = _facts(group, said, place)
+    first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
+
+
+def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: int) -> None:
+    """One episode's numbers, times and some pictures."""
+    for key, info in first.keys.items():
+        item = group.get(key)
+        if not isinstance(item, h5py.Dataset) or not item.shape or not item.shape[0]:
+            continue
+        where = f"{name} {key}"
+        try:
+            with explained(where):
+                if info.kind == "camera":
+                    _pictures(name, key, item, info, survey, pairs)
+                elif info.kind == "vector" and item.size <= MAX_VALUES:
+                    _values(name, key, numbers(group, key, name), info, survey, first)
+        except HMAError as fault:
+            survey.fault(where, fault)
+
+
+def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, first: _First) -> None:
+    survey.numbers(name, key, values)
+    seconds = seconds_of(values) if is_times(key, info.shape) else None
+    if seconds is not None:
+        clock = survey.times(name, key, seconds)
+        survey.made.add("rate")
+        measured = first.facts["rate"].startswith(_MEASURED)
+        source = f"{first.name} at" if measured else "the recording states"
+        for found in timestamp_checks.drift(f"{name}: {key}", clock.hz, first.rate, source):
+            survey.note(found)
+
+
+def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int) -> None:
+    for run in image_checks.runs(image_checks.choose(item.shape[0], pairs)):
+        found = rows(item, run)
+        if info.codec == "raw":
+            survey.pictures(name, key, as_rgb(found), run, info.codec)
+            continue
+        pictures = [
+            decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, run, strict=True)
+        ]
+        for start, frames in image_checks.stacked(pictures):
+            survey.pictures(name, key, frames, run[start : start + len(frames)], info.codec)
+
+
+def _length(sizes: dict[str, int]) -> int:
+    """The rows most keys agree on."""
+    for key in ("actions", "action"):
+        if key in sizes:
+            return sizes[key]
+    return max(sizes.values(), key=list(sizes.values()).count, default=0)
+
+
+def _facts(group: h5py.Group, said: dict[str, Any], place: Place) -> dict[str, str]:
+    """What is worth a line: the simulator and its controller, where episodes and words are."""
+    data = child(group.file, "data")
+    words = (name for name in TEXT_KEYS if name in group.attrs and text(group.attrs[name]))
+    simulated = [group.attrs.get("sim"), group.file.attrs.get("sim")]
+    simulator = ""
+    if any(isinstance(value, bool | np.bool_) and value for value in simulated):
+        simulator = "the attribute sim"
+    elif isinstance(kind := said.get("type"), int) and kind in _SIMULATORS:
+        simulator = f"{_SIMULATORS[kind]}, by env_args"
+    elif "model_file" in group.attrs or (isinstance(data, h5py.Group) and "env_info" in data.attrs):
+        simulator = "robosuite, by its attributes"
+    return {
+        "environment": str(said.get("env_name") or ""),
+        "simulator": simulator,
+        "controller": _controller(said),
+        "layout": "one file an episode" if place.group == WHOLE_FILE else "",
+        "instruction": next(words, ""),
+    }
+
+
+def _controller(said: dict[str, Any]) -> str:
+    """robosuite's, e.g. OSC_POSE; with `absolute` where it takes poses, not changes of them."""
+    found: Any = said.get("controller_configs")
+    if isinstance(found, list) and found:
+        found = found[0]
+    parts = found.get("body_parts") if isinstance(found, dict) else None
+    if isinstance(parts, dict):  # since robosuite 1.5
+        arms = [part for part in parts.values() if isinstance(part, dict) and "type" in part]
+        found = next(iter(arms), None)
+    if not isinstance(found, dict) or not isinstance(found.get("type"), str):
+        return ""
+    absolute = found.get("control_delta") is False or found.get("input_type") == "absolute"
+    return f"{found['type']} absolute" if absolute else str(found["type"])
+
+
+def _rate(
+    group: h5py.Group, said: dict[str, Any], keys: dict[str, KeyInfo], where: str
+) -> tuple[float | None, str, str]:
+    """Hz, what says so, and the key of times in seconds where there is one."""
+    stated, holder = _stated_rate(group, said)
+    key = next(
+        (key for key, info in keys.items() if info.kind == "vector" and is_times(key, info.shape)), None
+    )
+    if key is None:
+        return stated, holder, ""
+    values = numbers(group, key, where).reshape(-1)
+    unit = seconds_a_unit(values) if values.dtype.kind in "fiu" else None
+    if unit is None:
+        return stated, holder, ""
+    measured = 1 / (float(np.median(np.diff(values.astype(np.float64)))) * unit)
+    seconds = key if unit == 1.0 else ""
+    return (stated, holder, seconds) if stated else (measured, f"{_MEASURED} {key}", seconds)
+
+
+def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None, str]:
+    places: list[tuple[str, Any]] = [("the file's env_args", said)]
+    holders = (group, group.parent, group.file)
+    places += [(f"the attributes of {holder.name}", holder.attrs) for holder in holders]
+    for place, holder in places:
+        for name in _RATES:
+            value = holder.get(name)
+            number = value.item() if isinstance(value, np.generic) else value
+            if isinstance(number, int | float) and not isinstance(number, bool) and 0 < number < math.inf:
+                return float(number), f"{name} in {place}"
+    return None, ""
+
+
+def _keys(group: h5py.Group, place: Place) -> Iterator[KeyInfo]:
+    for key, item in walk(group):
+        count = item.shape[0] if item.shape else None
+        kind, shape, codec = _kind(item, f"{place} {key}")
+        kind = "other" if key in _BESIDE else kind
+        yield KeyInfo(key, kind, shape, str(item.dtype), codec=codec, count=count)
+
+
+def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | None]:
+    """Kind, shape of one sample, codec."""
+    shape = item.shape or ()
+    small = np.prod(shape[1:], dtype=float) <= MAX_ROW and chunk_bytes(item) <= MAX_BYTES
+    pictures = picture_kind(item) if shape and shape[0] and small else None
+    if pictures == "raw":
+        shape = as_rgb(rows(item, [0])).shape[1:]
+        return "camera", (*shape[:2], 1) if _is_grey(item.shape) else shape, "raw"
+    if pictures == "encoded":
+        first = rows(item, [0])[0]
+        start = bytes(encoded(first)[:8]) if isinstance(first, bytes | np.ndarray | np.void) else b""
+        codec = "jpeg" if start[:2] == b"\xff\xd8" else "png" if start[:4] == b"\x89PNG" else None
+        if codec:
+            shape = decode_image(encoded(first), where).shape
+            return "camera", (*shape[:2], 1) if one_channel(bytes(encoded(first))) else shape, codec
+    if item.dtype.kind in "OS":
+        return "text", shape[1:], None
+    if item.dtype.kind in "fiub" and 1 <= len(shape) <= 3:
+        return "vector", shape[1:] or (1,), None
+    return "other", shape[1:], None
+
+
+def _is_grey(shape: tuple[int, ...]) -> bool:
+    """Of raw pictures (T, H, W), (T, H, W, C) or (T, C, H, W)."""
+    return len(shape) == 3 or (shape[3] if shape[3] in (1, 3, 4) else shape[1]) == 1

@@ -1,0 +1,322 @@
+"""HDF5 recordings: robomimic, LIBERO, raw robosuite, ALOHA/ACT, and layouts a YAML describes.
+
+An episode is a group (`data/demo_0`) or a whole file. Which of the two is seen from the file, or
+said by `source.layout`:
+
+    source:
+      format: hdf5
+      layout: {episodes: "data/*", timestamps: obs/time}   # "/" means one file an episode
+
+A uri is a file or a folder of files. Keys are paths inside the episode's group. HDF5 keeps no
+rate: it is the embodiment's `frequency_hz`, unless `layout.timestamps` names seconds. Where
+pictures and states have one row more than the actions (ManiSkill), `last_observation: drop`
+leaves out the row after the last action.
+
+T frames of an episode.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.episode import Episode, Floats, Signal, rate_times
+from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.registry.components import Vector
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.hdf5.file import (
+    MAX_NUMBERS,
+    OpenFiles,
+    check_lengths,
+    child,
+    dataset,
+    explained,
+    member,
+    numbers,
+    text,
+    walk,
+)
+from hma_data.sources.hdf5.images import PictureRows, as_rgb, encoded, picture_kind
+from hma_data.sources.hdf5.layout import WHOLE_FILE, Layout, Place, Places, layout_of
+from hma_data.storage.paths import StrPath, as_text
+
+__all__ = ["Hdf5Source", "as_rgb", "encoded", "environment", "open", "picture_kind"]
+
+TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
+_SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "val")
+
+
+class Hdf5Source:
+    """See the module."""
+
+    def __init__(self) -> None:
+        self._files = OpenFiles()
+        self._places = Places(self._files)
+
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
+        """See Source."""
+        from hma_data.sources.hdf5.inspect import inspect
+
+        return inspect(as_text(uri), self._places, self._files, episodes)
+
+    def episode_ids(self, uri: StrPath) -> list[str]:
+        """Their ids, files by name and `demo_2` before `demo_10`."""
+        return list(self._places.all(as_text(uri)))
+
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+        """The episodes. A damaged file among others is one that `read` will refuse.
+
+        Raises:
+            SourceError: nothing there, a single file that is damaged, or no mask of the name `source.split`.
+        """
+        uri, chosen = as_text(uri), embodiment.source.split if embodiment else None
+        refs: list[EpisodeRef] = []
+        known: set[str] = set()
+        for file, places in self._places.by_file(uri, layout_of(embodiment).episodes):
+            fingerprint = file_fingerprint(file)
+            whole = any(place.group == WHOLE_FILE for place in places.values())
+            masks = {} if whole else self._masks(file)
+            known |= set(masks)
+            for episode_id, place in places.items():
+                name = place.group.rsplit("/", 1)[-1]
+                if chosen and name not in masks.get(chosen, ()):
+                    continue
+                split = None if chosen else _split_of(name, masks)
+                digest = hashlib.sha256(f"{fingerprint} {place.group}".encode()).hexdigest()[:16]
+                refs.append(EpisodeRef(episode_id, self._length(place, embodiment), split, digest))
+        if chosen and chosen not in known:
+            said = ", ".join(sorted(known)) or "none"
+            raise SourceError(uri, f"has no mask {chosen!r}", f"its masks: {said}")
+        return refs
+
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
+        """One episode; its pictures are read when asked for.
+
+        Raises:
+            EpisodeError: a damaged file, a missing key, a wrong width, an empty episode.
+            SourceError: no such episode, or no rate and no times.
+        """
+        layout = layout_of(embodiment)
+        place = self._places.find(as_text(uri), episode_id, layout.episodes)
+        where = str(place)
+        with explained(where):
+            group = self._places.group(place)
+            actions = _vector(group, embodiment.action, where)
+            series = _Series(group, embodiment, len(actions), where)
+            states = _vector(group, embodiment.state, where) if embodiment.state else None
+            if states is not None:
+                states = series.trimmed(
+                    embodiment.state.components[0].key if embodiment.state else "", states
+                )
+            streams = {
+                camera.name: self._pictures(place, group, camera.key, layout, series)
+                for camera in embodiment.cameras
+            }
+            return Episode(
+                id=episode_id,
+                streams=dict(streams),
+                actions=(Signal(series.times, actions),),
+                states=() if states is None else (Signal(series.times, states),),
+                instruction=_instruction(group, embodiment.source.instruction, where),
+                success=_success(group),
+                source=where,
+                metadata=_metadata(group),
+            )
+
+    def _pictures(
+        self, place: Place, group: h5py.Group, key: str, layout: Layout, series: "_Series"
+    ) -> PictureRows:
+        try:
+            found = dataset(group, key, str(place))
+        except EpisodeError as fault:
+            if "states" in group and not any(picture_kind(item) for _, item in walk(group)):
+                said = "holds a simulator's states and no pictures"
+                remedy = "render them first, as robomimic's dataset_states_to_obs.py does"
+                raise EpisodeError(place, said, remedy) from fault
+            raise
+        series.check(key, len(found))
+        return PictureRows(self._places, self._files, place, key, layout, series.times)
+
+    def _length(self, place: Place, embodiment: Embodiment | None) -> int:
+        """T as the action's rows, or the most rows of any dataset; 0 when it cannot be read."""
+        keys = [part.key for part in embodiment.action.components] if embodiment else ["actions", "action"]
+        try:
+            with explained(place):
+                group = self._places.group(place)
+                for key in keys:
+                    if key.strip("/") in group:
+                        found = dataset(group, key, str(place))
+                        return len(found) if len(found) <= MAX_NUMBERS else 0
+                lengths = [item.shape[0] for _, item in walk(group) if item.shape]
+                return max((length for length in lengths if length <= MAX_NUMBERS), default=0)
+        except HMAError:
+            return 0
+
+    def _masks(self, file: Path) -> dict[str, set[str]]:
+        """robomimic's filter keys: name -> names of demos."""
+        with explained(file, SourceError):
+            mask = child(self._files.get(file), "mask")
+            if not isinstance(mask, h5py.Group):
+                return {}
+            lists = {name: child(mask, name) for name in mask}
+            return {
+                name: {text(row).rsplit("/", 1)[-1] for row in numbers(mask, name, str(file))}
+                if len(found)
+                else set()
+                for name, found in lists.items()
+                if isinstance(found, h5py.Dataset) and found.ndim == 1
+            }
+
+
+def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
+    """Ours, by robomimic's masks, where they tell both."""
+    if not {_SPLITS.get(mask) for mask in masks} >= {"train", "val"}:
+        return None
+    return next((ours for mask, ours in _SPLITS.items() if demo in masks.get(mask, ())), None)
+
+
+class _Series:
+    """The lengths and times of an episode's series; its own times where the YAML names them.
+
+    Args:
+        length: of the actions, which all others must have.
+    """
+
+    def __init__(self, group: h5py.Group, embodiment: Embodiment, length: int, where: str) -> None:
+        self._where, self._length = where, length
+        self._drops = layout_of(embodiment).last_observation == "drop"
+        key = layout_of(embodiment).timestamps
+        if key is None and embodiment.frequency_hz is None:
+            raise SourceError(
+                f"embodiment {embodiment.id}",
+                "frequency_hz is null, and HDF5 keeps no times of itself",
+                "set frequency_hz, or source.layout.timestamps to the key of the seconds",
+            )
+        if key is not None:
+            self.times = self.trimmed(key, _times(group, key, where))
+        else:  # With an unknown rate a recording can still be looked at; converting it is refused before.
+            hz = embodiment.frequency_hz if isinstance(embodiment.frequency_hz, float) else 1.0
+            self.times = rate_times(length, hz)
+
+    def check(self, key: str, length: int) -> None:
+        """That a series is as long as the actions, or ends with the observation that is dropped.
+
+        Raises:
+            EpisodeError: it is not.
+        """
+        if length == self._length or (self._drops and length == self._length + 1):
+            return
+        remedy = ""
+        if length == self._length + 1:
+            remedy = (
+                "if the last was observed after the last action, set source.layout.last_observation: drop"
+            )
+        raise EpisodeError(self._where, f"differ in length: actions {self._length}, {key} {length}", remedy)
+
+    def trimmed(self, key: str, values: NDArray[Any]) -> NDArray[Any]:
+        """(T, …) values without the observation after the last action."""
+        self.check(key, len(values))
+        return values[: self._length]
+
+
+def _times(group: h5py.Group, key: str, where: str) -> Floats:
+    values = numbers(group, key, where)
+    if values.dtype.kind not in "fiu" or values.size != len(values):
+        raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")
+    return values.reshape(-1).astype(np.float64)
+
+
+def open() -> Hdf5Source:
+    """The source."""
+    return Hdf5Source()
+
+
+def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32]:
+    read: dict[str, NDArray[Any]] = {}
+    for part in vector.components:
+        if part.key not in read:
+            read[part.key] = numbers(group, part.key, where)
+    lengths = {key: len(values) for key, values in read.items()}
+    if len(set(lengths.values())) > 1:
+        raise EpisodeError(
+            where, "differ in length: " + ", ".join(f"{key} {length}" for key, length in lengths.items())
+        )
+    return compose(vector, [read[part.key] for part in vector.components], where)
+
+
+def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
+    """What was asked: at the key the YAML names, else in the places robomimic and LIBERO use."""
+    if key and key in group.attrs:
+        return text(group.attrs[key])
+    if key:
+        found = member(group, key, where)
+        if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+            raise EpisodeError(where, f"{key!r} is not a text")
+        check_lengths(found)
+        return text(found[()] if found.size == 1 else found[0] if found.shape else "")
+    for holder in (group, group.parent, group.file):
+        for name in TEXT_KEYS:
+            if name in holder.attrs and (found := text(holder.attrs[name])):
+                return found
+            if said := _text_row(holder, name):
+                return said
+        said = _json(holder, "problem_info").get("language_instruction", "")
+        if said := text("".join(map(str, said)) if isinstance(said, list) else said):
+            return said
+    return ""
+
+
+def _text_row(holder: h5py.Group, name: str) -> str:
+    """The text of a dataset of one value; empty where there is none."""
+    found = child(holder, name)
+    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+        return ""
+    if found.size != 1 or found.dtype.kind not in "OS":
+        return ""
+    check_lengths(found)
+    return text(found[()])
+
+
+def _success(group: h5py.Group) -> bool | None:
+    """By the last `success` or reward; by the last `done` only without them, for time-outs are done too."""
+    if "success" in group.attrs:
+        return bool(np.all(group.attrs["success"]))
+    for key in ("success", "rewards", "dones"):
+        found = child(group, key)
+        if isinstance(found, h5py.Dataset) and found.ndim == 1 and len(found) and found.dtype.kind in "fiub":
+            return bool(found[-1] > 0)
+    return None
+
+
+def _metadata(group: h5py.Group) -> dict[str, Any]:
+    """Short plain attributes of the episode; models and other long texts stay behind."""
+    found: dict[str, Any] = {}
+    for name in group.attrs:
+        value = group.attrs[name]
+        plain = value.item() if isinstance(value, np.generic) else value
+        if isinstance(plain, bool | int | float) or (isinstance(plain, str) and 0 < len(plain) <= 200):
+            found[name] = plain
+    return found
+
+
+def environment(handle: h5py.File) -> dict[str, Any]:
+    """What robomimic (`env_args`) or robosuite (`env_info`) say of the simulator."""
+    data = child(handle, "data")
+    if not isinstance(data, h5py.Group):
+        return {}
+    found = _json(data, "env_args") or _json(data, "env_info")
+    inner = found.get("env_kwargs")
+    return {**found, **inner} if isinstance(inner, dict) else found
+
+
+def _json(holder: Any, name: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text(holder.attrs[name])) if name in holder.attrs else {}
+    except (json.JSONDecodeError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}

@@ -1,0 +1,239 @@
+"""What is in a LeRobotDataset, without an embodiment: its metadata held against the files that are there.
+
+Metadata is looked at whole; numbers, times and a few pictures of a sample of the episodes whose files
+are there. What is on the Hub is not fetched to be looked at.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from hma_data.errors import EpisodeError, HMAError
+from hma_data.sources.base import Inspection, KeyInfo
+from hma_data.sources.common import image_checks, timestamp_checks
+from hma_data.sources.common.findings import Finding
+from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
+from hma_data.sources.common.video_file import VideoFile, frame_table
+from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
+from hma_data.sources.lerobot.rows import Rows, StillPictures, rows_of
+
+LENGTHS = 1_000  # told
+LOOKED_FOR = 20_000  # episodes whose files are looked for, spread over all
+CAMERA_BUDGET = 64  # videos opened at most, over all cameras
+
+
+def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
+    """See Source.inspect."""
+    lengths = [row["length"] for row in meta.episodes.values()]
+    survey = Survey(len(lengths))
+    _totals(meta, survey)
+    if not meta.folder.repo:
+        _Looking(meta, survey, episodes).look()
+    keys = tuple(survey.key(info) for info in _keys(meta))
+    return Inspection(
+        format="lerobot",
+        uri=uri,
+        episodes=len(lengths),
+        keys=keys,
+        frames=sum(lengths),
+        lengths=tuple(lengths[:LENGTHS]),
+        hz=meta.fps,
+        robot=meta.robot,
+        facts={"version": meta.version, "tasks": str(len(meta.tasks))},
+        looked_at=len(survey.looked),
+        findings=survey.findings(keys),
+        checks=survey.checks(),
+    )
+
+
+def _totals(meta: Metadata, survey: Survey) -> None:
+    survey.made.add("files")
+    lengths = [row["length"] for row in meta.episodes.values()]
+    for name, actual in (("total_episodes", len(lengths)), ("total_frames", sum(lengths))):
+        stated = meta.info.get(name)
+        if isinstance(stated, int) and stated != actual:
+            said = f"info.json says {name} {stated:,}, the episodes listed make {actual:,}"
+            survey.note(Finding("files", "warn", said, numbers={"stated": stated, "listed": actual}))
+
+
+class _Looking:
+    """A look at the files of a local dataset."""
+
+    def __init__(self, meta: Metadata, survey: Survey, episodes: int) -> None:
+        self._meta, self._survey, self._episodes = meta, survey, episodes
+        self._there = _Files(meta.folder.root)
+        self._videos = [name for name, item in meta.features.items() if item.dtype == "video"]
+        self._spans: dict[str, dict[int, Span]] = {}
+        indices = list(meta.episodes)
+        self._indices = [indices[i] for i in sampled(len(indices), LOOKED_FOR)]
+
+    def look(self) -> None:
+        """Which files are there, then into a sample of the episodes that have all of theirs."""
+        whole = self._with_rows()
+        for key in self._videos:
+            whole &= self._with_video(key)
+        order = [index for index in self._indices if index in whole]
+        chosen = [order[i] for i in sampled(len(order), self._episodes)] if order else []
+        pairs = max(1, image_checks.PAIRS // max(len(chosen), 1))
+        limit = max(1, CAMERA_BUDGET // max(len(self._videos), 1))
+        shown = set(chosen[:: max(1, -(-len(chosen) // limit))])
+        for index in chosen:
+            self._survey.episode(episode_name(index))
+            self._rows(index, pairs)
+        for key in self._videos:
+            for index in sorted(shown):
+                self._video(key, index, pairs)
+
+    def _with_rows(self) -> set[int]:
+        paths = {}
+        for index in self._indices:
+            try:
+                paths[index] = self._meta.data_path(index)
+            except EpisodeError as fault:
+                self._survey.fault(episode_name(index), fault)
+        return self._present("parquet files", paths)
+
+    def _with_video(self, key: str) -> set[int]:
+        try:
+            self._spans[key] = {index: self._meta.video(index, key) for index in self._indices}
+        except EpisodeError as fault:
+            self._survey.note(Finding("files", "warn", str(fault), key=key))
+            return set()
+        paths = {index: span.path for index, span in self._spans[key].items()}
+        return self._present(f"videos of {key}", paths, key)
+
+    def _present(self, what: str, paths: dict[int, str], key: str = "") -> set[int]:
+        """Episodes whose file is there; the missing ones are one finding."""
+        distinct = list(dict.fromkeys(paths.values()))
+        missing = {path for path in distinct if not self._there.has(path)}
+        if missing:
+            first = next(path for path in distinct if path in missing)
+            part = " looked for" if len(self._indices) < len(self._meta.episodes) else ""
+            said = f"{len(missing):,} of {len(distinct):,} {what}{part} are missing, {first} first"
+            numbers = {"missing": len(missing), "files": len(distinct)}
+            self._survey.note(Finding("files", "warn", said, key=key, numbers=numbers))
+        return {index for index, path in paths.items() if path not in missing}
+
+    def _rows(self, index: int, pairs: int) -> None:
+        """One episode's numbers, times and pictures kept in parquet."""
+        meta, name = self._meta, episode_name(index)
+        try:
+            rows = rows_of(meta.folder.path(meta.data_path(index)), index)
+        except HMAError as fault:
+            self._survey.fault(name, fault)
+            return
+        wanted = [key for key, item in meta.features.items() if item.dtype != "video"]
+        length = meta.episodes[index]["length"]
+        self._survey.lengths(name, length, {key: len(rows) for key in wanted if key in rows.columns}, wanted)
+        for key in wanted:
+            feature = meta.features[key]
+            if key not in rows.columns:
+                continue
+            try:
+                if feature.is_camera:
+                    self._stills(name, key, rows, pairs)
+                elif _is_vector(feature) and np.prod(feature.shape, dtype=float) * len(rows) <= MAX_VALUES:
+                    self._numbers(name, key, rows)
+            except HMAError as fault:
+                self._survey.fault(f"{name} {key}", fault)
+
+    def _numbers(self, name: str, key: str, rows: Rows) -> None:
+        values = rows.numbers(key)
+        self._survey.numbers(name, key, values)
+        if key == "timestamp":
+            clock = self._survey.times(name, key, values.reshape(len(values), -1)[:, 0].astype(np.float64))
+            self._survey.made.add("rate")
+            for found in timestamp_checks.drift(f"{name}: {key}", clock.hz, self._meta.fps):
+                self._survey.note(found)
+
+    def _stills(self, name: str, key: str, rows: Rows, pairs: int) -> None:
+        stream = StillPictures(rows, key, np.zeros(len(rows)), self._meta.folder)
+        codec = stream.codec()
+        for run in image_checks.runs(image_checks.choose(len(rows), pairs)):
+            self._survey.pictures(name, key, stream.frames(run), run, codec)
+
+    def _video(self, key: str, index: int, pairs: int) -> None:
+        """Counts an episode's video against its rows, and looks at some pictures."""
+        meta, name, span = self._meta, episode_name(index), self._spans[key][index]
+        self._survey.made.add("frames")
+        try:
+            file = VideoFile(meta.folder.path(span.path))
+            first, last = _part(file, span, meta.fps)
+            rows = meta.episodes[index]["length"]
+            if last - first != rows:
+                part = "" if span.stop is None else f" from {span.start:.3f} to {span.stop:.3f} s"
+                said = f"{span.path} has {last - first:,} frames{part} for {rows:,} rows"
+                numbers = {"frames": last - first, "rows": rows}
+                self._survey.note(Finding("frames", "warn", said, key=key, numbers=numbers))
+            if last > first:
+                indices = first + image_checks.choose(
+                    last - first, pairs, file.table.keys[first:last] - first
+                )
+                for run in image_checks.runs(indices):
+                    self._survey.pictures(name, key, file.frames(run), run, file.table.codec)
+            file.close()
+        except HMAError as fault:
+            self._survey.fault(f"{name} {key}", fault)
+
+
+class _Files:
+    """Which files a folder has, each directory listed once: datasets have a hundred thousand."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._listed: dict[str, set[str]] = {}
+
+    def has(self, relative: str) -> bool:
+        """Whether that file is there."""
+        parent, _, name = relative.rpartition("/")
+        if parent not in self._listed:
+            try:
+                with os.scandir(self._root / parent) as entries:
+                    self._listed[parent] = {entry.name for entry in entries if entry.is_file()}
+            except OSError:
+                self._listed[parent] = set()
+        return name in self._listed[parent]
+
+
+def _part(file: VideoFile, span: Span, fps: float) -> tuple[int, int]:
+    """Indices of the video's frames [from, to) that are the episode's."""
+    if span.stop is None:
+        return 0, len(file)
+    half = 0.5 / fps
+    first, last = np.searchsorted(file.timestamps, [span.start - half, span.stop - half])
+    return int(first), int(last)
+
+
+def _is_vector(feature: Feature) -> bool:
+    return feature.dtype.startswith(("float", "int", "uint", "bool"))
+
+
+# -- keys
+
+
+def _keys(meta: Metadata) -> tuple[KeyInfo, ...]:
+    found = []
+    for feature in meta.features.values():
+        kind = "vector" if _is_vector(feature) else "other"
+        shape, codec = feature.shape, feature.codec
+        if feature.is_camera:
+            kind, codec = "camera", codec or _codec(meta, feature.name)
+            if len(shape) == 3 and shape[0] in (1, 3) and shape[2] not in (1, 3):  # stated as C, H, W
+                shape = (shape[1], shape[2], shape[0])
+        elif feature.dtype in ("string", "large_string"):
+            kind = "text"
+        found.append(KeyInfo(feature.name, kind, shape, feature.dtype, meta.fps, feature.names, codec))
+    return tuple(found)
+
+
+def _codec(meta: Metadata, key: str) -> str | None:
+    """As the first episode has it; None where it cannot be seen."""
+    index = next(iter(meta.episodes))
+    try:
+        if meta.features[key].dtype == "video":
+            return frame_table(meta.folder.path(meta.video(index, key).path)).codec
+        rows = rows_of(meta.folder.path(meta.data_path(index)), index)
+        return StillPictures(rows, key, np.zeros(len(rows)), meta.folder).codec()
+    except HMAError:
+        return None

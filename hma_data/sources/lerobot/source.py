@@ -1,0 +1,245 @@
+"""LeRobotDataset versions 2.0, 2.1 and 3.0, read with pyarrow and PyAV alone.
+
+A uri is a folder, `hf://datasets/NAME/DATASET[@REVISION]`, or `NAME/DATASET` on the Hub, from
+where only the files of the episodes read are fetched. Keys are feature names (`action`,
+`observation.images.cam_high`). The rate is `fps` of info.json, and the embodiment must agree.
+
+T frames of an episode.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.align import nearest
+from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_times
+from hma_data.episodes.images import Images
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.registry.components import Camera, Vector
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
+from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.lerobot.metadata import Folder, Metadata, Span, episode_name
+from hma_data.sources.lerobot.rows import Rows, StillPictures, rows_of
+from hma_data.storage.paths import StrPath, as_text
+
+RATE_TOLERANCE = 0.01  # of the rate
+TIME_TOLERANCE = 0.25  # of a frame's period, between a row's time and its picture's
+_SAMPLE = 4096  # bytes of a video, at each end, that its fingerprint looks at
+
+
+class LeRobotSource:
+    """See the module."""
+
+    def __init__(self) -> None:
+        self._opened: dict[str, Metadata] = {}
+
+    def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
+        """What is in the dataset: its metadata, checked against the files that are there."""
+        from hma_data.sources.lerobot.inspect import inspect
+
+        return inspect(as_text(uri), self._open(as_text(uri), again=True), episodes)
+
+    def episode_ids(self, uri: StrPath) -> list[str]:
+        """Their ids, `episode_000000` and on."""
+        return [episode_name(index) for index in self._open(as_text(uri), again=True).episodes]
+
+    def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
+        """The episodes by metadata; a missing video is found when the episode is read.
+
+        Raises:
+            SourceError: damaged metadata, another rate than the embodiment's, or no such split.
+        """
+        uri = as_text(uri)
+        meta = self._open(uri, again=True)
+        if embodiment:
+            _check_rate(meta, embodiment)
+        chosen = embodiment.source.split if embodiment else None
+        if chosen and chosen not in meta.splits:
+            raise SourceError(
+                uri, f"has no split {chosen!r}", f"its splits: {', '.join(meta.splits) or 'none'}"
+            )
+        samples: dict[str, str] = {}
+        return [
+            EpisodeRef(
+                episode_name(index),
+                row["length"],
+                None if chosen else meta.split_of(index),
+                _fingerprint(meta, index, samples),
+            )
+            for index, row in meta.episodes.items()
+            if not chosen or index in meta.splits[chosen]
+        ]
+
+    def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
+        """One episode; its pictures are decoded when asked for.
+
+        Raises:
+            EpisodeError: a video is missing or has another number of frames, rows are damaged.
+            SourceError: no such episode, a key that is no feature, another rate than the embodiment's.
+        """
+        uri = as_text(uri)
+        meta = self._open(uri)
+        _check_rate(meta, embodiment)
+        index = _number(episode_id)
+        if index not in meta.episodes:
+            raise SourceError(uri, f"has no episode {episode_id!r}", "hma inspect lists what it has")
+        _check_keys(meta, embodiment)
+        path = meta.folder.path(meta.data_path(index))
+        rows = rows_of(path, index)
+        length = meta.episodes[index]["length"]
+        if len(rows) != length:
+            raise EpisodeError(path, f"has {len(rows)} rows of {episode_id}, its metadata says {length}")
+        times = _times(rows, meta.fps)
+        streams = {camera.name: _stream(meta, index, camera, rows, times) for camera in embodiment.cameras}
+        tasks = _tasks(meta, index, rows)
+        return Episode(
+            id=episode_id,
+            streams=streams,
+            actions=(Signal(times, _vector(rows, embodiment.action)),),
+            states=(Signal(times, _vector(rows, embodiment.state)),) if embodiment.state else (),
+            instruction=_instruction(rows, embodiment.source.instruction, tasks),
+            success=_success(rows),
+            source=str(path),
+            metadata={"tasks": tasks} if len(tasks) > 1 else {},
+        )
+
+    def _open(self, uri: str, again: bool = False) -> Metadata:
+        if again or uri not in self._opened:
+            self._opened[uri] = Metadata(Folder(uri))
+        return self._opened[uri]
+
+
+class _Video:
+    """A camera's Stream: an episode's part of a video file.
+
+    Args:
+        path: of the file.
+        span: the part of it.
+        times: (T,) seconds of the rows, from the episode's first frame.
+        fps: of the dataset.
+    """
+
+    def __init__(self, path: Path, span: Span, times: Floats, fps: float) -> None:
+        self.timestamps = times
+        self._file = VideoFile(path)
+        clock = self._file.timestamps
+        half = 0.5 / fps
+        first = 0 if span.stop is None else int(np.searchsorted(clock, span.start - half))
+        last = len(clock) if span.stop is None else int(np.searchsorted(clock, span.stop - half))
+        if last - first != len(times):
+            part = "" if span.stop is None else f" from {span.start:.3f} to {span.stop:.3f} s"
+            raise EpisodeError(path, f"has {last - first} frames{part}, the episode has {len(times)} rows")
+        self._indices, off_ms = nearest(clock, span.start + times)
+        worst = int(np.argmax(off_ms))
+        if off_ms[worst] > TIME_TOLERANCE * 1e3 / fps:
+            fault = f"its picture nearest to row {worst} is {off_ms[worst]:.1f} ms away"
+            raise EpisodeError(path, fault, f"rows and video disagree on time; a frame is {1e3 / fps:.1f} ms")
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        return self._file.frames(self._indices[np.asarray(indices, np.int64)])
+
+
+def open() -> LeRobotSource:
+    """The source."""
+    return LeRobotSource()
+
+
+def _number(episode_id: str) -> int:
+    digits = episode_id.removeprefix("episode_")
+    return int(digits) if digits.isdecimal() and episode_name(int(digits)) == episode_id else -1
+
+
+def _check_rate(meta: Metadata, embodiment: Embodiment) -> None:
+    stated = embodiment.frequency_hz
+    if isinstance(stated, float) and abs(stated - meta.fps) > RATE_TOLERANCE * meta.fps:
+        raise SourceError(
+            meta.folder.uri,
+            f"runs at {meta.fps:g} fps, embodiment {embodiment.id} says frequency_hz {stated:g}",
+            "correct frequency_hz in the YAML",
+        )
+
+
+def _check_keys(meta: Metadata, embodiment: Embodiment) -> None:
+    where = f"{meta.folder.uri}: embodiment {embodiment.id}"
+    vectors = [*embodiment.action.components, *(embodiment.state.components if embodiment.state else ())]
+    for key in [part.key for part in vectors] + [camera.key for camera in embodiment.cameras]:
+        if key not in meta.features:
+            near = get_close_matches(key, meta.features, n=3, cutoff=0.4) or list(meta.features)
+            raise SourceError(where, f"{key!r} is not a feature", f"did you mean {', '.join(near)}?")
+    for camera in embodiment.cameras:
+        feature = meta.features[camera.key]
+        if not feature.is_camera:
+            kind = "a depth map" if feature.depth else feature.dtype
+            cameras = ", ".join(name for name, item in meta.features.items() if item.is_camera)
+            raise SourceError(where, f"{camera.key!r} is {kind}, not colour pictures", f"cameras: {cameras}")
+
+
+def _times(rows: Rows, fps: float) -> Floats:
+    if "timestamp" not in rows.columns:
+        return rate_times(len(rows), fps)
+    times = rows.numbers("timestamp").reshape(len(rows), -1)[:, 0].astype(np.float64)
+    if not np.isfinite(times).all():
+        raise EpisodeError(rows.path, "has timestamps that are not finite")
+    return times
+
+
+def _vector(rows: Rows, vector: Vector) -> NDArray[np.float32]:
+    pieces = {part.key: rows.numbers(part.key) for part in vector.components}
+    return compose(vector, [pieces[part.key] for part in vector.components], str(rows.path))
+
+
+def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Floats) -> Stream:
+    if meta.features[camera.key].dtype == "image":
+        return StillPictures(rows, camera.key, times, meta.folder)
+    span = meta.video(index, camera.key)
+    return _Video(meta.folder.path(span.path), span, times, meta.fps)
+
+
+def _tasks(meta: Metadata, index: int, rows: Rows) -> list[str]:
+    """What was asked, in the order of the rows; by the episode's own list where rows do not say."""
+    if "task_index" in rows.columns and meta.tasks:
+        numbers = rows.numbers("task_index").reshape(-1).tolist()
+        return [meta.tasks[number] for number in dict.fromkeys(numbers) if number in meta.tasks]
+    said = meta.episodes[index].get("tasks")
+    return [str(task) for task in said] if isinstance(said, list) else []
+
+
+def _instruction(rows: Rows, key: str | None, tasks: list[str]) -> str:
+    if key and key != "task":
+        return str(rows.column(key)[0].as_py() or "")
+    return tasks[0] if tasks else ""
+
+
+def _success(rows: Rows) -> bool | None:
+    return bool(rows.numbers("next.success").reshape(-1)[-1]) if "next.success" in rows.columns else None
+
+
+def _fingerprint(meta: Metadata, index: int, samples: dict[str, str]) -> str:
+    """Over samples of the episode's files; each file is looked at once, however many episodes it has."""
+    parts = [str(meta.folder.revision or ""), episode_name(index), str(meta.episodes[index]["length"])]
+    try:
+        spans = [meta.video(index, key) for key, item in meta.features.items() if item.dtype == "video"]
+        parts += [f"{span.start} {span.stop}" for span in spans]
+        files = [(meta.data_path(index), file_fingerprint), *((span.path, _video_sample) for span in spans)]
+        for relative, sample in [] if meta.folder.repo else files:
+            path = meta.folder.path(relative)
+            if relative not in samples:
+                samples[relative] = sample(path) if path.is_file() else "missing"
+            parts.append(samples[relative])
+    except EpisodeError as fault:  # read will say the same
+        parts.append(str(fault))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def _video_sample(path: Path) -> str:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_SAMPLE)
+        file.seek(max(0, size - _SAMPLE))
+        return hashlib.sha256(b"%d" % size + head + file.read(_SAMPLE)).hexdigest()

@@ -1,0 +1,1 @@
+"""Read RLDS / Open X-Embodiment: TFDS folders of TFRecord or ArrayRecord files, without TensorFlow."""

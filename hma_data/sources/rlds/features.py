@@ -1,0 +1,298 @@
+"""What the records of a TFDS folder hold: features.json read, and columns decoded by it.
+
+TensorFlow Datasets flattens nested features to names joined by "/". A feature inside one
+sequence (RLDS' `steps`) is stored back to back over the steps; inside two or more it is ragged:
+`<name>/ragged_flat_values` and `<name>/ragged_row_lengths_<i>`. Numbers are stored as float32 or
+int64 whatever their dtype, unless the tensor is encoded to bytes. (Source: tensorflow_datasets
+4.9, features and example_serializer.)
+
+T steps of an episode.
+"""
+
+import json
+import math
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.sources.rlds.tf_example import Example
+
+Shape = tuple[int | None, ...]
+BFLOAT16 = "bfloat16"  # NumPy has none: given as the float32 of the same value
+MAX_TENSOR_BYTES = 1 << 28  # one value that claims more is a bomb or an error
+
+# Content keys of a feature in features.json -> the class that wrote it; legacy files name the class only.
+CONTENT = {
+    "featuresDict": "FeaturesDict", "sequence": "Sequence", "tensor": "Tensor", "image": "Image",
+    "video": "Video", "text": "Text", "classLabel": "ClassLabel", "boundingBox": "BBoxFeature",
+    "audio": "Audio", "translation": "Translation", "jsonFeature": "Json",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One leaf of features.json.
+
+    Attributes:
+        name: flattened, as records name it: steps/observation/image.
+        kind: number, text, picture or other (stored in a way that is not read here).
+        shape: of one value, None where it varies; pictures (H, W, C).
+        dtype: of one value, e.g. float32; "string" for text.
+        nesting: lengths of the sequences around it, outermost first, None where they vary.
+        encoding: none, bytes or zlib.
+        codec: of pictures, png or jpeg; as stated, pictures may differ.
+    """
+
+    name: str
+    kind: str
+    shape: Shape
+    dtype: str
+    nesting: Shape = ()
+    encoding: str = "none"
+    codec: str | None = None
+
+    @property
+    def width(self) -> int | None:
+        """Values a step; None where it varies."""
+        sizes = self.nesting[1:] + self.shape
+        return None if None in sizes else math.prod(size for size in sizes if size is not None)
+
+
+def read_features(text: str, where: str) -> dict[str, Feature]:
+    """The leaves of a features.json by name, in its order.
+
+    Raises:
+        SourceError: it is not JSON, or not what TFDS writes.
+    """
+    try:
+        return {leaf.name: leaf for leaf in _leaves(json.loads(text), "", ())}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as fault:
+        raise SourceError(
+            where, f"is not a TFDS features.json: {fault!r}", "write it again with tensorflow_datasets"
+        ) from fault
+
+
+def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
+    kind, content = _content(node)
+    if kind == "FeaturesDict":
+        children = content.get("features", content)
+        if isinstance(children.get("type"), str):  # legacy, and a feature is named "features"
+            children = content
+        return [
+            leaf
+            for key, child in children.items()
+            for leaf in _leaves(child, f"{name}/{key}" if name else key, nesting)
+        ]
+    if kind in ("Sequence", "Dataset"):
+        return _leaves(content["feature"], name, (*nesting, _size(content.get("length"))))
+    if kind == "Translation":
+        return [Feature(f"{name}/{key}", "text", (), "string", nesting) for key in content["languages"]]
+    return [_leaf(kind, content, name, nesting)]
+
+
+def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feature:
+    shape, dtype = _shape(content.get("shape")), str(content.get("dtype") or "")
+    if kind == "Text":
+        return Feature(name, "text", (), "string", nesting)
+    if kind == "ClassLabel":
+        return Feature(name, "number", (), "int64", nesting)
+    if kind == "BBoxFeature":
+        return Feature(name, "number", (4,), "float32", nesting)
+    if kind in ("Image", "LabeledImage", "Video"):
+        if kind == "Video":
+            nesting = (*nesting, shape[0] if shape else None)
+        codec = content.get("encodingFormat") or content.get("encoding_format") or "png"
+        return Feature(name, "picture", shape[-3:] or (None, None, 3), dtype or "uint8", nesting, codec=codec)
+    if kind in ("Tensor", "Scalar"):
+        encoding = str(content.get("encoding") or "none").lower()
+        if dtype in ("string", "object", "str"):
+            return Feature(name, "text", shape, "string", nesting)
+        return _tensor(name, shape, dtype, nesting, encoding)
+    return Feature(name, "other", shape, dtype or kind, nesting)
+
+
+def _tensor(name: str, shape: Shape, dtype: str, nesting: Shape, encoding: str) -> Feature:
+    try:
+        readable = dtype == BFLOAT16 or np.dtype(dtype).kind in "fiub"
+    except TypeError:  # float8 and the like
+        readable = False
+    if not nesting and shape and shape[0] is None and encoding == "none":
+        shape, nesting = shape[1:], (None,)  # an episode without `steps`: the tensor is the sequence
+    return Feature(name, "number" if readable else "other", shape, dtype, nesting, encoding)
+
+
+def _content(node: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """(class, its values) of a feature as written by any version of TFDS."""
+    if "type" in node:  # before 4.6
+        kind, content = str(node["type"]).rsplit(".", 1)[-1], node.get("content") or {}
+        if isinstance(content, str):
+            content = json.loads(content)
+        return kind, content
+    kind = str(node.get("pythonClassName") or node.get("python_class_name") or "").rsplit(".", 1)[-1]
+    for key, general in CONTENT.items():
+        snake = "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in key)
+        content = node.get(key, node.get(snake))
+        if content is not None:
+            return general, content
+    return kind, {}
+
+
+def _shape(value: Any) -> Shape:
+    if isinstance(value, dict):
+        value = value.get("dimensions")
+    return tuple(_size(item) for item in value or ())
+
+
+def _size(value: Any) -> int | None:
+    return None if value is None or int(value) < 0 else int(value)
+
+
+# -- columns
+
+
+def step_count(example: Example, features: dict[str, Feature], where: str) -> int:
+    """T, from the first feature that tells it.
+
+    Args:
+        features: those inside steps.
+
+    Raises:
+        EpisodeError: no feature tells it, or there are no steps.
+    """
+    for feature in sorted(features.values(), key=lambda item: item.width or 0):
+        steps = _rows(example, feature)
+        if steps is not None:
+            if not steps:
+                raise EpisodeError(where, "has no steps")
+            return steps
+    raise EpisodeError(where, "holds none of the features that features.json names")
+
+
+def _rows(example: Example, feature: Feature) -> int | None:
+    """How many steps a feature has, if that is to be known without the others."""
+    lengths = f"{feature.name}/ragged_row_lengths_0"
+    if lengths in example:
+        return len(example.ints(lengths))
+    if feature.name not in example:
+        return None
+    if feature.kind in ("picture", "text") or feature.encoding != "none":
+        count = example.count(feature.name)
+        return count // feature.width if feature.kind == "text" and feature.width else count
+    return len(example.numbers(feature.name)) // feature.width if feature.width else None
+
+
+def column(example: Example, feature: Feature, steps: int, where: str) -> NDArray[Any]:
+    """A feature of numbers over the steps: (T, …) in its dtype.
+
+    Raises:
+        EpisodeError: the feature is missing, of another kind, ragged, or has not T rows.
+    """
+    name, sizes = _stored(example, feature, steps, where)
+    if feature.encoding != "none":
+        values = _decoded(example, feature, name, where)
+    else:
+        values = example.numbers(name).astype(_given(feature), copy=False)
+    inner = values.shape[1:] if feature.encoding != "none" else feature.shape
+    shape = [*sizes, *(-1 if size is None else size for size in inner)]
+    try:
+        return values.reshape(shape)
+    except ValueError as fault:
+        raise EpisodeError(
+            where, f"{name} has {values.size} values, {steps} steps of {_printed(feature)} are expected"
+        ) from fault
+
+
+def column_blobs(example: Example, feature: Feature, steps: int, where: str) -> list[memoryview]:
+    """A feature of byte strings over the steps: T views.
+
+    Raises:
+        EpisodeError: the feature is missing, of another kind, or has not one string a step.
+    """
+    name, _ = _stored(example, feature, steps, where)
+    blobs = example.blobs(name)
+    if len(blobs) != steps:
+        raise EpisodeError(where, f"{name} has {len(blobs)} entries for {steps} steps")
+    return blobs
+
+
+def scalar(example: Example, feature: Feature) -> Any:
+    """A feature outside the steps as a plain bool, int, float or str; None where it is not one value."""
+    if feature.name not in example or feature.nesting or feature.shape or feature.encoding != "none":
+        return None
+    if feature.kind == "text":
+        blobs = example.blobs(feature.name)
+        return bytes(blobs[0]).decode(errors="replace") if blobs else None
+    values = example.numbers(feature.name) if feature.kind == "number" else ()
+    return np.asarray(values).astype(_given(feature))[0].item() if len(values) == 1 else None
+
+
+def _stored(example: Example, feature: Feature, steps: int, where: str) -> tuple[str, list[int]]:
+    """(name under which the values lie, sizes of the sequences around each value, T first)."""
+    if f"{feature.name}/ragged_flat_values" not in example:
+        inner = [-1 if size is None else size for size in feature.nesting[1:]]
+        dynamic = f"{feature.name}/value"  # a tensor of several unknown sizes keeps its shape beside it
+        return dynamic if dynamic in example else feature.name, [steps, *inner]
+    sizes = [steps]
+    for level in range(len(feature.nesting) - 1):
+        lengths = example.ints(f"{feature.name}/ragged_row_lengths_{level}")
+        if len(lengths) != math.prod(sizes):
+            raise EpisodeError(where, f"{feature.name} has {len(lengths)} rows for {math.prod(sizes)}")
+        if len(lengths) and (lengths != lengths[0]).any():
+            raise EpisodeError(
+                where, f"{feature.name} varies from {lengths.min()} to {lengths.max()} entries a step"
+            )
+        sizes.append(int(lengths[0]) if len(lengths) else 0)
+    return f"{feature.name}/ragged_flat_values", sizes
+
+
+def _given(feature: Feature) -> np.dtype:
+    """The dtype its values are given in."""
+    return np.dtype(np.float32 if feature.dtype == BFLOAT16 else feature.dtype)
+
+
+def _decoded(example: Example, feature: Feature, name: str, where: str) -> NDArray[Any]:
+    """Tensors kept as bytes or zlib, (n, …)."""
+    blobs = example.blobs(name)
+    shapes: Any = [feature.shape] * len(blobs)
+    if name.endswith("/value"):
+        shapes = example.ints(f"{feature.name}/shape")
+        if len(shapes) != len(blobs) * len(feature.shape):
+            raise EpisodeError(where, f"{feature.name} has {len(shapes)} sizes for {len(blobs)} tensors")
+        shapes = shapes.reshape(len(blobs), -1)
+    values = [tensor(blob, feature, shape, where) for blob, shape in zip(blobs, shapes)]
+    if len({value.shape for value in values}) > 1:
+        raise EpisodeError(where, f"{feature.name} changes shape from step to step")
+    return np.stack(values) if values else np.zeros((0, 0), _given(feature))
+
+
+def tensor(blob: memoryview, feature: Feature, shape: Any, where: str) -> NDArray[Any]:
+    """One tensor encoded to bytes.
+
+    Args:
+        shape: its sizes, at most one of them None.
+
+    Raises:
+        EpisodeError: the bytes do not decompress, or do not fill the shape.
+    """
+    sizes = [-1 if size is None else int(size) for size in shape]
+    dtype = np.dtype(np.uint16 if feature.dtype == BFLOAT16 else feature.dtype)
+    limit = MAX_TENSOR_BYTES if -1 in sizes else math.prod(sizes) * dtype.itemsize + 1
+    try:
+        data: Any = blob
+        if feature.encoding == "zlib":
+            data = zlib.decompressobj().decompress(blob, min(max(limit, 1), MAX_TENSOR_BYTES))
+        values = np.frombuffer(data, dtype).reshape(sizes)
+    except (zlib.error, ValueError) as fault:
+        raise EpisodeError(where, f"{feature.name} is not {_printed(feature)}: {fault}") from fault
+    if feature.dtype == BFLOAT16:
+        return (values.astype(np.uint32) << 16).view(np.float32)
+    return values
+
+
+def _printed(feature: Feature) -> str:
+    sizes = ", ".join("?" if size is None else str(size) for size in (*feature.nesting[1:], *feature.shape))
+    return f"{feature.dtype} ({sizes})"

@@ -1,0 +1,127 @@
+"""Whole shards of remote sets, kept on this machine by their sha256, so that later epochs are local.
+
+They lie in `$HMA_CACHE/shards` and take `$HMA_CACHE_GB` at most (default 20; 0 keeps none). Those not
+used for longest make room, but none of the last hour: a set that does not fit is read by ranges.
+"""
+
+import fcntl
+import hashlib
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from hma_data.errors import ShardError, UsageError
+from hma_data.storage.files import PART, cache_folder
+from hma_data.storage.remote import AHEAD, RangeFile, RemotePath
+
+LIMIT, DEFAULT_GB = "HMA_CACHE_GB", 20.0
+IN_USE_S = 3600.0
+SPARE, SPARE_BYTES = 0.1, 5 * 10**9  # a tenth of the disk is left free, of a large one so much
+
+
+def limit_bytes() -> int:
+    """How much may be kept.
+
+    Raises:
+        UsageError: $HMA_CACHE_GB is not a number of gigabytes.
+    """
+    stated = os.environ.get(LIMIT, "")
+    try:
+        gigabytes = float(stated) if stated else DEFAULT_GB
+        return int(gigabytes * 1e9)
+    except (ValueError, OverflowError) as fault:
+        raise UsageError(
+            f"${LIMIT}", f"{stated!r} is no number of gigabytes", "for example 20; 0: none"
+        ) from fault
+
+
+def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
+    """A shard's copy on this machine, downloaded where there is none; None where it would not fit.
+
+    Args:
+        sha256, size: as its manifest states.
+
+    Raises:
+        ShardError: its bytes are not those of the manifest.
+        StorageError: it cannot be read; StorageAwayError: the store does not answer.
+    """
+    folder = cache_folder() / "shards"
+    final = folder / f"{sha256}.parquet"
+    try:
+        if _is_there(final, size):
+            return final
+        folder.mkdir(parents=True, exist_ok=True)
+        with _one_at_a_time(folder / f".{sha256}.lock"):
+            if _is_there(final, size):
+                return final
+            if not _make_room(folder, size):
+                return None
+            return _download(path, sha256, size, final)
+    except OSError:  # a cache that cannot be written is none
+        return None
+
+
+def _is_there(final: Path, size: int) -> bool:
+    """Whether it is kept; if so it counts as used now."""
+    with suppress(OSError):
+        if final.stat().st_size == size:
+            os.utime(final)
+            return True
+    return False
+
+
+def _download(path: RemotePath, sha256: str, size: int, final: Path) -> Path:
+    part = final.with_name(f".{sha256}.{os.getpid()}{PART}")
+    digest = hashlib.sha256()
+    try:
+        with part.open("wb") as out:
+            source = RangeFile(path, size)
+            while piece := source.read(AHEAD):
+                digest.update(piece)
+                out.write(piece)
+        if digest.hexdigest() != sha256:
+            fault = "its bytes are not those of the manifest (sha256 differs)"
+            raise ShardError(path, fault, "hma shards verify tells what is damaged")
+        part.replace(final)
+    finally:
+        part.unlink(missing_ok=True)
+    return final
+
+
+def _make_room(folder: Path, size: int) -> bool:
+    """Delete what was not used for longest until `size` more bytes fit; False where that does not do."""
+    found = []
+    for path in folder.iterdir():
+        with suppress(OSError):
+            facts = path.stat()
+            found.append((facts.st_mtime, facts.st_size, path))
+    taken, limit = sum(item[1] for item in found), limit_bytes()
+    over = max(taken + size - limit, size - _usable_bytes(folder))
+    old = [item for item in sorted(found) if item[0] < time.time() - IN_USE_S]
+    if size > limit or over > sum(item[1] for item in old):
+        return False
+    for _, length, path in old:
+        if over <= 0:
+            break
+        path.unlink(missing_ok=True)
+        over -= length
+    return True
+
+
+def _usable_bytes(folder: Path) -> int:
+    disk = shutil.disk_usage(folder)
+    return disk.free - min(int(SPARE * disk.total), SPARE_BYTES)
+
+
+@contextmanager
+def _one_at_a_time(lock: Path) -> Iterator[None]:
+    """Of several processes that want one shard, one downloads it."""
+    with lock.open("w") as handle:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)

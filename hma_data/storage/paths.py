@@ -1,0 +1,51 @@
+"""Take paths as callers give them: text, a `Path` or any other path object.
+
+A public function takes `StrPath` and turns it, once, into what it works with: `as_text` where a URI or a
+name may be meant, `as_path` for a file or folder of this machine, `as_address` for a hub.
+`hma_data.storage.remote.place` does the same where the path may be of a store.
+"""
+
+import os
+import re
+from pathlib import Path, PurePath
+
+from hma_data.errors import UsageError
+
+StrPath = str | os.PathLike[str]
+_CUT = re.compile(r"([a-z][a-z0-9+.-]+):/+(?=.)")
+
+
+def as_text(path: StrPath) -> str:
+    """Return a path or URI as text.
+
+    `Path("s3://bucket/set")` is `s3:/bucket/set`: a URI in a path object gets back the slashes it lost.
+
+    Raises:
+        UsageError: it is bytes.
+        TypeError: it is no path.
+    """
+    if isinstance(path, str):
+        return path
+    text = str(path) if isinstance(path, PurePath) else os.fspath(path)  # a RemotePath has no os.fspath
+    if isinstance(text, bytes):
+        raise UsageError(repr(text), "is a path of bytes", "give text: os.fsdecode makes it of them")
+    return _CUT.sub(_whole_scheme, text, count=1) if _CUT.match(text) else text
+
+
+def as_path(path: StrPath) -> Path:
+    """Return a file or folder of this machine as a `Path`; a `Path` stays as it is. Errors as `as_text`."""
+    return path if isinstance(path, Path) else Path(as_text(path))
+
+
+def as_address(path: StrPath) -> str | Path:
+    """Return the address of a hub: text and URIs as text, any other path object as a `Path`.
+
+    Only text can name a repository: `org/name` may be one, `Path("org/name")` is always a folder.
+    Errors as `as_text`.
+    """
+    text = as_text(path)
+    return text if isinstance(path, str) or "://" in text else Path(text)
+
+
+def _whole_scheme(found: re.Match[str]) -> str:
+    return f"{found[1]}://" + ("/" if found[1] in ("file", "local") else "")

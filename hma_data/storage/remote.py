@@ -1,0 +1,417 @@
+"""Folders and files of object stores, used like paths: `s3://bucket/set`, `gs://`, `hf://`, `memory://`.
+
+`place` makes a path of what a user wrote. A `RemotePath` can be joined, listed, read by ranges and
+deleted; whole files get there by `put_file` and `put_bytes`. A store raises what it likes: what may
+pass by itself is tried again, the rest becomes FileNotFoundError, or one StorageError that names the URI.
+"""
+
+import errno
+import io
+import os
+import re
+import stat
+from collections.abc import Callable, Generator
+from contextlib import suppress
+from fnmatch import fnmatchcase
+from inspect import signature
+from pathlib import Path, PosixPath, PurePosixPath
+from typing import Any
+
+from hma_data.errors import HMAError, StorageAwayError, StorageError
+from hma_data.storage.fetch import file_system
+from hma_data.storage.paths import StrPath, as_text
+from hma_data.storage.retry import ABSENT, address_hint, may_pass, retried, said
+
+WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
+TAIL, AHEAD = 256 << 10, 8 << 20  # bytes: read at once from the end of a file; ahead of who reads on
+WHOLE_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "memory"}  # an object appears whole or not at all
+_SCHEME = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
+
+
+def place(where: StrPath) -> Path:
+    """The path a user named: of this machine, or a RemotePath where it begins with a store's scheme.
+
+    Args:
+        where: str or path; also what became of a URI in `Path("s3://bucket/set")`, `s3:/bucket/set`.
+
+    Raises:
+        StorageError: no store is known by that scheme, or it names nothing in it.
+        MissingDependencyError: its package is not installed.
+    """
+    if isinstance(where, RemotePath):
+        return where
+    text = as_text(where)
+    found, bare = _SCHEME.fullmatch(text), text.rstrip("/")
+    if bare.endswith(":") and bare[:-1] in WHOLE_PUTS | {"hf"}:
+        raise StorageError(f"{bare}//", "names no bucket or repository", f"as in {bare}//bucket/folder")
+    if not found:
+        return Path(text)
+    if found[1] in ("file", "local"):
+        return Path("/" + found[2])
+    path = RemotePath(text)
+    _ = path.files  # whether there is a driver
+    return path
+
+
+def is_remote(path: Path) -> bool:
+    """Whether a path is in a store rather than on this machine."""
+    return isinstance(path, RemotePath)
+
+
+def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
+    """What `action` returns, tried again where the store failed in a way that may pass.
+
+    Args:
+        doing: for the error, such as "written".
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        StorageAwayError: it failed in such a way every time.
+        StorageError: it fails for good.
+    """
+    try:
+        return retried(action, where, WAITS_S)
+    except HMAError:
+        raise
+    except ABSENT as fault:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(where)) from fault
+    except Exception as fault:  # stores raise what they like
+        text = f"cannot be {doing}: {said(fault)}"
+        if may_pass(fault):
+            remedy = address_hint(fault) + "everything finished is kept: run the same command again"
+            raise StorageAwayError(where, text, remedy) from fault
+        raise StorageError(where, text, _remedy(fault)) from fault
+
+
+def _remedy(fault: BaseException) -> str:
+    if "credential" in said(fault).lower():
+        return "give credentials, in the way its driver reads them (environment or configuration file)"
+    if isinstance(fault, PermissionError) or "401" in said(fault) or "403" in said(fault):
+        return "check the credentials, and what they allow"
+    return "check the URI and your access to it"
+
+
+class RemotePath(PosixPath):
+    """A file or folder of a store. What a path of this machine can and this cannot raises an error."""
+
+    def with_segments(self, *segments: Any) -> Any:
+        """A path of the same kind; one that is relative to a remote path is of no machine."""
+        pure = PurePosixPath(*segments)
+        return RemotePath(pure) if pure.parts and pure.parts[0] == self.parts[0] else pure
+
+    def __str__(self) -> str:
+        scheme, _, rest = PurePosixPath(*self.parts).as_posix().partition(":")
+        return f"{scheme}://{rest.lstrip('/')}"
+
+    __repr__ = __str__
+
+    def __fspath__(self) -> str:
+        raise TypeError(f"{self} is not a file of this machine")
+
+    def __reduce__(self) -> Any:
+        return RemotePath, (str(self),)
+
+    @property
+    def scheme(self) -> str:
+        """s3, gs, hf, memory, …"""
+        return self.parts[0].removesuffix(":")
+
+    @property
+    def files(self) -> Any:
+        """The store's file system; fsspec keeps one for each process.
+
+        Raises:
+            StorageError: no store is known by that scheme.
+            MissingDependencyError: its package is not installed.
+        """
+        return _files(str(self))
+
+    @property
+    def key(self) -> str:
+        """The path as the store's file system names it."""
+        return str(self.files._strip_protocol(str(self)))
+
+    # -- what is there
+
+    def info(self) -> dict[str, Any]:
+        """What the store says of a file or folder: type, size and more.
+
+        Raises:
+            FileNotFoundError: there is nothing.
+        """
+
+        def ask() -> dict[str, Any]:
+            self.files.invalidate_cache()  # others write here too
+            return dict(self.files.info(self.key))
+
+        return attempt(self, "read", ask)
+
+    def listing(self) -> dict[str, int]:
+        """Name below this folder -> bytes, of every file, by name; empty where there is none."""
+
+        def ask() -> dict[str, Any]:
+            self.files.invalidate_cache()
+            return dict(self.files.find(self.key, detail=True))
+
+        try:
+            found = attempt(self, "listed", ask)
+        except FileNotFoundError:
+            return {}
+        begin = f"{self.key}/"
+        sizes = {name: int(found[name]["size"] or 0) for name in sorted(found)}
+        return {name.removeprefix(begin): size for name, size in sizes.items() if name.startswith(begin)}
+
+    def exists(self, **_: Any) -> bool:
+        try:
+            self.info()
+        except FileNotFoundError:
+            return False
+        return True
+
+    def is_file(self, **_: Any) -> bool:
+        try:
+            return bool(self.info()["type"] == "file")
+        except FileNotFoundError:
+            return False
+
+    def is_dir(self, **_: Any) -> bool:
+        try:
+            return bool(self.info()["type"] == "directory")
+        except FileNotFoundError:
+            return False
+
+    def stat(self, **_: Any) -> os.stat_result:
+        """Size and kind; a store tells no more in common."""
+        found = self.info()
+        mode = stat.S_IFREG if found["type"] == "file" else stat.S_IFDIR
+        return os.stat_result((mode | 0o644, 0, 0, 0, 0, 0, int(found["size"] or 0), 0, 0, 0))
+
+    def iterdir(self) -> Generator["RemotePath"]:
+        """What is right below; nothing where there is nothing, as stores keep no empty folders."""
+
+        def ask() -> list[str]:
+            self.files.invalidate_cache()
+            return [str(item["name"]) for item in self.files.ls(self.key, detail=True)]
+
+        try:
+            names = attempt(self, "listed", ask)
+        except FileNotFoundError:
+            return
+        for name in sorted(names):
+            last = name.rstrip("/").rsplit("/", 1)[-1]
+            if name.rstrip("/") != self.key:
+                yield self / last
+
+    def glob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
+        """Files below whose path matches, part by part; folders are not told."""
+        wanted = pattern.split("/")
+        for name in self.listing():
+            parts = name.split("/")
+            if len(parts) == len(wanted) and all(map(fnmatchcase, parts, wanted)):
+                yield self / name
+
+    def rglob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
+        """Files anywhere below whose name matches."""
+        for name in self.listing():
+            if fnmatchcase(name.rsplit("/", 1)[-1], pattern):
+                yield self / name
+
+    def resolve(self, strict: bool = False) -> "RemotePath":
+        return self
+
+    def absolute(self) -> "RemotePath":
+        return self
+
+    # -- reading and deleting
+
+    def open(self, mode: str = "r", *_: Any, **options: Any) -> Any:
+        """The file, to read."""
+        if mode not in ("r", "rb", "rt"):
+            raise StorageError(self, f"cannot be opened for {mode!r}", "files of a store are put as a whole")
+        data = io.BufferedReader(RangeFile(self), 1 << 20)
+        if "b" in mode:
+            return data
+        return io.TextIOWrapper(data, encoding=options.get("encoding"), newline=options.get("newline"))
+
+    def read_bytes(self) -> bytes:
+        try:
+            return attempt(self, "read", lambda: bytes(self.files.cat_file(self.key)))
+        except (FileNotFoundError, StorageError):
+            with suppress(FileNotFoundError, StorageError):
+                found = self.info()
+                if (found["type"], found["size"]) == ("file", 0):  # some hubs do not send empty files
+                    return b""
+            raise
+
+    def read_text(self, encoding: str | None = None, errors: str | None = None, **_: Any) -> str:
+        return self.read_bytes().decode(encoding or "utf-8", errors or "strict")
+
+    def unlink(self, missing_ok: bool = False) -> None:
+        try:
+            attempt(self, "deleted", lambda: self.files.rm_file(self.key))
+        except FileNotFoundError:
+            if not missing_ok:
+                raise
+
+    def mkdir(self, *_: Any, **__: Any) -> None:
+        """Nothing: folders are there when something is in them."""
+
+    def delete_tree(self, keep: Callable[[str], bool] = lambda name: False) -> None:
+        """Delete every file below, but those whose name below this folder is to be kept."""
+        for name in self.listing():
+            if not keep(name):
+                (self / name).unlink(missing_ok=True)
+
+
+def _files(uri: str) -> Any:
+    try:
+        return file_system(uri)[0]
+    except ValueError as fault:
+        remedy = "use s3://, gs:// or hf://"
+        raise StorageError(uri, f"is of no store that is known: {said(fault)}", remedy) from fault
+
+
+# -- writing
+
+
+def put_file(local: Path, to: RemotePath) -> None:
+    """Upload a file; it appears under its name when it is whole.
+
+    Raises:
+        StorageError: the store refuses it; StorageAwayError: it does not answer.
+    """
+    files, size = to.files, local.stat().st_size
+    _put(to, lambda key: files.put_file(str(local), key), size)
+
+
+def put_bytes(content: bytes, to: RemotePath) -> None:
+    """Upload a small file; see `put_file`."""
+    _put(to, lambda key: to.files.pipe_file(key, content), len(content))
+
+
+def create_bytes(content: bytes, to: RemotePath) -> bool:
+    """Upload a small file if there is none of that name, as one step; False where there is one.
+
+    A store that knows no such condition is written to as by `put_bytes`.
+
+    Raises:
+        StorageError: the store refuses it; StorageAwayError: it does not answer.
+    """
+    files = to.files
+    if "mode" not in signature(getattr(files, "_pipe_file", files.pipe_file)).parameters:
+        put_bytes(content, to)
+        return True
+
+    def once() -> bool:
+        try:
+            files.pipe_file(to.key, content, mode="create")
+        except Exception:  # each driver says in its own way that there is one
+            files.invalidate_cache()
+            if files.exists(to.key):
+                return False
+            raise
+        return True
+
+    try:
+        return attempt(to, "written", once)
+    except StorageAwayError:
+        raise
+    except (FileNotFoundError, StorageError):  # refused: the condition, or any writing
+        put_bytes(content, to)
+        return True
+
+
+def _put(to: RemotePath, upload: Callable[[str], Any], size: int) -> None:
+    whole = to.scheme in WHOLE_PUTS
+    beside = to if whole else to.with_name(f".{to.name}.{os.getpid()}.part")
+
+    def once() -> None:
+        upload(beside.key)
+        if not whole:
+            to.files.mv(beside.key, to.key)
+
+    try:
+        attempt(to, "written", once)
+        arrived = to.info()["size"]
+    except FileNotFoundError as fault:
+        raise StorageError(to, "cannot be written: there is no such bucket", "create it first") from fault
+    if arrived != size:
+        raise StorageAwayError(
+            to, f"has {arrived} bytes after an upload of {size}", "run the same command again"
+        )
+
+
+# -- reading by ranges
+
+
+class RangeFile(io.RawIOBase):
+    """A remote file as a seekable one: its end at once, the rest as asked for, ahead of who reads on."""
+
+    def __init__(self, path: RemotePath, size: int | None = None) -> None:
+        self._path, self._at, self._last = path, 0, -1
+        self._files, self._key = path.files, path.key
+        self._size = int(path.info()["size"]) if size is None else size
+        self._begin, self._kept = 0, b""
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def size(self) -> int:
+        """Bytes in all."""
+        return self._size
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        data = self._bytes(len(view))
+        view[: len(data)] = data
+        return len(data)
+
+    def read(self, size: int | None = -1) -> bytes:
+        """Exactly `size` bytes where there are so many."""
+        return bytes(self._bytes(self._size if size is None or size < 0 else size))
+
+    def _bytes(self, count: int) -> memoryview:
+        begin, end = self._at, min(self._at + count, self._size)
+        if end <= begin:
+            return memoryview(b"")
+        if begin < self._begin or end > self._begin + len(self._kept):
+            start, stop = begin, end
+            if begin == self._last:
+                stop = min(max(end, begin + AHEAD), self._size)
+            elif end > self._size - TAIL:
+                start, stop = min(begin, max(0, self._size - TAIL)), self._size
+            self._kept, self._begin = self._fetch(start, stop), start
+        self._at = self._last = end
+        return memoryview(self._kept)[begin - self._begin : end - self._begin]
+
+    def _fetch(self, start: int, stop: int) -> bytes:
+        def ask() -> bytes:
+            data = bytes(self._files.cat_file(self._key, start=start, end=stop))
+            if len(data) != stop - start:
+                raise ConnectionError(f"{len(data)} bytes came where {stop - start} were asked for")
+            return data
+
+        return attempt(self._path, "read", ask)
+
+
+def parquet_input(path: Path) -> Any:
+    """What pyarrow reads a parquet file from: the path, or a file of ranges."""
+    return RangeFile(path) if isinstance(path, RemotePath) else path
+
+
+def parquet_file(path: Path, **options: Any) -> Any:
+    """A pyarrow ParquetFile wherever it is; of a remote one, a row group's bytes come in few requests."""
+    import pyarrow.parquet as pq
+
+    remote = is_remote(path)
+    return pq.ParquetFile(parquet_input(path), pre_buffer=remote, **options)

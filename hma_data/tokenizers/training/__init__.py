@@ -1,0 +1,1 @@
+"""Train and measure the embedded tokenizers: `hma tokenizer train` and `hma tokenizer eval`."""

@@ -1,0 +1,216 @@
+"""What a training of the embedded tokenizer is decided by, as YAML.
+
+Every value is checked before anything is read or trained; unknown keys are refused.
+"""
+
+import hashlib
+import json
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from hma_data.errors import RecipeError
+from hma_data.storage.paths import StrPath, as_path
+from hma_data.storage.yaml_io import read_yaml
+from hma_data.tokenizers.fsq_network import STRIDE, FsqConfig
+from hma_data.tokenizers.vae_network import VaeConfig
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class FsqRecipe(_Strict):
+    """`FsqConfig` as a recipe says it."""
+
+    levels: list[list[int]]
+    width: tuple[int, int]
+    hidden: int
+    encoder_blocks: tuple[int, int]
+    decoder_blocks: tuple[int, int, int]
+    fine_width: int
+
+    @model_validator(mode="after")
+    def _is_a_network(self) -> "FsqRecipe":
+        self.config()
+        return self
+
+    def config(self) -> FsqConfig:
+        """The network's shape."""
+        return FsqConfig.from_json(self.model_dump())
+
+
+class VaeRecipe(_Strict):
+    """`VaeConfig` as a recipe says it; the scale of the latents is measured, not said."""
+
+    channels: int
+    width: int
+    hidden: int
+    encoder_blocks: int
+    decoder_blocks: tuple[int, int]
+    fine_width: int
+    noise: float
+
+    @model_validator(mode="after")
+    def _is_a_network(self) -> "VaeRecipe":
+        self.config()
+        return self
+
+    def config(self) -> VaeConfig:
+        """The network's shape."""
+        return VaeConfig.from_json(self.model_dump())
+
+
+class TrainingRecipe(_Strict):
+    """How long and how fast.
+
+    Attributes:
+        steps: of the optimizer.
+        batch, crop: crops a step, and their side in pixels, a multiple of 16.
+        learning_rate: the highest, of Muon (matrices) in units of the spectral norm.
+        adam_learning_rate: the highest, of Adam (biases, first and last layers).
+        weight_decay: of Muon's matrices; their spectral norms stay below its inverse.
+        warmup_steps: of linear rise at the start.
+        fall: (step, share of the highest rate), in order: the rate is constant up to the first, linear
+            between them, and the last is (steps, 0). A run under way can be given another future,
+            shorter or longer, and goes on as if it had been meant so.
+        ema: decay of the averaged weights, which are the ones kept.
+        threads: of torch; the result depends on it in the last bits only.
+    """
+
+    steps: int = Field(gt=0)
+    batch: int = Field(gt=0)
+    crop: int = Field(gt=0, multiple_of=STRIDE)
+    learning_rate: float = Field(gt=0)
+    adam_learning_rate: float = Field(gt=0)
+    weight_decay: float = Field(ge=0, default=0.0)
+    warmup_steps: int = Field(ge=0, default=100)
+    fall: list[tuple[int, float]] = Field(default_factory=list)
+    ema: float = Field(ge=0, lt=1, default=0.998)
+    threads: int = Field(gt=0, default=1)
+
+    @model_validator(mode="after")
+    def _falls_to_the_end(self) -> "TrainingRecipe":
+        steps = [step for step, _ in self.fall]
+        if not self.fall:
+            return self
+        if sorted(set(steps)) != steps or min(steps) < 0 or self.fall[0][1] != 1:
+            raise ValueError("fall must begin with share 1, at ascending steps")
+        if self.fall[-1] != (self.steps, 0) or not all(0 <= share <= 1 for _, share in self.fall):
+            raise ValueError(f"fall must end with [{self.steps}, 0], shares within 0..1")
+        return self
+
+    def rate(self, step: int) -> float:
+        """Share of the highest learning rate at a step, counted from 0."""
+        rise = min(1.0, (step + 1) / max(1, self.warmup_steps))
+        if not self.fall:
+            return rise
+        steps, shares = [point[0] for point in self.fall], [point[1] for point in self.fall]
+        return min(rise, float(np.interp(step, steps, shares)))
+
+
+class LossRecipe(_Strict):
+    """Weights of the parts of the loss; pixels in [0, 1]."""
+
+    l2: float = Field(ge=0)
+    l1: float = Field(ge=0)
+    gradient: float = Field(ge=0)
+    ssim: float = Field(ge=0)
+
+
+class FileSource(_Strict):
+    """Pictures and videos under a folder of the corpus.
+
+    Attributes:
+        path: folder below the recipe's `corpus`.
+        glob: which files.
+        origin: the package and version they come from.
+        weight: how often a crop is from this source, relative to the others.
+        frames: taken from each video, evenly.
+    """
+
+    kind: Literal["files"]
+    path: str
+    glob: list[str]
+    origin: str
+    weight: float = Field(gt=0, default=1.0)
+    frames: int = Field(gt=0, default=40)
+
+
+class DrawnSource(_Strict):
+    """Pictures made by `recipes/tokenizer/draw.py`, in a folder of the corpus named by their kind."""
+
+    kind: Literal["pusht", "drawn"]
+    pictures: int = Field(gt=0, default=200)
+    weight: float = Field(gt=0, default=1.0)
+
+    @property
+    def path(self) -> str:
+        """Folder below the recipe's `corpus`."""
+        return self.kind
+
+    @property
+    def glob(self) -> list[str]:
+        """Which files."""
+        return ["*.png"]
+
+    @property
+    def frames(self) -> int:
+        """Taken from each file."""
+        return 1
+
+
+class TokenizerRecipe(_Strict):
+    """A whole training, so that it can be done again."""
+
+    job: Literal["tokenizer"]
+    name: str
+    seed: int = Field(ge=0)
+    corpus: str
+    network: FsqRecipe | VaeRecipe
+    training: TrainingRecipe
+    loss: LossRecipe
+    sources: list[FileSource | DrawnSource] = Field(min_length=1)
+
+    def digest(self) -> str:
+        """SHA-256 over all but where the corpus lies."""
+        return _digest(self.model_dump(mode="json", exclude={"corpus"}))
+
+    def course(self) -> str:
+        """SHA-256 over all but the rates: with the same past of those too, a run can go on."""
+        values = self.model_dump(mode="json", exclude={"corpus"})
+        for key in ("steps", "fall", "threads"):
+            values["training"].pop(key)
+        return _digest(values)
+
+
+def _digest(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def load_recipe(path: StrPath, overrides: dict[str, Any] | None = None) -> TokenizerRecipe:
+    """The recipe of a YAML file; `overrides` replace values by dotted key (`training.steps`).
+
+    Args:
+        path: str or path of the YAML.
+
+    Raises:
+        RecipeError: the file or an override is not valid.
+    """
+    path = as_path(path)
+    values = read_yaml(path, RecipeError)
+    for key, value in (overrides or {}).items():
+        *parents, last = key.split(".")
+        node = values
+        for parent in parents:
+            node = node.get(parent) if isinstance(node, dict) else None
+        if not isinstance(node, dict):
+            raise RecipeError(path, f"has no key {key!r} to override")
+        node[last] = value
+    try:
+        return TokenizerRecipe.model_validate(values)
+    except ValidationError as fault:
+        first = fault.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise RecipeError(path, f"{place}: {first['msg']}, got {first['input']!r:.80}") from fault

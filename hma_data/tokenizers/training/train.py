@@ -1,0 +1,335 @@
+"""Train an embedded tokenizer from a recipe.
+
+    train(Path("recipes/tokenizer/fsq.yaml"), Path("fsq.safetensors"), {"corpus": "/data/corpus"})
+
+The loss is what can be had without a pretrained network: squared and absolute error, gradients at
+several scales, and SSIM. Before the first step the network is the best linear code of patches
+(their principal components); the rest starts at zero and learns what is left. A weights' file is
+written now and then, and the state of the run beside it: running it again goes on, on any device.
+
+B crops, S side of a crop, C latent channels.
+"""
+
+import hashlib
+import math
+import platform
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hma_data.errors import RecipeError
+from hma_data.storage.files import write_atomic
+from hma_data.storage.paths import StrPath, as_path
+from hma_data.tokenizers.embedded import save_weights
+from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig
+from hma_data.tokenizers.network import open_device
+from hma_data.tokenizers.training.crops import Pool, draw_batch, load_pools
+from hma_data.tokenizers.training.eval import ssim_map
+from hma_data.tokenizers.training.muon import Muon
+from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
+from hma_data.tokenizers.vae_network import FORMAT as VAE_FORMAT
+from hma_data.tokenizers.vae_network import VaeAutoencoder, VaeConfig
+
+START, END = 2**32 - 1, 2**32 - 2  # numbers of the batches that start and measure a network
+Autoencoder = FsqAutoencoder | VaeAutoencoder
+
+
+def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
+    """The loss of (B, 3, S, S) pictures in [-1, 1], and the mean squared error in [0, 1] units."""
+    made, true = (made + 1) / 2, (true + 1) / 2
+    squared = functional.mse_loss(made, true)
+    loss = weights.l2 * squared
+    if weights.l1:
+        loss = loss + weights.l1 * functional.l1_loss(made, true)
+    if weights.gradient:
+        loss = loss + weights.gradient * _gradient_loss(made, true)
+    if weights.ssim:
+        loss = loss + weights.ssim * (1 - ssim_map(_grey(made), _grey(true)).mean())
+    return loss, squared.detach()
+
+
+def _grey(pictures: Tensor) -> Tensor:
+    weights = pictures.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
+    return (pictures * weights).sum(1, keepdim=True)
+
+
+def _gradient_loss(made: Tensor, true: Tensor) -> Tensor:
+    """Mean absolute error of the differences of neighbours, at three scales."""
+    error = made - true
+    total = error.new_zeros(())
+    for _ in range(3):
+        total = total + error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
+        error = functional.avg_pool2d(error, 2)
+    return total / 3
+
+
+def start_linear(network: Autoencoder, crops: Tensor) -> None:
+    """Set the linear paths to the principal components of the crops' patches, whitened and turned.
+
+    Args:
+        crops: (B, 3, S, S) in [-1, 1].
+    """
+    encoder, decoder, stride = network.encoder, network.decoder, network.stride
+    channels = encoder.linear.out_channels
+    patches = functional.unfold(crops, stride, stride=stride).transpose(1, 2).flatten(0, 1).double()
+    mean = patches.mean(0)
+    _, values, basis = torch.linalg.svd(patches - mean, full_matrices=False)
+    scale = values[:channels, None] / math.sqrt(len(patches))
+    whiten = basis[:channels] / scale
+    # Turned at random, so that every channel carries a share of the strong components.
+    turn = torch.linalg.qr(torch.randn(channels, channels, dtype=torch.float64))[0]
+    back = network.linear_gain * (turn @ (basis[:channels] * scale)).T
+    whiten = turn @ whiten
+    with torch.no_grad():
+        encoder.linear.weight.copy_(whiten.view(channels, 3, stride, stride))
+        encoder.linear.bias.copy_(-(whiten @ mean))  # type: ignore[union-attr]
+        encoder.head.weight.mul_(0.1)
+        decoder.linear.weight.copy_(back[:, :, None, None])
+        decoder.linear.bias.copy_(mean)  # type: ignore[union-attr]
+        decoder.head.weight.mul_(0.1)
+
+
+def _autoencoder(recipe: TokenizerRecipe) -> Autoencoder:
+    config = recipe.network.config()
+    return FsqAutoencoder(config) if isinstance(config, FsqConfig) else VaeAutoencoder(config)
+
+
+class Run:
+    """A training under way: network, averaged weights, optimizers, and the step it has reached."""
+
+    def __init__(self, recipe: TokenizerRecipe, pools: list[Pool], device: torch.device) -> None:
+        self.recipe, self.pools, self.step, self.seconds = recipe, pools, 0, 0.0
+        torch.manual_seed(recipe.seed)
+        network = _autoencoder(recipe)
+        start_linear(network, self.batch(START, 256))
+        self.device = device
+        self.network: Autoencoder = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.average = {name: p.detach().clone() for name, p in self.network.named_parameters()}
+        self.optimizers = _optimizers(self.network, recipe.training)
+
+    def batch(self, step: int, count: int) -> Tensor:
+        """(B, 3, S, S) crops of a step, in the CPU's memory."""
+        crops = draw_batch(self.pools, self.recipe.training.crop, count, self.recipe.seed, step)
+        return torch.from_numpy(crops).permute(0, 3, 1, 2)
+
+    def advance(self, crops: Tensor) -> float:
+        """One step on its crops; their mean squared error, pixels in [0, 1]."""
+        training = self.recipe.training
+        for optimizer, highest in zip(self.optimizers, (training.learning_rate, training.adam_learning_rate)):
+            optimizer.param_groups[0]["lr"] = highest * training.rate(self.step)
+        crops = crops.to(self.device)
+        generator = torch.Generator().manual_seed((self.recipe.seed * 1_000_003 + self.step) % 2**63)
+        made, latents = self.network(crops, generator)
+        loss, squared = reconstruction_loss(made, crops, self.recipe.loss)
+        (loss + 0.01 * _latent_penalty(latents)).backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        for optimizer in self.optimizers:
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        self.step += 1
+        decay = min(training.ema, self.step / (self.step + 10))
+        with torch.no_grad():
+            for name, parameter in self.network.named_parameters():
+                self.average[name].lerp_(parameter, 1 - decay)
+        return float(squared)
+
+    def write_weights(self, path: Path, facts: dict[str, Any]) -> None:
+        """Write the averaged weights as a tokenizer's file, with how they came about."""
+        config = self.recipe.network.config()
+        if isinstance(config, FsqConfig):
+            save_weights(path, FORMAT, config, self.average, facts)
+        else:
+            scaled = replace(config, latent_scale=self._latent_scale(config))
+            save_weights(path, VAE_FORMAT, scaled, self.average, facts)
+
+    @torch.no_grad()
+    def _latent_scale(self, config: VaeConfig) -> float:
+        """One by the standard deviation of the averaged encoder's latents over a batch."""
+        network = VaeAutoencoder(config)
+        network.load_state_dict(self.average)
+        return round(1 / float(network.encoder(self.batch(END, 128)).std()), 4)
+
+    def save(self, path: Path) -> None:
+        """Write what `resume` needs, atomically."""
+        metadata = {"course": self.recipe.course(), "step": str(self.step)}
+        metadata["rates"] = self._past_rates(self.step)
+        metadata["seconds"] = str(round(self.seconds, 3))
+        tensors = {name: tensor.contiguous() for name, tensor in self._state().items()}
+        write_atomic(path, save(tensors, metadata))
+
+    def _state(self) -> dict[str, Tensor]:
+        """Copies of parameters, averages and the optimizers' moments, by name."""
+        state = {f"network.{name}": p.detach().clone() for name, p in self.network.named_parameters()}
+        state |= {f"average.{name}": tensor.clone() for name, tensor in self.average.items()}
+        for number, optimizer in enumerate(self.optimizers):
+            for index, moments in optimizer.state_dict()["state"].items():
+                state |= {f"moment.{number}.{index}.{key}": m.clone() for key, m in moments.items()}
+        return state
+
+    def resume(self, path: Path) -> None:
+        """Go on from a state that `save` wrote.
+
+        Raises:
+            RecipeError: it is no such state, or of a training with other settings.
+        """
+        remedy = f"remove {path.name} to start anew"
+        try:
+            with safe_open(path, "pt") as file:
+                metadata = file.metadata() or {}
+                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            step = int(metadata.get("step", -1))
+            same = metadata.get("course") == self.recipe.course()
+            if step < 0 or not same or metadata.get("rates") != self._past_rates(step):
+                raise RecipeError(path, "is the state of a training with other settings", remedy)
+            self._restore(state)
+        except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as fault:
+            raise RecipeError(path, f"is no state of a training: {fault!s:.120}", remedy) from fault
+        self.step, self.seconds = step, float(metadata.get("seconds", 0))
+
+    def _restore(self, state: dict[str, Tensor]) -> None:
+        with torch.no_grad():
+            for name, parameter in self.network.named_parameters():
+                parameter.copy_(state[f"network.{name}"])
+                self.average[name].copy_(state[f"average.{name}"])
+        for number, optimizer in enumerate(self.optimizers):
+            moments: dict[int, dict[str, Tensor]] = {}
+            for name, tensor in state.items():
+                kind, *place = name.split(".")
+                if kind == "moment" and int(place[0]) == number:
+                    moments.setdefault(int(place[1]), {})[place[2]] = tensor
+            groups = optimizer.state_dict()["param_groups"]
+            optimizer.load_state_dict({"state": moments, "param_groups": groups})
+
+    def _past_rates(self, step: int) -> str:
+        """Digest of the rates of all steps before this one."""
+        rates = [round(self.recipe.training.rate(past), 9) for past in range(step)]
+        return hashlib.sha256(repr(rates).encode()).hexdigest()
+
+
+def _optimizers(network: Autoencoder, recipe: TrainingRecipe) -> list[torch.optim.Optimizer]:
+    matrices: list[nn.Parameter] = []
+    others: list[nn.Parameter] = []
+    for name, parameter in network.named_parameters():
+        inner = ".at" in name or ".down" in name or ".up" in name
+        (matrices if inner and parameter.ndim == 4 else others).append(parameter)
+    return [
+        Muon(matrices, lr=recipe.learning_rate, decay=recipe.weight_decay),
+        torch.optim.Adam(others, lr=recipe.adam_learning_rate, betas=(0.9, 0.99)),
+    ]
+
+
+def _latent_penalty(latents: Tensor) -> Tensor:
+    """Keeps latents where the squashing still has a slope: zero mean, unit variance, no far tails."""
+    per_channel = latents.transpose(0, 1).flatten(1)
+    spread = (per_channel.var(1) - 1).square().mean() + per_channel.mean(1).square().mean()
+    return spread + functional.relu(latents.abs() - 2.5).square().mean()
+
+
+def train(
+    recipe_path: StrPath,
+    out: StrPath,
+    overrides: dict[str, Any] | None = None,
+    *,
+    device: str = "cpu",
+    workers: int = 0,
+    report: Callable[[str], None] = print,
+    report_every: int = 100,
+) -> dict[str, Any]:
+    """Train as the recipe says and write the weights; a run that was stopped goes on.
+
+    Args:
+        recipe_path: str or path of a YAML, see `hma_data.tokenizers.training.recipe.TokenizerRecipe`.
+        out: str or path of the weights' file, rewritten at every report; `<out>.state` holds the run until
+            it ends.
+        overrides: values to replace in the recipe, by dotted key.
+        device: where the network is trained: cpu, cuda, mps.
+        workers: threads that draw crops ahead; 0 draws them in turn. The crops are the same.
+        report: takes a line of progress.
+        report_every: steps between reports.
+
+    Returns:
+        what the file's metadata says: recipe and corpus digests, seed, steps, training PSNR, seconds
+        and machine.
+
+    Raises:
+        RecipeError: the recipe is not valid, its corpus is not there, or the state beside `out`
+            is another training's.
+        TokenizerError: there is no such device.
+    """
+    place, out = open_device("tokenizer train", device), as_path(out)
+    recipe = load_recipe(recipe_path, overrides)
+    torch.set_num_threads(recipe.training.threads)
+    pools, corpus_sha256 = load_pools(recipe.sources, Path(recipe.corpus).expanduser())
+    report("pictures: " + ", ".join(f"{pool.name} {len(pool.pictures)}" for pool in pools))
+    run, state = Run(recipe, pools, place), out.with_name(out.name + ".state")
+    if state.exists():
+        run.resume(state)
+        report(f"going on from step {run.step}")
+    facts: dict[str, Any] = {
+        "recipe": recipe.name,
+        "recipe_sha256": recipe.digest(),
+        "corpus_sha256": corpus_sha256,
+        "seed": recipe.seed,
+        "machine": _machine(place, recipe.training.threads),
+    }
+    # Far below zero the slope of silu is a denormal number; with those a step takes seven times as long.
+    torch.set_flush_denormal(True)
+    try:
+        _advance(run, out, facts, workers, report, report_every)
+    finally:
+        torch.set_flush_denormal(False)
+    state.unlink(missing_ok=True)
+    return facts
+
+
+def _machine(device: torch.device, threads: int) -> str:
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{threads} thread"
+    return f"{platform.machine()}, {name}, torch {torch.__version__}"
+
+
+def _crops(run: Run, workers: int) -> Iterator[Tensor]:
+    """The crops of every step that is left, in order, drawn ahead by threads."""
+    count, steps = run.recipe.training.batch, iter(range(run.step, run.recipe.training.steps))
+    if not workers:
+        yield from (run.batch(step, count) for step in steps)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        ahead = deque(pool.submit(run.batch, step, count) for step in islice(steps, 2 * workers))
+        while ahead:
+            yield ahead.popleft().result()
+            ahead.extend(pool.submit(run.batch, step, count) for step in islice(steps, 1))
+
+
+def _advance(
+    run: Run,
+    out: Path,
+    facts: dict[str, Any],
+    workers: int,
+    report: Callable[[str], None],
+    report_every: int,
+) -> None:
+    """Take all the steps; now and then write weights and state, and report."""
+    errors: list[float] = []
+    last = time.monotonic()
+    for crops in _crops(run, workers):
+        errors.append(run.advance(crops))
+        now = time.monotonic()
+        run.seconds, last = run.seconds + now - last, now
+        if run.step % report_every == 0 or run.step == run.recipe.training.steps:
+            psnr = round(-10 * math.log10(sum(errors) / len(errors)), 2)
+            facts |= {"steps": run.step, "train_psnr_db": psnr, "seconds": round(run.seconds)}
+            errors.clear()
+            run.write_weights(out, facts)
+            run.save(out.with_name(out.name + ".state"))
+            report(f"step {run.step}: training PSNR {psnr} dB, {run.seconds:.0f} s")

@@ -1,0 +1,1 @@
+"""Benchmark the model: `hma bench generate`, `train`, `mup`, `waiting`."""

@@ -1,0 +1,107 @@
+"""`hma bench mup`: whether a learning rate found at one width serves at another.
+
+Small models of several widths learn a made world at several learning rates, with muP and without: patterns of
+tokens that actions move along a line. With muP the best rate should stay where it is as the width grows
+(Yang et al. 2022, arXiv 2203.03466); without, it moves. `plot=FILE.svg` draws the losses over the rates.
+"""
+
+import math
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
+
+from hma_data.errors import UsageError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ABOUT = "loss by learning rate and width, with muP and without: where the best rate lies"
+DEFAULTS: dict[str, Any] = {
+    "widths": "32,64,128",
+    "rates": "0.0005,0.001,0.002,0.004,0.008,0.016,0.032",
+    "steps": 120,
+    "layers": 2,
+    "batch": 8,
+    "seeds": 1,
+    "plot": "",
+}
+_TAIL = 0.2  # the share of the steps, at the end, over which the loss is averaged
+
+
+def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """A row for each parametrisation, width and rate: the mean loss at the end (None where it diverged)."""
+    widths, rates = _numbers(settings["widths"], int), _numbers(settings["rates"], float)
+    rows: list[dict[str, Any]] = []
+    for mup in (True, False):
+        for width in widths:
+            losses = {rate: _end(settings, width, rate, mup, widths[0]) for rate in rates}
+            finite = {rate: loss for rate, loss in losses.items() if math.isfinite(loss)}
+            best = min(finite, key=lambda rate: finite[rate]) if finite else None
+            rows += [
+                {
+                    "parametrisation": "muP" if mup else "standard",
+                    "width": width,
+                    "lr": rate,
+                    "nats_a_token": round(loss, 4) if math.isfinite(loss) else None,
+                    "best": rate == best,
+                }
+                for rate, loss in losses.items()
+            ]
+    if settings["plot"]:
+        draw(rows, Path(settings["plot"]))
+    return rows
+
+
+def _end(settings: dict[str, Any], width: int, rate: float, mup: bool, base_width: int) -> float:
+    from hma_model.bench.mup_world import make_model, train
+
+    ends = []
+    for seed in range(settings["seeds"]):
+        model = make_model(width, settings["layers"], mup, base_width, seed)
+        losses = train(model, rate, settings["steps"], settings["batch"], seed)
+        whole = len(losses) == settings["steps"]
+        ends.append(fmean(losses[-max(1, int(_TAIL * len(losses))) :]) if whole else math.nan)
+    return fmean(ends)
+
+
+def _numbers(text: Any, kind: type) -> list[Any]:
+    try:
+        values = [kind(part) for part in str(text).split(",")]
+    except ValueError as fault:
+        raise UsageError("bench mup", f"{text!r} is no list of numbers", "write 32,64,128") from fault
+    if not values or min(values) <= 0:
+        raise UsageError("bench mup", f"{text!r} holds numbers that are not positive", "write 32,64,128")
+    return values
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Loss over learning rate, a curve a width with its best rate ringed: muP left, without it right."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, name in zip(panels, ("muP", "standard")):
+        _panel(axes, name, [row for row in rows if row["parametrisation"] == name])
+    panels[0].set_ylabel("loss at the end, nats a token")
+    panels[0].legend(frameon=False, fontsize=9)
+    with matplotlib.rc_context({"svg.hashsalt": "hma", "svg.fonttype": "path"}):
+        figure.savefig(path, format="svg", metadata={"Date": None})
+
+
+def _panel(axes: "Axes", name: str, rows: list[dict[str, Any]]) -> None:
+    from hma_model.evaluation.plots import COLOURS, MARKERS, STYLES
+
+    for i, width in enumerate(sorted({row["width"] for row in rows})):
+        chosen = [row for row in rows if row["width"] == width and row["nats_a_token"] is not None]
+        chosen.sort(key=lambda row: row["lr"])
+        rates, losses = ([row[key] for row in chosen] for key in ("lr", "nats_a_token"))
+        colour, line, marker = COLOURS[i % 4], STYLES[i % 4], MARKERS[i % 4]
+        axes.plot(rates, losses, color=colour, ls=line, marker=marker, ms=5, label=f"width {width}")
+        ring = [(row["lr"], row["nats_a_token"]) for row in chosen if row["best"]]
+        axes.plot(*zip(*ring), ls="", marker="o", ms=13, mfc="none", color=colour)
+    axes.set_xscale("log", base=2)
+    axes.set_xlabel("learning rate")
+    axes.set_title(name, fontsize=10)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)

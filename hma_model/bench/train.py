@@ -1,0 +1,145 @@
+"""`hma bench train`: how long a training step takes, and how much memory.
+
+The loss of a batch of random windows, its gradients, their clipping and AdamW's step; 32 layers of width 256
+by default. The fastest step after a warm-up counts, since other work on the machine only ever slows one down.
+"""
+
+import time
+from statistics import median
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from hma_model.bench.generate import (
+    PRECISIONS,
+    ROBOT,
+    check,
+    device_name,
+    finish,
+    in_fresh_process,
+    make_model,
+    memory,
+)
+
+if TYPE_CHECKING:
+    import torch
+
+    from hma_model.network.model import HMA
+
+ABOUT = "seconds and memory of a training step"
+DEFAULTS: dict[str, Any] = {
+    "kind": "discrete",  # discrete | continuous | both
+    "steps": 3,  # measured, after a warm-up
+    "batch": 2,
+    "window": 12,
+    "precision": "fp32",  # fp32 | bf16: products in bf16, weights in fp32
+    "device": "auto",
+    "compile": False,
+    "checkpointing": False,  # recompute each block in the backward pass
+    "optimizer": True,
+    "layers": 32,
+    "width": 256,
+    "heads": 8,
+    "conditioning": "modulation",
+    "action_tokens": 1,
+    "action_dims": 35,  # of a chunk
+    "diffusion_width": 1024,
+    "threads": 0,  # 0: torch's choice
+}
+_KINDS = ("discrete", "continuous")
+_PEAKS = {"H200": 989e12, "H100": 989e12, "A100": 312e12, "L40": 181e12, "4090": 165e12}  # bf16, dense
+
+
+def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """One result for each kind.
+
+    Raises:
+        UsageError: a setting has a value that is not allowed.
+    """
+    check("train", settings, kind=(*_KINDS, "both"), precision=PRECISIONS)
+    kinds = _KINDS if settings["kind"] == "both" else (settings["kind"],)
+    return [in_fresh_process(measure, settings, kind) for kind in kinds]
+
+
+def measure(settings: dict[str, Any], kind: str) -> dict[str, Any]:
+    """The figures of one case."""
+    model = make_model(settings, kind).train()
+    model.trunk.checkpointing = settings["checkpointing"]
+    if settings["compile"]:
+        model.trunk.compile()
+    seconds = _step_seconds(model, settings)
+    return {
+        "kind": kind,
+        "device": device_name(model.device),
+        **{key: settings[key] for key in ("precision", "batch", "window", "optimizer", "compile")},
+        "checkpointing": settings["checkpointing"],
+        "seconds_per_step": round(min(seconds), 4),
+        "median_seconds_per_step": round(median(seconds), 4),
+        "windows_per_second": round(settings["batch"] / min(seconds), 4),
+        **memory(model.device),
+        **_used(model, settings, min(seconds)),
+    }
+
+
+def _step_seconds(model: "HMA", settings: dict[str, Any]) -> list[float]:
+    import torch
+
+    fused = model.device.type == "cuda"
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=fused) if settings["optimizer"] else None
+    generator = torch.Generator().manual_seed(0)
+    seconds = []
+    for _ in range(1 + settings["steps"]):
+        batch = _windows(model, settings, generator)
+        finish(model.device)
+        began = time.perf_counter()
+        with torch.autocast(model.device.type, torch.bfloat16, enabled=settings["precision"] == "bf16"):
+            loss = model(batch, generator=generator).loss
+        loss.backward()
+        if optimizer is not None:
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            optimizer.step()
+        model.zero_grad()
+        finish(model.device)
+        seconds.append(time.perf_counter() - began)
+    return seconds[1:]
+
+
+def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator") -> Any:
+    import torch
+
+    config, b, t = model.config, settings["batch"], settings["window"]
+    tokens = latents = None
+    if config.kind == "discrete":
+        tokens = torch.randint(0, config.vocab_size, (b, t, *config.grid), generator=generator)
+    else:
+        latents = torch.randn(b, t, config.channels, *config.grid, generator=generator)
+    actions = torch.randn(b, t, settings["action_dims"], generator=generator)
+    return SimpleNamespace(
+        embodiment=[ROBOT] * b,
+        actions=actions.to(model.device),
+        action_mask=torch.ones(b, t, dtype=torch.bool, device=model.device),
+        tokens=None if tokens is None else tokens.to(model.device),
+        latents=None if latents is None else latents.to(model.device),
+    )
+
+
+def step_flops(model: "HMA", settings: dict[str, Any]) -> int:
+    """Floating point operations of a step's products, without the readout; the backward pass counts twice.
+
+    A recomputed forward pass does not count: it is no use in itself.
+    """
+    config = model.config
+    frames, tokens = settings["batch"] * settings["window"], config.tokens_per_frame + config.appended_tokens
+    linear = sum(p.numel() for p in model.trunk.blocks.parameters() if p.ndim == 2) * frames * tokens
+    space = 2 * config.layers * frames * tokens**2 * config.width
+    time_ = config.layers * frames * tokens * (settings["window"] + 1) * config.width
+    return 3 * 2 * (linear + space + time_)
+
+
+def _used(model: "HMA", settings: dict[str, Any], seconds: float) -> dict[str, float]:
+    """Operations a second, and the share of a known GPU's peak."""
+    rate = step_flops(model, settings) / seconds
+    figures = {"teraflop_per_second": round(rate / 1e12, 3)}
+    peak = next((value for name, value in _PEAKS.items() if name in device_name(model.device)), None)
+    if peak is not None:
+        figures["mfu"] = round(rate / peak, 4)
+    return figures

@@ -1,0 +1,290 @@
+"""A checkpoint's folder (DESIGN section 9), opened and checked without reading weights.
+
+    config.json                  format version, architecture, tokenizer spec
+    trunk.safetensors            what all embodiments share
+    embodiments/<id>/            stem.safetensors, head.safetensors, embodiment.yaml, stats.json, card.json
+    README.md                    the model card, made from the card.json files
+    training/                    optimizer, sampler and rng state; never published
+
+The trunk's SHA-256 stands in every card and in every stem, with the digests of the tokenizer and of the
+statistics the stem was trained on, so that parts which do not belong together are refused. Only JSON,
+YAML and safetensors are ever read. Nothing outside the folder is followed.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hma_data.errors import CheckpointError, HMAError
+from hma_data.registry.embodiment import ID_PATTERN, Embodiment
+from hma_data.storage.files import file_sha256
+from hma_data.storage.folders import read_json, read_metadata
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.checkpoint import migrate
+from hma_model.config import HMAConfig
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import TokenizerSpec
+
+LIBRARY = "hma-toolkit"
+CONFIG, TRUNK, README, TRAINING = "config.json", "trunk.safetensors", "README.md", "training"
+STEM, HEAD, YAML, STATS, CARD = (
+    "stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json",
+)  # fmt: skip
+PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card last: it says that the others are there
+SAMPLE = "sample.png"  # optional, shown in the model card
+_APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
+_CUT_SHORT = "a push or pull was cut short: do it again"
+
+
+@dataclass(frozen=True)
+class ActionStats:
+    """Mean and standard deviation (A,) of the raw actions, as `stats.json` states them.
+
+    `zero_variance` is "divide" in an imported released model; see `ActionSpace`.
+    """
+
+    mean: list[float]
+    std: list[float]
+    zero_variance: str = "zero"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint's folder, opened and checked as far as it can be without reading weights.
+
+    Attributes:
+        folder: where it is.
+        config: of the network; the tokenizer's spec is in it.
+        embodiments: ids present, sorted.
+        trunk_sha256: of the trunk, as config.json states it.
+        tokenizer: digest of its spec.
+        format_version: of config.json and trunk.
+    """
+
+    folder: Path
+    config: HMAConfig
+    embodiments: tuple[str, ...]
+    trunk_sha256: str
+    tokenizer: str
+    format_version: int
+    _cards: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False, compare=False)
+
+    @classmethod
+    def open(cls, folder: StrPath) -> "Checkpoint":
+        """The checkpoint in a folder, or the newest one of a training run's folder.
+
+        Args:
+            folder: str or path of it.
+
+        Raises:
+            CheckpointError: there is none, it is damaged, or of a format this release does not read.
+        """
+        folder = resolve(folder)
+        values = read_json(inside(folder, CONFIG))
+        config = parse_config(values, folder / CONFIG)
+        home = folder / "embodiments"
+        found = sorted(path.name for path in home.iterdir()) if home.is_dir() else []
+        present = tuple(name for name in found if (home / name / CARD).is_file())
+        trunk, version = str(values.get("trunk_sha256")), int(values["format_version"])
+        return cls(folder, config, present, trunk, digest(values.get("tokenizer") or {}), version)
+
+    def trunk(self) -> Path:
+        """trunk.safetensors.
+
+        Raises:
+            CheckpointError: it is not the file that config.json names.
+        """
+        path = inside(self.folder, TRUNK)
+        if self._measured_sha256 != self.trunk_sha256:
+            raise CheckpointError(
+                path, f"is another trunk than {CONFIG} names", "pull the checkpoint again, into a new folder"
+            )
+        return path
+
+    @cached_property
+    def _measured_sha256(self) -> str:
+        return file_sha256(inside(self.folder, TRUNK))
+
+    def path(self, embodiment: str, part: str) -> Path:
+        """A file of an embodiment.
+
+        Raises:
+            CheckpointError: not an id, no such embodiment or file, or a link out of the folder.
+        """
+        check_id(embodiment, self.folder)
+        if embodiment not in self.embodiments:
+            raise CheckpointError(
+                self.folder,
+                f"has no embodiment {embodiment!r}",
+                f"it has: {', '.join(self.embodiments) or 'none'}",
+            )
+        return inside(self.folder, f"embodiments/{embodiment}/{part}")
+
+    def card(self, embodiment: str) -> dict[str, Any]:
+        """card.json of an embodiment."""
+        if embodiment not in self._cards:
+            path = self.path(embodiment, CARD)
+            self._cards[embodiment] = migrate.card(read_json(path), path)
+        return self._cards[embodiment]
+
+    def embodiment(self, embodiment: str) -> Embodiment:
+        """The embodiment as it was trained on."""
+        return Embodiment.load(self.path(embodiment, YAML))
+
+    def stats(self, embodiment: str) -> dict[str, Any]:
+        """stats.json of an embodiment: at least {"action": {"mean": [...], "std": [...]}}."""
+        path = self.path(embodiment, STATS)
+        values = read_json(path)
+        action_stats(values, path)
+        return values
+
+    def check(self, embodiment: str) -> None:
+        """Raise unless the embodiment's parts belong to this trunk, tokenizer and statistics.
+
+        Raises:
+            CheckpointError: naming the first part that does not, and why.
+        """
+        path = self.path(embodiment, STEM)
+        stem = read_metadata(path)
+        _same(path, stem, "embodiment", embodiment, "was saved for another embodiment")
+        for where, facts in ((path, stem), (self.path(embodiment, CARD), self.card(embodiment))):
+            _same(where, facts, "trunk_sha256", self.trunk_sha256, "belongs to another trunk")
+            _same(where, facts, "tokenizer", self.tokenizer, "was trained on another tokenizer")
+            stats = file_sha256(self.path(embodiment, STATS))
+            other = f"was trained with other statistics than {STATS}"
+            _same(where, facts, "stats_sha256", stats, other, _CUT_SHORT)
+        files = self.card(embodiment).get("files")
+        for part in (STEM, HEAD):
+            recorded = files.get(part) if isinstance(files, dict) else None
+            if recorded != file_sha256(self.path(embodiment, part)):
+                raise CheckpointError(
+                    self.path(embodiment, part),
+                    f"is not the file that {CARD} names",
+                    _CUT_SHORT,
+                )
+
+
+def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
+    """The network's config from config.json's values.
+
+    Raises:
+        CheckpointError: of another library, another format version, or not valid.
+    """
+    if values.get("library") != LIBRARY:
+        raise CheckpointError(
+            where,
+            f"is not of {LIBRARY}: library is {values.get('library')!r}",
+            "give a checkpoint of hma train; hma hub import brings in one of the paper's release",
+        )
+    values = migrate.config(values, where)
+    model, tokenizer = values.get("model"), values.get("tokenizer")
+    if not isinstance(model, dict) or not isinstance(tokenizer, dict):
+        raise CheckpointError(where, "lacks its 'model' or 'tokenizer'", "pull or save the checkpoint again")
+    try:
+        return HMAConfig.from_json({**model, "tokenizer": tokenizer}, str(where))
+    except (HMAError, TypeError, ValueError) as fault:
+        raise CheckpointError(where, f"does not describe a model: {fault}", "update or save again") from fault
+
+
+def resolve(folder: StrPath) -> Path:
+    """The checkpoint meant by a path: itself, or the newest below a training run's `checkpoints/`.
+
+    Args:
+        folder: str or path of it.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    folder = as_path(folder)
+    if (folder / CONFIG).is_file():
+        return folder
+    steps = training_checkpoints(folder)
+    if steps:
+        return steps[-1]
+    fault = f"has no {CONFIG} and no checkpoints/" if folder.is_dir() else "no such folder"
+    raise CheckpointError(folder, fault, "give a checkpoint, or the folder of a training run")
+
+
+def training_checkpoints(run: StrPath) -> list[Path]:
+    """Checkpoints of a training run (str or path of its folder), oldest first."""
+    return sorted(path for path in (as_path(run) / "checkpoints").glob("step-*") if (path / CONFIG).is_file())
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The path of a file that lies in the folder itself.
+
+    A link is refused, but for those of a Hugging Face cache, which point at its blobs.
+
+    Raises:
+        CheckpointError: there is none, or it leads out of the folder.
+    """
+    path = folder / name
+    if not path.is_file():
+        raise CheckpointError(path, "no such file", "pull or save the checkpoint again")
+    real, home = path.resolve(), folder.resolve()
+    repo = home.parent.parent if home.parent.name == "snapshots" else None
+    blobs = (repo / "blobs", repo.parent / "blobs" / real.parent.name) if repo else ()  # its own, the shared
+    if real == home / name or real.parent in blobs:
+        return path
+    raise CheckpointError(path, "is a link, or lies outside the checkpoint", "put the file itself there")
+
+
+def check_id(embodiment: str, where: object) -> None:
+    """Raise CheckpointError unless the name is an embodiment's id."""
+    if not ID_PATTERN.fullmatch(embodiment) or ".." in embodiment:
+        raise CheckpointError(where, f"{embodiment!r} is not an embodiment's id", "ids are of a-z 0-9 _ - .")
+
+
+def digest(tokenizer: Mapping[str, Any]) -> str:
+    """Sixteen hex digits over a tokenizer's spec."""
+    return hashlib.sha256(json.dumps(dict(tokenizer), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -> None:
+    """Raise CheckpointError naming the difference unless the model was trained on this tokenizer.
+
+    Which weights it had is not compared where the model does not know, as those of the release do not.
+    """
+    ours, theirs = dict(config.tokenizer), spec.to_json()
+    if not ours.get("weights_sha256"):
+        ours["weights_sha256"] = theirs["weights_sha256"]
+    differing = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
+    if differing:
+        key = differing[0]
+        raise CheckpointError(
+            where,
+            f"was trained on tokenizer {ours.get('name')!r}, this is {spec.name!r}: "
+            f"{key} is {ours.get(key)!r} there and {theirs.get(key)!r} here",
+            "use the tokenizer named in its config.json",
+        )
+
+
+def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
+    """Mean and std of the actions from stats.json's values.
+
+    Raises:
+        CheckpointError: they are not there, or not lists of numbers.
+    """
+    try:
+        action = stats["action"]
+        rule = str(action.get("zero_variance", "zero"))
+        return ActionStats([float(v) for v in action["mean"]], [float(v) for v in action["std"]], rule)
+    except (AttributeError, KeyError, TypeError, ValueError) as fault:
+        raise CheckpointError(where, "lacks action.mean or action.std as lists of numbers") from fault
+
+
+def _same(
+    where: Path, facts: Mapping[str, Any], key: str, expected: str, fault: str, remedy: str = _APART
+) -> None:
+    found = facts.get(key)
+    if found != expected:
+        raise CheckpointError(
+            where,
+            f"{fault}: its {key} is {str(found)[:16]}, here it is {expected[:16]}",
+            remedy,
+        )

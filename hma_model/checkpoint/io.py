@@ -1,0 +1,283 @@
+"""Checkpoints: save a model with all its embodiments, load a trunk with some of them.
+
+One folder, which is also the layout of the hub; `hma_model.checkpoint.folder` describes and checks it.
+"""
+
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hma_data.errors import CheckpointError, HMAError
+from hma_data.registry.embodiment import Embodiment
+from hma_data.storage.files import file_sha256, write_atomic
+from hma_data.storage.folders import new_folder, to_json, write_tensors
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.checkpoint import weights
+from hma_model.checkpoint.folder import (
+    CARD,
+    CONFIG,
+    HEAD,
+    LIBRARY,
+    PARTS,
+    README,
+    SAMPLE,
+    STATS,
+    STEM,
+    TRAINING,
+    TRUNK,
+    YAML,
+    ActionStats,
+    Checkpoint,
+    action_stats,
+    check_id,
+    digest,
+    inside,
+    parse_config,
+    require_tokenizer,
+    resolve,
+    training_checkpoints,
+)  # fmt: skip
+from hma_model.checkpoint.migrate import FORMAT_VERSION
+from hma_model.config import ActionSpace, HMAConfig
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import TokenizerSpec
+    from hma_model.network.model import HMA
+
+__all__ = [
+    "CARD", "CONFIG", "HEAD", "LIBRARY", "PARTS", "README", "SAMPLE", "STATS", "STEM", "TRAINING",
+    "TRUNK", "YAML", "ActionStats", "Checkpoint", "action_stats", "add_embodiment", "check_id",
+    "config_json", "digest", "inside", "load", "parse_config", "read_embodiment", "remove",
+    "require_tokenizer", "resolve", "save", "training_checkpoints", "update_card", "write_readme",
+]  # fmt: skip
+
+
+def save(
+    model: "HMA",
+    folder: StrPath,
+    *,
+    embodiment_yaml: Mapping[str, str],
+    stats: Mapping[str, dict[str, Any]],
+    cards: Mapping[str, dict[str, Any]],
+    tokenizer: Mapping[str, Any],
+    training: Callable[[Path], None] | None = None,
+    base: Checkpoint | None = None,
+    samples: Mapping[str, bytes] | None = None,
+) -> Checkpoint:
+    """Write a model and all its embodiments; an existing checkpoint of that name is replaced in one step.
+
+    Args:
+        model: with every embodiment of `embodiment_yaml`.
+        folder: str or path of its folder; an error leaves an older checkpoint there as it was.
+        embodiment_yaml: id -> registry YAML.
+        stats: id -> {"action": {"mean", "std", ...}, ...}.
+        cards: id -> what is known of its data and metrics; ids without one get an empty one.
+        tokenizer: the spec, plain values.
+        training: fills the folder `training/` it is given, for what only a resumed run needs.
+        base: a checkpoint whose trunk this is: its trunk, its configuration and the files of its other
+            embodiments are taken over as they are.
+        samples: id -> a PNG shown in the model card.
+
+    Raises:
+        CheckpointError: parts do not agree, the folder holds something else, or cannot be written.
+    """
+    from safetensors import SafetensorError
+
+    folder = Path(folder)
+    _check_parts(model, folder, embodiment_yaml, stats)
+    config = model.config.replace(tokenizer=dict(tokenizer))
+    try:
+        with new_folder(folder) as new:
+            if base:
+                trunk = _take_over(base, new, set(embodiment_yaml))
+            else:
+                write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"})
+                trunk = file_sha256(new / TRUNK)
+                (new / CONFIG).write_bytes(to_json(config_json(config, trunk)))
+            for name in sorted(embodiment_yaml):
+                home = new / "embodiments" / name
+                home.mkdir(parents=True)
+                (home / YAML).write_text(embodiment_yaml[name], encoding="utf-8")
+                (home / STATS).write_bytes(to_json(stats[name]))
+                if samples and name in samples:
+                    (home / SAMPLE).write_bytes(samples[name])
+                _write_embodiment(model, home, trunk, digest(tokenizer), cards.get(name, {}))
+            if training:
+                (new / TRAINING).mkdir()
+                training(new / TRAINING)
+            write_readme(new)
+    except (OSError, SafetensorError) as fault:
+        raise CheckpointError(
+            folder,
+            f"cannot be written: {fault}",
+            "free space or choose another folder; older checkpoints are intact",
+        ) from fault
+    return Checkpoint.open(folder)
+
+
+def load(
+    folder: StrPath,
+    embodiments: Iterable[str] | None = None,
+    device: str = "cpu",
+    tokenizer: "TokenizerSpec | None" = None,
+) -> "HMA":
+    """The model of a checkpoint with the trunk and the embodiments asked for, and nothing else read.
+
+    Args:
+        folder: str or path of a checkpoint, or of a training run.
+        embodiments: ids; None for all that are there.
+        device: where the model goes.
+        tokenizer: refuse a model that was trained on another.
+
+    Raises:
+        CheckpointError: missing, damaged, or parts that do not belong together; each with its reason.
+    """
+    from hma_model.network.model import HMA
+
+    checkpoint = Checkpoint.open(folder)
+    if tokenizer is not None:
+        require_tokenizer(checkpoint.config, tokenizer, checkpoint.folder)
+    trunk = weights.trunk(checkpoint)
+    model = HMA(checkpoint.config)
+    model.load_trunk(trunk)
+    for name in checkpoint.embodiments if embodiments is None else dict.fromkeys(embodiments):
+        add_embodiment(model, checkpoint, name)
+    vars(model)["origin"] = checkpoint.folder  # where hub.push_model finds YAML and statistics again
+    return model.to(device).eval()
+
+
+def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> None:
+    """Load one embodiment's stem and head beside a trunk that is already loaded."""
+    space, stem, head = read_embodiment(checkpoint, embodiment)
+    model.add_embodiment(space)
+    model.load_embodiment(embodiment, stem, head)
+
+
+def read_embodiment(
+    checkpoint: Checkpoint, embodiment: str
+) -> tuple[ActionSpace, weights.State, weights.State]:
+    """An embodiment's action space and the tensors of its stem and head, all checked.
+
+    Raises:
+        CheckpointError: parts do not belong together, or are damaged.
+    """
+    checkpoint.check(embodiment)
+    yaml, path = checkpoint.embodiment(embodiment), checkpoint.path(embodiment, STATS)
+    if yaml.id != embodiment:
+        raise CheckpointError(path.with_name(YAML), f"has id {yaml.id!r}", f"its folder says {embodiment!r}")
+    try:
+        space = ActionSpace.of(yaml, action_stats(checkpoint.stats(embodiment), path))
+    except HMAError as fault:
+        raise CheckpointError(
+            path, f"does not fit {YAML}: {fault.fault}", "pull the embodiment again"
+        ) from fault
+    return space, *weights.embodiment(checkpoint, embodiment, space)
+
+
+def update_card(folder: StrPath, embodiment: str, **facts: Any) -> dict[str, Any]:
+    """Add to an embodiment's card (`metrics` merges, all else replaces) and renew README.md."""
+    checkpoint = Checkpoint.open(folder)
+    card = dict(checkpoint.card(embodiment))
+    metrics = {**card.get("metrics", {}), **facts.pop("metrics", {})}
+    card.update(facts, metrics=metrics)
+    write_atomic(checkpoint.path(embodiment, CARD), to_json(card))
+    write_readme(checkpoint.folder)
+    return card
+
+
+def write_readme(folder: StrPath) -> None:
+    """Make README.md from the cards in a checkpoint's folder."""
+    from hma_model.checkpoint.model_card import render
+
+    folder = as_path(folder)
+    checkpoint = Checkpoint.open(folder)
+    cards = {name: checkpoint.card(name) for name in checkpoint.embodiments}
+    samples = {name for name in cards if (folder / "embodiments" / name / SAMPLE).is_file()}
+    text = render(config_json(checkpoint.config, checkpoint.trunk_sha256), cards, samples=samples)
+    write_atomic(folder / README, text)
+
+
+def remove(folder: StrPath) -> None:
+    """Delete a checkpoint so that a cut deletion leaves no half of one under its name."""
+    folder = as_path(folder)
+    doomed = folder.with_name(f".{folder.name}.partial-removed")
+    shutil.rmtree(doomed, ignore_errors=True)
+    folder.rename(doomed)
+    shutil.rmtree(doomed, ignore_errors=True)
+
+
+def config_json(config: HMAConfig, trunk_sha256: str) -> dict[str, Any]:
+    """What config.json holds."""
+    model = config.to_json()
+    tokenizer = model.pop("tokenizer")
+    return {
+        "format_version": FORMAT_VERSION,
+        "library": LIBRARY,
+        "trunk_sha256": trunk_sha256,
+        "tokenizer": tokenizer,
+        "model": model,
+    }
+
+
+def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
+    """Put a checkpoint's trunk and embodiments, but for some, in a new folder; returns the trunk's hash."""
+    kept = [name for name in base.embodiments if name not in besides]
+    names = [CONFIG, TRUNK]
+    for name in kept:
+        home = base.folder / "embodiments" / name
+        names += [f"embodiments/{name}/{part}" for part in (*PARTS, SAMPLE) if (home / part).is_file()]
+    for name in names:
+        (new / name).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            (new / name).hardlink_to(inside(base.folder, name))
+        except OSError:  # another file system, or one without links
+            shutil.copyfile(inside(base.folder, name), new / name)
+    return base.trunk_sha256
+
+
+def _write_embodiment(model: "HMA", home: Path, trunk: str, tokenizer: str, given: dict[str, Any]) -> None:
+    links = {"trunk_sha256": trunk, "tokenizer": tokenizer, "stats_sha256": file_sha256(home / STATS)}
+    metadata = {"format": "pt", "format_version": str(FORMAT_VERSION), "embodiment": home.name, **links}
+    write_tensors(home / STEM, model.stem_state(home.name), metadata)
+    write_tensors(home / HEAD, model.head_state(home.name), metadata)
+    card = {**_facts(Embodiment.load(home / YAML)), "data": {}, "metrics": {}, **given, **links}
+    card["files"] = {part: file_sha256(home / part) for part in PARTS[:-1]}
+    (home / CARD).write_bytes(to_json(card))
+
+
+def _facts(embodiment: Embodiment) -> dict[str, Any]:
+    unstated = embodiment.frequency_hz == "unknown" and not embodiment.sync.rate_hz
+    return {
+        "format_version": FORMAT_VERSION,
+        "id": embodiment.id,
+        "description": embodiment.description,
+        "robot": embodiment.robot,
+        "kind": embodiment.kind,
+        "action_space": embodiment.action.space,
+        "action_dim": embodiment.action_dim,
+        "stride": embodiment.stride,
+        "chunk_dim": embodiment.chunk_dim,
+        "effective_hz": None if unstated else embodiment.effective_hz,
+        "license": embodiment.license,
+    }
+
+
+def _check_parts(
+    model: "HMA", folder: Path, yaml: Mapping[str, str], stats: Mapping[str, dict[str, Any]]
+) -> None:
+    for name in yaml:
+        check_id(name, folder)
+        if name not in model.embodiments:
+            raise CheckpointError(folder, f"the model has no embodiment {name!r}", "add it before saving")
+        found = Embodiment.from_yaml(yaml[name], f"{folder}: {name}").id
+        if found != name:
+            raise CheckpointError(folder, f"the YAML given for {name!r} has id {found!r}")
+        action_stats(stats.get(name, {}), f"{folder}: statistics of {name}")
+    unnamed = sorted(set(model.embodiments) - set(yaml))
+    if unnamed:
+        raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
+    if folder.exists() and (
+        not folder.is_dir() or (any(folder.iterdir()) and not (folder / CONFIG).is_file())
+    ):
+        raise CheckpointError(folder, "is there already and is no checkpoint", "choose another folder")

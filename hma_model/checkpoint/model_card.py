@@ -1,0 +1,129 @@
+"""README.md of a checkpoint, made from its config.json and card.json files alone.
+
+The same facts give the same text, so that whoever pushes last writes what everybody would.
+Cards may come from strangers: see `hma_model.checkpoint.card_text`.
+"""
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from hma_data.storage.yaml_io import write_yaml
+from hma_model.checkpoint.card_text import licence, line, number
+
+_TAGS = ("robotics", "world-model", "video-prediction", "hma")
+_HEADINGS = ("embodiment", "robot", "action dims", "Hz", "stride", "data", "metrics", "licence")
+
+
+def render(
+    config: Mapping[str, Any],
+    cards: Mapping[str, Mapping[str, Any]],
+    *,
+    repo: str | None = None,
+    samples: Collection[str] = (),
+) -> bytes:
+    """The model card.
+
+    Args:
+        config: config.json's values.
+        cards: id -> card.json's values.
+        repo: how a reader will name the checkpoint; None for a path of their own.
+        samples: ids that have a sample.png.
+    """
+    name = repo or "PATH"
+    parts = [
+        _front_matter(cards),
+        f"# {line((repo or 'HMA world model').rsplit('/', 1)[-1])}",
+        _about(config),
+        "## Embodiments\n\n" + _table(cards),
+        *(_pictures(cards, samples)),
+        "## How to use\n\n" + _usage(name, cards),
+        _links(config),
+    ]
+    return ("\n\n".join(parts) + "\n").encode()
+
+
+def _front_matter(cards: Mapping[str, Mapping[str, Any]]) -> str:
+    values: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
+    values |= licence(card.get("license") for card in cards.values())
+    values["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
+    return f"---\n{write_yaml(values)}---"
+
+
+def _about(config: Mapping[str, Any]) -> str:
+    model, tokenizer = config["model"], config["tokenizer"]
+    grid = "×".join(str(side) for side in model.get("grid", ()))
+    return (
+        "An action-conditioned video model of robots (Heterogeneous Masked Autoregression): one trunk, "
+        "and a stem and head for each embodiment, which are published and pulled one at a time.\n\n"
+        f"- network: {line(model.get('kind'))}, {line(model.get('layers'))} layers, "
+        f"width {line(model.get('width'))}, {line(model.get('heads'))} heads, "
+        f"window of {line(model.get('frames'))} frames\n"
+        f"- tokenizer: {line(tokenizer.get('name'))}, {grid} tokens of a "
+        f"{line(tokenizer.get('image_size'))}-pixel picture\n"
+        f"- trunk SHA-256: `{line(config.get('trunk_sha256'))}`"
+    )
+
+
+def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
+    if not cards:
+        return "None yet."
+    rows = [" | ".join(_HEADINGS), " | ".join("---" for _ in _HEADINGS)]
+    for name in sorted(cards):
+        card = cards[name]
+        rows.append(
+            " | ".join(
+                (
+                    f"`{name}`",
+                    line(card.get("robot") or card.get("description")),
+                    f"{line(card.get('action_dim'))} ({line(card.get('action_space'))})",
+                    number(card.get("effective_hz")),
+                    line(card.get("stride")),
+                    _pairs(card.get("data")),
+                    _pairs(card.get("metrics")),
+                    line(card.get("license")) or "not stated",
+                )
+            )
+        )
+    return "\n".join(f"| {row} |" for row in rows)
+
+
+def _pictures(cards: Mapping[str, Any], samples: Collection[str]) -> list[str]:
+    shown = sorted(set(cards) & set(samples))
+    return [
+        f"### {name}\n\n![A rollout of {name} beside the truth](embodiments/{name}/sample.png)"
+        for name in shown
+    ]
+
+
+def _usage(name: str, cards: Mapping[str, Any]) -> str:
+    example = min(cards, default="ID")
+    return (
+        "```python\n"
+        "from hma_model import HMA\n\n"
+        f'model = HMA.from_pretrained("{name}", embodiments=["{example}"])\n'
+        f'frames = model.generate(prompt, actions, "{example}", frames=8)  # their token ids\n'
+        "```\n\n"
+        "```sh\n"
+        f"hma hub pull {name} --embodiment {example} --out model\n"
+        "hma generate model SHARDS --out rollout.mp4\n"
+        "```\n\n"
+        "`actions[:, k]` is the chunk of commands from frame k up to frame k + 1, in the units of the "
+        "embodiment's `embodiment.yaml`; the model normalises by itself."
+    )
+
+
+def _links(config: Mapping[str, Any]) -> str:
+    return (
+        f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
+        "parts that do not belong together are refused on loading."
+    )
+
+
+def _pairs(values: Any) -> str:
+    if not isinstance(values, Mapping) or not values:
+        return "not stated"
+    return ", ".join(
+        f"{line(key).replace('_', ' ')} {number(value)}"
+        for key, value in values.items()
+        if value is not None and not isinstance(value, dict | list)
+    )

@@ -1,0 +1,103 @@
+"""The weights of a checkpoint, checked against its configuration before a network of that size is built.
+
+A configuration may come from a stranger and ask for more memory than there is; its file of weights cannot,
+since it has the size that it has.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from hma_data.errors import CheckpointError
+from hma_data.storage.folders import read_metadata, read_tensors
+from hma_model.checkpoint import migrate
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from hma_model.checkpoint.io import Checkpoint
+    from hma_model.config import ActionSpace, HMAConfig
+
+State = dict[str, "Tensor"]
+MOST = 1_000_000  # of anything a configuration counts
+_COUNTS = ("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "history_frames",
+           "diffusion_depth", "diffusion_width", "diffusion_train_steps", "diffusion_sample_steps",
+           "grid", "factored")  # fmt: skip
+MOST_TENSORS = 20_000  # of a file; the paper's largest has some 2,000
+_FLOATS = ("float16", "bfloat16", "float32", "float64")
+_REMEDY = "pull the checkpoint again; if it stays so, do not use it"
+
+
+def trunk(checkpoint: "Checkpoint") -> State:
+    """The trunk's tensors, in the newest format version.
+
+    Raises:
+        CheckpointError: damaged, another trunk than config.json names, or not of its network.
+    """
+    path = checkpoint.trunk()
+    state: State = migrate.tensors("trunk", read_tensors(path), checkpoint.format_version, path)
+    _require_values(path, state)
+    _require_network(checkpoint.config, state, checkpoint.folder)
+    return state
+
+
+def embodiment(checkpoint: "Checkpoint", name: str, space: "ActionSpace") -> tuple[State, State]:
+    """The tensors of an embodiment's stem and head; `space` is what its YAML says.
+
+    Raises:
+        CheckpointError: damaged, or of fewer values than the action space has.
+    """
+    states = []
+    for part in ("stem", "head"):
+        path = checkpoint.path(name, f"{part}.safetensors")
+        if space.chunk_dim > path.stat().st_size:
+            raise CheckpointError(
+                path,
+                f"is too small for chunks of {space.chunk_dim:,} values, which embodiment.yaml asks for",
+                "pull the embodiment again",
+            )
+        version = read_metadata(path).get("format_version", str(migrate.FORMAT_VERSION))
+        number = int(version) if version.isdecimal() and len(version) < 6 else -1
+        states.append(migrate.tensors(part, read_tensors(path), number, path))
+        _require_values(path, states[-1])
+    return states[0], states[1]
+
+
+def _require_values(where: object, state: Mapping[str, "Tensor"]) -> None:
+    """Raise where what should be weights are no finite floating point numbers, or are strangely many."""
+    if len(state) > MOST_TENSORS:
+        raise CheckpointError(where, f"has {len(state):,} tensors: no network of ours", _REMEDY)
+    for name, tensor in state.items():
+        kind = str(tensor.dtype).removeprefix("torch.")
+        if kind not in _FLOATS and not name.startswith("normalizer."):
+            raise CheckpointError(where, f"holds {name[:80]} as {kind}, not floating point", _REMEDY)
+        if kind in _FLOATS and not bool(tensor.isfinite().all()):
+            raise CheckpointError(where, f"holds values in {name[:80]} that are not finite", _REMEDY)
+
+
+def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: object) -> None:
+    """Raise where a network of this configuration has more values than the trunk's file.
+
+    Names and shapes are compared when they are loaded; this only keeps what is built before that small.
+    """
+    for key in _COUNTS:
+        value = getattr(config, key)
+        for count in value if isinstance(value, tuple) else (value,):
+            if not isinstance(count, int) or count > MOST:
+                raise CheckpointError(where, f"model.{key} is {value!r}: no size of a network", _REMEDY)
+    values = sum(tensor.numel() for tensor in state.values())
+    width, hidden = config.width, config.mlp_ratio * config.width
+    needed = {
+        "layers": config.layers * width * max(width, hidden),
+        "grid": config.tokens_per_frame * width,
+        "frames": config.frames * width if config.time_position == "learned" else 0,
+    }
+    if config.kind == "discrete":
+        needed["factored"] = sum(config.factored) * width
+    else:
+        needed["diffusion_depth"] = config.diffusion_depth * config.diffusion_width**2
+        needed["channels"] = config.patch_dim * width
+    for key, count in needed.items():
+        if not count <= values:
+            raise CheckpointError(
+                where, f"model.{key} asks for {count:.3g} values, its trunk has {values:,}", _REMEDY
+            )

@@ -1,0 +1,215 @@
+"""The `hma` command: its entry point, the model verbs, and the data verbs of hma_data.cli.
+
+Every verb imports what it needs when it runs, so that --help answers at once.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hma_data.bench import BENCHES
+from hma_data.cli.verbs import mount
+from hma_data.console import print_json, print_table
+from hma_data.errors import HMAError
+from hma_data.priority import take_ordinary_priority
+from hma_data.threads import bound_spinning
+from hma_model.cli import train as cli_train
+from hma_model.cli.hub import Json, hub_app
+
+app = typer.Typer(
+    name="hma",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Robot recordings to tokenized shards, to a world model, to the hub. Add --debug for tracebacks.",
+)
+_Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[
+    2
+]  # ClickException, wherever typer keeps its click
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; errors become one line on stderr.
+
+    Args:
+        argv: the words after `hma`; None takes the process's own.
+
+    Returns:
+        The exit code: 0 well, 1 failed or problems found, 2 wrong usage, 130 interrupted.
+    """
+    take_ordinary_priority()
+    bound_spinning()
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words or bool(os.environ.get("HMA_DEBUG"))
+    try:
+        code = app([word for word in words if word != "--debug"], standalone_mode=False)
+    except SystemExit as ended:  # a rank whose error another rank has reported
+        return ended.code if isinstance(ended.code, int) else 1
+    except HMAError as fault:
+        if debug:
+            raise
+        return _fail(str(fault), fault.exit_code)
+    except _Wrong as fault:
+        context = getattr(fault, "ctx", None)
+        if not fault.format_message().strip() or type(fault).__name__ == "NoArgsIsHelpError":
+            return 2  # the help has been shown
+        hint = f" — see {context.command_path} --help" if context else ""
+        said = fault.format_message().replace("Value error, ", "")  # of the enum options
+        return _fail(said + hint, 2)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("interrupted; run the same command again to continue", 130)
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+    except Exception as fault:
+        if debug:
+            raise
+        text = f"{type(fault).__name__}: {fault}".splitlines()[0]
+        return _fail(f"{text} — this should have been a clearer error; --debug shows where it happened", 1)
+    return code if isinstance(code, int) else 0
+
+
+def _fail(text: str, code: int) -> int:
+    print(f"error: {' '.join(text.split())}", file=sys.stderr)
+    return code
+
+
+Checkpoint = Annotated[
+    str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
+]
+Data = Annotated[Path, typer.Argument(help="A shard set.")]
+UnmaskSteps = Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps a frame.")]
+SampleSteps = Annotated[
+    int | None,
+    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; default its own."),
+]
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Folder for everything the demo makes.")] = Path(
+        "hma-demo"
+    ),
+    episodes: Annotated[
+        int, typer.Option("--episodes", min=4, help="Recorded for each of the two robots.")
+    ] = 24,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Of training.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of recording and training.")] = 0,
+) -> None:
+    """The main job, small: record, convert, mix, train, publish, roll out, report.
+
+    Example: hma demo --out demo
+    """
+    from hma_model.demo.run import demo as run
+
+    report = run(out, episodes=episodes, steps=steps, seed=seed)
+    print(f"open {report}")
+
+
+@app.command()
+def evaluate(
+    checkpoint: Checkpoint,
+    data: Data,
+    split: Annotated[str, typer.Option("--split", help="train or val.")] = "val",
+    windows: Annotated[int, typer.Option("--windows", min=1, help="How many, evenly spaced.")] = 64,
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=2, help="Of a window; default the model's.")
+    ] = None,
+    prompt: Annotated[int | None, typer.Option("--prompt", min=1, help="True frames to start from.")] = None,
+    unmask_steps: UnmaskSteps = 2,
+    sample_steps: SampleSteps = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the rollouts.")] = 0,
+    json: Json = False,
+) -> None:
+    """Loss beside its baseline, and rollouts with true and shuffled actions.
+
+    Example: hma evaluate runs/first shards/my_arm
+    """
+    from hma_data.shards.preview import tokenizer_of
+    from hma_data.shards.reader import ShardSet
+    from hma_model.evaluation.evaluate import evaluate as run
+
+    shards = ShardSet(data)
+    found = run(
+        _model(checkpoint, shards.embodiment.id),
+        tokenizer_of(shards),
+        shards,
+        split=split,
+        count=windows,
+        frames=frames,
+        prompt=prompt,
+        unmask_steps=unmask_steps,
+        sample_steps=sample_steps,
+        seed=seed,
+    )
+    if json:
+        print_json(found)
+        return
+    plain = {key: value for key, value in found.items() if not isinstance(value, dict)}
+    print_table(["figure", "value"], list(plain.items()))
+    columns = ["psnr", "psnr_last", "ssim"]
+    rows = [[name, *(found[name][column] for column in columns)] for name in ("true", "shuffled", "copy")]
+    print_table(["rollout", "PSNR dB", "last frame dB", "SSIM"], rows)
+
+
+@app.command()
+def generate(
+    checkpoint: Checkpoint,
+    data: Data,
+    out: Annotated[Path, typer.Option("--out", help="The video: .mp4 or .webp.")],
+    split: Annotated[str, typer.Option("--split", help="train or val.")] = "val",
+    window: Annotated[int, typer.Option("--window", min=0, help="Number of the window to start at.")] = 0,
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=1, help="To predict; default to the window's end.")
+    ] = None,
+    prompt: Annotated[int, typer.Option("--prompt", min=1, help="True frames to start from.")] = 2,
+    unmask_steps: UnmaskSteps = 2,
+    sample_steps: SampleSteps = None,
+    temperature: Annotated[
+        float, typer.Option("--temperature", min=0, help="0 takes the likeliest token.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+) -> None:
+    """A rollout beside the truth, as a video.
+
+    Example: hma generate runs/first shards/my_arm --out rollout.mp4
+    """
+    from hma_data.shards.preview import tokenizer_of
+    from hma_data.shards.reader import ShardSet
+    from hma_model.evaluation.rollout_video import rollout_film, write_film
+
+    shards = ShardSet(data)
+    film = rollout_film(
+        _model(checkpoint, shards.embodiment.id),
+        tokenizer_of(shards),
+        shards,
+        split=split,
+        window=window,
+        frames=frames,
+        prompt=prompt,
+        unmask_steps=unmask_steps,
+        sample_steps=sample_steps,
+        temperature=temperature,
+        seed=seed,
+    )
+    write_film(out, film)
+    print(
+        f"wrote {out}: {len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
+    )
+
+
+def _model(checkpoint: str, embodiment: str) -> Any:
+    from hma_model.network.model import HMA
+
+    return HMA.from_pretrained(checkpoint, embodiments=[embodiment]).eval()
+
+
+mount(app)
+cli_train.mount(app)
+BENCHES.update({name: f"hma_model.bench.{name}" for name in ("generate", "mup", "train", "waiting")})
+app.add_typer(hub_app, name="hub")

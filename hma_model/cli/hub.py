@@ -1,0 +1,195 @@
+"""The verbs of `hma hub`: checkpoints robot by robot, shard sets, and the release's layout in and out."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hma_data.console import print_json, print_table
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Embodiments = Annotated[
+    list[str] | None, typer.Option("--embodiment", "-e", help="Only this robot; repeat for more.")
+]
+Revision = Annotated[str | None, typer.Option("--revision", help="Branch, tag or commit.")]
+Private = Annotated[bool, typer.Option("--private", help="Make a new repository a private one.")]
+hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, one robot at a time.")
+
+
+@hub_app.command("push")
+def push(
+    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint, or a run's folder.")],
+    target: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
+    embodiment: Embodiments = None,
+    sample: Annotated[
+        list[Path] | None, typer.Option("--sample", help="Shard set to roll out for the card's picture.")
+    ] = None,
+    private: Private = False,
+) -> None:
+    """Publish a checkpoint, whole or robot by robot.
+
+    Example: hma hub push runs/first ./my-hub/team/model -e my_arm
+    """
+    from hma_model.hub import publish as hub
+
+    if sample:
+        from hma_model.hub.sample import add_samples
+
+        add_samples(checkpoint, sample)
+    print(f"published to {hub.push(checkpoint, target, embodiment, private)}")
+
+
+@hub_app.command("pull")
+def pull(
+    source: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
+    embodiment: Embodiments = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder; default the local cache.")] = None,
+    revision: Revision = None,
+) -> None:
+    """Fetch the trunk and the robots asked for, nothing else.
+
+    Example: hma hub pull team/model -e my_arm --out model
+    """
+    from hma_model.hub import publish as hub
+
+    print(f"pulled to {hub.pull(source, embodiment, out, revision)}")
+
+
+@hub_app.command("list")
+def listing(
+    source: Annotated[str, typer.Argument(help="A folder with one checkpoint or many, or org/name.")],
+    revision: Revision = None,
+    json: Json = False,
+) -> None:
+    """The checkpoints there and their robots, and whether they can be used here.
+
+    Example: hma hub list ./my-hub
+    """
+    from hma_model.hub.listing import FIGURES, survey
+
+    found = survey(source, revision)
+    if json:
+        print_json(found[0] if len(found) == 1 else {"checkpoints": found})
+        return
+    columns = ["robot", "action_dim", "chunk_dim", "hz", *FIGURES, "licence"]
+    for facts in found:
+        rows = [
+            [
+                _cell(row["embodiment"]),
+                *(_cell(row[key]) for key in columns),
+                _megabytes(row["bytes"]),
+                _state(row),
+            ]
+            for row in facts["embodiments"]
+        ]
+        print(_summary(facts))
+        if rows:
+            shown = [i for i in range(len(rows[0])) if i == 0 or any(row[i] is not None for row in rows)]
+            names = ["embodiment", *columns, "MB", "state"]
+            print_table([names[i] for i in shown], [[row[i] for i in shown] for row in rows])
+
+
+@hub_app.command("push-data")
+def push_data(
+    folder: Annotated[Path, typer.Argument(help="A shard set.")],
+    target: Annotated[str, typer.Argument(help="org/name of a dataset on the hub, or a folder.")],
+    private: Private = False,
+) -> None:
+    """Publish a shard set as a dataset; run it again to go on after an interruption.
+
+    Example: hma hub push-data shards/my_arm team/my_arm
+    """
+    from hma_model.hub.datasets import push_data as run
+
+    print(f"published to {run(folder, target, private=private)}")
+
+
+@hub_app.command("pull-data")
+def pull_data(
+    source: Annotated[str, typer.Argument(help="org/name of a dataset on the hub, or a folder.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the shard set.")],
+    revision: Revision = None,
+) -> None:
+    """Fetch a published shard set; run it again to go on after an interruption.
+
+    Example: hma hub pull-data team/my_arm --out shards/my_arm
+    """
+    from hma_model.hub.datasets import pull_data as run
+
+    print(f"pulled to {run(source, out, revision=revision)}")
+
+
+@hub_app.command("import")
+def import_released(
+    source: Annotated[str, typer.Argument(help="A released checkpoint: a folder, or org/name on the hub.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the new checkpoint.")],
+    embodiment: Embodiments = None,
+    grid: Annotated[tuple[int, int] | None, typer.Option("--grid", help="h w, if not square.")] = None,
+    tokenizer: Annotated[str | None, typer.Option("--tokenizer", help="Default the paper's.")] = None,
+    revision: Revision = None,
+    json: Json = False,
+) -> None:
+    """Bring a checkpoint of the paper's release into our layout.
+
+    Example: hma hub import liruiw/hma-base-disc --out hma-base-disc
+    """
+    from hma_model.hub import publish as hub
+
+    made = hub.import_released(
+        source, out, embodiments=embodiment, grid=grid, tokenizer=tokenizer, revision=revision
+    )
+    if json:
+        print_json({"out": str(made.folder), "embodiments": list(made.embodiments)})
+    else:
+        print(f"imported to {made.folder}: {len(made.embodiments)} embodiments")
+
+
+@hub_app.command("export")
+def export_released(
+    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint, or a run's folder.")],
+    out: Annotated[Path, typer.Option("--out", help="A new folder: config.json, model.safetensors.")],
+    embodiment: Embodiments = None,
+) -> None:
+    """Write a checkpoint in the layout of the paper's release, for its code to read.
+
+    Example: hma hub export runs/first --out released
+    """
+    from hma_model.hub import publish as hub
+
+    print(f"exported to {hub.export_released(checkpoint, out, embodiments=embodiment)}")
+
+
+def _summary(facts: dict[str, Any]) -> str:
+    model, tokenizer = (facts[key] if isinstance(facts[key], dict) else {} for key in ("model", "tokenizer"))
+    parts = [facts["format"]]
+    if facts["origin"]:
+        parts.append(_cell(facts["origin"]))
+    if model:
+        parts.append(f"{_cell(model.get('layers'))} layers, width {_cell(model.get('width'))}")
+    if tokenizer:
+        parts.append(f"tokenizer {_cell(tokenizer.get('name'))}")
+    trunk = (
+        f"trunk {_cell(facts['trunk_sha256'])[:12]}, "
+        if isinstance(facts["trunk_sha256"], str)
+        else "weights "
+    )
+    size = _megabytes(facts["trunk_bytes"])
+    parts.append(f"{trunk}{'not in the cache' if size is None else f'{size} MB'}")
+    if facts["from_cache"]:
+        parts.append("the hub is out of reach, this is what the cache has")
+    return f"{_cell(facts['checkpoint'], 1000)}: {'; '.join(parts)}; {_state(facts)}"
+
+
+def _megabytes(size: int | None) -> float | None:
+    return None if size is None else round(size / 1e6, 2)
+
+
+def _state(facts: dict[str, Any]) -> str:
+    return _cell("; ".join(facts["problems"]), 400) or "usable here"
+
+
+def _cell(value: Any, most: int = 80) -> Any:
+    """A stranger's value as a terminal may show it: numbers as they are, text without control characters."""
+    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+        return value
+    return "".join(c if c.isprintable() else "?" for c in str(value))[:most]

@@ -1,0 +1,120 @@
+"""`hma train` and `hma finetune`."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hma_data.console import human_seconds, print_json
+
+if TYPE_CHECKING:
+    from hma_model.training.loop import TrainResult
+
+Overrides = Annotated[
+    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Dotted overrides of the recipe.")
+]
+Out = Annotated[Path | None, typer.Option("--out", help="The run's folder.")]
+Force = Annotated[bool, typer.Option("--force", help="Go on although recipe or shards changed.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def mount(app: typer.Typer) -> None:
+    """Add the verbs to the command."""
+    app.command("train")(train)
+    app.command("finetune")(finetune)
+
+
+def train(
+    recipe: Annotated[str, typer.Argument(help="A recipe: name or YAML file.")],
+    overrides: Overrides = None,
+    out: Out = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Train; run it again to resume. On several GPUs: torchrun --nproc-per-node N --no-python hma train …
+
+    Example: hma train discrete_tiny data=[shards/my_arm] --out runs/first
+    """
+    from hma_model.training.loop import train as run
+    from hma_model.training.rank_errors import report_once
+    from hma_model.training.recipe import load_recipe
+
+    with report_once():
+        result = run(load_recipe(recipe, overrides or []), out=out, force=force)
+    _tell(result, json)
+
+
+def finetune(
+    source: Annotated[
+        str, typer.Option("--from", help="A checkpoint, a run's folder, a URI, or ORG/NAME[@REVISION].")
+    ],
+    data: Annotated[
+        list[Path], typer.Option("--data", help="A shard set; more may follow it, or repeat --data.")
+    ],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[SHARDS]... [KEY=VALUE]...", help="More shard sets; overrides of the recipe."
+        ),
+    ] = None,
+    freeze_trunk: Annotated[
+        bool, typer.Option("--freeze-trunk", help="Train stems and heads; keep the trunk as it is.")
+    ] = False,
+    recipe: Annotated[str, typer.Option("--recipe", help="Name or YAML file.")] = "finetune",
+    out: Out = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """A new stem and head on a trained trunk; run it again to resume.
+
+    Example: hma finetune --from team/model --data shards/my_arm --freeze-trunk --out runs/my_arm
+    """
+    from hma_model.training.finetune import finetune as run
+    from hma_model.training.rank_errors import report_once
+
+    given = overrides or []
+    folders = [*data, *(Path(text) for text in given if "=" not in text)]
+    changes = [text for text in given if "=" in text]
+    with report_once():
+        result = run(
+            source,
+            folders,
+            out=out,
+            freeze_trunk=freeze_trunk,
+            overrides=changes,
+            recipe=recipe,
+            force=force,
+        )
+    _tell(result, json)
+
+
+def _tell(result: "TrainResult", json: bool) -> None:
+    if os.environ.get("RANK", "0") == "0":
+        _print(result, json)
+    raise typer.Exit(130 if result.interrupted else 0)
+
+
+def _print(result: "TrainResult", json: bool) -> None:
+    facts = {
+        "out": str(result.out),
+        "checkpoint": str(result.checkpoint),
+        "step": result.step,
+        "held_out_loss": result.masked_val_loss,
+        "baseline": result.baseline,
+        "seconds": result.seconds,
+        "skipped_steps": result.skipped,
+        "interrupted": result.interrupted,
+    }
+    if json:
+        print_json(facts)
+        return
+    done = f"step {result.step:,}, {human_seconds(result.seconds)}"
+    print(f"{result.out}: {done}, checkpoint {result.checkpoint}")
+    found, base = result.masked_val_loss, result.baseline
+    if found is not None and base is not None:
+        print(f"held-out loss {found:.4f} nats a token; looking at nothing {base:.4f}")
+    if result.skipped:
+        print(f"{result.skipped} steps were left out; see skipped in {result.out}/metrics.jsonl")
+    if (result.out / "report.html").is_file():
+        print(f"open {result.out}/report.html")

@@ -1,0 +1,1 @@
+"""Walk the whole road, small: `hma demo`."""

@@ -1,0 +1,376 @@
+"""How well a model predicts: its loss beside what ignoring everything reaches, and its rollouts.
+
+The loss is the cross-entropy in nats a token of each frame, fully masked, given the true frames and
+actions before it; it is averaged over the frames from the second on. The same form is computed for
+the frequencies of the training tokens, which is what a model would reach that looks at nothing.
+Rollouts go on from their own predictions; they are made with the true actions and with those of another
+window, so that the difference shows what the actions are worth.
+
+B batch, T frames, P frames of the prompt, h,w grid, F digits, V values a digit, S pixels a side.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hma_data.errors import UsageError
+from hma_data.loading.dataset import Batch, WindowDataset
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.schema import token_column
+from hma_data.storage.paths import StrPath
+from hma_model.checkpoint.io import require_tokenizer
+from hma_model.evaluation.metrics import perplexity, psnr, ssim
+from hma_model.evaluation.teacher_forcing import teacher_forced
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.network.model import HMA
+
+BASELINE_FRAMES = 200_000
+PSNR_LIMIT = 60.0  # dB; equal pictures would be infinite, and a mean over frames with them
+
+RealFrames = Callable[[int, NDArray[np.int64]], NDArray[np.uint8]]
+
+
+@dataclass
+class Means:
+    """Sums by embodiment, weighted by samples."""
+
+    sums: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def add(self, names: Sequence[str], values: Tensor | NDArray[Any]) -> None:
+        """One value (B,) a sample."""
+        for name, value in zip(names, values.tolist()):
+            self.sums[name] = self.sums.get(name, 0.0) + value
+            self.counts[name] = self.counts.get(name, 0) + 1
+
+    def by_embodiment(self) -> dict[str, float]:
+        """Mean of each, sorted by id."""
+        return {name: self.sums[name] / self.counts[name] for name in sorted(self.sums)}
+
+    def mean(self) -> float:
+        """Mean over all samples; not a number where there are none."""
+        return sum(self.sums.values()) / max(sum(self.counts.values()), 1) if self.counts else float("nan")
+
+
+# -- the loss and its baseline
+
+
+def windows(
+    data: StrPath | ShardSet, split: str, frames: int, count: int, batch_size: int = 8
+) -> Iterator[Batch]:
+    """Up to `count` windows of a split, evenly spaced and always the same, in batches."""
+    dataset = WindowDataset(data, split, frames)
+    chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(np.int64))
+    for start in range(0, len(chosen) if len(dataset) else 0, batch_size):
+        yield dataset.batch(chosen[start : start + batch_size])
+
+
+@torch.no_grad()
+def validation_losses(model: "HMA", batches: Iterable[Batch], seed: int = 0) -> tuple[Means, Means]:
+    """Loss and accuracy of each window, gathered by embodiment.
+
+    The continuous model's loss is its diffusion loss under masks and noise drawn from `seed`; it has no
+    accuracy.
+    """
+    losses, accuracy = Means(), Means()
+    training = model.training
+    model.eval()
+    for number, batch in enumerate(batches):
+        batch = batch.to(model.device)
+        if model.config.kind == "discrete":
+            nats, hits = teacher_forced(model, batch)
+            losses.add(batch.embodiment, nats.mean(dim=1))
+            accuracy.add(batch.embodiment, hits.mean(dim=1))
+        else:
+            generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
+            losses.add(batch.embodiment, model(batch, "forward", generator).per_sample)
+    model.train(training)
+    return losses, accuracy
+
+
+def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
+    """Mean loss over windows: nats a token of each fully masked frame given the true past."""
+    return validation_losses(model, batches)[0].mean()
+
+
+def digit_frequencies(
+    shards: ShardSet, split: str = "train", max_frames: int = BASELINE_FRAMES
+) -> list[NDArray[np.float64]]:
+    """How often each digit takes each of its values: F arrays (V,), add-one smoothed, summing to one.
+
+    Of a larger split, row groups spread evenly over it are counted, at most about `max_frames` frames.
+    """
+    factored = shards.spec.factored or (shards.spec.vocab_size or 1,)
+    counts = [np.ones(values) for values in factored]
+    places = [
+        (name, group, rows)
+        for name, groups in zip(shards.shards(split), shards.row_groups(split))
+        for group, rows in enumerate(groups)
+    ]
+    stride = max(1, -(-sum(rows for _, _, rows in places) // max_frames))
+    column = token_column(shards.spec)[0]
+    for name, group, _ in places[::stride]:
+        tokens = shards.read(name, [group], [column])[column].astype(np.int64).ravel()
+        for digit, values in enumerate(factored):
+            counts[digit] += np.bincount(tokens % values, minlength=values)
+            tokens //= values
+    return [count / count.sum() for count in counts]
+
+
+def unconditional_baseline(
+    train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet], batches: Iterable[Batch]
+) -> Means:
+    """What looking at nothing reaches: cross-entropy of each embodiment's training frequencies.
+
+    Args:
+        train: shard sets (or the str or path of each), whose train frames are counted, digit by digit.
+        batches: validation windows of discrete tokens.
+
+    Returns:
+        nats a token by embodiment, over the frames from the second on, as `masked_val_loss` counts.
+    """
+    sets = train.values() if isinstance(train, Mapping) else [_opened(item) for item in train]
+    scores = {s.embodiment.id: [np.log(p) for p in digit_frequencies(s)] for s in sets}
+    means = Means()
+    for batch in batches:
+        assert batch.tokens is not None
+        for name, tokens in zip(batch.embodiment, batch.tokens[:, 1:].numpy()):
+            nats, rest = np.zeros(tokens.shape), tokens.copy()
+            for digit in scores[name]:
+                nats -= digit[rest % len(digit)]
+                rest //= len(digit)
+            means.add([name], np.array([nats.mean()]))
+    return means
+
+
+# -- rollouts
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """A rollout and what it is held against, all uint8 (B, T, S, S, 3); the first P frames are the prompt."""
+
+    prompt: int
+    predicted: NDArray[np.uint8]
+    truth: NDArray[np.uint8]
+
+
+def rollout(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    batch: Batch,
+    frames: int | None = None,
+    *,
+    prompt: int | None = None,
+    actions: Tensor | None = None,
+    unmask_steps: int = 2,
+    temperature: float = 0.0,
+    sample_steps: int | None = None,
+    seed: int = 0,
+    truth: NDArray[np.uint8] | None = None,
+) -> Pictures:
+    """Go on from the first frames of each window with its actions.
+
+    Args:
+        model: in eval mode.
+        tokenizer: the one it was trained on.
+        batch: windows of T frames; their tokens are the truth.
+        frames: how many to predict; by default all after the prompt.
+        prompt: P true frames to start from; by default a third of the window, at least one.
+        actions: (B, T, K) raw instead of the window's own.
+        unmask_steps, temperature, sample_steps: as in `HMA.generate`.
+        seed: of every random draw.
+        truth: the decoded frames of another rollout of the same windows, to spare decoding them again.
+
+    Raises:
+        UsageError: more frames than the windows have.
+    """
+    length = batch.actions.shape[1]
+    first = default_prompt(length) if prompt is None else prompt
+    count = length - first if frames is None else frames
+    if first < 1 or count < 1 or first + count > length:
+        raise UsageError("rollout", f"{first} + {count} frames do not fit windows of {length}")
+    stored = batch.tokens if model.config.kind == "discrete" else batch.latents
+    assert stored is not None
+    predicted = model.generate(
+        stored[:, :first].to(model.device),
+        (batch.actions if actions is None else actions)[:, : first + count].to(model.device),
+        batch.embodiment,
+        count,
+        unmask_steps=unmask_steps,
+        temperature=temperature,
+        sample_steps=sample_steps,
+        generator=torch.Generator().manual_seed(seed),
+    )
+    if truth is None:
+        truth = decode(tokenizer, stored[:, : first + count])
+    made = decode(tokenizer, predicted)
+    return Pictures(first, np.concatenate([truth[:, :first], made], axis=1), truth)
+
+
+def default_prompt(length: int) -> int:
+    """Frames of a window of this length that a rollout starts from."""
+    return max(1, length // 3)
+
+
+def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
+    """(B, T, h, w) ids or (B, T, c, H, W) latents -> (B, T, S, S, 3) uint8."""
+    values = stored.flatten(0, 1).cpu().numpy()
+    dtype = np.uint32 if tokenizer.spec.kind == "discrete" else np.dtype(tokenizer.spec.dtype)
+    pictures = tokenizer.decode(values.astype(dtype))
+    return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
+
+
+def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0) -> Tensor:
+    """(B, T, K) each window's chunks from `begin` on replaced by another window's of the same embodiment.
+
+    A window that is the only one of its embodiment gets its own in reverse.
+    """
+    actions = batch.actions.clone()
+    source = batch.actions[:, begin:]
+    rng = np.random.default_rng([seed, 1])
+    for name in dict.fromkeys(batch.embodiment):
+        own = rng.permutation([i for i, other in enumerate(batch.embodiment) if other == name])
+        if len(own) == 1:
+            actions[own, begin:] = source[own].flip(1)
+        else:
+            actions[own, begin:] = source[np.roll(own, 1)]
+    return actions
+
+
+def evaluate(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    data: StrPath | ShardSet,
+    *,
+    split: str = "val",
+    count: int = 32,
+    frames: int | None = None,
+    prompt: int | None = None,
+    batch_size: int = 16,
+    unmask_steps: int = 2,
+    temperature: float = 0.0,
+    sample_steps: int | None = None,
+    seed: int = 0,
+    real: RealFrames | None = None,
+) -> dict[str, Any]:
+    """A model's figures on one shard set.
+
+    Args:
+        model: with the shard set's embodiment.
+        tokenizer: the shard set's.
+        data: str or path of the shard set, its URI, or the set itself.
+        split: train or val.
+        count: windows, evenly spaced; where the split has fewer, all.
+        frames: T of a window; by default the model's.
+        prompt: true frames a rollout starts from.
+        unmask_steps, temperature, sample_steps, seed: of the rollouts.
+        real: gives the recording's own frames of (episode_index, (n,) frame indices) at the tokenizer's size,
+            to hold the rollouts against; by default they are held against the decoded true tokens.
+
+    Returns:
+        `loss` (nats a token), and of discrete models `shuffled_loss` (given another window's actions),
+        `baseline_loss`, `perplexity` and `accuracy`; and for rollouts with the
+        `true` actions, with `shuffled` ones and for `copy`, the last frame of the prompt repeated: `psnr` and
+        `ssim` over the horizon, `psnr_last`, `psnr_by_frame`. `psnr_action_gain_last` is true less shuffled.
+
+    Raises:
+        CheckpointError: the model is of another tokenizer.
+        UsageError: the split has no window.
+    """
+    shards = _opened(data)
+    require_tokenizer(model.config, shards.spec, shards.folder)
+    length = frames or model.config.frames
+    first = default_prompt(length) if prompt is None else prompt
+    if not len(WindowDataset(shards, split, length)):
+        raise UsageError(shards.folder, f"has no window of {length} frames in {split}", "use another split")
+    table = _losses(model, shards, split, length, count, batch_size)
+    gathered: dict[str, list[Pictures]] = {"true": [], "shuffled": [], "copy": []}
+    for number, batch in enumerate(windows(shards, split, length, count, batch_size)):
+        options: dict[str, Any] = {
+            "prompt": first, "unmask_steps": unmask_steps, "temperature": temperature,
+            "sample_steps": sample_steps, "seed": seed + number,
+        }  # fmt: skip
+        true = rollout(model, tokenizer, batch, **options)
+        shuffled = shuffled_actions(batch, first - 1, seed)
+        other = rollout(model, tokenizer, batch, actions=shuffled, truth=true.truth, **options)
+        if real is not None:
+            truth = _real(real, batch, shards)
+            true, other = replace(true, truth=truth), replace(other, truth=truth)
+        for name, pictures in (("true", true), ("shuffled", other), ("copy", _copied(true))):
+            gathered[name].append(pictures)
+    scores = {name: _scores(parts) for name, parts in gathered.items()}
+    gain = scores["true"]["psnr_last"] - scores["shuffled"]["psnr_last"]
+    return {
+        "embodiment": shards.embodiment.id,
+        "split": split,
+        "windows": sum(len(part.truth) for part in gathered["true"]),
+        "frames": length,
+        "prompt": first,
+        "against": "decoded tokens" if real is None else "real frames",
+        **table,
+        **scores,
+        "psnr_action_gain_last": gain,
+    }
+
+
+def _losses(
+    model: "HMA", shards: ShardSet, split: str, frames: int, count: int, batch_size: int
+) -> dict[str, Any]:
+    losses, accuracy = validation_losses(model, windows(shards, split, frames, count, batch_size))
+    if model.config.kind == "continuous":
+        return {"loss": losses.mean()}
+    baseline = unconditional_baseline([shards], windows(shards, split, frames, count, batch_size))
+    other = (
+        replace(batch, actions=shuffled_actions(batch))
+        for batch in windows(shards, split, frames, count, batch_size)
+    )
+    return {
+        "loss": losses.mean(),
+        "shuffled_loss": masked_val_loss(model, other),
+        "baseline_loss": baseline.mean(),
+        "perplexity": perplexity(losses.mean()),
+        "accuracy": accuracy.mean(),
+    }
+
+
+def _scores(parts: list[Pictures]) -> dict[str, Any]:
+    first = parts[0].prompt
+    signal, similarity = [], []
+    for part in parts:
+        shape = part.truth[:, first:].shape
+        truth = part.truth[:, first:].reshape(-1, *shape[2:])
+        predicted = part.predicted[:, first:].reshape(-1, *shape[2:])
+        signal.append(np.minimum(psnr(truth, predicted), PSNR_LIMIT).reshape(shape[:2]))
+        similarity.append(ssim(truth, predicted).reshape(shape[:2]))
+    by_frame = np.concatenate(signal).mean(axis=0)
+    return {
+        "psnr": float(by_frame.mean()),
+        "psnr_last": float(by_frame[-1]),
+        "psnr_by_frame": [round(float(value), 3) for value in by_frame],
+        "ssim": float(np.concatenate(similarity).mean()),
+    }
+
+
+def _copied(pictures: Pictures) -> Pictures:
+    still = pictures.predicted.copy()
+    still[:, pictures.prompt :] = still[:, pictures.prompt - 1 : pictures.prompt]
+    return replace(pictures, predicted=still)
+
+
+def _real(real: RealFrames, batch: Batch, shards: ShardSet) -> NDArray[np.uint8]:
+    assert batch.episode is not None and batch.frame is not None
+    rows = batch.frame.numpy()[:, None] + np.arange(batch.actions.shape[1]) * shards.row_stride
+    recorded = rows * shards.manifest.frame_stride
+    return np.stack([real(int(e), frames) for e, frames in zip(batch.episode, recorded)])
+
+
+def _opened(item: StrPath | ShardSet) -> ShardSet:
+    return item if isinstance(item, ShardSet) else ShardSet(item)

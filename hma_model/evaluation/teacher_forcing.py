@@ -1,0 +1,87 @@
+"""The loss of every frame of a window, fully masked, given the true past: in one pass over the network.
+
+The window's frames come first, as they are; then each from the second on comes once more, masked, at the same
+time. A frame sees the true ones before it and itself, so that nothing has to be computed once a prefix.
+
+B batch, T frames, h,w grid, S = h*w.
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from hma_model.evaluation.metrics import token_hits, token_nats
+from hma_model.network.conditioning import Groups, Slots, align, condition
+from hma_model.network.trunk import Clock, rotary_angles
+
+if TYPE_CHECKING:
+    from hma_data.loading.dataset import Batch
+    from hma_model.config import HMAConfig
+    from hma_model.network.model import HMA
+
+
+@torch.no_grad()
+def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
+    """Each frame from the second on, fully masked, given as much of the true past as a window holds.
+
+    Args:
+        model: discrete, in eval mode.
+        batch: on its device.
+
+    Returns:
+        nats (B, T-1) float32 a token, averaged over the frame, and accuracy (B, T-1) of whole tokens.
+    """
+    assert batch.tokens is not None
+    count, held = batch.tokens.shape[1], model.config.frames
+    if count <= held:
+        return _scored(model, batch, _at_once(model, batch), slice(1, None))
+    first = _part(batch, slice(held))
+    parts = [_scored(model, first, _at_once(model, first), slice(1, None))]
+    for t in range(held, count):  # what such a frame sees begins later than the window
+        own = _part(batch, slice(t + 1 - held, t + 1))
+        assert own.tokens is not None
+        seen = own.tokens.clone()
+        seen[:, -1] = model.config.vocab_size
+        logits = model.video_logits(seen, own.actions, own.embodiment, own.action_mask)
+        parts.append(_scored(model, own, logits[:, -1:], slice(-1, None)))
+    nats, hits = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
+    return nats, hits
+
+
+def _at_once(model: "HMA", batch: "Batch") -> Tensor:
+    """Scores (B, T-1, h, w, F, V) of the masked frames."""
+    assert batch.tokens is not None
+    config, frames = model.config, batch.tokens.flatten(2)
+    count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
+    slots = align(config, batch.actions, batch.action_mask, count)
+    both = Slots(*(torch.cat([x, x[:, 1:]], dim=1) for x in (slots.chunks, slots.known)))
+    clock = _clock(config, count, frames.device)
+    masked = torch.full_like(frames[:, 1:], config.vocab_size)
+    x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)))
+    features = model.trunk(x, condition(model, both, groups, clock.positions), clock)
+    scores = model.token_readout(model.video_features(features)[:, count:])
+    return groups.unsort(model.token_readout.split(scores)).unflatten(2, config.token_grid)
+
+
+def _clock(config: "HMAConfig", frames: int, device: torch.device) -> Clock:
+    """Of a window's frames and all but the first once more; each sees the true ones before it and itself."""
+    positions = torch.cat([torch.arange(frames), torch.arange(1, frames)]).to(device)
+    true = torch.arange(len(positions), device=device) < frames
+    before = positions.unsqueeze(1) > positions
+    allowed = (before & true) | torch.eye(len(positions), dtype=torch.bool, device=device)
+    return Clock(positions, allowed, rotary_angles(config, positions))
+
+
+def _part(batch: "Batch", frames: slice) -> "Batch":
+    assert batch.tokens is not None
+    known = batch.action_mask[:, frames]
+    return replace(batch, tokens=batch.tokens[:, frames], actions=batch.actions[:, frames], action_mask=known)
+
+
+def _scored(model: "HMA", batch: "Batch", logits: Tensor, frames: slice) -> tuple[Tensor, Tensor]:
+    assert batch.tokens is not None
+    true, factored = batch.tokens[:, frames], model.config.factored
+    nats = token_nats(logits, true, factored).mean(dim=(2, 3))
+    return nats, token_hits(logits, true, factored).float().mean(dim=(2, 3))

@@ -1,0 +1,308 @@
+"""Rollouts: frame after frame from a prompt and actions, with a cache over time.
+
+    rollout = Rollout(model, "arm", batch=1)
+    rollout.prompt(tokens, actions)
+    frame = rollout.step(chunk)              # the frame the chunk leads to
+
+A frame costs as many passes as it is unmasked in: the first also brings the frame before it, now finished,
+into the cache. `cache=False` computes the whole history in every pass, with the same result.
+
+B batch, P frames of a prompt, h,w token grid, S = h*w, K = stride * action dim, c channels, H,W latent grid.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from hma_data.errors import HMAError
+from hma_model.generation.cache import Cache
+from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame
+from hma_model.network.conditioning import Groups, Slots, condition
+from hma_model.network.embed import patchify, unpatchify
+from hma_model.network.masking import masked_after
+from hma_model.network.model import HMA
+from hma_model.network.trunk import Conditioning, Trunk, window_clock
+
+
+class Rollout:
+    """B rollouts side by side, one frame a step.
+
+    A frame sees itself and the `frames` - 1 of the configuration before it. With rotary positions that window
+    rolls on, with learned ones it is computed anew for each frame beyond it.
+
+    Args:
+        model: any; it is used as it is, so call `eval()` on it before.
+        embodiment: one id for all, or one a sample.
+        batch: B.
+        unmask_steps, temperature, order, sample_steps, generator: as in `HMA.generate`.
+        cache: keep keys and values of past frames.
+        compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
+            take a minute or more.
+    """
+
+    def __init__(
+        self,
+        model: HMA,
+        embodiment: str | Sequence[str],
+        batch: int = 1,
+        *,
+        unmask_steps: int = 2,
+        temperature: float = 0.0,
+        order: str = "random",
+        sample_steps: int | None = None,
+        generator: torch.Generator | None = None,
+        cache: bool = True,
+        compile: bool = False,
+    ) -> None:
+        self.model, self.config = model, model.config
+        self.decoding = Decoding(unmask_steps, temperature, order, sample_steps, generator)
+        _check(self.decoding, self.config.kind)
+        self.caching = cache
+        self.compiled = _compiled(model.trunk) if compile and cache else None
+        self.groups = Groups.of(embodiment, batch)
+        self.sorted = Groups(self.groups.parts)  # what is kept here is in this order
+        self.batch = batch
+        self.width = max(model.stem(name).input.in_features for name, _ in self.groups.parts)
+        self.cache: Cache | None = None
+
+    @torch.no_grad()
+    def prompt(self, frames: Tensor, actions: Tensor | None) -> None:
+        """Begin anew from frames that are known.
+
+        Args:
+            frames: tokens (B, P, h, w) int64, or latents (B, P, c, H, W) as stored. Of more than the window
+                holds, the last are used.
+            actions: (B, P - 1 or more, K) raw, chunk k the commands from frame k to k+1; later ones are not
+                used. None for none.
+        """
+        self._check_prompt(frames)
+        if self.config.kind == "discrete":
+            values = frames.flatten(2).long()
+        else:
+            values = patchify(frames.float() * self.config.latent_scale, self.config.patch)
+        count = frames.shape[1]
+        self.frames = self.groups.sort(values.to(self.model.device))
+        self.slots = self._slots_of(actions, count)
+        self.passive = actions is None
+        self.begun, self.cache = False, None
+        self._keep(self.config.frames)
+        self.fresh = self.time = self.frames.shape[1]  # fresh: frames not in the cache yet
+
+    @torch.no_grad()
+    def step(self, chunk: Tensor | None = None, following: Tensor | None = None) -> Tensor:
+        """The next frame.
+
+        Args:
+            chunk: (B, K) raw commands from the newest frame to the one asked for; None where there are none.
+            following: (B, K) the commands after it, which condition it where the configuration aligns actions
+                with the current frame (released weights); the same chunk again by default.
+
+        Returns:
+            (B, h, w) int64 tokens, or (B, c, H, W) float32 latents as stored.
+        """
+        self._take(chunk, following)
+        self._slide()
+        conditioning = self._condition(self.fresh + 1)
+        frame = self._blank()
+        left = tokens = self.config.tokens_per_frame
+        for step in range(self.decoding.steps):
+            count = left - masked_after(step, self.decoding.steps, tokens)
+            if count > 0:
+                features, position = self._features(frame, conditioning, first=left == tokens)
+                own = features[:, :tokens]
+                frame.unmask(self.model.readout, own, position, count)  # type: ignore[arg-type]
+                left -= count
+        self._append(frame.values)
+        return self._show(frame.values)
+
+    # -- one pass -----------------------------------------------------------------------------------------
+
+    def _features(
+        self, frame: TokenFrame | PatchFrame, conditioning: Conditioning, first: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The new frame's features (B, N, D) and its time (1,)."""
+        fresh = self.fresh if first or not self.caching else 0
+        x = self._embed(frame, fresh)
+        if not self.caching:
+            clock = window_clock(self.config, fresh + 1, self.model.device)
+            features = self.model.trunk(x, conditioning, clock)
+        else:
+            clock = self._cache().clock(self.time - fresh, fresh + 1)
+            part = conditioning if first else conditioning.last()
+            trunk = self.compiled if self.compiled and x.shape[1] <= 2 else self.model.trunk
+            features = trunk(x, part, clock, self._cache().layers)
+        return features[:, -1], clock.positions[-1:]
+
+    def _embed(self, frame: TokenFrame | PatchFrame, fresh: int) -> Tensor:
+        """The frames not in the cache yet, and the new one (B, fresh + 1, S, D)."""
+        past = self.frames[:, self.frames.shape[1] - fresh :]
+        values = torch.cat([past, frame.values.unsqueeze(1)], dim=1)
+        if isinstance(frame, TokenFrame):
+            return self.model.embed_tokens(values)
+        known = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
+        masked = torch.cat([known, frame.masked.unsqueeze(1)], dim=1)
+        return self.model.embed_patches(values, masked.unsqueeze(-1))
+
+    def _cache(self) -> Cache:
+        if self.cache is None:
+            appended = self.config.absent_tokens if self.passive else self.config.appended_tokens
+            like = self.model.trunk.position.detach()
+            if torch.is_autocast_enabled(like.device.type):
+                like = like.to(torch.get_autocast_dtype(like.device.type))
+            tokens = self.config.tokens_per_frame + appended
+            self.cache = Cache(self.config, self.batch, tokens, like)
+            if self.compiled is not None:
+                self.cache.hold_still()
+        return self.cache
+
+    # -- what is kept -------------------------------------------------------------------------------------
+
+    def _condition(self, frames: int) -> Conditioning:
+        """For the last frames, the new one among them; it does not change from pass to pass."""
+        start = self.slots.known.shape[1] - frames
+        slots = Slots(self.slots.chunks[:, start:], self.slots.known[:, start:])
+        positions = torch.arange(self.time + 1 - frames, self.time + 1, device=self.model.device)
+        return condition(self.model, None if self._skips() else slots, self.sorted, positions)
+
+    def _skips(self) -> bool:
+        return self.passive and self.config.absent_action != "embedding"
+
+    def _slots_of(self, actions: Tensor | None, frames: int) -> Slots:
+        """The chunk in force at each known frame; aligned with the current one, the last waits for `step`."""
+        shape, device = (self.batch, frames), self.model.device
+        slots = Slots(
+            torch.zeros(*shape, self.width, device=device),
+            torch.zeros(shape, dtype=torch.bool, device=device),
+        )
+        if actions is None or frames == 1:
+            return slots
+        if actions.shape[1] < frames - 1 or actions.shape[2] < self.width:
+            fault = f"actions of shape {tuple(actions.shape)} for a prompt of {frames} frames"
+            raise HMAError("prompt", fault, f"give (batch, {frames - 1} or more, {self.width})")
+        late = int(self.config.action_alignment == "previous")
+        place = slice(late, frames - 1 + late)
+        slots.chunks[:, place] = self.groups.sort(actions.to(device))[:, : frames - 1, : self.width].float()
+        slots.known[:, place] = True
+        return slots
+
+    def _take(self, chunk: Tensor | None, following: Tensor | None) -> None:
+        """Put the chunk at the frame it conditions, and a slot for the new frame."""
+        if self.begun and self.config.absent_action != "embedding" and self.passive != (chunk is None):
+            raise HMAError("step", "actions came or went during a rollout", "give them always or never")
+        self.passive = self.passive and chunk is None
+        self.begun = True
+        new = self._slots_of(None, 1)
+        if chunk is not None:
+            values = self._chunk(chunk)
+            if self.config.action_alignment == "current":
+                self.slots.chunks[:, -1], self.slots.known[:, -1] = values, True
+                values = values if following is None else self._chunk(following)
+            new.chunks[:, 0], new.known[:, 0] = values, True
+        self.slots = Slots(
+            torch.cat([self.slots.chunks, new.chunks], 1), torch.cat([self.slots.known, new.known], 1)
+        )
+
+    def _chunk(self, chunk: Tensor) -> Tensor:
+        if chunk.shape[0] != self.batch or chunk.shape[-1] < self.width or chunk.dim() != 2:
+            fault = f"a chunk of shape {tuple(chunk.shape)}"
+            raise HMAError("step", fault, f"give ({self.batch}, {self.width})")
+        return self.groups.sort(chunk.to(self.model.device))[:, : self.width].float()
+
+    def _append(self, values: Tensor) -> None:
+        self.frames = torch.cat([self.frames, values.unsqueeze(1)], dim=1)
+        self.time += 1
+        self.fresh = 1 if self.caching else self.frames.shape[1]
+        if self.caching and self.config.time_position == "rotary":
+            self._keep(1)
+
+    def _slide(self) -> None:
+        """With learned positions the window's frames change theirs as it moves, so they are computed anew."""
+        if self.config.time_position == "learned" and self.time == self.config.frames:
+            self._keep(self.config.frames - 1, ahead=1)
+            self.fresh = self.time = self.frames.shape[1]
+            if self.cache is not None:
+                self.cache.clear()
+
+    def _keep(self, frames: int, ahead: int = 0) -> None:
+        """Forget all but the last frames, and all slots but theirs and the ones ahead of them."""
+        self.frames = self.frames[:, max(self.frames.shape[1] - frames, 0) :]
+        start = max(self.slots.known.shape[1] - frames - ahead, 0)
+        self.slots = Slots(self.slots.chunks[:, start:].clone(), self.slots.known[:, start:].clone())
+
+    # -- in and out ---------------------------------------------------------------------------------------
+
+    def _blank(self) -> TokenFrame | PatchFrame:
+        """A new frame, all masked."""
+        shape, device = (self.batch, self.config.tokens_per_frame), self.model.device
+        if self.config.kind == "discrete":
+            mask_id = self.config.vocab_size
+            return TokenFrame(torch.full(shape, mask_id, device=device), mask_id, self.decoding)
+        return PatchFrame(torch.zeros(*shape, self.config.patch_dim, device=device), self.decoding)
+
+    def _show(self, values: Tensor) -> Tensor:
+        values = self.groups.unsort(values)
+        if self.config.kind == "discrete":
+            return values.unflatten(1, self.config.token_grid)
+        latents = unpatchify(values.unsqueeze(1), self.config.patch, self.config.token_grid)
+        return latents.squeeze(1) / self.config.latent_scale
+
+    def _check_prompt(self, frames: Tensor) -> None:
+        config = self.config
+        shape = config.grid if config.kind == "discrete" else (config.channels, *config.grid)
+        if (
+            frames.dim() != 2 + len(shape)
+            or tuple(frames.shape[2:]) != shape
+            or frames.shape[0] != self.batch
+        ):
+            fault = f"frames of shape {tuple(frames.shape)}"
+            raise HMAError("prompt", fault, f"give ({self.batch}, frames, {', '.join(map(str, shape))})")
+        if frames.shape[1] < 1:
+            raise HMAError("prompt", "has no frames", "give at least one")
+
+
+def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
+    """The trunk for passes of a fixed shape; a result holds until the next pass."""
+    mode = "reduce-overhead" if trunk.position.device.type == "cuda" else "default"
+    compiled = torch.compile(trunk, dynamic=False, mode=mode)
+
+    def call(*arguments: object) -> Tensor:
+        torch.compiler.cudagraph_mark_step_begin()
+        features: Tensor = compiled(*arguments)
+        return features
+
+    return call
+
+
+def _check(decoding: Decoding, kind: str) -> None:
+    if decoding.steps < 1:
+        raise HMAError("unmask_steps", f"{decoding.steps} is not allowed", "give at least 1")
+    if not decoding.temperature >= 0:
+        raise HMAError("temperature", f"{decoding.temperature} is not allowed", "give at least 0")
+    orders = ("random", "confidence") if kind == "discrete" else ("random",)
+    if decoding.order not in orders:
+        fault = f"{decoding.order!r} is not an order of a {kind} model"
+        raise HMAError("order", fault, "give one of " + ", ".join(orders))
+
+
+def generate(
+    model: HMA,
+    prompt: Tensor,
+    actions: Tensor | None,
+    embodiment: str | Sequence[str],
+    frames: int,
+    **decoding: object,
+) -> Tensor:
+    """Continue a prompt by `frames` frames; `HMA.generate` explains the arguments."""
+    known = prompt.shape[1]
+    rollout = Rollout(model, embodiment, prompt.shape[0], **decoding)  # type: ignore[arg-type]
+    if actions is not None and actions.shape[1] < known + frames - 1:
+        fault = f"{actions.shape[1]} action chunks for {known} + {frames} frames"
+        raise HMAError("actions", fault, f"give {known + frames}")
+    rollout.prompt(prompt, actions)
+    made = []
+    for index in range(known - 1, known - 1 + frames):
+        chunk = None if actions is None else actions[:, index]
+        last = actions is None or index + 1 >= actions.shape[1]
+        made.append(rollout.step(chunk, None if last else actions[:, index + 1]))  # type: ignore[index]
+    return torch.stack(made, dim=1)

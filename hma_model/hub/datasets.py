@@ -1,0 +1,175 @@
+"""Publish and pull shard sets: a dataset repository of the hub, a folder, or any fsspec URI.
+
+The files lie as `docs/format.md` has them, and the card tells the hub's viewer which of them are tables.
+"""
+
+import tempfile
+from pathlib import Path
+from typing import Protocol
+
+from hma_data.errors import HubError, ShardError
+from hma_data.shards.manifest import MANIFEST, SHARD_NAME, Manifest, seal_problem
+from hma_data.shards.publish import SMALL, Place, publish
+from hma_data.storage.files import file_sha256, write_atomic
+from hma_data.storage.paths import StrPath, as_address, as_path
+from hma_model.checkpoint.io import README
+from hma_model.hub.data_card import render
+from hma_model.hub.publish import REPOSITORY, is_repository
+
+_OURS = {*SMALL, MANIFEST, README, ".gitattributes"}
+_AGAIN = "pull again; if it stays so, have it pushed again"
+_DATASETS = "hf://datasets/"
+
+
+class DataStore(Place, Protocol):
+    """Where a shard set is published; see `hma_model.hub.publish.Store`."""
+
+    name: str
+
+    @property
+    def repo(self) -> str | None: ...
+
+    def check_card(self, page: bytes) -> None:
+        """Raise where the page would not be taken."""
+        ...
+
+    def download(self, names: list[str], out: Path) -> None:
+        """Bring files to a folder."""
+        ...
+
+
+def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str:
+    """Publish a shard set.
+
+    Args:
+        folder: str or path of what `hma convert` wrote.
+        target: organisation/name of a dataset, `hf://datasets/organisation/name`, a folder or a URI.
+        private: make a new repository a private one.
+
+    Returns:
+        Where it is now.
+
+    Raises:
+        ShardError: the set is not finished, or a shard is not the one its manifest names.
+        HubError: another shard set is there, or it cannot be reached or written.
+    """
+    folder = as_path(folder)
+    manifest = _whole(folder)
+    store = _open(as_address(target), write=True, private=private)
+    page = render(manifest, store.repo)
+    _refuse_others(store, manifest)
+    store.check_card(page)
+    return publish(store, folder, lambda: _refuse_others(store, manifest), page=page)
+
+
+def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> Path:
+    """Fetch a published shard set; what is in `out` already is not transferred again.
+
+    Args:
+        source: as `push_data`'s target.
+        out: str or path of a new folder, or of one that an interrupted pull has left.
+        revision: branch, tag or commit of a repository.
+
+    Returns:
+        `out`.
+
+    Raises:
+        HubError: no such dataset, no shard set, or out of reach.
+        ShardError: what came is not what the manifest names.
+    """
+    out, store = as_path(out), _open(as_address(source), revision)
+    files = store.files()
+    manifest, content = _published(store)
+    if (out / MANIFEST).is_file() and (out / MANIFEST).read_bytes() != content:
+        raise HubError(out, "holds another shard set", "pull to another folder")
+    shards = {shard.path: shard.sha256 for shard in manifest.shards}
+    lacking = [path for path in shards if path not in files]
+    if lacking:
+        raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "push it again")
+    wanted = [path for path in shards if not _is(out / path, shards[path])]
+    store.download([*wanted, *(name for name in SMALL if name in files)], out)
+    for path in wanted:
+        if not _is(out / path, shards[path]):
+            raise ShardError(out / path, f"is not the shard that {MANIFEST} names", _AGAIN)
+    for name in SMALL:
+        if name in manifest.files and not _is(out / name, manifest.files[name]):
+            raise ShardError(out / name, f"is not the file that {MANIFEST} names", _AGAIN)
+    write_atomic(out / MANIFEST, content)
+    return out
+
+
+# -- pieces
+
+
+def _whole(folder: Path) -> Manifest:
+    """The manifest of a set whose files are all as it says."""
+    manifest = Manifest.load(folder)
+    if problem := seal_problem((folder / MANIFEST).read_bytes()):
+        raise ShardError(folder / MANIFEST, problem, f"hma shards restat {folder} writes it anew")
+    for shard in manifest.shards:
+        path = folder / shard.path
+        if not path.is_file() or path.stat().st_size != shard.bytes or not _is(path, shard.sha256):
+            raise ShardError(path, "is not the shard its manifest names", f"run hma shards verify {folder}")
+    for name, sha256 in manifest.files.items():
+        if name not in SMALL or not _is(folder / name, sha256):
+            remedy = f"hma shards restat {folder} writes it anew"
+            raise ShardError(folder / name, "is not the file its manifest names", remedy)
+    return manifest
+
+
+def _open(
+    address: str | Path, revision: str | None = None, write: bool = False, private: bool = False
+) -> DataStore:
+    text = str(address)
+    given = text.startswith(_DATASETS)
+    name = text.removeprefix(_DATASETS)
+    if given or is_repository(address):
+        from hma_data.hub.repository import Repository
+
+        name = name.removeprefix("hf://")
+        if not REPOSITORY.fullmatch(name):
+            raise HubError(address, f"is not {_DATASETS}ORGANISATION/NAME", "name a dataset repository")
+        return Repository(name, revision, write, "dataset", private)
+    from hma_model.hub.folder import FolderStore
+
+    if revision is not None:
+        raise HubError(address, f"is a folder, and has no revision {revision!r}", "leave the revision out")
+    return FolderStore(address, write)
+
+
+def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[Manifest, bytes]:
+    """The manifest that is there, and its bytes.
+
+    Raises:
+        HubError: there is none.
+        ShardError: it is damaged.
+    """
+    if MANIFEST not in store.files():
+        raise HubError(store.name, f"has no {MANIFEST}", "is it a shard set, and has its push finished?")
+    with tempfile.TemporaryDirectory() as folder:
+        store.download([MANIFEST], Path(folder))
+        try:
+            return Manifest.load(Path(folder)), (Path(folder) / MANIFEST).read_bytes()
+        except ShardError as fault:
+            raise ShardError(f"{store.name}/{MANIFEST}", fault.fault, remedy) from fault
+
+
+def _refuse_others(store: DataStore, manifest: Manifest) -> dict[str, int]:
+    """Return what is there; raise HubError unless it is nothing or this robot's set under this tokenizer."""
+    files = store.files()
+    strange = [name for name in files if not (name in _OURS or SHARD_NAME.fullmatch(name))]
+    if strange:
+        raise HubError(store.name, f"holds something else: {strange[0]}", "push to a place of its own")
+    if MANIFEST not in files:
+        return files
+    there = _published(store, f"delete {MANIFEST} there if the set is yours, and push again")[0]
+    ours = (manifest.embodiment.id, manifest.tokenizer.name, manifest.tokenizer.weights_sha256)
+    theirs = (there.embodiment.id, there.tokenizer.name, there.tokenizer.weights_sha256)
+    if ours != theirs:
+        fault = f"holds the shard set of {theirs[0]} under {theirs[1]}, not of {ours[0]} under {ours[1]}"
+        raise HubError(store.name, fault, "push to a place of its own")
+    return files
+
+
+def _is(path: Path, sha256: str) -> bool:
+    return path.is_file() and file_sha256(path) == sha256

@@ -1,0 +1,173 @@
+"""What a hub holds: the checkpoints in a repository or folder, ours and the release's, and what fits here.
+
+A folder may hold one checkpoint or many, in folders of their own. Nothing but JSON is read.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from hma_data.errors import HMAError, HubError
+from hma_data.storage.folders import parse_json
+from hma_data.storage.paths import StrPath
+from hma_model.checkpoint import migrate
+from hma_model.checkpoint.io import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
+from hma_model.hub.publish import Store, embodiment_ids, open_store, total_bytes
+
+RELEASED_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
+FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
+MOST = 200  # checkpoints shown of a folder
+
+
+def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
+    """Every checkpoint there.
+
+    Args:
+        source: str or path of a folder, a URI, or a repository.
+        revision: branch, tag or commit of a repository.
+
+    Returns:
+        For each: `checkpoint` (address), `format` (hma-toolkit or released), `format_version`, `model`,
+        `tokenizer`, `trunk_sha256`, `trunk_bytes`, `problems` (why it cannot be used here, or none),
+        `from_cache` (the hub was out of reach: this is what the client's cache has of it) and `embodiments`:
+        rows of id, action, rate, figures, licence, bytes and problems. Bytes that the cache lacks are None.
+
+    Raises:
+        HubError: not there, not reachable, or without any checkpoint.
+    """
+    store = open_store(source, revision)
+    files = store.files()
+    roots = sorted(name.removesuffix(CONFIG) for name in files if f"/{name}".endswith(f"/{CONFIG}"))
+    found = [
+        one | {"from_cache": store.from_cache}
+        for root in roots[:MOST]
+        if (one := _checkpoint(store, files, root))
+    ]
+    if not found:
+        fault = f"has no {CONFIG} of a checkpoint of {LIBRARY} or of the release"
+        raise HubError(store.name, fault, "is not of hma-toolkit; check the name")
+    return found
+
+
+def listed(described: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A row an embodiment of what `hub.describe` returns."""
+    rows = []
+    for name, facts in described["embodiments"].items():
+        row = _row(name, facts["card"], facts["bytes"], [])
+        rows.append({key: row[key] for key in row if key not in ("chunk_dim", "data", "problems")})
+    return rows
+
+
+def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, Any] | None:
+    """The checkpoint in a folder of a hub; None where config.json is of something else."""
+    inside = {name.removeprefix(root): size for name, size in files.items() if name.startswith(root)}
+    where = store.name + (f"/{root.rstrip('/')}" if root else "")
+    try:
+        values = parse_json(store.read(root + CONFIG), f"{where}/{CONFIG}", HubError)
+    except HMAError as fault:
+        return _unusable(where, fault) if TRUNK in inside else None
+    if values.get("library") == LIBRARY:
+        return _ours(store, inside, root, where, values)
+    if any(name in inside for name in RELEASED_WEIGHTS) and "num_layers" in values and "d_model" in values:
+        return _released(inside, where, values)
+    return None
+
+
+def _ours(
+    store: Store, files: Mapping[str, int], root: str, where: str, values: dict[str, Any]
+) -> dict[str, Any]:
+    size = total_bytes(store, files, [TRUNK])
+    facts = _facts(where, LIBRARY, size, _tokenizer_problems(values.get("tokenizer")))
+    try:
+        parse_config(values, f"{where}/{CONFIG}")
+        values = migrate.config(values, where) | {"format_version": values["format_version"]}
+    except HMAError as fault:
+        facts["problems"].append(f"{fault.fault}: {fault.remedy}")
+    facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
+    if TRUNK not in files:
+        facts["problems"].append(f"the cache lacks {TRUNK}" if store.from_cache else f"has no {TRUNK}")
+    store.warm([f"{root}embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
+    for name in embodiment_ids(files):
+        place = f"embodiments/{name}"
+        size = total_bytes(store, files, [f"{place}/{part}" for part in PARTS])
+        try:
+            card = parse_json(store.read(f"{root}{place}/{CARD}"), f"{where}/{place}/{CARD}", HubError)
+            lacks = "the cache lacks" if store.from_cache else "lacks"
+            lacking = [f"{lacks} {part}" for part in PARTS if f"{place}/{part}" not in files]
+            problems = lacking + _card_problems(card, values)
+        except HMAError as fault:
+            card, problems = {}, [fault.fault]
+        facts["embodiments"].append(_row(name, card, size, problems))
+    origins = {_of(row["data"], "released_checkpoint") for row in facts["embodiments"]} - {None}
+    facts["origin"] = f"imported from {min(map(str, origins))}" if origins else None
+    return facts
+
+
+def _released(files: Mapping[str, int], where: str, values: dict[str, Any]) -> dict[str, Any]:
+    size = next(files[name] for name in RELEASED_WEIGHTS if name in files)
+    facts = _facts(where, "released", size, ["in the release's layout: bring it in with hma hub import"])
+    facts["model"] = {"layers": values.get("num_layers"), "width": values.get("d_model")}
+    domains, dims = values.get("action_domains"), values.get("d_actions")
+    if isinstance(domains, list) and isinstance(dims, list) and len(domains) == len(dims):
+        facts["embodiments"] = [
+            _row(str(name)[:100], {"chunk_dim": dim}, 0, []) for name, dim in zip(domains, dims)
+        ]
+    return facts
+
+
+def _unusable(where: str, fault: HMAError) -> dict[str, Any]:
+    return _facts(where, LIBRARY, 0, [fault.fault])
+
+
+def _facts(where: str, layout: str, size: int | None, problems: list[str]) -> dict[str, Any]:
+    named = ("format_version", "origin", "model", "tokenizer", "trunk_sha256")
+    return {
+        "checkpoint": where,
+        "format": layout,
+        **dict.fromkeys(named),
+        "trunk_bytes": size,
+        "problems": problems,
+        "embodiments": [],
+    }
+
+
+def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[str]) -> dict[str, Any]:
+    metrics = card.get("metrics")
+    return {
+        "embodiment": name,
+        "robot": card.get("robot"),
+        "action_dim": card.get("action_dim"),
+        "chunk_dim": card.get("chunk_dim"),
+        "hz": card.get("effective_hz"),
+        "stride": card.get("stride"),
+        **{key: _of(metrics, key) for key in FIGURES},
+        "data": card.get("data"),
+        "licence": card.get("license"),
+        "bytes": size,
+        "problems": problems,
+    }
+
+
+def _card_problems(card: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
+    problems = []
+    if card.get("trunk_sha256") != config.get("trunk_sha256"):
+        problems.append("belongs to another trunk")
+    tokenizer = config.get("tokenizer")
+    if isinstance(tokenizer, dict) and card.get("tokenizer") != digest(tokenizer):
+        problems.append("was trained on another tokenizer")
+    return problems
+
+
+def _tokenizer_problems(tokenizer: Any) -> list[str]:
+    """What stands between here and decoding what the model predicts."""
+    from hma_data.tokenizers.catalog import CATALOG
+
+    name = _of(tokenizer, "name")
+    entry = CATALOG.get(name) if isinstance(name, str) else None
+    if entry is None:
+        return [f"tokenizer {str(name)[:60]!r} is not one of this release: pictures need it"]
+    missing = entry.missing()
+    return [f"tokenizer {name} needs {', '.join(missing)}: {entry.extra}"] if missing else []
+
+
+def _of(values: Any, key: str) -> Any:
+    return values.get(key) if isinstance(values, dict) else None

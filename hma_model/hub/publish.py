@@ -1,0 +1,455 @@
+"""Publish and pull checkpoints, one embodiment at a time.
+
+A hub is a folder, any fsspec URI, or a repository of the Hugging Face Hub; all hold the layout of
+`hma_model.checkpoint`. `org/name` is a repository, `hf://org/name` too; `./org/name` or any other path is a
+folder. A push touches the files of its embodiments and README.md, and the trunk only when there is none yet.
+"""
+
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from hma_data.errors import CheckpointError, HMAError, HubError
+from hma_data.hub.partial import remove_dead_parts
+from hma_data.registry.embodiment import ID_PATTERN
+from hma_data.storage.folders import parse_json
+from hma_data.storage.paths import StrPath, as_address, as_path
+from hma_model.checkpoint import io as checkpoints
+from hma_model.checkpoint import migrate
+from hma_model.checkpoint.io import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
+from hma_model.checkpoint.model_card import render
+from hma_model.hub.check import require_publishable, require_yaml
+
+if TYPE_CHECKING:
+    import torch
+
+    from hma_model.network.model import HMA
+
+Content = Path | bytes
+SHOWN = 50  # ids that an error lists
+REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
+
+
+class Store(Protocol):
+    """Where a checkpoint is published."""
+
+    name: str  # for errors
+
+    @property
+    def from_cache(self) -> bool:
+        """Whether the hub was out of reach, so that `files` told what the cache has."""
+        ...
+
+    @property
+    def repo(self) -> str | None:
+        """For the model card; None where it is only a path."""
+        ...
+
+    def files(self) -> dict[str, int]:
+        """Sizes by name of what is there."""
+        ...
+
+    def read(self, name: str) -> bytes:
+        """A small file."""
+        ...
+
+    def warm(self, names: list[str]) -> None:
+        """Say which small files will be read."""
+        ...
+
+    def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str:
+        """Put files in place, delete where None, return the address; `changes` is asked again if somebody
+        else was faster."""
+        ...
+
+    def pull(self, names: list[str], out: Path | None) -> Path:
+        """Bring files here, card last; return their folder, which may be a cache and not `out`."""
+        ...
+
+
+def open_store(
+    address: StrPath, revision: str | None = None, write: bool = False, private: bool | None = None
+) -> Store:
+    """The hub behind an address; `private` is of a repository that is made now.
+
+    Args:
+        address: str or path, see `addressed`; to write without a revision.
+
+    Raises:
+        HubError: it is not there, or cannot be reached.
+    """
+    place = as_address(address)
+    if not write:
+        place, revision = addressed(place, revision)
+    if is_repository(place):
+        from hma_data.hub.repository import Repository
+
+        return Repository(str(place).removeprefix("hf://"), revision, write, private=private)
+    from hma_model.hub.folder import FolderStore
+
+    if revision is not None:
+        raise HubError(place, f"is a folder, and has no revision {revision!r}", "leave the revision out")
+    return FolderStore(place, write)
+
+
+def addressed[Address: str | Path](
+    address: Address, revision: str | None = None
+) -> tuple[Address | str, str | None]:
+    """`org/name@revision` as the repository and its branch, tag or commit; anything else stays as it is."""
+    repository, _, named = str(address).partition("@")
+    if revision is None and named and not Path(address).exists() and is_repository(repository):
+        return repository, named
+    return address, revision
+
+
+def is_repository(address: StrPath) -> bool:
+    """Whether an address means a repository of the hub: hf://org/name, or org/name that is no folder here."""
+    place = as_address(address)
+    if isinstance(place, Path):
+        return False
+    if place.startswith("hf://"):
+        if not REPOSITORY.fullmatch(place.removeprefix("hf://")):
+            raise HubError(place, "is not hf://ORGANISATION/NAME", "name a model repository")
+        return True
+    return REPOSITORY.fullmatch(place) is not None and not Path(place).is_dir()
+
+
+def push(
+    checkpoint: StrPath,
+    target: StrPath,
+    embodiments: Iterable[str] | None = None,
+    private: bool | None = None,
+) -> str:
+    """Publish embodiments of a checkpoint, with the trunk where there is none yet.
+
+    Args:
+        checkpoint: str or path of its folder, or of that of a training run.
+        target: str or path of a folder, a URI, or a repository; made where it is not there.
+        embodiments: ids; None for all.
+        private: make a new repository a private one.
+
+    Returns:
+        Where it is now: a path, URI or web address.
+
+    Raises:
+        CheckpointError: the checkpoint's parts do not belong together or are damaged, or it lacks an
+            embodiment; nothing is made or sent then.
+        HubError: what is there has another trunk or is something else, or it cannot be reached or written.
+    """
+    source = Checkpoint.open(checkpoint)
+    ids = sorted(set(source.embodiments if embodiments is None else embodiments))
+    require_publishable(source, ids)
+    store = open_store(target, write=True, private=private)
+
+    def changes() -> dict[str, Content]:
+        return _changes(source, ids, store)
+
+    return store.publish(changes, f"Add {', '.join(ids)}" if ids else "Add the trunk")
+
+
+def pull(
+    source: StrPath,
+    embodiments: Iterable[str] | None = None,
+    out: StrPath | None = None,
+    revision: str | None = None,
+) -> Path:
+    """Bring the trunk and the embodiments asked for, and nothing else.
+
+    Args:
+        source: str or path of a folder, a URI, or a repository.
+        embodiments: ids; None for all.
+        out: str or path of a folder; what it has already is not transferred again. By default a local folder
+            stays where it is, and all else goes to the cache.
+        revision: branch, tag or commit of a repository.
+
+    Returns:
+        A checkpoint's folder.
+
+    Raises:
+        HubError: not there, not reachable, no such embodiment or revision.
+        CheckpointError: what came does not belong together.
+    """
+    return _pull(as_address(source), embodiments, as_path(out) if out else None, revision)[0]
+
+
+def _pull(
+    source: str | Path, embodiments: Iterable[str] | None, out: Path | None, revision: str | None
+) -> tuple[Path, list[str]]:
+    """The checkpoint's folder, and the ids that were asked for; the folder may hold others from before."""
+    source, revision = addressed(source, revision)
+    store = open_store(source, revision)
+    files = store.files()
+    values = _config(store, files)
+    there = embodiment_ids(files)
+    wanted = list(dict.fromkeys(there if embodiments is None else embodiments))
+    for name in wanted:
+        check_id(name, store.name)
+        if name not in there:
+            known = ", ".join(there[:SHOWN]) or "none"
+            away = " in the cache, and is out of reach" if store.from_cache else ""
+            raise HubError(store.name, f"has no embodiment {name!r}{away}", f"it has: {known}")
+        lacking = [part for part in PARTS if f"embodiments/{name}/{part}" not in files]
+        if lacking and not store.from_cache:
+            fault = f"lacks {lacking[0]} of embodiment {name!r}"
+            raise HubError(store.name, fault, "name the embodiments you want, or have it pushed again")
+    if TRUNK not in files and not store.from_cache:
+        raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
+    names = [f"embodiments/{name}/{part}" for name in wanted for part in (SAMPLE, *PARTS)]
+    names = [CONFIG, TRUNK, *(name for name in names if name in files or not name.endswith(SAMPLE))]
+    place = out
+    if place is None and "://" in str(source) and not is_repository(source):
+        key = f"{store.name} {values.get('trunk_sha256')}".encode()
+        place = cache_folder() / "hub" / hashlib.sha256(key).hexdigest()[:24]
+    folder = store.pull(names, place)
+    if place and folder != place and is_repository(source):
+        from hma_model.hub.folder import FolderStore
+
+        folder = FolderStore(folder).pull(names, place)
+    pulled = Checkpoint.open(folder)
+    pulled.trunk()
+    for name in wanted:
+        pulled.check(name)
+        require_yaml(pulled, name)
+    if out:
+        remove_dead_parts(folder / README)
+        checkpoints.write_readme(folder)
+    return folder, wanted
+
+
+def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
+    """What is published there, a row an embodiment: ids, action, rate, figures, licence, bytes."""
+    from hma_model.hub.listing import listed
+
+    return listed(describe(source, revision))
+
+
+def describe(source: StrPath, revision: str | None = None) -> dict[str, Any]:
+    """Return what is published: the trunk's hash and bytes, tokenizer and model; of each id `card`, `bytes`.
+
+    Bytes are None where the hub is out of reach and the client's cache does not have the files.
+    """
+    store = open_store(source, revision)
+    files = store.files()
+    values = _config(store, files)
+    store.warm([f"embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
+    return {
+        "source": store.name,
+        **{key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
+        "trunk_bytes": total_bytes(store, files, [TRUNK]),
+        "embodiments": {
+            name: {
+                "card": _card(store, name),
+                "bytes": total_bytes(store, files, [f"embodiments/{name}/{part}" for part in PARTS]),
+            }
+            for name in embodiment_ids(files)
+        },
+    }
+
+
+def total_bytes(store: Store, files: Mapping[str, int], names: Iterable[str]) -> int | None:
+    """Return the bytes of files; None where the hub is out of reach and the cache has not all of them."""
+    sizes = [files.get(name) for name in names]
+    if store.from_cache and None in sizes:
+        return None
+    return sum(size or 0 for size in sizes)
+
+
+def from_pretrained(
+    source: StrPath,
+    embodiments: Iterable[str] | None = None,
+    revision: str | None = None,
+    device: "str | torch.device" = "cpu",
+) -> "HMA":
+    """See `HMA.from_pretrained`; the source may also be a training run's folder."""
+    address, revision = addressed(as_address(source), revision)
+    if not is_repository(address) and "://" not in str(address):
+        address = checkpoints.resolve(Path(address).expanduser())
+    folder, ids = _pull(address, embodiments, None, revision)
+    return checkpoints.load(folder, ids, str(device))
+
+
+def import_released(
+    source: StrPath,
+    out: StrPath,
+    *,
+    embodiments: Iterable[str] | None = None,
+    grid: tuple[int, int] | None = None,
+    tokenizer: str | None = None,
+    revision: str | None = None,
+) -> Checkpoint:
+    """Bring a checkpoint of the paper's release into our layout.
+
+    Args:
+        source: str or path of a folder or file, or a hub repository.
+        revision: branch, tag or commit of a repository.
+
+    The rest as for `hma_model.released.importing.import_released`.
+
+    Raises:
+        CheckpointError: not a released checkpoint, damaged, or of an architecture the release does not have.
+        HubError: the repository is not there or out of reach.
+    """
+    from hma_model.released import importing
+
+    address = as_address(source)
+    local = address if Path(address).expanduser().exists() else _fetch_released(address, revision)
+    return importing.import_released(
+        local, out, embodiments=embodiments, grid=grid, tokenizer=tokenizer, origin=address
+    )
+
+
+def _fetch_released(address: str | Path, revision: str | None) -> Path:
+    """Fetch config and weights of the release from a repository; return the weights' file."""
+    from hma_model.released.importing import CONFIG as RELEASED_CONFIG
+    from hma_model.released.importing import WEIGHTS
+
+    address, revision = addressed(address, revision)
+    if not is_repository(address) and "://" not in str(address):
+        raise CheckpointError(address, "no such file or folder", "give a folder, or ORGANISATION/NAME")
+    store = open_store(address, revision)
+    there = store.files()
+    wanted = [name for name in WEIGHTS if name in there][:1]
+    if RELEASED_CONFIG not in there or not wanted:
+        fault = f"has no {RELEASED_CONFIG} with {' or '.join(WEIGHTS)}"
+        raise HubError(store.name, fault, "is it a released checkpoint?")
+    return store.pull([RELEASED_CONFIG, *wanted], None) / wanted[0]
+
+
+def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[str] | None = None) -> Path:
+    """Write a checkpoint in the paper's released layout; see `hma_model.released.exporting`."""
+    from hma_model.released import exporting as released_export
+
+    return released_export.export_released(checkpoint, out, embodiments=embodiments)
+
+
+def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None = None) -> str:
+    """See `HMA.push_to_hub`: YAML, statistics and cards are those the model was loaded with.
+
+    Raises:
+        HubError: an embodiment has no YAML, neither where the model was loaded from nor in the registry.
+    """
+    origin = getattr(model, "origin", None)
+    known = Checkpoint.open(origin) if origin else None
+    yaml, stats, cards = {}, {}, {}
+    for name, space in model.embodiments.items():
+        if known and name in known.embodiments:
+            yaml[name] = known.embodiment(name).to_yaml()
+            stats[name] = known.stats(name)
+            cards[name] = {key: known.card(name).get(key, {}) for key in ("data", "metrics", "training")}
+        else:
+            yaml[name] = _registered(name)
+            action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
+            stats[name] = {"action": action}
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoints.save(
+            model,
+            Path(folder) / "model",
+            embodiment_yaml=yaml,
+            stats=stats,
+            cards=cards,
+            tokenizer=model.config.tokenizer,
+        )
+        return push(Path(folder) / "model", target, embodiments)
+
+
+def cache_folder() -> Path:
+    """Where pulled URIs are kept: $HMA_CACHE, or below the user's cache."""
+    given = os.environ.get("HMA_CACHE")
+    return Path(given) if given else Path.home() / ".cache" / "hma-toolkit"
+
+
+# -- what a push changes
+
+
+def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
+    from hma_data.shards.manifest import MANIFEST
+
+    files = store.files()
+    present: dict[str, Content] = {}
+    if CONFIG in files:
+        _require_trunk(source, _config(store, files), store.name)
+    else:
+        if MANIFEST in files:
+            raise HubError(store.name, "holds a shard set", "push to a place of its own")
+        present[CONFIG] = inside(source.folder, CONFIG)
+    if TRUNK not in files:
+        present[TRUNK] = source.trunk()
+    for name in ids:
+        sample = source.folder / "embodiments" / name / SAMPLE
+        parts = (SAMPLE, *PARTS) if sample.is_file() else PARTS
+        present.update({f"embodiments/{name}/{part}": source.path(name, part) for part in parts})
+    others = [name for name in embodiment_ids(files) if name not in ids]
+    store.warm([f"embodiments/{name}/{CARD}" for name in others])
+    cards = {name: _readable_card(store, name) for name in others}
+    cards.update({name: source.card(name) for name in ids})
+    suffix = f"/{SAMPLE}"
+    samples = {path.split("/")[1] for path in (*files, *present) if path.endswith(suffix)}
+    config = checkpoints.config_json(source.config, source.trunk_sha256)
+    present[README] = render(config, cards, repo=store.repo, samples=samples)
+    return present
+
+
+def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:
+    if there.get("trunk_sha256") != source.trunk_sha256:
+        raise HubError(
+            where,
+            f"has another trunk: {str(there.get('trunk_sha256'))[:16]}, this checkpoint's is "
+            f"{source.trunk_sha256[:16]}",
+            "push to a hub of its own, or finetune on the trunk that is there",
+        )
+    if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
+        raise HubError(where, "has the same trunk with another tokenizer", "push to a hub of its own")
+
+
+def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
+    """config.json's values, checked."""
+    if CONFIG not in files:
+        raise HubError(store.name, f"has no {CONFIG}", "it is no checkpoint of hma-toolkit; check the name")
+    values = parse_json(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
+    try:
+        checkpoints.parse_config(values, f"{store.name}: {CONFIG}")
+        return migrate.config(values, store.name) | {"format_version": values["format_version"]}
+    except CheckpointError as fault:
+        raise HubError(fault.where, fault.fault, fault.remedy) from fault
+
+
+def embodiment_ids(files: Iterable[str]) -> list[str]:
+    """Ids with a card, which is written last, in a listing of a checkpoint's files."""
+    found = set()
+    for path in files:
+        parts = path.split("/")
+        if len(parts) != 3 or parts[0] != "embodiments" or parts[2] != CARD:
+            continue
+        if ID_PATTERN.fullmatch(parts[1]) and ".." not in parts[1]:
+            found.add(parts[1])
+    return sorted(found)
+
+
+def _card(store: Store, name: str) -> dict[str, Any]:
+    path = f"embodiments/{name}/{CARD}"
+    return parse_json(store.read(path), f"{store.name}: {path}", HubError)
+
+
+def _readable_card(store: Store, name: str) -> dict[str, Any]:
+    """Somebody else's card for the table; an empty one where it is broken, which is theirs to mend."""
+    try:
+        return _card(store, name)
+    except HubError:
+        return {}
+
+
+def _registered(name: str) -> str:
+    from hma_data.registry.embodiment import find
+
+    try:
+        return find(name).to_yaml()
+    except HMAError as fault:
+        raise HubError(
+            f"embodiment {name}",
+            "has no YAML where the model was loaded from, nor in the registry",
+            "save with hma_model.checkpoint.io.save and push the folder",
+        ) from fault

@@ -1,0 +1,105 @@
+"""The sample picture of a model card: a short rollout beside the truth, and one with other actions."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hma_data.errors import CheckpointError, UsageError
+from hma_data.storage.files import write_atomic
+from hma_data.storage.paths import StrPath
+from hma_model.checkpoint import io as checkpoints
+from hma_model.checkpoint.io import SAMPLE, Checkpoint
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hma_data.loading.dataset import Batch
+    from hma_data.shards.reader import ShardSet
+    from hma_data.tokenizers.base import Tokenizer
+
+COLUMNS, SIDE = 6, 128  # pictures of a row, and pixels a side
+
+
+def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
+    """Put a sample.png beside each embodiment that has one of the shard sets, and renew the card.
+
+    Args:
+        checkpoint: str or path of its folder, or of that of a training run.
+        data: str or path of shard sets, one an embodiment.
+
+    Returns:
+        The pictures' paths.
+
+    Raises:
+        CheckpointError: the checkpoint lacks the embodiment, or is of another tokenizer.
+        UsageError: a shard set has no window long enough.
+    """
+    from hma_data.shards.reader import ShardSet
+
+    source, made = Checkpoint.open(checkpoint), []
+    for folder in data:
+        shards = ShardSet(folder)
+        name = shards.embodiment.id
+        if name not in source.embodiments:
+            known = ", ".join(source.embodiments) or "none"
+            raise CheckpointError(source.folder, f"has no embodiment {name!r}", f"it has: {known}")
+        path = source.folder / "embodiments" / name / SAMPLE
+        write_atomic(path, sample(source.folder, shards))
+        made.append(path)
+    checkpoints.write_readme(source.folder)
+    return made
+
+
+def sample(checkpoint: StrPath, shards: "ShardSet", tokenizer: "Tokenizer | None" = None) -> bytes:
+    """A PNG of one window of `shards`: truth, prediction and prediction with other actions, over time.
+
+    Args:
+        checkpoint: str or path of its folder.
+        shards: of one of its embodiments; validation episodes are preferred.
+        tokenizer: the one that made the shards; None finds it.
+
+    Raises:
+        CheckpointError: the checkpoint is of another tokenizer.
+        UsageError: there is no window as long as the model's.
+    """
+    from hma_data.episodes.sheets import grid, png_bytes
+    from hma_data.shards.preview import tokenizer_of
+    from hma_model.evaluation.evaluate import rollout
+
+    model = checkpoints.load(checkpoint, [shards.embodiment.id])
+    checkpoints.require_tokenizer(model.config, shards.spec, shards.folder)
+    batch = _window(shards, model.config.frames)
+    tokenizer = tokenizer or tokenizer_of(shards)
+    true = rollout(model, tokenizer, batch)
+    other = rollout(model, tokenizer, batch, actions=batch.actions.flip(1), truth=true.truth)
+    picks = np.unique(np.linspace(0, true.truth.shape[1] - 1, COLUMNS).astype(int))
+    rows = {
+        "truth": true.truth[0],
+        f"predicted from frame {true.prompt} on": true.predicted[0],
+        "with the actions in reverse": other.predicted[0],
+    }
+    return png_bytes(
+        grid([[_shown(frame) for frame in frames[picks]] for frames in rows.values()], list(rows))
+    )
+
+
+def _window(shards: "ShardSet", frames: int) -> "Batch":
+    """The middle window of the validation split, or of training where that has none."""
+    from hma_data.loading.dataset import WindowDataset
+
+    for split in ("val", "train"):
+        windows = WindowDataset(shards, split, frames)
+        if len(windows):
+            return windows.batch([len(windows) // 2])
+    raise UsageError(shards.folder, f"has no window of {frames} frames", "give shards with longer episodes")
+
+
+def _shown(frame: "NDArray[np.uint8]") -> "NDArray[np.uint8]":
+    """A frame at the size of the card: small ones enlarged, large ones thinned out."""
+    side = frame.shape[0]
+    if side < SIDE:
+        scale = -(-SIDE // side)
+        return frame.repeat(scale, 0).repeat(scale, 1)
+    return frame[:: side // SIDE, :: side // SIDE]

@@ -1,0 +1,153 @@
+"""From a batch's actions to what the trunk is conditioned on, embodiment by embodiment.
+
+A batch may mix embodiments. Its samples are sorted so that each embodiment's lie side by side: the trunk sees
+the batch whole, and each stem and modulation is called once.
+
+B batch, T frames, D width, K = stride * action dim, L layers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from hma_data.errors import HMAError
+from hma_model.config import HMAConfig
+from hma_model.network.trunk import Conditioning, rows_at
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The samples of a batch by embodiment, each embodiment's samples side by side.
+
+    Attributes:
+        parts: embodiment id and number of samples, in order.
+        order: (B,) where each sorted sample was, and inverse: the way back; None when sorted already.
+    """
+
+    parts: tuple[tuple[str, int], ...]
+    order: list[int] | None = None
+    inverse: list[int] | None = None
+
+    @classmethod
+    def of(cls, embodiment: str | Sequence[str], batch: int) -> Self:
+        """Sort the batch's embodiments, keeping the order of first appearance."""
+        if isinstance(embodiment, str):
+            return cls(((embodiment, batch),))
+        if len(embodiment) != batch:
+            raise HMAError(
+                "embodiment", f"{len(embodiment)} ids for a batch of {batch}", "give one id a sample"
+            )
+        names = list(dict.fromkeys(embodiment))
+        rank = {name: index for index, name in enumerate(names)}
+        order = sorted(range(batch), key=lambda sample: rank[embodiment[sample]])
+        parts = tuple((name, sum(e == name for e in embodiment)) for name in names)
+        if order == list(range(batch)):
+            return cls(parts)
+        inverse = sorted(range(batch), key=lambda sample: order[sample])
+        return cls(parts, order, inverse)
+
+    def sort(self, x: Tensor) -> Tensor:
+        """Samples side by side by embodiment."""
+        return x if self.order is None else x[self.order]
+
+    def unsort(self, x: Tensor) -> Tensor:
+        """Samples in the batch's own order."""
+        return x if self.inverse is None else x[self.inverse]
+
+    def spans(self) -> list[tuple[str, slice]]:
+        """Each embodiment's place among the sorted samples."""
+        spans, start = [], 0
+        for name, size in self.parts:
+            spans.append((name, slice(start, start + size)))
+            start += size
+        return spans
+
+
+@dataclass
+class Slots:
+    """The chunk in force at each frame.
+
+    Attributes:
+        chunks: (B, T, K) float32 raw.
+        known: (B, T) bool, False where there is none or it is hidden.
+    """
+
+    chunks: Tensor
+    known: Tensor
+
+
+def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int) -> Slots:
+    """Put chunks (B, >= T-1, K), of which some are known (B, >= T-1), at the frames they condition."""
+    late = config.action_alignment == "previous"
+    if actions.shape[1] < frames - late:
+        fault = f"{actions.shape[1]} action chunks for {frames} frames"
+        raise HMAError("actions", fault, f"give {frames} chunks")
+    if known is None:
+        known = torch.ones(actions.shape[:2], dtype=torch.bool, device=actions.device)
+    if not late:
+        return Slots(actions[:, :frames], known[:, :frames])
+    return Slots(F.pad(actions[:, : frames - 1], (0, 0, 1, 0)), F.pad(known[:, : frames - 1], (1, 0)))
+
+
+def unknown(model: "HMA", groups: Groups, frames: int) -> Slots:
+    """Slots of which none is known: conditioning on the absence of each."""
+    batch = sum(size for _, size in groups.parts)
+    widest = max(model.stem(name).input.in_features for name, _ in groups.parts)
+    shape = (batch, frames)
+    return Slots(
+        torch.zeros(*shape, widest, device=model.device),
+        torch.zeros(shape, dtype=torch.bool, device=model.device),
+    )
+
+
+def condition(model: "HMA", slots: Slots | None, groups: Groups, positions: Tensor) -> Conditioning:
+    """What the trunk is conditioned on, for the samples as `groups` sorts them.
+
+    Args:
+        model: whose stems and modulation are used, once per embodiment.
+        slots: in the batch's order; None for no actions at all.
+        groups: the batch's embodiments.
+        positions: (T,) int64, the frames' times.
+    """
+    config, absent = model.config, rows_at(model.trunk.absent, positions)
+    if slots is None and config.absent_action == "skip":
+        return Conditioning()
+    if slots is None and config.absent_action == "tokens":
+        batch = sum(size for _, size in groups.parts)
+        return Conditioning(tokens=absent.expand(batch, len(positions), -1))
+    if slots is None:
+        slots = unknown(model, groups, len(positions))
+    chunks, known = groups.sort(slots.chunks), groups.sort(slots.known).unsqueeze(-1)
+    shown = torch.ones_like(known) if config.absent_action == "tokens" else known
+    embeddings, modulations, outs = [], [], []
+    for name, span in groups.spans():
+        stem = model.stem(name)
+        width = stem.input.in_features
+        if chunks.shape[-1] < width:
+            fault = f"chunks of {chunks.shape[-1]} values where {name} has {width}"
+            raise HMAError("actions", fault, "flatten stride x action_dim values into a chunk")
+        embedded = stem(chunks[span, :, :width].masked_fill(~shown[span], 0))
+        embedding = torch.where(shown[span], embedded, absent)
+        embeddings.append(embedding)
+        if stem.modulation is None:
+            continue
+        modulations.append(stem.modulation(embedding))
+        out = stem.modulation.out
+        if out is not None:
+            outs.append((embedding.shape[0], *out))
+    embedding = _cat(embeddings, 0)
+    tokens = torch.where(known, embedding, absent) if config.appended_tokens else None
+    if model.trunk.modulation is not None:
+        modulations = [model.trunk.modulation(embedding)]
+    return Conditioning(embedding, _cat(modulations, 1) if modulations else None, outs or None, tokens)
+
+
+def _cat(parts: list[Tensor], dim: int) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim)

@@ -1,0 +1,118 @@
+"""What is hidden and what is corrupted in training, and how many tokens stay masked in decoding.
+
+Every draw comes from the given generator, on the generator's device, so that a run repeats exactly.
+
+B batch, T frames, S tokens of a frame, F digits.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from hma_model.config import HMAConfig
+from hma_model.network.embed import to_digits
+
+
+def uniform(
+    shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
+) -> Tensor:
+    """Float32 numbers in [0, 1), drawn on the generator's device and brought to `device`."""
+    source = "cpu" if generator is None else generator.device
+    return torch.rand(tuple(shape), generator=generator, device=source).to(device)
+
+
+def randn(
+    shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
+) -> Tensor:
+    """Standard normal float32 numbers, drawn on the generator's device and brought to `device`."""
+    source = "cpu" if generator is None else generator.device
+    return torch.randn(tuple(shape), generator=generator, device=source).to(device)
+
+
+@dataclass
+class VideoMask:
+    """Which tokens of a window are hidden from the model.
+
+    Attributes:
+        masked: (B, T, S) bool; frame 0 never is. The video loss is over these.
+        corruption: (B, T) float32, the probability that a digit of a visible token is replaced.
+    """
+
+    masked: Tensor
+    corruption: Tensor
+
+
+def draw_video_mask(
+    config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None
+) -> VideoMask:
+    """Mask each frame with a probability cos(u pi/2), and corrupt a share of everything.
+
+    With `history_probability` a sample keeps a history of at least `history_frames` frames unmasked, and each
+    frame after it is corrupted more than the one before, as in a rollout of the model's own predictions.
+    Each sample draws for itself.
+    """
+    tokens = config.tokens_per_frame
+    where = "cpu" if generator is None else generator.device
+    index = torch.arange(frames, device=where)
+    first, long = _first_masked(config, batch, frames, generator)
+    ratio = torch.cos(uniform((batch, frames), generator, where) * (math.pi / 2)).clamp(
+        min=config.mask_ratio_min
+    )
+    masked = uniform((batch, frames, tokens), generator, where) < ratio.unsqueeze(-1)
+    masked &= (index >= first.unsqueeze(1)).unsqueeze(-1)
+
+    kept = 0.2 + 0.8 * uniform((batch, 1), generator, where)
+    shrink = 0.9 + 0.1 * uniform((batch, frames), generator, where)
+    after = (index >= first.unsqueeze(1)) & long.unsqueeze(1)
+    drift = 1 - kept * torch.where(after, shrink, 1.0).cumprod(1)
+    base = config.corrupt_max * uniform((batch, 1), generator, where)
+    corruption = torch.where(after, torch.maximum(drift, base), base)
+    return VideoMask(masked, corruption if config.corrupt_max else torch.zeros_like(corruption))
+
+
+def _first_masked(
+    config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor]:
+    """(B,) the first frame that may be masked, and (B,) whether the sample keeps a long history."""
+    draw = uniform((2, batch), generator, "cpu" if generator is None else generator.device)
+    start = min(config.history_frames, frames - 1)
+    long = (draw[0] < config.history_probability) & (frames > 2)
+    first = start + (draw[1] * (frames - start)).long()
+    return torch.where(long, first, 1), long
+
+
+def corrupt_tokens(
+    config: HMAConfig, tokens: Tensor, mask: VideoMask, generator: torch.Generator | None
+) -> Tensor:
+    """Token ids (B, T, S) with digits replaced at random and masked ones set to the vocabulary's size."""
+    digits = to_digits(tokens, config.factored)
+    if config.corrupt_max:
+        values = torch.tensor(config.factored, device=tokens.device)
+        random = (uniform(digits.shape, generator, tokens.device) * values).long()
+        hit = (
+            uniform(digits.shape, generator, tokens.device)
+            < mask.corruption.to(tokens.device)[..., None, None]
+        )
+        digits = torch.where(hit, torch.minimum(random, values - 1), digits)
+    weights = torch.tensor(
+        [math.prod(config.factored[:i]) for i in range(len(config.factored))], device=tokens.device
+    )
+    return (digits * weights).sum(-1).masked_fill(mask.masked.to(tokens.device), config.vocab_size)
+
+
+def drop_chunks(present: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Which chunks to hide (B, T): each sample draws its rate U(0, 1) and hides at least one present."""
+    draw = uniform(present.shape, generator, present.device)
+    rate = uniform((present.shape[0], 1), generator, present.device)
+    lowest = torch.where(present, draw, 2.0).argmin(1, keepdim=True)
+    return (draw < rate).scatter(1, lowest, True)
+
+
+def masked_after(step: int, steps: int, tokens: int) -> int:
+    """How many of a frame's tokens stay masked after step `step` of `steps`: the cosine schedule."""
+    if step + 1 >= steps:
+        return 0
+    return min(math.ceil(math.cos((step + 1) / steps * math.pi / 2) * tokens), tokens - 1)

@@ -1,0 +1,378 @@
+"""The world model: one trunk for all embodiments, a stem and a head for each.
+
+    model = HMA(HMAConfig(layers=4, width=128))
+    model.add_embodiment(embodiment, stats)
+    output = model(batch)                    # masks, corrupts, and gives the loss
+    frames = model.generate(prompt, actions, embodiment.id, frames=8)
+
+B batch, T frames, h,w token grid, S = h*w, N = S + action tokens, D width, K = stride * action dim,
+F digits, V values of a digit, c channels and H,W grid of latents, p patch side.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from hma_data.errors import CheckpointError, HMAError
+from hma_data.storage.paths import StrPath
+from hma_model.config import ActionSpace, HMAConfig
+from hma_model.network.conditioning import Groups, align, condition, unknown
+from hma_model.network.embed import LatentEmbedding, TokenEmbedding, patchify
+from hma_model.network.head import ActionHead, LatentReadout, TokenReadout
+from hma_model.network.state import check_fit, module_key, space_of_stem
+from hma_model.network.stem import Stem
+from hma_model.network.trunk import Clock, Conditioning, Trunk, window_clock
+
+if TYPE_CHECKING:
+    from hma_model.network.objectives import Output, Windows
+
+
+class HMA(nn.Module):
+    """Heterogeneous masked autoregression over tokens or latents (paper section 3).
+
+    Attributes:
+        config: the architecture.
+        embodiments: the action space of each embodiment present, by id.
+        trunk, readout: what all embodiments share.
+        stems, heads: per embodiment; `stem(id)` and `head(id)` find them.
+    """
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.embodiments: dict[str, ActionSpace] = {}
+        self.trunk = Trunk(config)
+        continuous = config.kind == "continuous"
+        self.readout: nn.Module = LatentReadout(config) if continuous else TokenReadout(config)
+        self.stems = nn.ModuleDict()
+        self.heads = nn.ModuleDict()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the trunk is."""
+        return self.trunk.position.device
+
+    @property
+    def token_readout(self) -> TokenReadout:
+        """The discrete model's way out."""
+        assert isinstance(self.readout, TokenReadout)
+        return self.readout
+
+    @property
+    def latent_readout(self) -> LatentReadout:
+        """The continuous model's way out."""
+        assert isinstance(self.readout, LatentReadout)
+        return self.readout
+
+    # -- embodiments ------------------------------------------------------------------------------------
+
+    def add_embodiment(self, embodiment: Any, stats: Any = None) -> None:
+        """Give an embodiment a stem and a head of its own, freshly initialised.
+
+        Args:
+            embodiment: a registry `Embodiment`, or an `ActionSpace`.
+            stats: its `Stats`; without them actions are not normalised.
+
+        Raises:
+            CheckpointError: the id is there with another action space. The same one again does nothing.
+        """
+        space = embodiment if isinstance(embodiment, ActionSpace) else ActionSpace.of(embodiment, stats)
+        known = self.embodiments.get(space.id)
+        if known is not None:
+            if known.agrees_with(space):
+                return
+            fault = f"already there with {known.action_dim} dims, stride {known.stride}, or other statistics"
+            raise CheckpointError(space.id, fault, "use another id, or the statistics it was trained with")
+        like = self.trunk.position
+        self.stems[module_key(space.id)] = Stem(self.config, space).to(like.device, like.dtype)
+        self.heads[module_key(space.id)] = ActionHead(self.config, space).to(like.device, like.dtype)
+        self.embodiments[space.id] = space
+
+    def stem(self, embodiment: str) -> Stem:
+        """The stem of an embodiment."""
+        self._known(embodiment)
+        return self.stems[module_key(embodiment)]  # type: ignore[return-value]
+
+    def head(self, embodiment: str) -> ActionHead:
+        """The action head of an embodiment."""
+        self._known(embodiment)
+        return self.heads[module_key(embodiment)]  # type: ignore[return-value]
+
+    def _known(self, embodiment: str) -> None:
+        if embodiment not in self.embodiments:
+            there = ", ".join(self.embodiments) or "none"
+            raise HMAError(
+                embodiment, f"the model has no such embodiment; it has {there}", "add or load it first"
+            )
+
+    # -- states -----------------------------------------------------------------------------------------
+
+    def trunk_state(self) -> dict[str, Tensor]:
+        """Everything the embodiments share, names relative to the model."""
+        return {
+            f"{part}.{name}": tensor
+            for part in ("trunk", "readout")
+            for name, tensor in getattr(self, part).state_dict().items()
+        }
+
+    def stem_state(self, embodiment: str) -> dict[str, Tensor]:
+        """An embodiment's action stem, statistics and modulation weights."""
+        return self.stem(embodiment).state_dict()
+
+    def head_state(self, embodiment: str) -> dict[str, Tensor]:
+        """An embodiment's action head."""
+        return self.head(embodiment).state_dict()
+
+    def load_trunk(self, state: Mapping[str, Tensor]) -> None:
+        """Load what `trunk_state` gave; CheckpointError names every key that does not fit."""
+        check_fit("trunk", state, self.trunk_state())
+        for part in ("trunk", "readout"):
+            prefix = f"{part}."
+            own = {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
+            getattr(self, part).load_state_dict(own)
+
+    def load_embodiment(
+        self, embodiment: str, stem: Mapping[str, Tensor], head: Mapping[str, Tensor]
+    ) -> None:
+        """Load what `stem_state` and `head_state` gave; an embodiment not there yet is added from them."""
+        self.add_embodiment(space_of_stem(embodiment, stem))
+        check_fit(f"{embodiment}: stem", stem, self.stem_state(embodiment))
+        check_fit(f"{embodiment}: head", head, self.head_state(embodiment))
+        self.stem(embodiment).load_state_dict(stem)
+        self.head(embodiment).load_state_dict(head)
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        source: StrPath,
+        embodiments: Sequence[str] | None = None,
+        revision: str | None = None,
+        device: str | torch.device = "cpu",
+    ) -> "HMA":
+        """The trunk and the embodiments asked for, all by default.
+
+        Args:
+            source: str or path of a checkpoint or training run, a URI, or a hub repository.
+            embodiments: ids.
+            revision: branch, tag or commit of a repository.
+            device: where the model goes.
+        """
+        from hma_model.hub import publish as hub  # needs the network's client, which most uses do not
+
+        return hub.from_pretrained(source, embodiments=embodiments, revision=revision, device=device)
+
+    def push_to_hub(self, repo: StrPath, embodiments: Sequence[str] | None = None) -> str:
+        """Publish the model, or only some of its embodiments, to a repository or folder (str or path)."""
+        from hma_model.hub import publish as hub
+
+        return hub.push_model(self, repo, embodiments=embodiments)
+
+    # -- the network ------------------------------------------------------------------------------------
+
+    def forward(
+        self, batch: "Windows", objective: str | None = None, generator: torch.Generator | None = None
+    ) -> "Output":
+        """Mask, corrupt and predict a batch of windows.
+
+        Args:
+            batch: windows of one or several embodiments, on the model's device.
+            objective: forward, passive, policy, full or inverse; by default drawn by its weight.
+            generator: of every random draw; the draws take place on its device.
+
+        Returns:
+            The losses, and outside training the logits; see `Output`.
+        """
+        from hma_model.network.objectives import compute
+
+        return compute(self, batch, objective, generator)
+
+    def video_logits(
+        self,
+        tokens: Tensor,
+        actions: Tensor | None,
+        embodiment: str | Sequence[str],
+        action_mask: Tensor | None = None,
+    ) -> Tensor:
+        """Scores of every token of a window.
+
+        Args:
+            tokens: (B, T, h, w) int64; the vocabulary's size means masked.
+            actions: (B, T, K) raw chunks, or None for none at all.
+            embodiment: one id for all, or one a sample.
+            action_mask: (B, T) bool, True where the chunk is there; all by default.
+
+        Returns:
+            (B, T, h, w, F, V) float32, low digit first.
+        """
+        self._require("discrete", "video_logits")
+        groups, clock = Groups.of(embodiment, len(tokens)), self.clock(tokens.shape[1])
+        conditioning = self._condition(actions, action_mask, groups, clock)
+        x = self.embed_tokens(groups.sort(tokens.flatten(2)))
+        scores = self.token_readout(self.video_features(self.trunk(x, conditioning, clock)))
+        return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
+
+    def video_conditions(
+        self,
+        latents: Tensor,
+        mask: Tensor,
+        actions: Tensor | None,
+        embodiment: str | Sequence[str],
+        action_mask: Tensor | None = None,
+    ) -> Tensor:
+        """What the diffusion head is conditioned on.
+
+        Args:
+            latents: (B, T, c, H, W), already multiplied by the configuration's `latent_scale`.
+            mask: (B, T, H, W) bool, True for latent pixels the model may not see.
+            actions, embodiment, action_mask: as in `video_logits`.
+
+        Returns:
+            (B, T, H/p, W/p, D).
+        """
+        self._require("continuous", "video_conditions")
+        groups, clock = Groups.of(embodiment, len(latents)), self.clock(latents.shape[1])
+        conditioning = self._condition(actions, action_mask, groups, clock)
+        patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
+        x = self.embed_patches(groups.sort(patches), groups.sort(pixels))
+        conditions = self.latent_readout(
+            self.video_features(self.trunk(x, conditioning, clock)), clock.positions
+        )
+        return groups.unsort(conditions).unflatten(2, self.config.token_grid)
+
+    @torch.no_grad()
+    def predict_actions(
+        self,
+        frames: Tensor,
+        embodiment: str | Sequence[str],
+        actions: Tensor | None = None,
+        action_mask: Tensor | None = None,
+        readout: str = "policy",
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Action chunks from video.
+
+        Args:
+            frames: tokens (B, T, h, w) int64, or latents (B, T, c, H, W) as stored.
+            embodiment: one id for all, or one a sample.
+            actions: (B, T, K) raw chunks that are known; none by default.
+            action_mask: (B, T) bool, which of them are known; all by default.
+            readout: "policy", chunk k from frames up to k; "inverse", chunk k from frames up to k+1,
+                whose last chunk, without a frame after it, is the policy's.
+            generator: of the diffusion head's noise, where there is one.
+
+        Returns:
+            (B, T, K) float32 raw; narrower embodiments of a mixed batch are padded with zeros.
+        """
+        groups, count = Groups.of(embodiment, len(frames)), frames.shape[1]
+        clock = self.clock(count)
+        slots = None if self.config.absent_action == "tokens" else unknown(self, groups, count)
+        if actions is not None:
+            slots = align(self.config, actions, action_mask, count)
+        conditioning = condition(self, slots, groups, clock.positions)
+        if frames.is_floating_point():
+            patches = patchify(frames.float() * self.config.latent_scale, self.config.patch)
+            x = self.embed_patches(groups.sort(patches), torch.zeros_like(patches[..., :1], dtype=torch.bool))
+        else:
+            x = self.embed_tokens(groups.sort(frames.flatten(2)))
+        pooled = self.action_features(self.trunk(x, conditioning, clock))
+        chunks = [
+            self._predict(part, name, readout, generator)
+            for part, (name, _) in zip(pooled.split([size for _, size in groups.parts]), groups.parts)
+        ]
+        widest = max(chunk.shape[-1] for chunk in chunks)
+        padded = [torch.nn.functional.pad(chunk, (0, widest - chunk.shape[-1])) for chunk in chunks]
+        return groups.unsort(torch.cat(padded))
+
+    def _condition(
+        self, actions: Tensor | None, known: Tensor | None, groups: Groups, clock: Clock
+    ) -> Conditioning:
+        if actions is None:
+            return condition(self, None, groups, clock.positions)
+        slots = align(self.config, actions, known, len(clock.positions))
+        return condition(self, slots, groups, clock.positions)
+
+    def _predict(
+        self, pooled: Tensor, embodiment: str, readout: str, generator: torch.Generator | None
+    ) -> Tensor:
+        head = self.head(embodiment)
+        chunks = head.predict(pooled.flatten(0, 1), "policy", generator).unflatten(0, pooled.shape[:2])
+        if readout == "inverse":
+            after = head.predict(pooled[:, 1:].flatten(0, 1), "inverse", generator)
+            chunks = torch.cat([after.unflatten(0, (len(pooled), -1)), chunks[:, -1:]], dim=1)
+        return chunks if self.config.action_target == "raw" else self.stem(embodiment).normalizer.undo(chunks)
+
+    @torch.no_grad()
+    def generate(
+        self,
+        prompt: Tensor,
+        actions: Tensor | None,
+        embodiment: str | Sequence[str],
+        frames: int,
+        unmask_steps: int = 2,
+        temperature: float = 0.0,
+        generator: torch.Generator | None = None,
+        order: str = "random",
+        cache: bool = True,
+        sample_steps: int | None = None,
+    ) -> Tensor:
+        """Continue a prompt, frame by frame.
+
+        Args:
+            prompt: tokens (B, P, h, w) int64, or latents (B, P, c, H, W) as stored.
+            actions: (B, P + frames, K) raw, chunk k the commands from frame k to k+1; None for none.
+            embodiment: one id for all, or one a sample.
+            frames: how many to add.
+            unmask_steps: passes a frame.
+            temperature: 0 takes the likeliest, else it divides the logits (continuous: share of noise).
+            generator: of every random draw.
+            order: in which tokens are unmasked, "random" or "confidence".
+            cache: keep keys and values of past frames; False computes everything again, with the same result.
+            sample_steps: of the diffusion head.
+
+        Returns:
+            (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
+        """
+        from hma_model.generation.rollout import generate
+
+        return generate(
+            self, prompt, actions, embodiment, frames, unmask_steps=unmask_steps, temperature=temperature,
+            generator=generator, order=order, cache=cache, sample_steps=sample_steps,
+        )  # fmt: skip
+
+    # -- parts that training and decoding share -----------------------------------------------------------
+
+    def clock(self, frames: int) -> Clock:
+        """The clock of a window of this many frames."""
+        if frames > self.config.frames and self.config.time_position == "learned":
+            fault = f"{frames} frames where the learned positions end at {self.config.frames}"
+            raise HMAError("window", fault, "give a shorter window")
+        return window_clock(self.config, frames, self.device)
+
+    def embed_tokens(self, tokens: Tensor) -> Tensor:
+        """Ids (B, T, S) -> (B, T, S, D)."""
+        assert isinstance(self.trunk.embed, TokenEmbedding)
+        return self.trunk.embed(tokens)
+
+    def embed_patches(self, patches: Tensor, masked: Tensor) -> Tensor:
+        """Patches (B, T, S, c*p*p), scaled, and masked pixels (B, T, S, p*p or 1) -> (B, T, S, D)."""
+        assert isinstance(self.trunk.embed, LatentEmbedding)
+        return self.trunk.embed(patches, masked)
+
+    def video_features(self, features: Tensor) -> Tensor:
+        """(B, T, N, D) -> (B, T, S, D), without the action tokens."""
+        return features[:, :, : self.config.tokens_per_frame]
+
+    def action_features(self, features: Tensor) -> Tensor:
+        """(B, T, N, D) -> (B, T, D): the mean of the action tokens, or without any, of the frame's own."""
+        own = self.config.tokens_per_frame
+        if features.shape[2] > own:
+            return features[:, :, own:].mean(2)
+        if self.config.absent_action == "tokens":  # the released code takes as many of the frame's last
+            return features[:, :, -self.config.action_tokens :].mean(2)
+        return features.mean(2)
+
+    def _require(self, kind: str, name: str) -> None:
+        if self.config.kind != kind:
+            raise HMAError(name, f"is of {kind} models; this one is {self.config.kind}")

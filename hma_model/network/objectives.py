@@ -1,0 +1,201 @@
+"""What the model is trained for, and the losses of each objective (paper section 3).
+
+forward: masked video from past video and actions. passive: without actions. policy: the chunk to command from
+each frame on. inverse: the chunk that led from one frame to the next. full: video and policy together.
+
+B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = stride * action dim.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from hma_data.errors import HMAError
+from hma_model.config import OBJECTIVES, HMAConfig
+from hma_model.network.conditioning import Groups, align, condition
+from hma_model.network.embed import patchify, to_digits
+from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks, uniform
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+
+
+class Windows(Protocol):
+    """The batch a loader gives; see `hma_data.loading.dataset.Batch`."""
+
+    embodiment: list[str]
+    actions: Tensor
+    action_mask: Tensor
+    tokens: Tensor | None
+    latents: Tensor | None
+
+
+@dataclass
+class Output:
+    """What a training or validation pass gives.
+
+    Attributes:
+        loss: scalar to minimise.
+        video_loss: scalar, nats a token or squared error of the noise; None where video is not predicted.
+        action_loss: scalar; None where actions are not predicted.
+        per_sample: (B,) detached, each sample's video loss, or its action loss where there is no other.
+        masked: (B, T, h, w) bool, the tokens the video loss is over.
+        objective: the one that was used.
+        video_logits: (B, T, h, w, F, V) float32 of the discrete model outside training, else None.
+    """
+
+    loss: Tensor
+    video_loss: Tensor | None
+    action_loss: Tensor | None
+    per_sample: Tensor
+    masked: Tensor
+    objective: str
+    video_logits: Tensor | None = None
+
+
+def compute(model: "HMA", batch: Windows, objective: str | None, generator: torch.Generator | None) -> Output:
+    """The losses of one batch; `HMA.forward` explains the arguments."""
+    config = model.config
+    objective = objective or draw_objective(config, generator)
+    if objective not in OBJECTIVES:
+        raise HMAError("objective", f"{objective!r} is unknown", "give one of " + ", ".join(OBJECTIVES))
+    frames, count, size = _frames(model, batch), batch.actions.shape[1], len(batch.actions)
+    groups, clock = Groups.of(batch.embodiment, size), model.clock(count)
+
+    own = getattr(batch, "context", None)  # what the model sees where that is not the truth
+    seen = frames if own is None else _frames(model, batch, own)
+    video = draw_video_mask(config, size, count, generator)
+    inside = getattr(batch, "frame_mask", None)
+    if inside is not None:  # no loss is due where a short episode was padded
+        video.masked &= inside.to(video.masked.device).unsqueeze(-1)
+    if objective in ("policy", "inverse"):
+        video.masked = torch.zeros_like(video.masked)
+    dropped = torch.zeros_like(batch.action_mask)
+    if objective in ("policy", "full"):
+        dropped = drop_chunks(batch.action_mask, generator)
+    elif objective == "inverse":  # the last chunk has no frame after it to be read from
+        dropped[:, :-1] = drop_chunks(batch.action_mask[:, :-1], generator)
+
+    slots = None
+    if objective != "passive":
+        slots = align(config, batch.actions, batch.action_mask & ~dropped, count)
+    conditioning = condition(model, slots, groups, clock.positions)
+    x = _embed(model, seen, video, groups, generator)
+    features = model.trunk(x, conditioning, clock)
+
+    video_loss = action_loss = logits = None
+    per_sample = torch.zeros(size, device=features.device)
+    if objective in ("policy", "inverse", "full"):
+        action_loss, per_sample = _action_loss(model, features, batch, dropped, objective, groups, generator)
+    if objective in ("forward", "passive", "full"):
+        own = model.video_features(features)
+        predictors = own if config.kind == "discrete" else model.latent_readout(own, clock.positions)
+        video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
+        if config.kind == "discrete" and not model.training:
+            scores = model.token_readout.split(model.token_readout(own.detach()))
+            logits = groups.unsort(scores).unflatten(2, config.token_grid)
+    loss = torch.zeros((), device=features.device)
+    if video_loss is not None:
+        loss = loss + video_loss
+    if action_loss is not None:
+        loss = loss + config.action_loss_weight * action_loss
+    masked = video.masked.to(features.device).unflatten(2, config.token_grid)
+    return Output(loss, video_loss, action_loss, per_sample.detach(), masked, objective, logits)
+
+
+def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
+    """An objective by the configuration's weights."""
+    names, weights = zip(*config.objectives.items())
+    if len(names) == 1:
+        return names[0]
+    limits = torch.tensor(weights, dtype=torch.float64).cumsum(0)
+    index = int((uniform((1,), generator).double() * limits[-1] >= limits).sum())
+    return names[min(index, len(names) - 1)]
+
+
+def _frames(model: "HMA", batch: Windows, instead: Tensor | None = None) -> Tensor:
+    """Token ids (B, T, S), or scaled patches (B, T, S, c*p*p), in the batch's order."""
+    config = model.config
+    values = batch.tokens if config.kind == "discrete" else batch.latents
+    values = values if instead is None else instead
+    if values is None:
+        have = "latents" if config.kind == "discrete" else "tokens"
+        raise HMAError("batch", f"has {have} for a {config.kind} model", "use the tokenizer the model is for")
+    shape = config.grid if config.kind == "discrete" else (config.channels, *config.grid)
+    if tuple(values.shape[2:]) != tuple(shape):
+        fault = f"frames of shape {tuple(values.shape[2:])} where the model takes {tuple(shape)}"
+        raise HMAError("batch", fault, "use the tokenizer the model is for")
+    if config.kind == "discrete":
+        return values.flatten(2).long()
+    return patchify(values.float() * config.latent_scale, config.patch)
+
+
+def _embed(
+    model: "HMA", frames: Tensor, video: VideoMask, groups: Groups, generator: torch.Generator | None
+) -> Tensor:
+    """The masked and corrupted frames, embedded, samples sorted."""
+    if model.config.kind == "discrete":
+        return model.embed_tokens(groups.sort(corrupt_tokens(model.config, frames, video, generator)))
+    masked = video.masked.to(frames.device).unsqueeze(-1)
+    return model.embed_patches(groups.sort(frames), groups.sort(masked))
+
+
+def _video_loss(
+    model: "HMA",
+    features: Tensor,
+    frames: Tensor,
+    masked: Tensor,
+    groups: Groups,
+    generator: torch.Generator | None,
+) -> tuple[Tensor, Tensor]:
+    """The mean loss over masked tokens, and each sample's (B,), in the batch's order."""
+    masked = groups.sort(masked)
+    rows = masked.flatten().nonzero().squeeze(1)  # on the generator's device: no wait for an accelerator
+    sample = (rows // masked[0].numel()).to(features.device)
+    rows = rows.to(features.device)
+    chosen, targets = features.flatten(0, 2)[rows], groups.sort(frames).flatten(0, 2)[rows]
+    if model.config.kind == "discrete":
+        losses = model.token_readout.loss(chosen, to_digits(targets, model.config.factored))
+    else:
+        losses = model.latent_readout.diffusion.loss(targets, chosen, generator)
+    return losses.sum() / max(len(rows), 1), groups.unsort(_means(losses, sample, len(frames)))
+
+
+def _action_loss(
+    model: "HMA",
+    features: Tensor,
+    batch: Windows,
+    dropped: Tensor,
+    objective: str,
+    groups: Groups,
+    generator: torch.Generator | None,
+) -> tuple[Tensor, Tensor]:
+    """The mean loss over predicted chunks, and each sample's (B,), in the batch's order."""
+    readout = "inverse" if objective == "inverse" else "policy"
+    wanted = batch.action_mask.clone()
+    if readout == "inverse" or model.config.action_alignment == "current":
+        wanted &= dropped  # a chunk the model was shown is nothing to predict
+    pooled = model.action_features(features)
+    if readout == "inverse":
+        pooled, wanted = pooled[:, 1:], wanted[:, :-1]
+    actions, wanted = groups.sort(batch.actions)[:, : wanted.shape[1]], groups.sort(wanted)
+    losses, samples = [], []
+    for name, span in groups.spans():
+        sample, frame = wanted[span].nonzero(as_tuple=True)
+        stem = model.stem(name)
+        target = actions[span, :, : stem.input.in_features][sample, frame]
+        if model.config.action_target == "normalized":
+            target = stem.normalizer(target)
+        losses.append(model.head(name).loss(pooled[span][sample, frame], target, readout, generator))
+        samples.append(sample + span.start)
+    flat = torch.cat(losses)
+    return flat.sum() / max(len(flat), 1), groups.unsort(_means(flat, torch.cat(samples), len(actions)))
+
+
+def _means(losses: Tensor, sample: Tensor, batch: int) -> Tensor:
+    """Each sample's mean (B,) of losses (M,); 0 where it has none."""
+    zeros = losses.new_zeros(batch)
+    count = zeros.index_add(0, sample, torch.ones_like(losses))
+    return zeros.index_add(0, sample, losses.detach()) / count.clamp(min=1)

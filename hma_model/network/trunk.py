@@ -1,0 +1,381 @@
+"""The space-time transformer that all embodiments share (paper section 3).
+
+A block attends in both directions among a frame's tokens, is modulated by the action, attends to earlier
+frames at the same place, and ends with an MLP. Nothing ever flows backwards in time, so keys and values of
+past frames can be kept (`cache`).
+
+B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers, R cache slots.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from hma_model.config import HMAConfig
+from hma_model.network.embed import LatentEmbedding, TokenEmbedding
+from hma_model.network.stem import Modulation
+
+
+@dataclass
+class Conditioning:
+    """What actions tell the trunk.
+
+    Attributes:
+        embedding: (B, T, D) of the chunk in force at each frame; None without conditioning.
+        tokens: (B, T, D) what is put after each frame's own tokens; None for nothing.
+        modulation: (L, B, T, 2D) shift and gain.
+        out: per group of samples, in batch order, its size and the embodiment's projections after the
+            modulated norm (L, D, D) and (L, D); None when the trunk has them.
+    """
+
+    embedding: Tensor | None = None
+    modulation: Tensor | None = None
+    out: list[tuple[int, Tensor, Tensor]] | None = None
+    tokens: Tensor | None = None
+
+    def last(self) -> "Conditioning":
+        """Of the last frame alone."""
+        embedding, tokens = (None if x is None else x[:, -1:] for x in (self.embedding, self.tokens))
+        modulation = None if self.modulation is None else self.modulation[:, :, -1:]
+        return Conditioning(embedding, modulation, self.out, tokens)
+
+
+@dataclass
+class Clock:
+    """When the frames of a call take place.
+
+    Attributes:
+        positions: (T,) int64, the frames' times.
+        allowed: (T, keys) bool, which key frames each frame may see.
+        rotary: cos and sin (T, head_dim / 2) of the rotary angles.
+        causal: `allowed` is the plain lower triangle.
+        slots: (T,) int64, where in the cache the frames' keys and values go; None without a cache.
+    """
+
+    positions: Tensor
+    allowed: Tensor
+    rotary: tuple[Tensor, Tensor]
+    causal: bool = False
+    slots: Tensor | None = None
+
+
+@dataclass
+class LayerCache:
+    """Keys and values of one layer.
+
+    Attributes:
+        time: (2, R, B, N, heads, head_dim); a frame's lie side by side, as they are computed.
+        action: (2, B, heads, R, head_dim), with cross-attention.
+    """
+
+    time: Tensor
+    action: Tensor | None = None
+
+
+def rows_at(table: Tensor, positions: Tensor) -> Tensor:
+    """The rows of a table over absolute times, or the only row of one that has no times."""
+    return table if table.shape[0] == 1 else table[positions]
+
+
+def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Cos and sin, float32 (T, head_dim / 2), of the rotary angles at the times (T,)."""
+    half = max(config.head_dim // 2, 1)
+    steps = torch.arange(half, device=positions.device, dtype=torch.float32) / half
+    angles = positions.float().unsqueeze(-1) * config.rotary_base**-steps
+    return angles.cos(), angles.sin()
+
+
+def window_clock(config: HMAConfig, frames: int, device: torch.device | str) -> Clock:
+    """The clock of `frames` consecutive frames, each seeing itself and the `config.frames` - 1 before it."""
+    positions = torch.arange(frames, device=device)
+    age = positions.unsqueeze(1) - positions
+    allowed = (age >= 0) & (age < config.frames)
+    return Clock(positions, allowed, rotary_angles(config, positions), causal=frames <= config.frames)
+
+
+def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
+    """Rotate neighbouring pairs of x (..., T, heads, head_dim) by each frame's angles."""
+    cos, sin = (angle.to(x.dtype).unsqueeze(-2) for angle in rotary)
+    even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
+    return torch.stack([even * cos - odd * sin, odd * cos + even * sin], dim=-1).flatten(-2)
+
+
+def rotate_qkv(
+    qkv: Tensor, rotary: tuple[Tensor, Tensor], within: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotate queries and keys, the values staying; give the three.
+
+    Without a compiler to fuse it, one complex product over contiguous memory is several times as fast.
+
+    Args:
+        qkv: (..., T, 3, heads, head_dim), or `within` frames (..., T, N, 3, heads, head_dim).
+        rotary: cos and sin (T, head_dim / 2).
+        within: whether there are places between the times and the three.
+    """
+    cos, sin = (angle.unsqueeze(1) if within else angle for angle in rotary)
+    if qkv.dtype != torch.float32 or torch.compiler.is_compiling():
+        q, k, v = qkv.unbind(-3)
+        return rotate(q, (cos, sin)), rotate(k, (cos, sin)), v
+    turn = torch.complex(cos, sin)
+    turns = torch.stack([turn, turn, torch.ones_like(turn)], dim=-2).unsqueeze(-2)
+    turns = turns.expand(*turns.shape[:-2], qkv.shape[-2], -1).flatten(-3)
+    flat = torch.view_as_complex(qkv.view(*qkv.shape[:-3], -1, 2)) * turns
+    q, k, v = torch.view_as_real(flat).view_as(qkv).unbind(-3)
+    return q, k, v
+
+
+def light(function: Callable[..., Tensor], *inputs: Any) -> Tensor:
+    """Call a function that ends in a product, keeping for the backward pass no more than its inputs.
+
+    What leads to the product is computed again there; the product is not, since the recomputation ends when
+    what the backward pass wants is there.
+    """
+    if not torch.is_grad_enabled():
+        return function(*inputs)
+    out: Tensor = checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
+    return out
+
+
+class Attention(nn.Module):
+    """Projections around scaled dot-product attention."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.heads, self.normed = config.heads, config.qk_norm
+        self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
+        self.qkv = nn.Linear(width, 3 * width, bias=config.qkv_bias)
+        self.proj = nn.Linear(width, width, bias=config.proj_bias)
+        self.q_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
+        self.k_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
+
+    def project(
+        self, x: Tensor, norm: nn.Module, rotary: tuple[Tensor, Tensor] | None, within: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(..., length, D), or `within` frames (..., T, N, D) -> three times (..., heads, head_dim)."""
+        qkv = light(lambda x: self.qkv(norm(x)), x).unflatten(-1, (3, self.heads, -1))
+        if rotary is not None and not self.normed:
+            return rotate_qkv(qkv, rotary, within)
+        q, k, v = qkv.unbind(-3)
+        q, k = self.q_norm(q), self.k_norm(k)
+        if rotary is not None:
+            q, k, _ = rotate_qkv(torch.stack([q, k, v], dim=-3), rotary, within)
+        return q, k, v
+
+    def merge(
+        self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None, causal: bool = False
+    ) -> Tensor:
+        """Attend over (M, length, heads, head_dim) and project back: (M, length, D)."""
+        q, k, v = (x.transpose(1, 2) for x in (q, k, v))
+        mixed = F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=self.scale)
+        return self.proj(mixed.transpose(1, 2).flatten(-2))
+
+
+class TemporalAttention(Attention):
+    """Causal attention over time, at each place of the frame by itself."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__(config)
+        self.rotary = config.time_position == "rotary"
+
+    def forward(self, x: Tensor, norm: nn.Module, clock: Clock, cache: LayerCache | None) -> Tensor:
+        """(B, T, N, D), to be normed -> the same shape."""
+        rotary = clock.rotary if self.rotary else None
+        if cache is not None:
+            q, k, v = self.project(x, norm, rotary, within=True)
+            assert clock.slots is not None
+            for values, kept in zip((k, v), cache.time):
+                kept.index_copy_(0, clock.slots, values.transpose(0, 1))
+            return self.proj(self._recall(q, clock, cache.time))
+        b, t, n, width = x.shape
+        q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), norm, rotary)
+        mask = None if clock.causal else clock.allowed
+        return self.merge(q, k, v, mask, clock.causal).view(b, n, t, width).transpose(1, 2)
+
+    def _recall(self, q: Tensor, clock: Clock, cache: Tensor) -> Tensor:
+        """Attend to the whole cache: queries (B, T, N, heads, head_dim) -> (B, T, N, D)."""
+        b, t, n, heads, size = q.shape
+        if q.device.type != "cpu" or q.dtype != torch.float32:
+            queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
+            k, v = cache.flatten(2, 3).permute(0, 2, 3, 1, 4)
+            mixed = F.scaled_dot_product_attention(queries, k, v, clock.allowed, scale=self.scale)
+            return mixed.view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
+        # On a CPU so few frames a place take half as long in batched products as in the fused kernel, and the
+        # softmax a tenth where places, not frames, fill the vectors.
+        rows = q.permute(0, 2, 3, 1, 4).reshape(-1, t, size)
+        k, v = cache.flatten(2, 4).transpose(1, 2)  # (B*N*heads, R, head_dim)
+        hidden = torch.zeros_like(clock.allowed, dtype=q.dtype).masked_fill(~clock.allowed, -torch.inf)
+        scores = torch.baddbmm(hidden, rows, k.transpose(1, 2), alpha=self.scale)
+        weights = scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
+        return torch.bmm(weights, v).view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
+
+
+class ActionAttention(nn.Module):
+    """Cross-attention: a frame's tokens attend to the action embeddings up to that frame, in rotary time."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.heads = config.heads
+        self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
+        self.q = nn.Linear(width, width, bias=config.qkv_bias)
+        self.kv = nn.Linear(width, 2 * width, bias=config.qkv_bias)
+        self.proj = nn.Linear(width, width, bias=config.proj_bias)
+
+    def forward(self, x: Tensor, embedding: Tensor, clock: Clock, cache: LayerCache | None) -> Tensor:
+        """Tokens (B, T, N, D) and action embeddings (B, T, D) -> (B, T, N, D)."""
+        b, t, n, _ = x.shape
+        q = rotate(
+            self.q(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), clock.rotary
+        )  # (B, N, T, heads, hd)
+        k, v = self.kv(embedding).unflatten(-1, (2, self.heads, -1)).unbind(2)
+        k, v = rotate(k, clock.rotary).transpose(1, 2), v.transpose(1, 2)
+        if cache is not None and cache.action is not None:
+            assert clock.slots is not None
+            k, v = (
+                cache.action[0].index_copy_(2, clock.slots, k),
+                cache.action[1].index_copy_(2, clock.slots, v),
+            )
+        queries = q.permute(0, 3, 2, 1, 4).flatten(2, 3)  # (B, heads, T*N, head_dim)
+        mask = clock.allowed.repeat_interleave(n, dim=0)
+        mixed = F.scaled_dot_product_attention(queries, k, v, mask, scale=self.scale)
+        return self.proj(mixed.transpose(1, 2).flatten(-2)).view(b, t, n, -1)
+
+
+class MLP(nn.Module):
+    """Two linear maps with a GELU between."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        hidden = int(config.width * config.mlp_ratio)
+        self.fc1 = nn.Linear(config.width, hidden, bias=config.mlp_bias)
+        self.fc2 = nn.Linear(hidden, config.width, bias=config.mlp_bias)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, x: Tensor, norm: nn.Module) -> Tensor:
+        """(..., D), to be normed -> the same shape."""
+        hidden = light(lambda x: self.fc1(norm(x)), x)
+        if self.dropout.p:
+            return self.dropout(self._out(hidden))
+        return light(self._out, hidden)
+
+    def _out(self, hidden: Tensor) -> Tensor:
+        return self.fc2(self.dropout(F.gelu(hidden)))
+
+
+class Block(nn.Module):
+    """Space, action, time, MLP; each is added to the stream."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.space_norm = nn.LayerNorm(width) if config.norms == "before" else nn.Identity()
+        self.space = Attention(config)
+        self.modulation_out: nn.Linear | None = None
+        if "modulation" in config.conditioning and config.modulation_out == "trunk":
+            self.modulation_out = nn.Linear(width, width)
+        self.adds = "add" in config.conditioning and config.add_at == "layers"
+        self.action: ActionAttention | None = None
+        if "cross_attention" in config.conditioning:
+            self.action_norm = nn.LayerNorm(width)
+            self.action = ActionAttention(config)
+        self.time_norm = nn.LayerNorm(width) if config.temporal_norm else nn.Identity()
+        self.time = TemporalAttention(config)
+        self.mlp_norm = nn.LayerNorm(width) if config.norms == "before" else nn.Identity()
+        self.mlp = MLP(config)
+
+    def forward(
+        self, x: Tensor, conditioning: Conditioning, layer: int, clock: Clock, cache: LayerCache | None
+    ) -> Tensor:
+        """(B, T, N, D) -> the same shape."""
+        qkv = self.space.project(x.flatten(0, 1), self.space_norm, None)
+        x = x + self.space.merge(*qkv).view(x.shape)
+        if self.adds and conditioning.embedding is not None:
+            x = x + conditioning.embedding.unsqueeze(2)
+        if conditioning.modulation is not None:
+            x = x + light(self.modulate, x, conditioning, layer)
+        if self.action is not None and conditioning.embedding is not None:
+            x = x + self.action(self.action_norm(x), conditioning.embedding, clock, cache)
+        x = x + self.time(x, self.time_norm, clock, cache)
+        return x + self.mlp(x, self.mlp_norm)
+
+    def modulate(self, x: Tensor, conditioning: Conditioning, layer: int) -> Tensor:
+        """The modulated norm of all tokens, projected."""
+        assert conditioning.modulation is not None
+        shift, gain = conditioning.modulation[layer].unsqueeze(2).chunk(2, dim=-1)
+        modulated = torch.addcmul(shift, F.layer_norm(x, x.shape[-1:], eps=1e-6), gain)
+        if self.modulation_out is not None:
+            return self.modulation_out(modulated)
+        assert conditioning.out is not None
+        parts = modulated.split([size for size, _, _ in conditioning.out])
+        projected = [F.linear(part, w[layer], b[layer]) for part, (_, w, b) in zip(parts, conditioning.out)]
+        return projected[0] if len(projected) == 1 else torch.cat(projected)
+
+
+class Trunk(nn.Module):
+    """Embedding, positions, blocks.
+
+    Attributes:
+        checkpointing: recompute each block in the backward pass instead of keeping its activations.
+    """
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.checkpointing = False
+        learned = config.time_position == "learned"
+        tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
+        self.embed = LatentEmbedding(config) if config.kind == "continuous" else TokenEmbedding(config)
+        self.position = nn.Parameter(
+            torch.randn(config.frames if learned else 1, tokens, config.width) * 0.02
+        )
+        self.embed_norm = (
+            nn.LayerNorm(config.width, eps=1e-6) if config.kind == "continuous" else nn.Identity()
+        )
+        self.absent = nn.Parameter(torch.randn(config.frames if learned else 1, config.width) * 0.02)
+        self.modulation: Modulation | None = None
+        if "modulation" in config.conditioning and config.shared_modulation:
+            self.modulation = Modulation(config)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
+        self.norm = nn.LayerNorm(config.width) if config.final_norm else nn.Identity()
+        initialize(self, config)
+
+    def forward(
+        self, x: Tensor, conditioning: Conditioning, clock: Clock, caches: list[LayerCache] | None = None
+    ) -> Tensor:
+        """Embedded tokens (B, T, S, D) -> features (B, T, N, D), action tokens after the frame's own."""
+        x = self.embed_norm(self.join(x, conditioning, clock))
+        for layer, block in enumerate(self.blocks):
+            cache = None if caches is None else caches[layer]
+            if self.checkpointing and self.training and torch.is_grad_enabled():
+                x = checkpoint(block, x, conditioning, layer, clock, cache, use_reentrant=False)
+            else:
+                x = block(x, conditioning, layer, clock, cache)
+        return self.norm(x)
+
+    def join(self, x: Tensor, conditioning: Conditioning, clock: Clock) -> Tensor:
+        """Add or append the action embeddings, and add the positions."""
+        embedding, config = conditioning.embedding, self.config
+        if embedding is not None and "add" in config.conditioning and config.add_at == "input":
+            x = x + embedding.unsqueeze(2)
+        if conditioning.tokens is not None:
+            copies = conditioning.tokens.unsqueeze(2).expand(-1, -1, config.action_tokens, -1)
+            x = torch.cat([x, copies.to(x.dtype)], dim=2)
+        return x + rows_at(self.position, clock.positions)[:, : x.shape[2]]
+
+
+def initialize(trunk: Trunk, config: HMAConfig) -> None:
+    """Unit-variance maps, with the ends of the residual branches scaled so that the stream stays level."""
+    branches = (3 + bool({"modulation", "cross_attention"} & set(config.conditioning))) * config.layers
+    for name, module in trunk.blocks.named_modules():
+        if isinstance(module, nn.Linear):
+            ends = name.endswith(("proj", "fc2", "modulation_out"))
+            std = module.in_features**-0.5 * (branches**-0.5 if ends else 1.0)
+            nn.init.normal_(module.weight, std=std)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)

@@ -1,0 +1,167 @@
+"""The batches of a step, the same whatever number of ranks shares them.
+
+A step is so many passes, each over a batch of its own; rank r of W makes passes r, r + W and so on. Pass p
+draws from the mixture as if it were rank p of as many as there are passes: what it sees does not depend on W,
+and a run may go on with another number of ranks.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from hma_data.errors import RecipeError, TrainingError, UsageError
+from hma_data.loading.dataset import Batch, MixtureDataset
+from hma_data.loading.mixture import Mixture
+from hma_data.shards.reader import ShardSet
+from hma_model.training.parallel import World
+from hma_model.training.resume import seed_for
+
+if TYPE_CHECKING:
+    from hma_model.training.recipe import Recipe
+
+MEMORY_MIB = 2048  # of decoded rows, of all passes together, so that it is the same on any number of ranks
+
+
+def share(recipe: "Recipe", ranks: int) -> tuple[int, int]:
+    """How the windows of a step are shared: (passes of all ranks together, windows a pass).
+
+    Raises:
+        RecipeError: they cannot be shared evenly.
+    """
+    total = recipe.windows_per_step
+    passes = recipe.accumulate if recipe.accumulate % ranks == 0 else ranks
+    if total % passes:
+        raise RecipeError(
+            "recipe: batch_size",
+            f"{total} windows a step cannot be shared evenly by {ranks} ranks",
+            f"choose batch_size × accumulate as a multiple of {ranks}, such as {-(-total // ranks) * ranks}",
+        )
+    return passes, total // passes
+
+
+@contextmanager
+def _workers_alive() -> Iterator[None]:
+    """Around the wait for what other processes decode.
+
+    Raises:
+        TrainingError: one of them has ended.
+    """
+    try:
+        yield
+    except (RuntimeError, ConnectionError, EOFError) as fault:
+        said = (str(fault).splitlines() or [""])[0][:200]
+        if isinstance(fault, RuntimeError) and "DataLoader worker" not in said:
+            raise
+        raise TrainingError(
+            "workers",
+            f"a process that decodes batches has ended: {said or type(fault).__name__}",
+            "where memory is short choose fewer; the same command goes on from the last checkpoint",
+        ) from fault
+
+
+class Feed:
+    """This rank's batches.
+
+    Args:
+        recipe: states mixture, windows and seed.
+        sets: shard sets by embodiment.
+        world: the ranks.
+
+    Attributes:
+        passes: of a step, of all ranks together.
+        own: numbers of those that are this rank's.
+
+    Raises:
+        RecipeError: a step has more windows than there are, or they cannot be shared.
+        ShardError: a set without a single window.
+    """
+
+    def __init__(self, recipe: "Recipe", sets: Mapping[str, ShardSet], world: World) -> None:
+        self.passes, size = share(recipe, world.size)
+        self.own = range(world.rank, self.passes, world.size)
+        self._workers = -(-recipe.workers // len(self.own))
+        self._data = [self._dataset(recipe, sets, size, self.own[0])]
+        self._batches: list[Iterator[Batch]] = []
+        count = sum(self.mixture.counts)
+        if recipe.windows_per_step > count:
+            raise RecipeError(
+                "recipe: batch_size",
+                f"{recipe.windows_per_step} windows a step are more than the {count} there are",
+                "lower batch_size or accumulate, or add data",
+            )
+        self._data += [self._dataset(recipe, sets, size, number) for number in self.own[1:]]
+
+    def _dataset(
+        self, recipe: "Recipe", sets: Mapping[str, ShardSet], size: int, number: int
+    ) -> MixtureDataset:
+        mixture = recipe.mixture
+        try:
+            return MixtureDataset(
+                list(sets.values()),
+                size,
+                recipe.frames,
+                temperature=mixture.temperature,
+                weights=mixture.weights or None,
+                groups=mixture.groups or None,
+                caps=mixture.caps or None,
+                max_epochs=mixture.max_epochs,
+                samples=recipe.steps * recipe.windows_per_step if mixture.max_epochs else None,
+                draw=mixture.draw,
+                short=recipe.short,
+                seed=seed_for(recipe.seed, "sampler"),
+                rank=number,
+                world=self.passes,
+                memory_mib=max(MEMORY_MIB // self.passes, 1),
+            )
+        except UsageError as fault:
+            remedy = fault.remedy or f"the data has {', '.join(sets)}"
+            where = fault.where.replace("mixture ", "mixture.")
+            raise RecipeError(f"recipe: {where}", fault.fault, remedy) from fault
+
+    @property
+    def mixture(self) -> Mixture:
+        """How often each embodiment is drawn."""
+        return self._data[0].mixture
+
+    def step(self) -> Iterator[tuple[int, Batch]]:
+        """This rank's batches of the next step, each with the number of its pass.
+
+        Raises:
+            ShardError: a shard is missing or damaged.
+            TrainingError: a worker has ended.
+        """
+        if not self._batches:
+            self._batches = [data.batches(self._workers) for data in self._data]
+        for number, batches in zip(self.own, self._batches):
+            with _workers_alive():
+                batch = next(batches)
+            yield number, batch
+
+    def realised(self) -> list[dict[str, Any]]:
+        """What this rank has drawn of each embodiment, beside what was intended: `Mixture.table`."""
+        drawn = [[int(row["samples"]) for row in data.realised()] for data in self._data]
+        return self.mixture.table([sum(column) for column in zip(*drawn, strict=True)])
+
+    def state(self, world: World) -> dict[str, Any]:
+        """Where all passes stand after whole steps; every rank must ask."""
+        mine = dict(zip(self.own, (data.state_dict() for data in self._data)))
+        known = {number: state for part in world.gather(mine) for number, state in part.items()}
+        return {"passes": [known[number] for number in range(self.passes)]}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from `state`, saved by any number of ranks.
+
+        Raises:
+            UsageError: it is of another mixture, or of a step that was shared otherwise.
+        """
+        kept = state.get("passes")
+        if not isinstance(kept, list) or len(kept) != self.passes:
+            count = len(kept) if isinstance(kept, list) else 0
+            raise UsageError("sampler state", f"is of {count} passes a step, this run has {self.passes}")
+        for number, data in zip(self.own, self._data):
+            data.load_state_dict(kept[number])
+
+    def shared_otherwise(self, state: Mapping[str, Any]) -> bool:
+        """Whether a state is of the same windows a step, made in another number of passes."""
+        kept = state.get("passes")
+        return isinstance(kept, list) and len(kept) != self.passes

@@ -1,0 +1,60 @@
+"""Bring a robot to a trained trunk: a new stem and head on it, with the trunk as it is or tuned along.
+
+    result = finetune("runs/base", ["shards/my_arm"], out="runs/my_arm", freeze_trunk=True)
+
+With the trunk frozen the result can be pushed to the hub that the trunk came from, beside its other robots.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from hma_data.errors import UsageError
+from hma_data.storage.paths import StrPath, as_text
+from hma_model.training.recipe import load_recipe
+
+if TYPE_CHECKING:
+    from hma_model.training.loop import TrainResult
+
+RECIPE = "finetune"
+
+
+def finetune(
+    source: StrPath,
+    data: Sequence[StrPath],
+    *,
+    out: StrPath | None = None,
+    freeze_trunk: bool = False,
+    overrides: Sequence[str] = (),
+    recipe: StrPath = RECIPE,
+    **options: Any,
+) -> "TrainResult":
+    """Train on a checkpoint's trunk; run it again to resume.
+
+    Args:
+        source: str or path of a checkpoint or a run's folder, a URI, or a hub repository, also
+            `org/name@revision`.
+        data: str or path of folders of shards, made with the checkpoint's tokenizer.
+        out: str or path of the run's folder; by default that of the overrides.
+        freeze_trunk: train stems and heads alone.
+        overrides: `key=value` over the recipe.
+        recipe: name, or str or path of a YAML.
+        options: `show`, `force`, `on_progress` of `hma_model.training.loop.train`.
+
+    Raises:
+        UsageError: no shards, or no folder for the run.
+        CheckpointError: the shards are of another tokenizer, or know the robot with other actions.
+        HubError: there is no such checkpoint.
+    """
+    from hma_model.training.loop import train
+
+    if not data:
+        raise UsageError("--data", "names no shards", "give the folder of hma convert")
+    given = {
+        "start": as_text(source),
+        "data": [as_text(folder) for folder in data],
+        "freeze": "trunk" if freeze_trunk else "nothing",
+    }
+    ours = [f"{key}={yaml.safe_dump(value, default_flow_style=True)}" for key, value in given.items()]
+    return train(load_recipe(recipe, [*ours, *overrides]), out=out, **options)

@@ -1,0 +1,189 @@
+"""Where a run begins that does not begin from nothing: another run's checkpoint, or one from a hub.
+
+The run keeps its own copy in `.start/`, so that it goes on whatever becomes of the source. Robots of the data
+that the checkpoint knows go on from their stem and head, with the statistics these were trained with; others
+get fresh ones. Of a hub the trunk and the robots of the data are fetched, nothing else. With the trunk frozen
+the run's checkpoints carry the very files of the trunk and, from a checkpoint on this machine, of all other
+robots; a tuned trunk leaves them behind, because they belong to the trunk as it was.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hma_data.errors import CheckpointError, HubError, RecipeError
+from hma_data.shards.reader import ShardSet
+from hma_data.storage.folders import read_json
+from hma_model.checkpoint import io as checkpoints
+from hma_model.checkpoint import weights
+from hma_model.checkpoint.io import Checkpoint, require_tokenizer
+from hma_model.config import HMAConfig
+from hma_model.training.runtime import RECIPE, START
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+    from hma_model.training.recipe import Recipe
+
+# what may differ from the checkpoint's network, because no weight's meaning depends on it
+TRAINED_BY = {
+    *("dropout", "action_loss_weight", "label_smoothing", "corrupt_max", "history_probability"),
+    *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
+}
+
+
+@dataclass(frozen=True)
+class Start:
+    """A checkpoint to begin from.
+
+    Attributes:
+        checkpoint: the run's own copy.
+        frozen: the trunk stays as it is.
+        source: where it came from, for notes.
+    """
+
+    checkpoint: Checkpoint
+    frozen: bool
+    source: str
+
+    @classmethod
+    def bring(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> None:
+        """Bring the recipe's checkpoint into the run's folder, unless it is there.
+
+        Raises:
+            HubError, CheckpointError: it is not there, or damaged.
+            CheckpointError: the data is of another tokenizer.
+        """
+        from hma_model.hub import publish as hub
+
+        assert recipe.start is not None
+        frozen, place = recipe.freeze == "trunk", out / START
+        source, revision = hub.addressed(recipe.start)
+        local = not hub.is_repository(source) and "://" not in source
+        if (place / checkpoints.README).is_file():  # written last
+            _require_source(recipe.start, out)
+            return
+        if local:
+            found = Checkpoint.open(checkpoints.resolve(Path(source).expanduser()))
+            require_tokenizer(found.config, _spec(sets), found.folder)
+            found.trunk()
+            source = str(found.folder)
+        try:
+            known = hub.embodiment_ids(hub.open_store(source, revision).files())
+            wanted = [name for name in known if name in sets or (frozen and local)]
+            hub.pull(source, wanted, place, revision)
+        except HubError as fault:
+            if local or "://" in source:
+                raise
+            both = f"is no folder here; as a repository of the hub: {fault.fault}"
+            raise HubError(
+                recipe.start, both, f"give the path of a checkpoint or run, or: {fault.remedy}"
+            ) from fault
+
+    @classmethod
+    def open(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> "Start":
+        """What `bring` has brought.
+
+        Raises:
+            CheckpointError: it is damaged, or the data is of another tokenizer.
+        """
+        start = cls(Checkpoint.open(out / START), recipe.freeze == "trunk", str(recipe.start))
+        require_tokenizer(start.checkpoint.config, _spec(sets), start.source)
+        return start
+
+    def network(self, recipe: "Recipe") -> HMAConfig:
+        """The checkpoint's network, trained as the recipe says.
+
+        Raises:
+            RecipeError: the recipe asks for another network.
+        """
+        config = self.checkpoint.config
+        changes: dict[str, Any] = {"objectives": recipe.objectives}
+        for key, value in recipe.model.items():
+            if key in TRAINED_BY:
+                changes[key] = value
+            elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
+                raise RecipeError(
+                    f"recipe: model.{key}",
+                    f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}",
+                    "leave it out: the network is the checkpoint's",
+                )
+        if config.time_position == "learned" and recipe.frames > config.frames:
+            raise RecipeError(
+                "recipe: frames",
+                f"{recipe.frames} are more than the checkpoint's {config.frames}",
+                "use fewer",
+            )
+        return config.replace(**changes)
+
+    def stats(self, shards: ShardSet) -> dict[str, Any]:
+        """A robot's statistics: the checkpoint's where it knows the robot, else those of the shards.
+
+        Raises:
+            CheckpointError: it knows the robot with other actions.
+        """
+        name = shards.embodiment.id
+        if name not in self.checkpoint.embodiments:
+            return shards.manifest.stats
+        theirs, ours = self.checkpoint.embodiment(name), shards.embodiment
+        for key in ("action_dim", "stride", "normalize_mask"):
+            a, b = getattr(theirs, key), getattr(ours, key)
+            if list(a) != list(b) if key == "normalize_mask" else a != b:
+                raise CheckpointError(
+                    self.source,
+                    f"knows {name} with {key} {a}, the shards have {b}",
+                    "give the robot of the shards another id",
+                )
+        return self.checkpoint.stats(name)
+
+    def fill(self, model: "HMA") -> None:
+        """Put the checkpoint's weights in a model that has its embodiments, and freeze what stays."""
+        model.load_trunk(weights.trunk(self.checkpoint))
+        for name in model.embodiments:
+            if name in self.checkpoint.embodiments:
+                checkpoints.add_embodiment(model, self.checkpoint, name)
+        if self.frozen:
+            for part in (model.trunk, model.readout):
+                part.requires_grad_(False)
+
+    def remarks(self, names: Mapping[str, Any]) -> list[str]:
+        """What becomes of the checkpoint's robots and of those of the data."""
+        known = [name for name in names if name in self.checkpoint.embodiments]
+        fresh = [name for name in names if name not in known]
+        notes = [f"from {self.source}: trunk {'frozen' if self.frozen else 'tuned'}"]
+        if fresh:
+            notes.append(f"fresh stem and head: {', '.join(fresh)}")
+        if known:
+            notes.append(f"going on from its stem and head, with its statistics: {', '.join(known)}")
+        return notes
+
+
+def _require_source(source: str, out: Path) -> None:
+    """Raise where a run is asked to go on from another checkpoint than the one it was begun from.
+
+    The same one may have moved; a source that is gone, or a run that trained on, is no other one.
+    """
+    from hma_model.hub import publish as hub
+
+    before = _begun_from(out)
+    if before in (None, source):
+        return
+    address, revision = hub.addressed(source)
+    if not hub.is_repository(address) and "://" not in address:
+        path = Path(address).expanduser()
+        trunk = Checkpoint.open(checkpoints.resolve(path)).trunk_sha256 if path.exists() else None
+    else:
+        trunk = hub.describe(address, revision)["trunk_sha256"]
+    if trunk not in (None, Checkpoint.open(out / START).trunk_sha256):
+        raise RecipeError(
+            out, f"was begun from {before}, not from {source}", "train into another folder, or name the first"
+        )
+
+
+def _begun_from(out: Path) -> str | None:
+    path = out / RECIPE
+    return read_json(path).get("start") if path.is_file() else None
+
+
+def _spec(sets: Mapping[str, ShardSet]) -> Any:
+    return next(iter(sets.values())).spec

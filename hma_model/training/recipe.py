@@ -1,0 +1,305 @@
+"""What to train, stated whole before it begins: a frozen recipe from YAML and dotted overrides.
+
+    extends: discrete_tiny          # another recipe, by name or path beside this one
+    data: [shards/arm, shards/hand]
+    model: {layers: 4, width: 128}
+    lr: 1e-3
+
+A recipe refuses what it does not know. What the shards state (kind, grid, vocabulary, latents) is
+derived from them and cannot be given.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from hma_data.errors import RecipeError, UsageError
+from hma_data.storage.paths import StrPath, as_text
+from hma_data.storage.shipped import shipped
+from hma_data.storage.yaml_io import parse_yaml, read_yaml
+from hma_model.config import HMAConfig
+from hma_model.training.recipe_faults import DERIVED, network_values, problem
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import TokenizerSpec
+
+MAX_EXTENDS = 8
+MAX_NAME = 200  # characters of a name that are shown
+# what may differ when a run goes on: where and how often, but nothing that changes the weights
+_FREE = {
+    *("data", "out", "start", "device", "workers", "parallel", "compile", "checkpointing"),
+    *("eval_every", "eval_windows", "pictures", "pictures_share", "checkpoint_every", "keep_last"),
+    *("report", "track", "project"),
+}
+
+
+def _no_bool(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+def _named(value: str) -> str:
+    if not value.strip():
+        raise ValueError("must name a folder or URI")
+    # in YAML and in key=value no shell has done it; a URI must not go through Path
+    return str(Path(value).expanduser()) if value.startswith("~") else value
+
+
+Count = Annotated[int, BeforeValidator(_no_bool)]
+Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
+Beta = Annotated[Number, Field(ge=0, lt=1)]
+Cap = Annotated[Number, Field(gt=0, le=1)]
+Place = Annotated[str, AfterValidator(_named)]
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class MixtureSettings(_Settings):
+    """How often each embodiment is drawn; see `hma_data.loading.mixture`."""
+
+    temperature: Number = Field(3.0, gt=0)
+    draw: Literal["per_sample", "per_batch"] = "per_sample"
+    weights: dict[str, Number] = Field({}, description="embodiment id -> factor on its probability")
+    groups: dict[str, str] = Field({}, description="embodiment id -> group; groups have equal shares")
+    caps: dict[str, Cap] = Field({}, description="embodiment id -> its largest probability")
+    max_epochs: Number | None = Field(None, gt=0, description="passes over an embodiment's windows at most")
+
+
+class Recipe(_Settings):
+    """A training run. Made by `load_recipe`, which explains its errors."""
+
+    data: Annotated[tuple[Place, ...], BeforeValidator(_listed)] = Field(
+        (), description="folders of shards, one an embodiment"
+    )
+    mixture: MixtureSettings = MixtureSettings()
+    frames: Count = Field(12, ge=2, le=4096, description="T of a window")
+    short: Literal["drop", "pad"] = Field("drop", description="episodes shorter than a window")
+    batch_size: Count = Field(8, ge=1, description="windows a forward pass")
+    accumulate: Count = Field(1, ge=1, description="forward passes a step")
+    model: dict[str, Any] = Field({}, description="fields of HMAConfig")
+    objectives: dict[str, Number] = Field({"forward": 1.0}, description="how often each is drawn")
+
+    start: Place | None = Field(None, description="a checkpoint to begin from: folder, run, URI or hub repo")
+    freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
+    readout_bias: Literal["frequencies", "zero"] = Field(
+        "frequencies", description="what the token readout begins with: the training tokens' log frequencies"
+    )
+
+    steps: Count = Field(1000, ge=1, le=10**12)
+    lr: Number = Field(3e-4, gt=0, le=1e6)
+    lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")
+    warmup: Count = Field(100, ge=0, description="steps in which lr rises from 0")
+    schedule: Literal["constant_with_warmup", "cosine"] = "constant_with_warmup"
+    lr_end: Number = Field(0.1, ge=0, le=1, description="cosine: the last step's share of lr")
+    betas: tuple[Beta, Beta] = (0.9, 0.95)
+    eps: Number = Field(1e-8, gt=0, le=1e6)
+    weight_decay: Number = Field(0.05, ge=0, le=1e6)
+    clip: Number = Field(1.0, gt=0, description="of the gradient's norm")
+    nonfinite: Literal["stop", "skip"] = Field(
+        "stop", description="at a loss that is not a number, or at a spike"
+    )
+    spike: Number = Field(
+        0.0, ge=0, description="a gradient's norm above this many times its running mean; 0 never"
+    )
+    ema: Number = Field(
+        0.0, ge=0, lt=1, description="decay of averaged weights, then evaluated and saved; 0 without"
+    )
+    self_forward: Number = Field(
+        0.0, ge=0, le=1, description="share of the windows whose past is the model's own prediction"
+    )
+    self_forward_frames: Count = Field(2, ge=1, description="frames in a row of such a past")
+    self_forward_from: Count = Field(0, ge=0, description="step from which that share rises,")
+    self_forward_over: Count = Field(0, ge=0, description="and in how many steps it is reached")
+
+    seed: Count = Field(42, ge=0, lt=2**63)
+    precision: Literal["fp32", "bf16"] = "fp32"
+    device: str = Field("auto", pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")
+    parallel: Literal["ddp", "fsdp"] = Field("ddp", description="with torchrun: how ranks hold the network")
+    compile: bool = Field(False, description="torch.compile of the trunk's blocks")
+    checkpointing: bool = Field(False, description="recompute activations: less memory, a third more time")
+    workers: Count = Field(0, ge=0, le=512, description="processes that decode batches, a rank")
+    eval_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
+    eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
+    pictures: Count = Field(1, ge=0, description="windows rolled out for a picture at evaluations, a robot")
+    pictures_share: Number = Field(
+        0.05, ge=0, description="of the steps' time, for pictures before the last evaluation's"
+    )
+    checkpoint_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
+    keep_last: Count = Field(3, ge=1)
+    report: bool = Field(True, description="write report.html")
+    track: Annotated[tuple[Literal["tensorboard", "trackio", "wandb"], ...], BeforeValidator(_listed)] = (
+        Field(
+            (), description="where figures go besides metrics.jsonl and report.html; each needs its package"
+        )
+    )
+    project: str = Field("hma", description="the name trackio and wandb file the run under")
+    out: Place | None = Field(None, description="the run's folder")
+
+    @property
+    def windows_per_step(self) -> int:
+        """Windows between two updates of the weights."""
+        return self.batch_size * self.accumulate
+
+    def values(self) -> dict[str, Any]:
+        """Plain values, all of them."""
+        return self.model_dump(mode="json")
+
+    def identity(self) -> dict[str, Any]:
+        """What must be the same for a run to go on."""
+        return {key: value for key, value in self.values().items() if key not in _FREE}
+
+    def network(self, spec: "TokenizerSpec") -> HMAConfig:
+        """The network's config for tokens of this tokenizer.
+
+        Raises:
+            RecipeError: a value of `model` is not allowed.
+        """
+        derived: dict[str, Any] = {"kind": spec.kind, "grid": spec.grid, "tokenizer": spec.to_json()}
+        if spec.kind == "discrete":
+            derived["factored"] = spec.factored or (spec.vocab_size,)
+        else:
+            derived.update(channels=spec.channels, latent_scale=spec.latent_scale)
+        derived.update(frames=self.frames, objectives=self.objectives)
+        try:
+            return HMAConfig(**{**self.model, **derived})
+        except TypeError as fault:  # a text where the config compares numbers
+            raise RecipeError("recipe: model", f"a value is of the wrong type: {fault}") from fault
+
+
+def load_recipe(name_or_path: StrPath, overrides: Sequence[str] = ()) -> Recipe:
+    """The recipe of a YAML file, with overrides.
+
+    Args:
+        name_or_path: str or path of a file, or the name of a recipe that comes with the package.
+        overrides: `key=value` with dots for keys inside keys, values as YAML: `model.layers=4`.
+
+    Raises:
+        RecipeError: no such recipe, or all its problems, each with key, value and what is allowed.
+        UsageError: an override is not key=value.
+    """
+    path = find_recipe(name_or_path)
+    values = merge(_extended(path, []), parse_overrides(overrides), "override")
+    return make_recipe(values, f"{path}" + (" with overrides" if overrides else ""))
+
+
+def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
+    """The recipe of plain values; errors as `load_recipe`."""
+    found: list[str] = []
+    model = network_values(values.get("model", {}), values.get("objectives", {"forward": 1.0}), found)
+    given = {**values, "model": model} if isinstance(values.get("model"), dict) else dict(values)
+    try:
+        recipe = Recipe.model_validate(given)
+    except ValidationError as fault:
+        known = {"": list(Recipe.model_fields), "mixture": list(MixtureSettings.model_fields)}
+        known["model"] = [f for f in HMAConfig.__dataclass_fields__ if f not in DERIVED]
+        found += [problem(item, known) for item in fault.errors(include_url=False)]
+    if found:
+        raise RecipeError(where, "; ".join(found), "correct the recipe or the override")
+    return recipe
+
+
+def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
+    """The file of a recipe: a path, or a name below the shipped `recipes/` or `recipes/train/`.
+
+    Args:
+        name_or_path: what was given.
+        where: the recipe that extends it, for the error.
+
+    Raises:
+        RecipeError: there is none.
+    """
+    name_or_path = as_text(name_or_path)
+    given, folder = Path(name_or_path), shipped("recipes")
+    said = name_or_path if len(name_or_path) <= MAX_NAME else f"{name_or_path[:MAX_NAME]}…"
+    for candidate in (given, folder / "train" / f"{given}.yaml", folder / f"{given}.yaml", folder / given):
+        if _is_file(candidate) and (candidate == given or not given.is_absolute()):
+            return candidate
+    fault = f"extends {said!r}: no such recipe" if where else "no such recipe"
+    if name_or_path and os.path.lexists(given) and len(said) <= MAX_NAME:
+        fault = f"extends {said!r}, which is no file" if where else "is no file of YAML"
+    known = sorted(path.stem for path in (folder / "train").glob("*.yaml"))
+    near = get_close_matches(given.stem.lower(), known, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    remedy = f"{hint}give a YAML file or one of {', '.join(known)}"
+    raise RecipeError(where or said or "recipe", fault, remedy)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long for any file
+        return False
+
+
+def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
+    """`["model.layers=4", "lr=1e-3"]` as nested values.
+
+    Raises:
+        UsageError: one is not key=value.
+    """
+    values: dict[str, Any] = {}
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        parts = key.strip().split(".")
+        if not equals or not all(parts):
+            raise UsageError(f"override {override!r}", "is not key=value", "write for example model.layers=4")
+        nested: Any = parse_yaml(text, f"override {override!r}", UsageError)
+        for part in reversed(parts):
+            nested = {part: nested}
+        values = merge(values, nested, f"override {override!r}")
+    return values
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any], where: object) -> dict[str, Any]:
+    """Mappings merge key by key; anything else of `over` replaces what `base` has."""
+    merged = dict(base)
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(merged.get(key), dict) and key != "objectives":
+            merged[key] = merge(merged[key], value, where)
+        else:
+            merged[key] = value
+    return merged
+
+
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """What differs between two recipes' values: `lr: 0.001, now 0.002`, one an entry."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        return [
+            line
+            for key in sorted(old.keys() | new.keys())
+            for line in differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+        ]
+    return [] if old == new else [f"{path}: {old!r}, now {new!r}"]
+
+
+def _extended(path: Path, seen: list[Path]) -> dict[str, Any]:
+    if path.resolve() in seen or len(seen) >= MAX_EXTENDS:
+        chain = " -> ".join(p.name for p in [*seen, path])
+        raise RecipeError(path, f"extends itself or too deep: {chain}", "extend another recipe")
+    values = read_yaml(path, RecipeError)
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        fault = f"must be a mapping, is {type(values).__name__}"
+        raise RecipeError(path, fault, "write keys with values, as in steps: 1000")
+    base = values.pop("extends", None)
+    if base is None:
+        return values
+    if not isinstance(base, str):
+        raise RecipeError(
+            path, f"extends must name a recipe, is {base!r}", "name one, as in extends: discrete_tiny"
+        )
+    beside = path.parent / (base if base.endswith((".yaml", ".yml")) else f"{base}.yaml")
+    found = next((p for p in (path.parent / base, beside) if _is_file(p)), None) or find_recipe(base, path)
+    return merge(_extended(found, [*seen, path.resolve()]), values, path)

@@ -1,0 +1,235 @@
+"""What a training run needs to go on exactly: the folder `training/` of its checkpoints.
+
+    state.json                step, recipe, the shards' digests, where the sampler stands
+    optimizer.safetensors     moments by parameter name
+    weights.safetensors       of training, where the checkpoint's own are averages of them
+
+There is no state of random numbers: every draw of a step comes from (seed, what, step) by `seed_for`.
+
+A run goes on only in the format versions that it was written in: what an optimizer knows of its weights
+cannot be brought to others. The weights can: a new run starts from such a checkpoint with `start`.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hma_data.errors import CheckpointError, RecipeError
+from hma_data.storage.files import file_sha256
+from hma_data.storage.folders import finite, read_json, read_tensors, to_json, write_tensors
+from hma_model.checkpoint.io import CONFIG, HEAD, STEM, TRAINING, Checkpoint, inside
+from hma_model.checkpoint.migrate import FORMAT_VERSION
+from hma_model.config import HMAConfig
+from hma_model.network.state import check_fit, module_key
+from hma_model.training.init_from import TRAINED_BY
+from hma_model.training.recipe import Recipe, differences
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from hma_data.shards.reader import ShardSet
+    from hma_model.network.model import HMA
+
+STATE, OPTIMIZER, WEIGHTS = "state.json", "optimizer.safetensors", "weights.safetensors"
+VERSION = 1  # of `training/`; it rises with any change of what its files mean
+
+
+class OtherVersionError(CheckpointError):
+    """A checkpoint of another format version: whole, but not to be passed over for an older one."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a run stood when its checkpoint was written.
+
+    Attributes:
+        step: steps done.
+        recipe: `Recipe.identity` of the run.
+        data: embodiment id -> digest of its shards.
+        sampler: `Feed.state`.
+        skipped: steps left out for losses that were not numbers.
+        seconds: spent in steps so far.
+        evaluation: the last one's figures.
+        norms: running mean of the gradients' norms, and over how many.
+    """
+
+    step: int
+    recipe: dict[str, Any]
+    data: dict[str, str]
+    sampler: dict[str, Any]
+    skipped: int = 0
+    seconds: float = 0.0
+    evaluation: dict[str, Any] = field(default_factory=dict)
+    norms: list[float] = field(default_factory=list)
+
+    def require_same(self, recipe: dict[str, Any], data: dict[str, str], where: object) -> None:
+        """Raise RecipeError with the differences unless recipe and shards are those of the run."""
+        before = {**Recipe().identity(), **self.recipe}  # keys that came later had their defaults
+        changed = differences(before, recipe) + differences(self.data, data, "data")
+        if changed:
+            raise RecipeError(
+                where,
+                f"was begun with another recipe or other shards: {'; '.join(changed)}",
+                "train into another folder, undo the change, or accept it with --force",
+            )
+
+
+def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
+    """Raise RecipeError where a run would go on with another network or tokenizer, which nothing allows."""
+    free = TRAINED_BY | {"objectives"} | ({"frames"} if before.time_position == "rotary" else set())
+    for item in dataclasses.fields(HMAConfig):
+        old, new = getattr(before, item.name), getattr(now, item.name)
+        if item.name not in free and old != new:
+            if item.name == "tokenizer":
+                old, new = (spec.get("name") for spec in (old, new))
+                fault = f"was begun with another tokenizer: {old!r}, now {new!r} or other weights of it"
+            else:
+                fault = f"was begun with another network: {item.name} is {new!r}, there it is {old!r}"
+            raise RecipeError(where, fault, "train into another folder; --force cannot accept this")
+
+
+def seed_for(seed: int, what: str, *index: int) -> int:
+    """A seed of its own for each purpose and place, below 2**63."""
+    content = repr((seed, what, index)).encode()
+    return int.from_bytes(hashlib.sha256(content).digest()[:8], "little") >> 1
+
+
+def data_digests(sets: Mapping[str, "ShardSet"]) -> dict[str, str]:
+    """Sixteen hex digits over the shards of each embodiment."""
+    return {
+        name: hashlib.sha256("".join(s.sha256 for s in shards.manifest.shards).encode()).hexdigest()[:16]
+        for name, shards in sets.items()
+    }
+
+
+def write_state(
+    folder: Path, state: State, moments: Mapping[str, "Tensor"], weights: Mapping[str, "Tensor"]
+) -> None:
+    """Fill a checkpoint's `training/`; without `weights` those of the checkpoint are the run's."""
+    write_tensors(folder / OPTIMIZER, moments, {"format": "pt"})
+    if weights:
+        write_tensors(folder / WEIGHTS, weights, {"format": "pt"})
+    files = {path.name: file_sha256(path) for path in sorted(folder.iterdir())}
+    values = finite({"version": VERSION, **asdict(state), "files": files})
+    (folder / STATE).write_bytes(to_json({**values, "sha256": _digest(values)}))
+
+
+def _digest(values: Mapping[str, Any]) -> str:
+    content = json.dumps({key: value for key, value in values.items() if key != "sha256"}, sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def require_version(path: Path) -> None:
+    """Raise unless a run can go on from the checkpoint in a folder with this release.
+
+    Raises:
+        OtherVersionError: it names both versions.
+        CheckpointError: a file that says so is missing or damaged.
+    """
+    checks = (
+        (path / CONFIG, "format_version", FORMAT_VERSION, None),
+        (path / TRAINING / STATE, "version", VERSION, 1),
+    )
+    for file, key, own, absent in checks:
+        found = read_json(file).get(key, absent)
+        if isinstance(found, int) and found != own:
+            newer = "update hma-toolkit, or begin" if found > own else "begin"
+            remedy = f"{newer} a new run from its weights with start={path}"
+            raise OtherVersionError(file, f"is of {key} {found}, this release trains on with {own}", remedy)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a checkpoint keeps of a run, read whole so that nothing can fail half way.
+
+    Attributes:
+        state: where the run stood.
+        shown: of the trunk ("") and each embodiment's stem and head, as published.
+        weights: of training, where these differ.
+        moments: of the optimizer.
+    """
+
+    state: State
+    shown: dict[str, tuple[dict[str, "Tensor"], ...]]
+    weights: dict[str, "Tensor"]
+    moments: dict[str, "Tensor"]
+    _averages: dict[str, "Tensor"] = field(default_factory=dict)
+
+    @property
+    def averages(self) -> dict[str, "Tensor"]:
+        """Averaged parameters by name, once `fill` has seen them."""
+        return self._averages
+
+    def fill(self, model: "HMA") -> None:
+        """Bring the weights of training into a whole model.
+
+        Raises:
+            CheckpointError: parts that do not fit the model.
+        """
+        model.load_trunk(self.shown[""][0])
+        for name in self.shown.keys() - {""}:
+            model.load_embodiment(name, *self.shown[name])
+        if not self.weights:
+            return
+        self._averages.update({n: p.detach().cpu().clone() for n, p in model.named_parameters()})
+        fresh = _prefixes(model.embodiments.keys() - self.shown.keys())
+        own = {name: tensor for name, tensor in model.state_dict().items() if not name.startswith(fresh)}
+        weights = {name: self.weights[name] for name in self.weights.keys() & own.keys()}
+        check_fit(f"{TRAINING}/{WEIGHTS}", weights, own)
+        model.load_state_dict(weights, strict=False)
+
+
+def _prefixes(embodiments: Iterable[str]) -> tuple[str, ...]:
+    return tuple(f"{part}.{module_key(name)}." for name in embodiments for part in ("stems", "heads"))
+
+
+def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) -> Kept:
+    """What a checkpoint keeps of a run with these embodiments; of those it does not know, nothing.
+
+    Raises:
+        CheckpointError: parts are missing, damaged, or do not belong together.
+    """
+    shown: dict[str, tuple[dict[str, Tensor], ...]] = {"": (read_tensors(checkpoint.trunk()),)}
+    for name in set(embodiments) & set(checkpoint.embodiments):
+        checkpoint.check(name)
+        shown[name] = tuple(read_tensors(checkpoint.path(name, part)) for part in (STEM, HEAD))
+    weights = _own_file(checkpoint, WEIGHTS) if WEIGHTS in _files(checkpoint) else {}
+    moments = _own_file(checkpoint, OPTIMIZER)
+    return Kept(state, shown, weights, moments)
+
+
+def _files(checkpoint: Checkpoint) -> dict[str, str]:
+    """The files of `training/` by their hashes; an older release has left none of these."""
+    folder = checkpoint.folder / TRAINING
+    there = {name: "" for name in (OPTIMIZER, WEIGHTS) if (folder / name).is_file()}
+    files = read_json(folder / STATE).get("files")
+    return files if isinstance(files, dict) else there
+
+
+def _own_file(checkpoint: Checkpoint, name: str) -> "dict[str, Tensor]":
+    path = inside(checkpoint.folder, f"{TRAINING}/{name}")
+    recorded = _files(checkpoint).get(name)
+    if recorded and recorded != file_sha256(path):
+        raise CheckpointError(path, f"is not the file that {STATE} names", "delete this checkpoint")
+    return read_tensors(path)
+
+
+def read_state(checkpoint: Checkpoint) -> State:
+    """Where the run stood.
+
+    Raises:
+        CheckpointError: it is not said, or damaged.
+    """
+    path = inside(checkpoint.folder, f"{TRAINING}/{STATE}")
+    values = read_json(path)
+    stated = values.pop("sha256", None)
+    if stated is not None and stated != _digest(values):
+        raise CheckpointError(path, "is not what was written", "delete this checkpoint")
+    try:
+        return State(**{key: value for key, value in values.items() if key not in ("version", "files")})
+    except TypeError as fault:
+        raise CheckpointError(path, f"is damaged: {fault}", "delete this checkpoint") from fault

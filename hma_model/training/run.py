@@ -1,0 +1,453 @@
+"""A run's model, optimizer and data, and what is done with them step by step.
+
+`hma_model.training.loop` runs the loop. Every rank takes part in gathering weights; rank 0 writes files.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
+from hma_data.loading.dataset import Batch, WindowDataset, open_sets
+from hma_data.shards.reader import ShardSet
+from hma_data.storage.files import write_atomic
+from hma_data.storage.folders import remove_partial, to_json
+from hma_model.checkpoint import io as checkpoints
+from hma_model.checkpoint.io import Checkpoint, action_stats, training_checkpoints
+from hma_model.config import ActionSpace, HMAConfig
+from hma_model.evaluation.evaluate import Means, digit_frequencies, unconditional_baseline, windows
+from hma_model.evaluation.sample_images import newest_pictures, sample_pictures
+from hma_model.network.model import HMA
+from hma_model.training.data import Feed
+from hma_model.training.ema import Average
+from hma_model.training.guards import Pulse, culprits, listed, suspects
+from hma_model.training.init_from import Start
+from hma_model.training.optim import load_optimizer_state, lr_scale, make_optimizer, optimizer_state, set_lr
+from hma_model.training.parallel import Spread, World, gathered
+from hma_model.training.recipe import Recipe
+from hma_model.training.resume import (
+    Kept,
+    OtherVersionError,
+    State,
+    data_digests,
+    read_kept,
+    read_state,
+    require_network,
+    require_version,
+    seed_for,
+    write_state,
+)
+from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require_memory
+from hma_model.training.scheduled_sampling import forwarded, share_at
+from hma_model.training.step_metrics import Tally, peak_memory_mib
+from hma_model.training.validation import main_objective, validate
+
+
+class Run:
+    """What a run is made of.
+
+    Args:
+        recipe: what to train.
+        out: the run's folder; it is there.
+        device: where the model is.
+        world: the ranks it is trained by.
+
+    Attributes:
+        step, skipped, seconds: steps done, those of them left out, and the time they took.
+        evaluation: the last one's figures.
+    """
+
+    def __init__(self, recipe: Recipe, out: Path, device: torch.device, world: World | None = None) -> None:
+        if not recipe.data:
+            raise RecipeError("recipe: data", "names no shards", "add data=[FOLDER, …]")
+        self.out, self.device, self.world = out, device, world or World()
+        if recipe.self_forward and recipe.parallel == "fsdp" and self.world.size > 1:
+            fault = "needs a network that each rank can call by itself"
+            raise RecipeError("recipe: self_forward", fault, "use parallel=ddp")
+        self.sets = open_sets(recipe.data)
+        self.start = self._fetch(recipe)
+        if self.start and "frames" not in recipe.model_fields_set:
+            recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
+        self.recipe = recipe
+        self.feed = Feed(recipe, self.sets, self.world)
+        self.digests = data_digests(self.sets)
+        if self.start:
+            self.digests["the checkpoint it starts from"] = self.start.checkpoint.trunk_sha256[:16]
+        stats = self.start.stats if self.start else lambda shards: shards.manifest.stats
+        self.stats = {name: stats(shards) for name, shards in self.sets.items()}
+        torch.manual_seed(seed_for(recipe.seed, "init"))
+        self.model = self._network()
+        if self.start:
+            self.start.fill(self.model)
+        self.model.to(device).train()
+        self.model.trunk.checkpointing = recipe.checkpointing
+        self.held_out = {
+            name: s for name, s in self.sets.items() if len(WindowDataset(s, "val", recipe.frames))
+        }
+        self.step, self.skipped, self.seconds = 0, 0, 0.0
+        self.pulse = Pulse(recipe.spike)
+        self.evaluation: dict[str, Any] = {}
+        self._baseline: Means | None = None
+        self._twin: HMA | None = None
+        self._unseen, self._complained = "", False
+        self._painted, self._painting = 0.0, 0.0  # seconds for pictures so far, and for the last ones
+
+    def _fetch(self, recipe: Recipe) -> Start | None:
+        if recipe.start is None:
+            if recipe.freeze == "trunk":
+                raise RecipeError("recipe: freeze", "keeps a trunk that nothing has trained", "add start=…")
+            return None
+        self.world.once(lambda: Start.bring(recipe, self.sets, self.out))
+        return Start.open(recipe, self.sets, self.out)
+
+    def _network(self) -> HMA:
+        spec = next(iter(self.sets.values())).spec
+        config: HMAConfig = self.start.network(self.recipe) if self.start else self.recipe.network(spec)
+        spread = self.world.size if self.recipe.parallel == "fsdp" else 1
+        require_memory(config, self.device, spread, bool(self.start and self.start.frozen))
+        model = HMA(config)
+        for name, shards in self.sets.items():
+            try:
+                space = ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name))
+            except RecipeError as fault:
+                raise RecipeError(shards.folder, f"{name}: {fault.fault}", fault.remedy) from fault
+            model.add_embodiment(space)
+        return model
+
+    @property
+    def nats(self) -> bool:
+        """Whether the losses are nats a token."""
+        video = main_objective(self.recipe.objectives) in ("forward", "passive", "full")
+        return self.model.config.kind == "discrete" and video
+
+    def remarks(self) -> list[str]:
+        """What somebody who watches should know."""
+        missing = sorted(set(self.sets) - set(self.held_out))
+        frames = self.recipe.frames
+        notes = [f"no validation windows of {frames} frames: {', '.join(missing)}"] if missing else []
+        if self.recipe.warmup > self.recipe.steps:
+            notes.append(
+                f"lr never reaches its value: warmup {self.recipe.warmup} of {self.recipe.steps} steps"
+            )
+        if self.start and not self.step:
+            notes += self.start.remarks(self.sets)
+        if self.world.size > 1:
+            passes = f"{self.feed.passes} passes a step over {self.world.size} ranks"
+            notes.append(f"{passes}, {self.recipe.parallel}")
+        return notes
+
+    @torch.no_grad()
+    def begin(self) -> None:
+        """Give a fresh readout the training tokens' log frequencies, so that no step is spent on them."""
+        plain = self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete"
+        if plain or self.start:
+            return
+        shares = [
+            [p * digit for digit in digit_frequencies(shards)]
+            for p, shards in zip(self.feed.mixture.p, self.sets.values())
+        ]
+        bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
+        own = self.model.token_readout.linear.bias
+        own.copy_(torch.from_numpy(bias).to(own))
+
+    def prepare(self, kept: Kept | None) -> None:
+        """Spread the model over the ranks, and make what moves it; `kept` is what a checkpoint knows of that.
+
+        Raises:
+            CheckpointError: moments that fit no parameter.
+        """
+        if self.recipe.compile:
+            for block in self.model.trunk.blocks:
+                block.compile()
+        self.spread = Spread(self.model, self.world, self.recipe.parallel)
+        self.optimizer = make_optimizer(self.model, self.recipe)
+        self.average = Average(self.model, self.recipe.ema) if self.recipe.ema else None
+        if kept is None:
+            return
+        own = {name for group in self.optimizer.param_groups for name in group["names"]}
+        moments = {key: value for key, value in kept.moments.items() if key.rpartition("/")[0] in own}
+        load_optimizer_state(self.optimizer, moments, self.out)
+        if self.average and kept.averages:
+            self.average.load(kept.averages)
+
+    # -- a step
+
+    def advance(self) -> dict[str, Any]:
+        """One update of the weights; returns its line of metrics.jsonl."""
+        recipe, begun = self.recipe, time.monotonic()
+        lr = set_lr(self.optimizer, lr_scale(self.step, recipe))
+        self.optimizer.zero_grad(set_to_none=True)
+        tally, seen, waited = Tally(list(self.sets), self.device), [], 0.0
+        batches = self.feed.step()
+        for _ in self.feed.own:
+            asked = time.monotonic()
+            number, batch = next(batches)
+            waited += time.monotonic() - asked
+            output = self._pass(number, batch.to(self.device), number == self.feed.own[-1])
+            tally.add(batch.embodiment, output)
+            seen.append((batch, output.per_sample))
+        self.spread.average()
+        norm = self.spread.clip(recipe.clip)
+        loss, by_embodiment, objectives = tally.whole(self.world, self.feed.passes)
+        self.step += 1
+        fault = self.pulse.fault(loss, norm)
+        if fault:
+            self._refuse(fault, seen)
+        else:
+            self.optimizer.step()
+            self.pulse.take(norm)
+            if self.average:
+                self.average.update(self.step)
+        spent = time.monotonic() - begun
+        self.seconds += spent
+        return {
+            "step": self.step,
+            "loss": loss,
+            "loss_by_embodiment": by_embodiment,
+            "objectives": objectives,
+            "lr": lr,
+            "grad_norm": norm,
+            "windows": recipe.windows_per_step,
+            "step_seconds": round(spent, 6),
+            "data_seconds": round(waited, 6),
+            "memory_mib": peak_memory_mib(self.device),
+            "skipped": self.skipped,
+        }
+
+    def _pass(self, number: int, batch: Batch, last: bool) -> Any:
+        """Forward and backward; the step's loss is the mean over its passes, whoever makes them."""
+        torch.manual_seed(seed_for(self.recipe.seed, "dropout", self.step, number))
+        generator = torch.Generator().manual_seed(seed_for(self.recipe.seed, "masks", self.step, number))
+        with self.spread.passing(last):
+            with self._autocast():
+                batch = self._past(number, batch)
+                output = self.spread(batch, generator=generator)
+            if not output.loss.requires_grad:
+                fault = f"nothing that may learn takes part in the objective {output.objective}"
+                raise RecipeError("recipe: freeze", fault, "use freeze=nothing, or another objective")
+            (output.loss / len(self.feed.own)).backward()
+        return output
+
+    def _past(self, number: int, batch: Batch) -> Batch:
+        """The batch as the model is to see it: with frames of its own where the recipe asks for them."""
+        share = share_at(self.step, self.recipe)
+        if not share:
+            return batch
+        seed = seed_for(self.recipe.seed, "self_forward", self.step, number)
+        draws = torch.Generator().manual_seed(seed)
+        return forwarded(self.model, batch, share, self.recipe.self_forward_frames, draws)
+
+    def _autocast(self) -> AbstractContextManager[Any]:
+        if self.recipe.precision == "fp32":
+            return nullcontext()
+        return torch.autocast(self.device.type, torch.bfloat16)
+
+    def _refuse(self, fault: str, seen: list[tuple[Batch, Tensor]]) -> None:
+        if self.recipe.nonfinite == "skip":
+            self.skipped += 1
+            return
+        suspected = [item for part in self.world.gather(suspects(seen, self.sets)) for item in part]
+        raise TrainingError(
+            f"step {self.step}",
+            f"{fault}; windows: {listed(culprits(suspected))}",
+            "look at these with hma shards preview, lower lr, or go on without such steps by nonfinite=skip",
+        )
+
+    # -- evaluation and checkpoints
+
+    def shown(self) -> HMA:
+        """The model that is evaluated and saved, whole on this rank; every rank must ask."""
+        if not self.average and not self.spread.sharded:
+            return self.model
+        state = self.average.state() if self.average else gathered(self.model.state_dict().items())
+        if self.world.main:
+            self._twin = self._twin or self._network().to(self.device)
+            self._twin.load_state_dict(state)
+        return self._twin or self.model
+
+    def evaluate(self) -> dict[str, Any]:
+        """Validation loss beside its baseline; returns the line of metrics.jsonl."""
+        model = self.shown()
+        self.evaluation = self.world.once(lambda: self._evaluated(model))
+        return self.evaluation
+
+    def _evaluated(self, model: HMA) -> dict[str, Any]:
+        recipe = self.recipe
+
+        def held_out() -> Iterator[Batch]:
+            for shards in self.held_out.values():
+                yield from windows(shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size)
+
+        def baseline() -> Means:
+            self._baseline = self._baseline or unconditional_baseline(self.sets, held_out())
+            return self._baseline
+
+        with self._autocast(), torch.compiler.set_stance("force_eager"):
+            facts = validate(model, held_out, baseline, recipe.seed, self.step)
+            if self._picture_due():
+                begun = time.monotonic()
+                self._unseen = sample_pictures(
+                    model,
+                    self.held_out,
+                    self.out,
+                    self.step,
+                    frames=recipe.frames,
+                    count=recipe.pictures,
+                    seed=recipe.seed,
+                )
+                self._painting = time.monotonic() - begun
+                self._painted += self._painting
+        return facts
+
+    def _picture_due(self) -> bool:
+        """Whether this evaluation leaves pictures: the last one does, others as far as time allows."""
+        last = self.step == self.recipe.steps
+        spare = self.recipe.pictures_share * self.seconds - self._painted - self._painting
+        return bool(self.recipe.pictures) and (last or spare > 0)
+
+    def complaint(self) -> str:
+        """Why there are no pictures, once; nothing where there are."""
+        text = "" if self._complained else self._unseen
+        self._complained = self._complained or bool(text)
+        return text
+
+    def save(self) -> Path:
+        """Write checkpoints/step-N, and delete all but the last few; every rank must ask."""
+        model, sampler = self.shown(), self.feed.state(self.world)
+        moments = optimizer_state(self.optimizer)
+        weights = gathered(self.model.state_dict().items()) if self.average else {}
+        state = State(
+            step=self.step,
+            recipe=self.recipe.identity(),
+            data=self.digests,
+            sampler=sampler,
+            skipped=self.skipped,
+            seconds=self.seconds,
+            evaluation=self.evaluation,
+            norms=[self.pulse.mean, float(self.pulse.count)],
+        )
+
+        def write() -> Path:
+            path = self.out / "checkpoints" / f"step-{self.step:08d}"
+            checkpoints.save(
+                model,
+                path,
+                embodiment_yaml={name: s.embodiment.to_yaml() for name, s in self.sets.items()},
+                stats=self.stats,
+                cards={name: self._card(name, s) for name, s in self.sets.items()},
+                tokenizer=model.config.tokenizer,
+                training=lambda folder: write_state(folder, state, moments, weights),
+                base=self.start.checkpoint if self.start and self._carries_others else None,
+                samples=newest_pictures(self.out, self.sets),
+            )
+            for old in training_checkpoints(self.out)[: -self.recipe.keep_last]:
+                checkpoints.remove(old)
+            return path
+
+        return self.world.once(write)
+
+    def _card(self, name: str, shards: ShardSet) -> dict[str, Any]:
+        figures = (("val_loss", "loss"), ("baseline_loss", "baseline"), ("accuracy", "accuracy"))
+        metrics = {
+            ours: self.evaluation[f"{theirs}_by_embodiment"].get(name)
+            for ours, theirs in figures
+            if f"{theirs}_by_embodiment" in self.evaluation
+        }
+        train = shards.manifest.splits.get("train", {})
+        data: dict[str, Any] = {key: train.get(key) for key in ("episodes", "frames")}
+        if "://" in shards.manifest.source:  # a path would only be of use here
+            data["source"] = shards.manifest.source
+        training: dict[str, Any] = {"steps": self.step, "seed": self.recipe.seed}
+        if self.start:
+            training["from_trunk_sha256"] = self.start.checkpoint.trunk_sha256
+            training["trunk"] = "frozen" if self.start.frozen else "tuned"
+        return {"data": data, "metrics": metrics, "training": training}
+
+    def resume(self, force: bool) -> tuple[Kept | None, list[str]]:
+        """Go to where the newest readable checkpoint stands.
+
+        Returns:
+            What `prepare` needs of it, and what there is to say about it.
+
+        Raises:
+            RecipeError: recipe or shards differ from the run's.
+            OtherVersionError: the newest checkpoint is of another format version.
+            CheckpointError: there are checkpoints, and none can be read.
+        """
+        self.world.once(lambda: remove_partial(self.out / "checkpoints"))
+        notes: list[str] = []
+        kept = None
+        paths = training_checkpoints(self.out)
+        for path in reversed(paths):
+            try:
+                require_version(path)
+                checkpoint = Checkpoint.open(path)
+                state = read_state(checkpoint)
+                if not force:
+                    state.require_same(self.recipe.identity(), self.digests, self.out)
+                require_network(checkpoint.config, self.model.config, self.out)
+                kept = read_kept(checkpoint, state, self.sets)
+                notes += self._adopt(checkpoint)
+                kept.fill(self.model)
+            except OtherVersionError:
+                raise
+            except CheckpointError as fault:
+                if path == paths[0]:
+                    remedy = "no checkpoint here can be read: restore one, or train into another folder"
+                    raise CheckpointError(fault.where, fault.fault, remedy) from fault
+                notes.append(f"passed over a damaged checkpoint: {fault}")
+                continue
+            notes += self._continue(state, force)
+            break
+        self.world.once(self._describe)
+        return kept, notes
+
+    def _adopt(self, checkpoint: Checkpoint) -> list[str]:
+        """Keep the statistics that stems were trained with, where the shards have others by now."""
+        left = sorted(set(checkpoint.embodiments) - set(self.sets)) if not self._carries_others else []
+        notes, gone = [], [f"left out of checkpoints from here on: {', '.join(left)}"] if left else []
+        for name, shards in self.sets.items():
+            if name not in checkpoint.embodiments:
+                notes.append(f"{name} is new here: fresh stem and head")
+                continue
+            stats = checkpoint.stats(name)
+            space = ActionSpace.of(shards.embodiment, action_stats(stats, name))
+            if not self.model.embodiments[name].agrees_with(space):
+                self.stats[name] = stats
+                notes.append(f"{name} keeps the statistics it was begun with")
+        if notes:
+            self.model = self._network().to(self.device).train()
+            self.model.trunk.checkpointing = self.recipe.checkpointing
+            if self.start:
+                self.start.fill(self.model)
+        return notes + gone
+
+    @property
+    def _carries_others(self) -> bool:
+        """Whether checkpoints keep robots that are not trained: those of a frozen trunk's source."""
+        return bool(self.start and self.start.frozen)
+
+    def _describe(self) -> None:
+        write_atomic(self.out / RECIPE, to_json(self.recipe.values()))
+        facts = {**environment(self.device), "ranks": self.world.size}
+        write_atomic(self.out / ENVIRONMENT, to_json(facts))
+
+    def _continue(self, state: State, force: bool) -> list[str]:
+        self.step, self.skipped, self.seconds = state.step, state.skipped, state.seconds
+        self.evaluation = state.evaluation
+        if state.norms:
+            self.pulse.mean, self.pulse.count = state.norms[0], int(state.norms[1])
+        notes = [f"going on from step {state.step}"]
+        try:
+            self.feed.load_state(state.sampler)
+        except UsageError as fault:
+            if not force and not self.feed.shared_otherwise(state.sampler):
+                raise
+            notes.append(f"the sampler begins anew: {fault}")
+        return notes

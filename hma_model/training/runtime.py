@@ -1,0 +1,208 @@
+"""A run's ground: its folder, its device, the signals that end it, and what its figures may depend on."""
+
+import fcntl
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, TextIO
+
+import torch
+
+from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
+from hma_model.training.parallel import local_rank
+
+if TYPE_CHECKING:
+    from hma_model.config import HMAConfig
+
+RECIPE, ENVIRONMENT = "recipe.json", "environment.json"
+LOCK, START = ".lock", ".start"  # START: the checkpoint that the run begins from
+_NO_MEMORY = re.compile("out of memory|can't allocate memory|not enough memory|bad_alloc", re.IGNORECASE)
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of a recipe's `device`; auto takes an accelerator where there is one.
+
+    Raises:
+        RecipeError: the device is not there.
+    """
+    cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
+    if name == "auto":
+        name = "cuda" if cuda else "mps" if mps else "cpu"
+    device = torch.device(f"cuda:{local_rank()}" if name == "cuda" else name)
+    there = {"cuda": cuda and (device.index or 0) < torch.cuda.device_count(), "mps": mps, "cpu": True}
+    if not there[device.type]:
+        raise RecipeError("recipe: device", f"{name} is not there", "use device=auto or device=cpu")
+    return device
+
+
+def environment(device: torch.device) -> dict[str, Any]:
+    """What the run's figures may depend on besides the recipe."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        release = version("hma-toolkit")
+    except PackageNotFoundError:
+        release = ""
+    return {
+        "hma_toolkit": release,
+        "git_revision": _git_revision(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
+        "threads": torch.get_num_threads(),
+        "platform": platform.platform(),
+    }
+
+
+def _git_revision() -> str:
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+@contextmanager
+def own_folder(out: Path) -> Iterator[None]:
+    """The run's folder, made if need be, and nobody else's while the block runs.
+
+    A block that fails before it has left anything in it leaves no folder either, where there was none before.
+
+    Raises:
+        OutputError: it cannot be made, holds something else, or another run is at work in it.
+    """
+    made = [path for path in (out, *out.parents) if not path.exists()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        others = [path.name for path in out.iterdir() if not path.name.startswith(".")]
+        if others and not (out / RECIPE).is_file():
+            raise OutputError(out, f"holds {others[0]} and no {RECIPE}", "train into a folder of its own")
+        ours = not (out / LOCK).exists()
+        lock = (out / LOCK).open("a")
+    except OSError as fault:
+        raise OutputError(out, f"cannot be used: {fault.strerror}", "choose another folder") from fault
+    with lock:
+        _hold(lock, out)
+        try:
+            yield
+        except HMAError:
+            if ours and {path.name for path in out.iterdir()} <= {LOCK, START}:
+                _remove_empty(out, made)
+            raise
+
+
+def _hold(lock: TextIO, out: Path) -> None:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        held = os.path.samestat(os.fstat(lock.fileno()), (out / LOCK).stat())
+    except (BlockingIOError, FileNotFoundError):
+        held = False
+    except OSError:  # a file system without locks
+        return
+    if not held:
+        raise OutputError(out, "another training is at work here", "wait for it or stop it")
+
+
+def _remove_empty(out: Path, made: list[Path]) -> None:
+    with suppress(OSError):  # somebody has put something there meanwhile
+        shutil.rmtree(out / START, ignore_errors=True)
+        (out / LOCK).unlink()
+        for path in made:
+            path.rmdir()
+
+
+@contextmanager
+def writable(out: Path) -> Iterator[None]:
+    """Around what writes into a run's folder.
+
+    Raises:
+        OutputError: something cannot be written.
+    """
+    try:
+        yield
+    except OSError as fault:
+        where, why = fault.filename or out, fault.strerror or str(fault)
+        remedy = "free space or choose another folder; checkpoints that are there are intact"
+        raise OutputError(where, f"cannot be written: {why}", remedy) from fault
+
+
+@contextmanager
+def enough_memory() -> Iterator[None]:
+    """Around what may ask for more memory than there is.
+
+    Raises:
+        TrainingError: it did.
+    """
+    try:
+        yield
+    except (RuntimeError, MemoryError) as fault:
+        text = (str(fault).splitlines() or [""])[0]
+        if isinstance(fault, RuntimeError) and not _NO_MEMORY.search(text):
+            raise
+        raise TrainingError(
+            "memory",
+            f"there is not enough for this model and batch: {text[:200] or type(fault).__name__}",
+            "lower batch_size (accumulate makes up for it), frames or model.width, or set checkpointing=true",
+        ) from fault
+
+
+def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen: bool) -> None:
+    """Refuse a network of which the weights and what training keeps for each cannot fit.
+
+    Args:
+        config: of the network.
+        device: where it is to be.
+        parts: over how many ranks it is spread.
+        frozen: the trunk's weights have no gradients and moments.
+
+    Raises:
+        RecipeError: the smallest estimate is above the memory of the device.
+    """
+    values = config.layers * config.width**2 * (8 + 2 * config.mlp_ratio)
+    if config.kind == "continuous":
+        values += config.diffusion_depth * config.diffusion_width**2
+    needed = values * (4 if frozen else 16) / parts
+    if device.type == "cuda":
+        there = float(torch.cuda.get_device_properties(device).total_memory)
+    else:
+        there = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    if needed > there:
+        raise RecipeError(
+            "recipe: model",
+            f"{values / 1e9:,.1f} billion weights take {needed / 2**30:,.0f} GiB in training, "
+            f"here are {there / 2**30:,.0f} GiB",
+            "lower model.width or model.layers",
+        )
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[threading.Event]:
+    """An event that SIGTERM and the first SIGINT set; a second SIGINT ends the process as usual."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, before[signal.SIGINT])
+        if os.environ.get("RANK", "0") == "0":
+            asked = number == signal.SIGINT
+            print("saving" + "; a second Ctrl-C stops at once" * asked, file=sys.stderr, flush=True)
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,115 @@
+"""Training on the model's own past, so that long rollouts drift less.
+
+In a rollout the frames that the model goes on from are its own. Here some windows of a batch get a few frames
+of their past replaced by what the model itself predicts for them, one after the other, each from the true
+frames before and those already replaced; the loss still asks for the truth. The share of such windows may
+rise over the run: predictions of an untrained model teach nothing. (The paper corrupts the past at random
+instead; that is `corrupt_max` and `history_probability` of the model.)
+
+B batch, T frames, h,w token grid, c,H,W latents, D frames replaced.
+"""
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from hma_data.loading.dataset import Batch
+from hma_model.network.embed import from_digits, unpatchify
+from hma_model.network.masking import uniform
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+    from hma_model.training.recipe import Recipe
+
+SAMPLE_STEPS = 8  # of the diffusion head: a past good enough to learn from
+
+
+@dataclass
+class Forwarded(Batch):
+    """A batch of which the model sees another past than the one it is to predict.
+
+    Attributes:
+        context: (B, T, h, w) tokens or (B, T, c, H, W) latents that the model sees.
+    """
+
+    context: Tensor | None = None
+
+
+def share_at(step: int, recipe: "Recipe") -> float:
+    """The share of windows with a past of their own in step `step`, counted from 0."""
+    if step < recipe.self_forward_from or not recipe.self_forward:
+        return 0.0
+    along = (step + 1 - recipe.self_forward_from) / max(recipe.self_forward_over, 1)
+    return recipe.self_forward * min(along, 1.0)
+
+
+@torch.no_grad()
+def forwarded(
+    model: "HMA", batch: Batch, share: float, depth: int, generator: torch.Generator | None = None
+) -> Batch:
+    """The batch with the model's own past in some windows.
+
+    Args:
+        model: as it is trained; its mode is as before afterwards.
+        batch: on the model's device.
+        share: of the windows that get one, drawn one by one.
+        depth: D, frames in a row that are replaced; where they begin is drawn, and the first frame and the
+            last one stay true.
+        generator: of every draw.
+    """
+    true = batch.tokens if batch.tokens is not None else batch.latents
+    assert true is not None
+    size, frames = true.shape[:2]
+    where = "cpu" if generator is None else generator.device
+    draws = uniform((2, size), generator, where).to(true.device)
+    chosen = draws[0] < share
+    if frames < 3 or not bool(chosen.any()):
+        return batch
+    depth = min(depth, frames - 2)
+    first = 1 + (draws[1] * (frames - 1 - depth)).long()
+    context, rows = true[chosen].clone(), torch.arange(int(chosen.sum()), device=true.device)
+    names = [name for name, taken in zip(batch.embodiment, chosen.tolist()) if taken]
+    training = model.training
+    model.eval()
+    for offset in range(depth):
+        at = first[chosen] + offset
+        context[rows, at] = _predicted(model, context, at, batch, chosen, names, generator)
+    model.train(training)
+    seen = true.clone()
+    seen[chosen] = context
+    given = {f.name: getattr(batch, f.name) for f in fields(Batch)}
+    return Forwarded(**given, context=seen)
+
+
+def _predicted(
+    model: "HMA",
+    context: Tensor,
+    at: Tensor,
+    batch: Batch,
+    chosen: Tensor,
+    names: list[str],
+    generator: torch.Generator | None,
+) -> Tensor:
+    """Frame `at` (n,) of each window, wholly hidden, from the frames before it."""
+    config, rows = model.config, torch.arange(len(at), device=at.device)
+    actions = None
+    if any(weight for name, weight in config.objectives.items() if name != "passive"):
+        actions = batch.actions[chosen]
+    known = None if actions is None else batch.action_mask[chosen]
+    if config.kind == "discrete":
+        hidden = context.clone()
+        hidden[rows, at] = config.vocab_size
+        digits = model.video_logits(hidden, actions, names, known)[rows, at].argmax(-1)
+        return from_digits(digits, config.factored)
+    scaled = context.float() * config.latent_scale
+    mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)
+    mask[rows, at] = True
+    conditions = model.video_conditions(scaled, mask, actions, names, known)[rows, at]
+    patches = model.latent_readout.diffusion.sample(
+        conditions.flatten(0, 2), steps=SAMPLE_STEPS, generator=generator
+    )
+    whole = patches.view(len(at), 1, -1, config.patch_dim)
+    latents = unpatchify(whole, config.patch, config.token_grid)
+    return (latents[:, 0] / config.latent_scale).to(context.dtype)

@@ -1,0 +1,69 @@
+"""The rooms in the order of the road: a module imports only from its own room and from those before it."""
+it."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = (
+    "hma_data.errors", "hma_data.console", "hma_data.priority", "hma_data.threads", "hma_data.storage",
+    "hma_data.hub", "hma_data.registry", "hma_data.episodes", "hma_data.sources", "hma_data.tokenizers",
+    "hma_data.shards", "hma_data.tokenizers.training", "hma_data.inspection", "hma_data.conversion",
+    "hma_data.loading", "hma_data.loader", "hma_data.lab", "hma_data.bench", "hma_data.cli", "hma_data",
+    "hma_model.config", "hma_model.network", "hma_model.checkpoint", "hma_model.generation",
+    "hma_model.evaluation", "hma_model.released", "hma_model.hub", "hma_model.training", "hma_model.demo",
+    "hma_model.bench", "hma_model.cli", "hma_model",
+)  # fmt: skip
+DOORS = {  # HMA.generate; HMA.from_pretrained and push_to_hub: imported when they are called
+    ("hma_model.network.model", "hma_model.generation.rollout"),
+    ("hma_model.network.model", "hma_model.hub.publish"),
+}
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for package in ("hma_data", "hma_model")
+    for path in (ROOT / package).rglob("*.py")
+}
+
+
+def imports(module: str) -> Iterator[str]:
+    """Yield the modules of ours that one imports, anywhere in it, TYPE_CHECKING included."""
+    for node in ast.walk(ast.parse(MODULES[module].read_text())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: imports are absolute"
+            base = node.module or ""
+            names = [f"{base}.{a.name}" if f"{base}.{a.name}" in MODULES else base for a in node.names]
+        else:
+            continue
+        yield from (name for name in names if name in MODULES)
+
+
+def room(module: str) -> str:
+    """Return the room of a module: the longest name that it begins with."""
+    parts = module.split(".")
+    for size in range(len(parts), 1, -1):
+        if ".".join(parts[:size]) in ROOMS:
+            return ".".join(parts[:size])
+    return module
+
+
+def test_every_module_is_in_a_room() -> None:
+    assert not [module for module in MODULES if room(module) not in ROOMS]
+
+
+@pytest.mark.parametrize("module", sorted(set(MODULES) - {"hma_data", "hma_model"}))
+def test_a_module_imports_only_from_rooms_before_its_own(module: str) -> None:
+    here = ROOMS.index(room(module))
+    wrong = [
+        name for name in imports(module) if ROOMS.index(room(name)) > here and (module, name) not in DOORS
+    ]
+    assert not wrong
+
+
+def test_a_room_says_what_it_is_for() -> None:
+    silent = [name for name in MODULES if not ast.get_docstring(ast.parse(MODULES[name].read_text()))]
+    assert not silent
