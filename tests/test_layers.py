@@ -1,5 +1,4 @@
 """The rooms in the order of the road: a module imports only from its own room and from those before it."""
-it."""
 
 import ast
 from collections.abc import Iterator

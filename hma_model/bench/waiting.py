@@ -7,6 +7,7 @@ medians count, since other work on the machine disturbs single figures. CPU seco
 
 import multiprocessing
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -53,7 +54,10 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     for _ in range(settings["rounds"]):
         for wait, busy in cases:
             with _environment(WAITS[wait]), _busy_cores(usable_cores() if busy else 0):
-                rounds[wait, busy].append(in_fresh_process(measure, settings))
+                found = in_fresh_process(measure, settings)
+            rounds[wait, busy].append(found)
+            rate = f"{found['steps_per_second']:.2f} steps/s"
+            print(f"{wait}, {'busy cores' if busy else 'alone'}: {rate}", file=sys.stderr, flush=True)
     return [
         {"wait": wait, "beside": "busy cores" if busy else "nothing", **_medians(found)}
         for (wait, busy), found in rounds.items()
