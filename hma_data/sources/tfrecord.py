@@ -84,7 +84,7 @@ def _walk(
 
 @contextmanager
 def reader(files: Any, path: str, size: int) -> Iterator[Read]:
-    """Yield a function that reads parts of a file: directly for a local one, with read-ahead for a remote one."""
+    """Yield a function that reads parts of a file: a local one directly, a remote one with read-ahead."""
     if not is_local(files):
         yield _Window(files, path, size)
         return
