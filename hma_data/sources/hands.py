@@ -322,7 +322,7 @@ def _flags(runs: Runs, number: int, alone: bool) -> dict[str, int]:
 def _signal(
     vector: Vector, file: VideoFile, labels: HandLabels, span: tuple[int, int], to_last: bool = False
 ) -> Signal:
-    """Make a vector over a run of n labels: n - 1 values, or n `to_last` where all keys are current values."""
+    """Make a vector over a run of n labels: n - 1 values, or n with `to_last` where all are current."""
     keys = [part.key for part in vector.components]
     if to_last and all(key in POINTS for key in keys):
         pieces = [labels.points[key][slice(*span)] for key in keys]

@@ -79,7 +79,7 @@ class Square:
     angle: float
 
     def to_picture(self, size: int) -> Floats:
-        """Return the (2, 3) affine map from a picture of the square, `size` pixels wide, to the whole picture."""
+        """Return the (2, 3) affine map from a picture of the square, `size` pixels wide, to the picture."""
         scale = self.side / size
         cos, sin = math.cos(self.angle) * scale, math.sin(self.angle) * scale
         half = size / 2
@@ -207,7 +207,7 @@ def cut(picture: Images, square: Square, size: int) -> NDArray[np.float32]:
 
 
 def palm_anchors() -> Floats:
-    """Return the palm model's anchors, (2016, 2) x and y in 0..1: two a cell of 24×24, six a cell of 12×12."""
+    """Return the palm model's anchors, (2016, 2) x and y in 0..1: two a cell of 24×24, six of 12×12."""
     found = []
     for stride, copies in ((8, 2), (16, 6)):
         cells = PALM_SIDE // stride

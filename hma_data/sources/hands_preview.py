@@ -1,4 +1,4 @@
-"""Draw the detected hands of a video into a copy of it.
+"""Draw the labelled hands of a video into an MP4.
 
 The left hand is orange with filled dots, the right hand blue with rings. A grey bar at the top marks a frame
 that is in no run, or that is masked because a needed hand is missing. A cross without fingers is a held

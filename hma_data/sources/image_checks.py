@@ -161,7 +161,7 @@ def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> 
 
 
 def runs(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return the chosen frames run by run, which bounds how many pictures are in memory."""
+    """Divide the chosen frames into runs of neighbours, so that only one run of pictures is in memory."""
     return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
 
 

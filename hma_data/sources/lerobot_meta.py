@@ -46,7 +46,7 @@ class Feature:
 
 @dataclass(frozen=True)
 class Span:
-    """The part of a video that holds an episode, in seconds of its clock; the whole file where `stop` is None."""
+    """The part of a video that holds an episode, in seconds of its clock; the whole file without `stop`."""
 
     path: str
     start: float = 0.0

@@ -278,7 +278,7 @@ class _EpisodeReading:
     # -- results
 
     def _stream(self, camera: Camera, shown: Floats | None = None) -> Stream:
-        """Return a camera; for an episode inside a bag, its own pictures, or those around the times `shown`."""
+        """Return a camera; for an episode in a bag, its own pictures, or those around the times `shown`."""
         track, clock = self._tracks[camera.key], camera.stamp or self._embodiment.sync.stamp
         if self._segment is None or self._table is None:
             return camera_stream(self._bag, track, clock)
@@ -305,10 +305,11 @@ class _EpisodeReading:
         return Signal(times, component_values(column.component, column.values()[order], self._where))
 
     def _around(self, received: Rows, times: Floats, shown: Floats) -> tuple[int, int]:
-        """Return the range of samples, in order of receipt, from the one in force at the first picture to the first
-        one after the last picture.
+        """Return the range of samples, in order of receipt, that the pictures shown need.
 
-        Where a clock begins anew between two episodes, only the samples on this episode's side count.
+        It begins with the sample in force at the first picture, and ends with the first sample at or after
+        the last. Where a clock begins anew between two episodes, only the samples on this episode's side
+        count.
         """
         assert self._segment
         inside = np.searchsorted(received, [self._segment.first_ns, self._segment.last_ns + 1])
