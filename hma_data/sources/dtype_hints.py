@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-HEAD = 65536  # bytes in which a JPEG's start of frame is looked for
-UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # times since 1970 from, seconds a unit
+HEAD = 65536  # bytes that are searched for a JPEG's start of frame
+UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least time since 1970, seconds a unit
 TIMES = re.compile(r"(.*/)?(time_?stamps?|times?|stamps?|t)(_s|_sec|_ns)?")
 STEPS_S = (1e-4, 5.0)  # between samples of a recording
 

@@ -125,7 +125,7 @@ def scan_cached(path: Path, detector: Detector, models: HandModels, layout: Hand
     try:
         _write(kept, {path.name: found})
     except OutputError:
-        return found  # without a cache that can be written, work goes on
+        return found  # the cache cannot be written: continue without it
     return found
 
 

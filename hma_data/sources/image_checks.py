@@ -28,12 +28,12 @@ STILL, BLANK = 0.5, 2.0  # limits: share of equal neighbours; standard deviation
 
 @dataclass
 class Look:
-    """What was seen of one camera.
+    """Statistics of one camera's pictures.
 
     Attributes:
         lossless: whether pictures are stored without loss, so that the YCbCr sign can be used.
         pictures: how many were added.
-        sizes: (height, width) -> how many times `add` met it.
+        sizes: (height, width) -> number of calls of `add` with it.
         changes: how often the size changes within an episode.
         neighbours, same: pairs of neighbouring pictures compared, and equal ones among them.
         blank, episodes: episodes in which the camera shows one colour; all episodes looked at.
@@ -98,7 +98,7 @@ class Look:
                         f"{straight:.0%} as they stand"
                     )
                 if straight >= SURE and turned <= CHANCE:
-                    return "no", ""  # however blue the scene
+                    return "no", ""  # even where the scene is blue
         count = max(self.pictures, 1)
         cold, warm = self.cold / count, self.warm / count
         if cold > COLD and cold > 4 * warm and self.blue > 1.25 * self.red:
@@ -188,7 +188,7 @@ def findings(looks: dict[str, Look]) -> Iterator[Finding]:
             said = f"{key}: shows nothing (one colour) in {look.blank} of {look.episodes} episodes looked at"
             severity: Severity = (
                 "info" if look.blank == look.episodes else "warn"
-            )  # a camera never plugged in
+            )  # info where every episode is blank: the camera was never plugged in
             yield Finding("blank", severity, said, "is it another camera's key?", key)
         share = look.same / max(look.neighbours, 1)
         if share > STILL and look.blank < look.episodes:

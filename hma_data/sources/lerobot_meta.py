@@ -2,7 +2,7 @@
 
 Version 2 stores one parquet file an episode, and one video an episode and camera; `meta/episodes.jsonl` and
 `meta/tasks.jsonl` list them. Version 3 packs many episodes into each file; `meta/episodes/*.parquet` names
-the file of an episode and, within a video, its begin and end.
+the file of an episode and, within a video, its start and end.
 """
 
 import json
@@ -325,7 +325,7 @@ def _names(found: Any, count: int) -> tuple[str, ...] | None:
             return tuple(str(name) for name in sorted(found, key=lambda name: int(found[name])))
         groups = {name: _flat(inner) for name, inner in found.items()}
         names = [name for inner in groups.values() for name in inner]
-        if len(set(names)) < len(names):  # both arms name their joints alike
+        if len(set(names)) < len(names):  # both arms use the same names
             names = [f"{group}_{name}" for group, inner in groups.items() for name in inner]
     else:
         names = _flat(found)

@@ -13,7 +13,7 @@ from hma_data.sources.findings import Finding
 
 
 def unfollowed(root: Path, told: Collection[Path] = ()) -> list[Finding]:
-    """Return one finding for each kind of link under a folder that is not followed.
+    """Return one finding for each kind of unfollowed link under a folder.
 
     Args:
         root: folder of the recordings; a file has no links.

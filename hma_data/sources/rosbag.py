@@ -3,7 +3,7 @@
 A bag is one episode, or several with `source.segments`; a folder of bags holds many. One pass over an episode
 gathers the times and numbers of the topics that the embodiment names. Pictures are read again on demand, so
 memory does not grow with the size of a bag. Streams keep their own clocks; `align` brings them to one clock.
-An episode inside a bag also gets each topic's last message before it, which is still in force.
+An episode inside a bag is read together with the earlier messages that are still in force.
 """
 
 import re

@@ -1,7 +1,7 @@
 """Find and read the records of TFRecord files, with their checksums verified.
 
 A record is its length (uint64), the masked CRC-32C of those eight bytes, the data, and the masked CRC-32C
-of the data; all little endian (format: TensorFlow's TFRecord). A scan reads only the length and the
+of the data; all little endian (format: TensorFlow's TFRecord). A scan needs only the length and the
 checksums, 16 bytes a record, so any record of a large file is found without reading the data of the
 others. A remote file is read no further than the record that is asked for.
 """
@@ -21,13 +21,13 @@ from hma_data.sources.record_index import EMPTY, Framing
 
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
-READ_AHEAD = 32 << 10  # bytes a request brings while records are shorter than that
+READ_AHEAD = 32 << 10  # bytes of one request, while records are shorter than that
 MAX_RECORD = 2**31  # protobuf's own limit
 Read = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
 
 
 def masked_crc(data: Any) -> int:
-    """Return the CRC-32C of the data, rotated by 15 bits plus a constant, as TFRecord stores it."""
+    """Return TFRecord's masked CRC-32C: rotated right by 15 bits, with a constant added."""
     crc = google_crc32c.value(data)
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 

@@ -21,13 +21,13 @@ DRIFT = 0.02  # share of the stated rate by which the measured rate may differ
 
 @dataclass(frozen=True)
 class Clock:
-    """What the timestamps of one stream in one episode say.
+    """The timing of one stream in one episode, measured from its timestamps.
 
     Attributes:
         hz, jitter_ms: rate and standard deviation of the intervals; None for fewer than two intervals, or
             where their sum is not positive.
         repeated, back: stamps equal to the one before, and stamps earlier than it.
-        gap_s, gap_at_s: the longest interval, and its begin after the earliest sample.
+        gap_s, gap_at_s: the longest interval, and its start in seconds after the earliest sample.
         period_s: the median interval.
         regular: share of intervals within a third of the median one.
         lost: frames missing at this rate, where the stream is regular; else None.
@@ -123,7 +123,7 @@ def findings(key: str, clock: Clock, camera: bool = False, episode: str = "") ->
 def drift(
     key: str, measured_hz: float | None, stated_hz: float | None, source: str = "the recording states"
 ) -> Iterator[Finding]:
-    """Yield a finding where the measured rate differs from the stated one; `source` says who stated it."""
+    """Yield a finding where the rates differ by more than DRIFT; `source` says who stated the rate."""
     if measured_hz and stated_hz and abs(measured_hz / stated_hz - 1) > DRIFT:
         said = f"{key}: ticks at {measured_hz:.4g} Hz, {source} {stated_hz:.4g}"
         numbers = {"measured_hz": measured_hz, "stated_hz": stated_hz}

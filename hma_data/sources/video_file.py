@@ -142,7 +142,7 @@ class VideoFile:
         self._container: Any = None
         self._decoder: Iterator[Any] = iter(())
         self._next = 0  # index of the frame the decoder gives next
-        self._entry = -1  # index of the keyframe that was last sought
+        self._entry = -1  # index of the keyframe of the last seek
         self._counts, self._seeks = False, True  # whether frames are counted; whether seeking is used
         self._spoilt = False  # whether the last frame, or a frame it may depend on, is damaged
         self._reformatter: Any = None

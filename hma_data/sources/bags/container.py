@@ -92,7 +92,7 @@ class Container(Protocol):
     path: Path
 
     def counts(self) -> Counter[Channel]:
-        """Count the messages of each channel, from the index if there is one; include channels without any."""
+        """Count the messages of each channel, from the index if there is one; also of empty channels."""
         ...
 
     def records(self, wanted: Wanted) -> Iterator[Record]:

@@ -180,7 +180,7 @@ class ChunkHead(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """Check whether its records lie in the file unpacked."""
+        """Check whether its records are stored uncompressed."""
         return self.codec in ("", "none") and self.packed == self.size
 
 
@@ -218,7 +218,7 @@ def between(
 
     Args:
         load: unpacks a chunk.
-        chunk: where an unpacked chunk is walked, the offsets of the chunk and of its records.
+        chunk: offsets of the chunk and of its records, where a chunk stored uncompressed is walked.
     """
     for opcode, offset, length in frames(file, at, end):
         if opcode in (DATA_END, FOOTER):

@@ -33,7 +33,7 @@ MAX_LENGTHS = 1000
 MAX_FIELDS = 64  # most numeric keys of a topic whose values are checked
 MAX_HELD = 1 << 16  # most numbers of a key in memory
 MAX_WIDTH = 4096  # most values of an action or state; wider fields are maps or point clouds
-LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # no streams
+LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # not streams
 APART_S = 1.0  # header stamps further than this from receive times are reported
 
 

@@ -121,7 +121,7 @@ class _ChunkHead(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """Check whether its records lie in the file unpacked."""
+        """Check whether its records are stored uncompressed."""
         return self.codec == "none"
 
 
@@ -246,7 +246,7 @@ def _made_index(file: BinaryIO) -> _Index:
 
 
 def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
-    """Return header and content of the record at `at` of a chunk, and the begin of the next record."""
+    """Return header and content of the record at `at` of a chunk, and the offset of the next record."""
     parts = []
     for _ in range(2):
         size = int.from_bytes(view[at : at + 4], "little")

@@ -1,4 +1,4 @@
-"""Find the begin and end of the episodes inside one bag, without decoding a picture.
+"""Find the start and end of the episodes inside one bag, without decoding a picture.
 
 One pass over the primary camera's stamps and the markers' topics makes a table. The last bags and their
 tables are cached for the other episodes of the same bag, while no file changes; an episode is then read by
@@ -261,7 +261,7 @@ def _segment(received: NDArray[np.int64], begin: int, stop: int) -> Segment:
 
 
 def _reach_ns(camera: TopicTrack, clock: str) -> int:
-    """Return a second plus the largest delay of the camera's pictures.
+    """Return a second plus the largest delay of the camera's pictures, of which at most MAX_DELAY_S counts.
 
     Other messages may arrive without that delay.
     """

@@ -1,4 +1,4 @@
-"""Index which messages are where in a bag file, so that a time range is read without the rest.
+"""Index where the messages of a bag file lie, so that a time range is read without the rest.
 
 A piece is a run of a file's records: one chunk, or messages outside of chunks. Its topics and its times of
 receipt are known. A file has some thousands of pieces.
