@@ -1,7 +1,8 @@
-"""What a source is: one recording format, read episode by episode.
+"""Define what a source is: one recording format, read episode by episode.
 
-A source keeps no open files between calls that would not survive a fork; it is cheap to make
-in every worker. `open_source` finds the module by format name, `detect` by looking at the files.
+A source must be cheap to make, because every worker makes its own. Between calls it keeps no file open
+that would not survive a fork. `open_source` finds a source by the name of its format; `detect` finds the
+format of the files at a path.
 
 T frames of an episode, A values of a vector.
 """
@@ -38,7 +39,7 @@ VIDEO_SUFFIXES = (
 )  # fmt: skip
 
 ENDINGS = dict.fromkeys((".h5", ".hdf5", ".hdf"), "hdf5") | dict.fromkeys((".bag", ".mcap", ".db3"), "rosbag")
-PACKED = {  # what unpacks a file, by the end of its name
+PACKED = {  # the command that unpacks a file, by the end of its name
     ".tar": "tar xf", ".tar.gz": "tar xf", ".tgz": "tar xf", ".tar.bz2": "tar xf", ".tar.xz": "tar xf",
     ".tar.zst": "tar xf", ".zip": "unzip", ".7z": "7z x", ".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz",
     ".zst": "unzstd", ".zstd": "unzstd", ".lz4": "unlz4",
@@ -47,15 +48,15 @@ PACKED = {  # what unpacks a file, by the end of its name
 
 @dataclass(frozen=True)
 class EpisodeRef:
-    """An episode before it is read.
+    """An episode that has not been read yet.
 
     Attributes:
         id: unique and stable within the source.
-        frames: how many it has, or a fair estimate; for planning shards without decoding.
-        split: the source's own, "train" or "val"; None where it has none.
+        frames: how many it has, or an estimate; for planning shards without decoding.
+        split: the source's own split, "train" or "val"; None where it has none.
         fingerprint: changes when the recording's bytes change (size and sample of content, not time stamps).
-        group: shared by episodes cut from one recording, which belong into one split; its own id where empty.
-        left_out: frames of that recording which are in none of its episodes.
+        group: shared by the episodes cut from one recording, which must stay in one split; empty means `id`.
+        left_out: frames of that recording that belong to none of its episodes.
     """
 
     id: str
@@ -68,7 +69,7 @@ class EpisodeRef:
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """The topic a key of a bag is in, as the messages were.
+    """The topic of a bag that holds a key, as measured from its messages.
 
     Attributes:
         name: of the topic.
@@ -87,24 +88,24 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class KeyInfo:
-    """One key of a recording: what `hma inspect` lists.
+    """One key of a recording, as `hma inspect` lists it.
 
     Attributes:
         key: as an embodiment's YAML would name it.
         kind: camera, vector, text or other.
-        shape: of one sample, pictures (H, W, 3); (H, W, 1) where they are recorded in grey.
+        shape: of one sample; pictures are (H, W, 3), or (H, W, 1) where they are recorded in grey.
         dtype: as recorded.
         hz: measured or stated rate; None when unknown.
         names: of the values, where the recording has them.
         codec: of pictures: jpeg, png, raw, av1, h264.
         count: samples seen (of one episode, or of the whole recording when it is a topic).
         jitter_ms: standard deviation of the intervals.
-        topic: of bags.
-        constant: whether a vector never changes in the episodes looked at.
-        still: which values of a vector never change in them.
-        low, high: least and greatest finite number met.
-        swapped: of pictures, whether red and blue changed places: sure, hint, no; None where nobody can tell.
-        skew_ms: of a stream with a clock of its own: p50, p95 and max from the first camera's frames.
+        topic: the topic that holds the key; of bags only.
+        constant: whether a vector never changes in the sampled episodes.
+        still: indices of the values of a vector that never change in the sampled episodes.
+        low, high: smallest and largest finite number in the sampled episodes.
+        swapped: whether red and blue are swapped in the pictures: sure, hint, no; None where it is unknown.
+        skew_ms: p50, p95 and max distance from the first camera's frames, for a stream with its own clock.
     """
 
     key: str
@@ -127,19 +128,19 @@ class KeyInfo:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is in a recording, without an embodiment.
+    """What a recording holds, found without an embodiment.
 
     Attributes:
         format: rlds, hdf5, rosbag, lerobot or hands.
         episodes: how many.
-        frames: in all, None when it would need a full read.
+        frames: of all episodes together; None when counting them would need a full read.
         lengths: of the first episodes (at most 1,000).
         keys: each key once.
-        robot: as the recording names it.
-        facts: anything else worth a line.
-        looked_at: episodes whose values and pictures were looked at.
-        findings: what the looks found, as they were met.
-        checks: names of the checks that could be made here; those without a finding passed.
+        robot: the robot's name in the recording.
+        facts: other facts about the recording, by name.
+        looked_at: how many episodes were sampled for their values and pictures.
+        findings: what the checks found, in the order of the checks.
+        checks: names of the checks that could be made; a check without a finding passed.
     """
 
     format: str
@@ -157,36 +158,36 @@ class Inspection:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What looks wrong, a sentence each."""
+        """Return the findings that are errors or warnings, one sentence each."""
         return tuple(str(finding) for finding in self.findings if finding.severity != "info")
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+        """Return plain values for `--json`."""
         return asdict(self) | {"problems": list(self.problems)}
 
 
 class Source(Protocol):
-    """One recording format; `uri` is a str or path of a recording, or its URI."""
+    """One recording format. `uri` is the path (str or path object) or the URI of a recording."""
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
-        """What is in the recording; values and pictures of so many episodes are looked at."""
+        """Return what the recording holds; sample the values and pictures of `episodes` episodes."""
         ...
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """The episodes, in a stable order, without decoding any."""
+        """Return the episodes in a stable order, without decoding any."""
         ...
 
     def episode_ids(self, uri: StrPath) -> list[str]:
-        """Their ids alone."""
+        """Return the ids of the episodes."""
         ...
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """One episode, lazily."""
+        """Return one episode; its pictures are decoded on demand."""
         ...
 
 
 def open_source(name: str) -> Source:
-    """The source of that format, e.g. "rlds".
+    """Return the source of a format, e.g. "rlds".
 
     Raises:
         SourceError: no such format.
@@ -198,13 +199,13 @@ def open_source(name: str) -> Source:
 
 
 def detect(uri: StrPath) -> str:
-    """The format of the recording at `uri`, by its files' names and first bytes.
+    """Return the format of the recording at `uri`, found by the names and first bytes of its files.
 
     Args:
         uri: str or path of the recording, or its URI.
 
     Raises:
-        SourceError: nothing there, or nothing we know.
+        SourceError: nothing is there, or its format is unknown.
     """
     uri = as_text(uri)
     if not uri:
@@ -238,11 +239,11 @@ def detect(uri: StrPath) -> str:
 
 
 def of_another_format(uri: str, name: str, fault: SourceError) -> SourceError:
-    """What is wrong with a recording that could not be read as of that format: maybe it is of another.
+    """Return the error of a recording that could not be read; name the format that it seems to have.
 
     Args:
         name: the format that was stated.
-        fault: why it could not be read.
+        fault: the error of reading it as that format; returned as it is where no other format is detected.
     """
     try:
         known = detect(uri) if Path(uri.removeprefix("file://")).expanduser().exists() else name
@@ -255,7 +256,7 @@ def of_another_format(uri: str, name: str, fault: SourceError) -> SourceError:
 
 
 def _unpack_first(files: Sequence[Path]) -> str:
-    """What to do about the first packed file; empty where none is."""
+    """Return how to unpack the first packed file; empty where there is none."""
     for file in files:
         for suffix, tool in PACKED.items():
             if file.name.lower().endswith(suffix):
@@ -264,7 +265,7 @@ def _unpack_first(files: Sequence[Path]) -> str:
 
 
 def _names_a_dataset(uri: str) -> bool:
-    """Whether it reads NAME/DATASET[@REVISION] of the Hub, and nothing of this machine is meant by it."""
+    """Check whether a URI reads NAME/DATASET[@REVISION] of the Hub, and names no path on this machine."""
     path = Path(uri).expanduser()
     found = re.fullmatch(r"\w[\w.-]*/\w[\w-]*(\.\d[\w.-]*)?(@[\w./-]+)?", uri)
     return bool(found) and not path.exists() and not path.parent.exists()
@@ -278,10 +279,10 @@ def _is_bag(path: Path) -> bool:
 
 
 def local_path(uri: str) -> Path:
-    """The local path of a plain path or file:// URI.
+    """Return the local path of a plain path or file:// URI.
 
     Raises:
-        SourceError: it does not exist, or is of a store.
+        SourceError: it does not exist, or it is a URI of remote storage.
     """
     path = Path(uri.removeprefix("file://")).expanduser()
     if not path.exists() and "://" in uri.removeprefix("file://"):
@@ -294,7 +295,7 @@ def local_path(uri: str) -> Path:
 
 
 def leaves(path: Path, folder: Path) -> bool:
-    """Whether a path leads out of its folder by a link or `..`.
+    """Check whether a path leads out of its folder by a link or `..`.
 
     The Hugging Face Hub's cache keeps the files of a snapshot as links to its blobs, which may be followed.
     """
@@ -305,7 +306,7 @@ def leaves(path: Path, folder: Path) -> bool:
 
 
 def first_bytes(path: Path, count: int) -> bytes:
-    """The first bytes of a file; empty when it cannot be read."""
+    """Return the first bytes of a file; empty when it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(count)
@@ -314,7 +315,10 @@ def first_bytes(path: Path, count: int) -> bytes:
 
 
 def file_fingerprint(path: Path) -> str:
-    """Sixteen hex digits over a file's size and its first, middle and last 64 KiB; blind to time stamps."""
+    """Return 16 hex digits hashed from a file's size and its first, middle and last 64 KiB.
+
+    Time stamps do not change it.
+    """
     size = path.stat().st_size
     digest = hashlib.sha256(str(size).encode())
     with path.open("rb") as file:
@@ -325,9 +329,9 @@ def file_fingerprint(path: Path) -> str:
 
 
 def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArray[np.float32]:
-    """The vector over time from what was found at each component's key.
+    """Return a vector over time, joined from the recorded values of its components.
 
-    Slices, sign and offset are applied here and nowhere else.
+    Slices, signs and offsets are applied only here.
 
     Args:
         vector: of the embodiment.
@@ -351,7 +355,7 @@ def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArr
 
 
 def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.float32]:
-    """One component's (T, dims) float32; see `compose`."""
+    """Return the values (T, dims) float32 of one component; see `compose`."""
     if piece.dtype == object or piece.dtype.kind not in "fiub":
         raise EpisodeError(where, f"{part.key} holds {piece.dtype}, not numbers")
     if piece.ndim < 1 or not len(piece):
@@ -373,5 +377,5 @@ def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.f
             "correct dims or give slice in the YAML",
         )
     values = values.astype(np.float64) * np.asarray(part.sign) + np.asarray(part.offset)
-    with np.errstate(over="ignore"):  # what float32 cannot hold is refused as not finite by align
+    with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite, and align refuses it
         return values.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Open a bag: one recording, in one file or in a ROS 2 folder of several, told apart by content."""
+"""Open a bag: one recording, in one file or in a ROS 2 folder of several files; detect its format."""
 
 import os
 import tempfile
@@ -29,11 +29,11 @@ from hma_data.sources.base import file_fingerprint, first_bytes, leaves
 from hma_data.storage.yaml_io import read_yaml
 
 SUFFIXES = (".bag", ".mcap", ".db3")
-MAX_EXPANSION = 200  # a file that unpacks to more than so many times its size is a bomb
+MAX_EXPANSION = 200  # most times its packed size that a file may have unpacked, against decompression bombs
 
 
 class Place(NamedTuple):
-    """Say where a message is: which file of the bag, and the place in it."""
+    """The place of a message: the file of the bag, and two numbers that give the place in it."""
 
     file: int
     first: int
@@ -41,14 +41,14 @@ class Place(NamedTuple):
 
 
 class Bag:
-    """Read one recording. Cheap to make; holds no open files, and unpacked chunks up to a fixed size.
+    """One recording. It is cheap to make, holds no open files, and keeps unpacked chunks up to a fixed size.
 
     Args:
         path: a bag file, or a folder with rosbag2's metadata.yaml.
-        root: links that lead out of it are refused; default the bag itself.
+        root: a link that leads out of this folder is refused; default the bag itself.
 
     Raises:
-        EpisodeError: it cannot be one, by its first bytes or its metadata.
+        EpisodeError: it cannot be a bag, by its first bytes or its metadata.
     """
 
     def __init__(self, path: Path, root: Path | None = None) -> None:
@@ -69,14 +69,14 @@ class Bag:
         self._counts: Counter[Channel] | None = None
 
     def files(self) -> list[Container]:
-        """Return its files in recording order; packed ones (.zstd) are unpacked to a temporary folder."""
+        """Return its files in recording order; packed files (.zstd) are unpacked to a temporary folder."""
         if self._files is None:
             chunks = ChunkCache()
             self._files = [_container(self._plain(path), chunks) for path in self._paths]
         return self._files
 
     def notes(self) -> dict[str, str]:
-        """Return what MCAP metadata records say of it; empty for the other kinds."""
+        """Return the entries of MCAP metadata records; empty for the other formats."""
         found: dict[str, str] = {}
         for file in self.files():
             if isinstance(file, McapFile):
@@ -99,11 +99,11 @@ class Bag:
         return total
 
     def records(self, topics: frozenset[str] | None = None) -> Iterator[tuple[Place, Record]]:
-        """Yield the messages of those topics (of all, with None), file by file."""
+        """Yield the messages of those topics (of all topics with None), file by file."""
         return self.wanted(Wanted(topics))
 
     def wanted(self, wanted: Wanted) -> Iterator[tuple[Place, Record]]:
-        """Yield the wanted messages, file by file; a part of the time costs about its own bytes."""
+        """Yield the wanted messages, file by file; a time range costs about its own bytes."""
         if self._message_packed:
             wanted = replace(wanted, heads=frozenset())
         for number, file in enumerate(self.files()):
@@ -130,11 +130,11 @@ class Bag:
                 yield self._unpack(data) if self._message_packed else data
 
     def fingerprint(self) -> str:
-        """Return what changes when a byte does; see EpisodeRef."""
+        """Return a text that changes when a byte of the bag does; see EpisodeRef."""
         return "-".join(file_fingerprint(path) for path in self._paths)
 
     def state(self) -> tuple[tuple[str, ...], ...]:
-        """Return what is equal only while no file of the bag changes; for what is kept of it in memory."""
+        """Return facts that stay equal only while no file of the bag changes; the key for caching it."""
         found = []
         with reading(self.path):
             for path in [*self._paths, *(item for item in map(_log, self._paths) if item.is_file())]:
@@ -180,10 +180,10 @@ class Bag:
 
 
 def find_bags(root: Path) -> dict[str, Path]:
-    """Return episode id -> bag at or under that path, in order of the ids.
+    """Return episode id -> bag at or under a path, in order of the ids.
 
-    An id is the path relative to `root` without suffix; the suffix stays where two would be equal.
-    A folder with rosbag2's metadata.yaml is one bag; elsewhere every bag file is.
+    An id is the path relative to `root` without suffix; the suffix stays where two ids would be equal. A
+    folder with rosbag2's metadata.yaml is one bag; elsewhere every bag file is one.
     """
     if root.is_file() or is_bag_folder(root):
         return {root.stem if root.is_file() else root.name: root}
@@ -204,7 +204,7 @@ def find_bags(root: Path) -> dict[str, Path]:
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Check whether the folder is a ROS 2 bag."""
+    """Check whether a folder is a ROS 2 bag."""
     return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 4096)
 
 
@@ -228,7 +228,7 @@ def _refuse_link(path: Path, root: Path) -> None:
 
 
 def _log(path: Path) -> Path:
-    """Return where sqlite3 keeps what is not merged yet."""
+    """Return the path where sqlite3 keeps changes that are not merged yet."""
     return path.with_name(path.name + "-wal")
 
 
@@ -255,7 +255,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
-    """List the files metadata.yaml names, by their last name: older versions put the folder before it."""
+    """List the files of metadata.yaml by their last name, because older versions put the folder before it."""
     where = folder / "metadata.yaml"
     names = metadata.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):

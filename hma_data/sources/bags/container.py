@@ -1,9 +1,8 @@
 """Define what the three kinds of bag file share: the contract, records, chunks, binary fields.
 
-A container is one file. It yields the messages of wanted topics in the file's order, tells how
-many there are without reading them where it has an index, and finds a message again by its
-place, so that nothing but places needs to be kept of pictures. No container holds an open file
-between calls.
+A container is one file. It yields the messages of wanted topics in the file's order. Where it has an index,
+it counts the messages without reading them. It finds a message again by its place, so for pictures only
+places are kept in memory. No container holds an open file between calls.
 """
 
 import bz2
@@ -19,7 +18,7 @@ from typing import BinaryIO, NamedTuple, Protocol
 from hma_data.errors import EpisodeError
 
 CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
-MAX_CHUNK = 512 << 20  # bytes; a chunk that unpacks to more is a bomb or an error
+MAX_CHUNK = 512 << 20  # most bytes of an unpacked chunk, against decompression bombs and errors
 FOREVER = 2**64
 HEAD = 64  # bytes: the stamp of a message is within them
 FAULTS = (
@@ -33,13 +32,13 @@ Place = tuple[int, int]
 
 @dataclass(frozen=True)
 class Channel:
-    """Describe a topic as one writer declared it.
+    """A topic as one writer declared it.
 
     Attributes:
         type: of its messages, "sensor_msgs/msg/JointState" or as the schema names it.
-        encoding: of its messages: ros1, cdr, json, protobuf, or what the file says.
+        encoding: of its messages: ros1, cdr, json, protobuf, or another that the file states.
         schema_encoding: ros1msg, ros2msg, ros2idl, jsonschema, protobuf; empty without a schema.
-        schema: the definition carried by the file.
+        schema: the definition in the file.
     """
 
     topic: str
@@ -50,7 +49,7 @@ class Channel:
 
 
 class Record(NamedTuple):
-    """Hold a message as stored: `log_ns` is when it was received, `place` where `payloads` finds it again."""
+    """A stored message: `log_ns` is its time of receipt, `place` is where `payloads` finds it again."""
 
     channel: Channel
     log_ns: int
@@ -60,12 +59,12 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True)
 class Wanted:
-    """Say which messages are asked of a container.
+    """The messages that a container is asked for.
 
     Attributes:
         topics: None for all.
-        first_ns, last_ns: received from the one to the other, both included.
-        heads: topics of whose messages the first HEAD bytes will do; more may come.
+        first_ns, last_ns: range of the time of receipt, both ends included.
+        heads: topics for which the first HEAD bytes of a message are enough; more may be returned.
     """
 
     topics: frozenset[str] | None = None
@@ -75,7 +74,7 @@ class Wanted:
 
     @property
     def bounded(self) -> bool:
-        """Check whether a part of the recording's time is asked for."""
+        """Check whether only a part of the recording's time is asked for."""
         return self.first_ns > 0 or self.last_ns < FOREVER
 
     def topic(self, name: str) -> bool:
@@ -83,25 +82,25 @@ class Wanted:
         return self.topics is None or name in self.topics
 
     def time(self, log_ns: int) -> bool:
-        """Check whether a message received then is asked for."""
+        """Check whether a message received at that time is asked for."""
         return self.first_ns <= log_ns <= self.last_ns
 
 
 class Container(Protocol):
-    """Read one file of a bag. Every method raises EpisodeError when the file is damaged."""
+    """One file of a bag. Every method raises EpisodeError when the file is damaged."""
 
     path: Path
 
     def counts(self) -> Counter[Channel]:
-        """Count the messages of each channel, from the index where there is one; also those without any."""
+        """Count the messages of each channel, from the index if there is one; also of empty channels."""
         ...
 
     def records(self, wanted: Wanted) -> Iterator[Record]:
-        """Yield those messages, in the file's order."""
+        """Yield the wanted messages, in the file's order."""
         ...
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
-        """Return each topic's last message before that time; topics without one are left out."""
+        """Return each topic's last message before a time; topics without one are left out."""
         ...
 
     def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
@@ -111,7 +110,7 @@ class Container(Protocol):
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Tell whatever goes wrong inside as damage of that file."""
+    """Raise any error inside as damage of that file."""
     try:
         yield
     except FAULTS as fault:
@@ -127,14 +126,14 @@ def damaged(path: Path, fault: str) -> EpisodeError:
 
 
 class ChunkCache:
-    """Keep the chunks of one bag that were unpacked last: at most CACHED_BYTES of them, and always one."""
+    """Keep the last unpacked chunks of one bag: at most CACHED_BYTES of them, and always at least one."""
 
     def __init__(self) -> None:
         self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()
         self._bytes = 0
 
     def get(self, path: Path, offset: int, load: Callable[[], bytes]) -> memoryview:
-        """Return the chunk at that offset of that file; `load` unpacks it where it is not kept."""
+        """Return the chunk at an offset of a file; `load` unpacks it where it is not cached."""
         key = (path, offset)
         if key in self._chunks:
             self._chunks.move_to_end(key)
@@ -147,10 +146,10 @@ class ChunkCache:
 
 
 def decompress(codec: str, data: bytes, size: int) -> bytes:
-    """Return the `size` bytes that a chunk unpacks to.
+    """Return the `size` bytes of an unpacked chunk.
 
     Raises:
-        ValueError: another codec or size, or more than MAX_CHUNK bytes.
+        ValueError: the codec is unknown, the size is another, or it exceeds MAX_CHUNK bytes.
     """
     if size > MAX_CHUNK:
         raise ValueError(f"a chunk claims {size:,} bytes, more than {MAX_CHUNK:,}")
@@ -172,10 +171,10 @@ def decompress(codec: str, data: bytes, size: int) -> bytes:
 
 
 def unzstd(data: Data, limit: int) -> bytes:
-    """Return up to `limit` + 1 unpacked bytes.
+    """Unpack zstd data; return at most `limit` + 1 bytes.
 
     Raises:
-        ValueError: not zstd.
+        ValueError: the data is not zstd.
     """
     import zstandard
 
@@ -190,7 +189,7 @@ def unzstd(data: Data, limit: int) -> bytes:
 
 
 class Fields:
-    """Read little-endian fields off bytes; ValueError where they end too soon."""
+    """Read little-endian fields from bytes; raise ValueError where the bytes end too soon."""
 
     def __init__(self, data: Data) -> None:
         self._data = memoryview(data)
@@ -208,11 +207,11 @@ class Fields:
         return int.from_bytes(self.take(size), "little")
 
     def block(self) -> memoryview:
-        """Take the bytes after their 32-bit length."""
+        """Take the bytes that follow their 32-bit length."""
         return self.take(self.number(4))
 
     def text(self) -> str:
-        """Read UTF-8 after its 32-bit length."""
+        """Read UTF-8 text that follows its 32-bit length."""
         return str(self.block(), "utf-8")
 
     def __bool__(self) -> bool:
@@ -220,10 +219,11 @@ class Fields:
 
 
 def read_exact(file: BinaryIO, size: int) -> bytes:
-    """Read that many bytes.
+    """Read exactly `size` bytes.
 
     Raises:
-        EOFError: the file ends before.
+        EOFError: the file ends before that.
+        ValueError: `size` is more than MAX_CHUNK.
     """
     if size > MAX_CHUNK:
         raise ValueError(f"a record claims {size:,} bytes, more than {MAX_CHUNK:,}")

@@ -1,11 +1,11 @@
-"""Read the numbers that the keys of bags stand for.
+"""Read the numbers at the keys of bags.
 
 A camera's key is its topic. A number's key is the topic and a path into its messages:
-`/joint_states.position`, `/joint_states.position[0:7]`, `/markers.poses[2].position.x`,
-`/cmd_vel.linear` (a message of numbers gives them in its fields' order), `/cmd_vel`.
+`/joint_states.position`, `/joint_states.position[0:7]`, `/markers.poses[2].position.x`, `/cmd_vel`,
+`/cmd_vel.linear` (a message of numbers gives them in the order of its fields).
 
-A key's dtype is the one that the message definition states: ROS messages are looked up in the typestore,
-protobuf's in their descriptor; JSON states none.
+A key's dtype is the one in the message definition: ROS messages are looked up in the typestore, protobuf
+messages in their descriptor; JSON states none.
 
 T messages of a topic, A values of a component.
 """
@@ -39,17 +39,17 @@ PROTOBUF = {
 
 @dataclass(frozen=True)
 class Field:
-    """Hold a key taken apart."""
+    """A key, parsed into its topic and the steps of its path."""
 
     key: str
     topic: str
     steps: tuple[Step, ...]
 
     def value(self, message: Any, where: str) -> Any:
-        """Return what is there in the message.
+        """Return the value at the key in a message.
 
         Raises:
-            EpisodeError: nothing is; names what would be.
+            EpisodeError: there is none; the error names the fields that are there.
         """
         for i, step in enumerate(self.steps):
             message = self._step(message, step, i, where)
@@ -77,10 +77,10 @@ class Field:
 
 
 def parse_key(key: str, topics: Iterable[str], where: str) -> Field:
-    """Take a key apart; its topic is the longest of the bag's that it begins with.
+    """Parse a key; its topic is the longest topic of the bag with which the key begins.
 
     Raises:
-        EpisodeError: no topic fits, or the path is not one.
+        EpisodeError: no topic fits, or the rest of the key is not a path.
     """
     topics = list(topics)
     fitting = [t for t in topics if key == t or (key.startswith(t) and key[len(t)] in ".[")]
@@ -122,9 +122,9 @@ def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
 class Column:
     """Gather the values of one component, message by message.
 
-    Where the message that holds the field also holds a list `name` (JointState), the component's
-    `names` select and order the values, unless the key or the YAML slices; messages of another
-    publisher, with none of those names, are left out.
+    Where the message that holds the field also has a list `name` (JointState), the component's `names` select
+    and order the values, unless the key or the YAML slices. Messages of another publisher, with none of those
+    names, are left out.
     """
 
     def __init__(self, component: Component, field: Field, where: str) -> None:
@@ -139,7 +139,7 @@ class Column:
         )
 
     def add(self, message: Any, row: int) -> None:
-        """Take the values out of message `row`."""
+        """Add the values of message `row`."""
         value = self.field.value(message, self._where)
         try:
             values = numbers(value)
@@ -160,7 +160,7 @@ class Column:
         self._rows.append(row)
 
     def rows(self) -> NDArray[np.int64]:
-        """Return which messages gave values.
+        """Return the indices of the messages that gave values.
 
         Raises:
             EpisodeError: none did.
@@ -174,7 +174,7 @@ class Column:
         return np.frombuffer(self._rows, np.int64)
 
     def values(self) -> Floats:
-        """Return (T, A) as recorded."""
+        """Return the values (T, A) as recorded."""
         return np.frombuffer(self._values, np.float64).reshape(len(self._rows), -1)
 
     def _pick(self, message: Any, width: int) -> list[int] | None:
@@ -222,15 +222,16 @@ class Column:
 
 
 def stated_dtype(channel: Channel, message: Any, steps: Sequence[Step]) -> str | None:
-    """Return what the definition says of the numbers at that path.
+    """Return the dtype that the definition states for the numbers at a path.
 
     Args:
         channel: of the message.
-        message: any of the channel, decoded.
+        message: any decoded message of the channel.
         steps: of the key.
 
     Returns:
-        numpy's name, of a message of several the one that holds all; None where nothing states it.
+        numpy's name of the dtype; for a message of several dtypes, one that holds all; None where none
+        is stated.
     """
     try:
         if channel.encoding in ("ros1", "cdr"):
@@ -241,12 +242,12 @@ def stated_dtype(channel: Channel, message: Any, steps: Sequence[Step]) -> str |
         else:
             return None
         return str(np.result_type(*sorted(names))) if names else None
-    except (KeyError, TypeError, AttributeError, RecursionError):  # no number of numpy's; its own kind within
+    except (KeyError, TypeError, AttributeError, RecursionError):  # not a numpy number, or a recursive type
         return None
 
 
 def _ros_field(store: Any, kind: str, steps: Sequence[Step]) -> Any:
-    """Return rosbags's (node type, content) of the field at that path."""
+    """Return rosbags's (node type, content) of the field at a path."""
     from rosbags.interfaces import Nodetype
 
     found: Any = (Nodetype.NAME, kind)

@@ -1,7 +1,7 @@
 """Turn messages into pictures: raw, compressed, and video stored one frame a message.
 
-sensor_msgs Image and CompressedImage, foxglove CompressedImage, RawImage and CompressedVideo, the
-latter in any encoding of messages. T messages; H×W pixels, uint8 RGB.
+The types are Image and CompressedImage of sensor_msgs; CompressedImage, RawImage and CompressedVideo of
+foxglove, in any encoding of messages; and FFMPEGPacket. T messages; H×W pixels, uint8 RGB.
 """
 
 import base64
@@ -31,7 +31,7 @@ KINDS = {
     "ffmpeg_image_transport_msgs/FFMPEGPacket": VIDEO,
 }
 DEPTH = ("compresseddepth", "16uc1", "32fc1", "mono16")
-BYTES = {  # a pixel
+BYTES = {  # bytes of a pixel
     "rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4, "8uc4": 4, "mono8": 1, "8uc1": 1,
     "bayer_rggb8": 1, "bayer_bggr8": 1, "bayer_gbrg8": 1, "bayer_grbg8": 1,
     "yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2, "nv12": 1, "nv21": 1,
@@ -43,7 +43,7 @@ TO_RGB = {
 
 CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}  # Foxglove's and FFmpeg's names
 NAL_UNIT = re.compile(b"\x00\x00\x01(.)", re.DOTALL)
-AV1_SEQUENCE = 1  # kind of unit
+AV1_SEQUENCE = 1  # type of the unit that holds a sequence header
 HIGH_PROFILES = {
     100,
     110,
@@ -63,13 +63,13 @@ ENCODERS = (("264", "h264"), ("265", "h265"), ("hevc", "h265"), ("vp9", "vp9"), 
 
 
 def picture_kind(message_type: str) -> str | None:
-    """Return raw, still or video; None for a type that holds no pictures."""
+    """Return raw, still or video; None for a type without pictures."""
     short = re.sub(r"^foxglove(_msgs)?[./](msg[./])?", "foxglove/", message_type).replace("/msg/", "/")
     return KINDS.get(short)
 
 
 def codec(message: Any, kind: str) -> str:
-    """Name how the picture is stored: jpeg, png, raw, h264 …"""
+    """Return how the picture is stored: jpeg, png, raw, h264 …"""
     if kind == RAW:
         return "raw"
     if kind == VIDEO:
@@ -82,7 +82,7 @@ def codec(message: Any, kind: str) -> str:
 
 
 def video_codec(message: Any) -> str:
-    """Return h264, h265, vp9, av1, or what else the message says.
+    """Return h264, h265, vp9, av1, or another codec that the message states.
 
     FFMPEGPacket names the encoder (libx264, hevc_nvenc), or the codec first: "h264;yuv420p;bgr8;bgr8".
     """
@@ -93,10 +93,10 @@ def video_codec(message: Any) -> str:
 
 
 def picture(message: Any, kind: str, where: str) -> Images:
-    """Return (H, W, 3) RGB of a raw or still picture.
+    """Return a raw or still picture as (H, W, 3) RGB.
 
     Raises:
-        EpisodeError: not colour or grey of 8 bits, sizes that do not fit, bytes that are no picture.
+        EpisodeError: it is not colour or grey of 8 bits, its sizes do not fit, or its bytes are no picture.
     """
     try:
         if kind == RAW:
@@ -110,14 +110,14 @@ def picture(message: Any, kind: str, where: str) -> Images:
 
 
 def is_grey(message: Any, kind: str) -> bool:
-    """Check whether a raw or still picture that can be read has one channel."""
+    """Check whether a raw or still picture has one channel."""
     if kind == RAW:
         return str(child(message, "encoding")).lower() in ("mono8", "8uc1")
     return kind == STILL and one_channel(payload(message))
 
 
 def payload(message: Any) -> bytes:
-    """Return the stored bytes of a picture; JSON holds them in base64."""
+    """Return the stored bytes of a picture; JSON stores them in base64."""
     data = child(message, "data")
     if isinstance(data, str):
         try:
@@ -155,7 +155,7 @@ def _raw(message: Any, where: str) -> Images:
 def _semi_planar(
     flat: NDArray[np.uint8], height: int, width: int, step: int, encoding: str, where: str
 ) -> Images:
-    """Convert rows of luma, then half as many of the two colours in turn."""
+    """Convert NV12 or NV21: rows of luma, then half as many rows with both colour channels interleaved."""
     rows = height * 3 // 2
     if height % 2 or width % 2 or len(flat) < step * (rows - 1) + width:
         raise EpisodeError(where, f"a picture of {width}×{height} in {encoding} has {len(flat):,} bytes")
@@ -183,7 +183,7 @@ def _to_rgb(pixels: NDArray[np.uint8], encoding: str) -> Images:
 
 
 def is_keyframe(data: bytes, codec: str) -> bool | None:
-    """Check whether decoding can begin at this message; None for a codec that is not looked into."""
+    """Check whether decoding can begin at a message; None for a codec that is not parsed."""
     kinds = {unit[1][0] for unit in NAL_UNIT.finditer(data)}
     if codec == "h264":
         return any(kind & 0x1F == 5 for kind in kinds)
@@ -202,7 +202,7 @@ def _vp9_begins(data: bytes) -> bool:
 
 
 def _av1_begins(data: bytes) -> bool:
-    """Check whether a sequence header is in it, as with every key frame: AV1 specification, section 5.3."""
+    """Check for a sequence header, which comes with every key frame: AV1 specification, section 5.3."""
     at = 0
     while at < len(data):
         kind, extended, sized = data[at] >> 3 & 15, data[at] & 4, data[at] & 2
@@ -220,16 +220,16 @@ def _av1_begins(data: bytes) -> bool:
 
 
 class VideoDecoder:
-    """Decode a video; go on where it stopped when asked in order, else begin at a key frame.
+    """Decode a video; continue from the last frame when asked in order, else begin at a key frame.
 
     Args:
         codec: h264, h265, vp9 or av1.
         keyframes: (T,) bool, where decoding can begin; True at 0.
-        fetch: the stored bytes of the messages from a position to the last.
+        fetch: yields the stored bytes of the messages from a position to the last.
         where: the episode and topic, for the error.
 
     Raises:
-        EpisodeError: the codec is another.
+        EpisodeError: the codec is not one of these.
     """
 
     def __init__(
@@ -239,13 +239,13 @@ class VideoDecoder:
             raise EpisodeError(where, f"video in {codec!r} cannot be read", f"these can: {', '.join(CODECS)}")
         self._codec, self._keyframes, self._fetch, self._where = codec, keyframes, fetch, where
         self._context: Any = None
-        self._next = 0  # message the decoder takes next
-        self._taken = -1  # last picture given out
-        self._ready: dict[int, Any] = {}  # decoded, not given out; None for a damaged one
-        self._spoilt = False  # whether the last one decoded, or one it may be made from, is damaged
+        self._next = 0  # the message that the decoder takes next
+        self._taken = -1  # the last picture returned
+        self._ready: dict[int, Any] = {}  # pictures decoded but not returned yet; None for a damaged one
+        self._spoilt = False  # whether the last decoded picture, or one it may depend on, is damaged
         self._count = H264Count()
-        self._lost = -1  # the first message since the last key frame that misses one before it
-        self._made_without: dict[int, int] = {}  # message -> the one from which on a picture is missing
+        self._lost = -1  # the first message since the last key frame that lacks an earlier picture
+        self._made_without: dict[int, int] = {}  # message -> the first one that lacks an earlier picture
 
     def frames(self, indices: Sequence[int]) -> dict[int, Images]:
         """Return the picture (H, W, 3) of each of those indices.
@@ -293,7 +293,7 @@ class VideoDecoder:
         self._taken = self._next - 1
 
     def _follow(self, index: int, misses: bool) -> None:
-        """Note whether message `index` is made from one that is missing, by itself or by one before it."""
+        """Note whether message `index`, or one it may depend on, lacks an earlier picture."""
         if self._keyframes[index]:
             self._lost = -1
         elif misses and self._lost < 0:
@@ -302,7 +302,7 @@ class VideoDecoder:
             self._made_without[index] = self._lost
 
     def _decode(self, data: bytes | None, wanted: int) -> None:
-        """Give the decoder its next message, or with None let it finish."""
+        """Give the decoder its next message; with None, let it finish."""
         import av
 
         if self._context is None:
@@ -331,15 +331,16 @@ class VideoDecoder:
                 self._ready[frame.pts] = None if self._spoilt else frame
 
 
-_LOGGING = threading.Lock()  # what PyAV logs is decided for the whole process
+_LOGGING = threading.Lock()  # PyAV's log settings hold for the whole process
 
 
 @contextmanager
 def _missing_references(codec: str) -> Iterator[list[str]]:
-    """Gather what FFmpeg logs of missing reference pictures; it does so for H.265 alone.
+    """Gather FFmpeg's log messages on missing reference pictures; it writes them for H.265 only.
 
-    A decoder goes on without a lost picture and marks nothing as damaged. Of H.264 the numbers of the
-    pictures tell it (H264Count), of H.265 the log; of AV1 dav1d gives out no picture made from a lost one.
+    A decoder goes on without a lost picture, and marks no frame as damaged. So a loss is found in other ways:
+    in H.264 by the numbers of the pictures (H264Count), in H.265 by the log. In AV1, dav1d returns no picture
+    that depends on a lost one.
     """
     import av.logging as log
 
@@ -360,22 +361,22 @@ def _missing_references(codec: str) -> Iterator[list[str]]:
 
 
 class H264Count:
-    """Count reference pictures of H.264: each has the number after the last, or its own again.
+    """Check the numbers of H.264's reference pictures: each has the number after the last, or the same.
 
-    frame_num in ITU-T H.264, 7.3.2.1, 7.3.3 and 7.4.3. FFmpeg says nothing of those that are missing.
+    The number is frame_num in ITU-T H.264, 7.3.2.1, 7.3.3 and 7.4.3. FFmpeg does not report missing ones.
     """
 
     def __init__(self) -> None:
-        self._bits: dict[int, int] = {}  # sequence parameter set -> bits of frame_num, where it counts
+        self._bits: dict[int, int] = {}  # sequence parameter set -> bits of frame_num, where it is checked
         self._of: dict[int, int] = {}  # picture parameter set -> sequence parameter set
         self._last: int | None = None  # frame_num of the reference picture before
 
     def complete(self, data: bytes) -> bool:
-        """Check whether all that this message is made from came before; True where nothing tells."""
+        """Check whether all pictures that a message depends on came before; True where it is unknown."""
         starts = [found.end() - 1 for found in NAL_UNIT.finditer(data)]
         whole = True
         for start, end in zip(starts, [*starts[1:], len(data) + 3]):
-            with suppress(ValueError):  # the decoder will say what is wrong with it
+            with suppress(ValueError):  # the decoder reports what is wrong with the unit
                 whole &= self._unit(data[start : end - 3])
         return whole
 
@@ -398,13 +399,13 @@ class H264Count:
         return kind == 5 or before is None or number in (before, (before + 1) % (1 << size))
 
     def _sequence(self, bits: "_Bits") -> None:
-        """Take a sequence parameter set; what is rare in live video is not counted."""
+        """Learn a sequence parameter set; forms that are rare in live video are not checked."""
         profile = bits.u(8)
         bits.u(16)
         number = bits.ue()
         self._bits.pop(number, None)
         if profile in HIGH_PROFILES:
-            if bits.ue() == 3 and bits.u(1):  # colours are coded apart
+            if bits.ue() == 3 and bits.u(1):  # colour planes are coded separately
                 return
             bits.ue(), bits.ue(), bits.u(1)  # depths, transform bypass
             if bits.u(1):  # scaling lists
@@ -415,20 +416,20 @@ class H264Count:
         if order == 0:
             bits.ue()
         bits.ue()  # reference frames
-        if not bits.u(1):  # numbers may not be left out
+        if not bits.u(1):  # gaps in frame_num are not allowed
             self._bits[number] = size
 
 
 class _Bits:
-    """Read the syntax elements of a unit; ValueError where it ends before."""
+    """Read the syntax elements of a unit; raise ValueError where it ends before."""
 
     def __init__(self, unit: bytes) -> None:
-        plain = unit.replace(b"\x00\x00\x03", b"\x00\x00")  # bytes that keep start codes unique
+        plain = unit.replace(b"\x00\x00\x03", b"\x00\x00")  # drop the emulation prevention bytes
         self._text = "".join(f"{byte:08b}" for byte in plain)
         self._at = 0
 
     def u(self, bits: int) -> int:
-        """Read an unsigned number of that many bits."""
+        """Read an unsigned number of `bits` bits."""
         self._at += bits
         if self._at > len(self._text):
             raise ValueError("the unit ends in its header")

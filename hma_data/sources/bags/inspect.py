@@ -1,7 +1,7 @@
-"""Inspect bags: topics with rates and jitter, keys as a YAML would name them.
+"""Inspect bags: topics with rates and jitter, and keys as a YAML would name them.
 
-Every bag is counted by its index. A sample of them is read message by message, up to a limit over
-all: the first that can be read tells the keys, each adds its times and numbers.
+Every bag is counted by its index. A sample of the bags is read message by message, up to a limit over all of
+them. The first readable bag gives the keys; each bag adds its times and numbers.
 """
 
 from array import array
@@ -30,20 +30,20 @@ from hma_data.sources.common.timestamp_checks import Clock, clock_of, skew
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
 MAX_LENGTHS = 1000
-MAX_FIELDS = 64  # numeric keys of a topic whose values are looked at
-MAX_HELD = 1 << 16  # numbers of a key in memory
-MAX_WIDTH = 4096  # wider than this is a map or a cloud, no action or state
-LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # no streams
-APART_S = 1.0  # header stamps further than this from receive times are worth a word
+MAX_FIELDS = 64  # most numeric keys of a topic whose values are checked
+MAX_HELD = 1 << 16  # most numbers of a key in memory
+MAX_WIDTH = 4096  # most values of an action or state; wider fields are maps or point clouds
+LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # not streams
+APART_S = 1.0  # header stamps further than this from receive times are reported
 
 
 @dataclass
 class _Values:
-    """Gather the numbers at one key, message by message; leave out those of another width than the first."""
+    """The numbers of one key, message by message, without those of another width than the first."""
 
     place: Field
     width: int = 0
-    taken: int = 0  # rows handed on
+    taken: int = 0  # rows already handed to the survey
     held: array[float] = field(default_factory=lambda: array("d"))
 
     def add(self, message: Any, where: str) -> None:
@@ -56,7 +56,7 @@ class _Values:
             self.held.extend(found)
 
     def hand_on(self, survey: Survey, episode: str) -> None:
-        """Hand what is held to the survey."""
+        """Hand the numbers in memory to the survey."""
         if self.held:
             read = np.array(self.held).reshape(-1, self.width)
             survey.numbers(episode, self.place.key, read, self.taken)
@@ -65,7 +65,7 @@ class _Values:
 
 @dataclass
 class _Topic:
-    """Hold a topic while it is measured; `sample` is its first message, or that which names most joints."""
+    """A topic while it is measured; `sample` is its first message, or the one that names most joints."""
 
     track: TopicTrack
     count: int = 0
@@ -75,7 +75,10 @@ class _Topic:
     values: list[_Values] = field(default_factory=list)
 
     def look_at(self, message: Any, where: str) -> None:
-        """Take a message's values; two publishers of one JointState topic name different joints."""
+        """Add a message's values, and keep it as the sample where it names more joints.
+
+        Two publishers of one JointState topic may name different joints.
+        """
         named = child(message, "name") if "name" in field_names(message) else ""
         count = len(named) if is_list(named) else 0
         first = self.sample is None
@@ -92,7 +95,7 @@ class _Topic:
 
 @dataclass
 class _Budget:
-    """Count what may still be read."""
+    """The bytes and messages that may still be read."""
 
     bytes: int = MAX_BYTES
     messages: int = MAX_MESSAGES
@@ -103,7 +106,7 @@ class _Budget:
 
 
 def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspection:
-    """Return the inspection of those bags.
+    """Return the inspection of bags.
 
     Raises:
         SourceError: none of them can be read.
@@ -175,7 +178,7 @@ def _length(counts: Counter[Channel], cameras: list[KeyInfo]) -> int:
 
 
 class _Telling:
-    """Read one bag once: its keys, and into the survey its numbers, times, skew and some pictures.
+    """Read one bag once: keep its keys; hand its numbers, times, skew and some pictures to the survey.
 
     Raises:
         EpisodeError: the bag is damaged.
@@ -237,7 +240,7 @@ class _Telling:
         ]
 
     def _times(self, topic: _Topic, times: Floats, camera: bool) -> Clock:
-        """Hand the times to the survey, with what only messages with two times can show."""
+        """Hand the times to the survey; check what only messages with two times can show."""
         track, name = topic.track, topic.track.topic
         self._survey.made.add("stamps")
         self._frozen += [name] if track.frozen else []
@@ -265,7 +268,7 @@ class _Telling:
         return KeyInfo(name, "camera", (*frames.shape[1:3], channels), "uint8", codec=stored)
 
     def _skew(self) -> None:
-        """Measure the skew of each stream that a YAML could name from the frames of the first camera."""
+        """Measure the skew of each camera and vector stream from the frames of the first camera."""
         topics = {key.topic.name: key.kind for key in self.keys if key.topic and key.kind in _STREAMS}
         cameras = [name for name, kind in topics.items() if kind == "camera"]
         if not cameras:
@@ -282,7 +285,7 @@ _STREAMS, _PAIRS = ("camera", "vector"), 4
 
 
 def _starts(keyframes: Any) -> Any:
-    """Return for each frame the keyframe before it, counted from the first; None where it is not known."""
+    """Return for each frame the keyframe before it, counted from the first; None where it is unknown."""
     if keyframes is None or not keyframes.any():
         return None
     shown = keyframes[int(np.argmax(keyframes)) :]
@@ -307,7 +310,7 @@ def _about(topic: _Topic, times: Floats, kind: str) -> TopicInfo:
 
 
 def _recorded(topic: _Topic) -> list[KeyInfo]:
-    """Return the keys of a topic without pictures, with the dtypes their definition states."""
+    """Return the keys of a topic without pictures, with the dtypes that their definition states."""
     name, channel = topic.track.topic, topic.track.channels[0]
     found = _values(name, topic.sample)
     if channel.encoding == "json":
@@ -321,7 +324,7 @@ def _recorded(topic: _Topic) -> list[KeyInfo]:
 
 
 def _values(key: str, value: Any) -> list[KeyInfo]:
-    """Return what a YAML could name at or below that key."""
+    """Return the keys that a YAML could name at or below a key."""
     if isinstance(value, str):
         return [KeyInfo(key, "text", (), "string")]
     if not is_message(value):
@@ -339,7 +342,7 @@ def _values(key: str, value: Any) -> list[KeyInfo]:
 
 
 def _trajectory(key: str, value: Any, names: list[str]) -> list[KeyInfo]:
-    """Return the first point of a JointTrajectory, the one in force when it is sent."""
+    """Return the first point of a JointTrajectory, which is in force when the message is sent."""
     points: Any = child(value, "points") if {"points", "joint_names"} <= set(names) else ()
     if not is_list(points) or not len(points) or not is_message(points[0]):
         return []
@@ -351,7 +354,7 @@ def _trajectory(key: str, value: Any, names: list[str]) -> list[KeyInfo]:
 
 
 def _named(found: list[KeyInfo], owner: Any, name: str) -> list[KeyInfo]:
-    """Add the names of the owner's list `name`, where it has one of that length (JointState)."""
+    """Add the names from the owner's list `name`, where that list has the vector's length (JointState)."""
     labels = child(owner, "name") if "name" in field_names(owner) and name != "name" else ()
     if len(found) != 1 or not is_list(labels) or found[0].shape != (len(labels),) or not len(labels):
         return found

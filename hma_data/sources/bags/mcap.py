@@ -1,12 +1,12 @@
-"""Read MCAP files as the format's specification lays them out: https://mcap.dev/spec
+"""Read MCAP files by the format's specification: https://mcap.dev/spec
 
-Chunked or not, with or without summary. Read here rather than with the mcap package because that
-package takes a short read for a whole record, and its reader fails on files whose summary does
-not repeat the channels; places for random access come with it.
+Files may have chunks or not, and a summary or not. The mcap package is not used: it takes a short read for a
+whole record, its reader fails on files whose summary does not repeat the channels, and it gives no places for
+random access.
 
-Chunks that are not packed need not be read whole: their records are walked in the file itself. Counts
-are in the file's summary. Where messages lie in time is gathered from the heads of the chunks and the
-message indexes behind them, which is sure also where the summary leaves it out.
+Chunks that are not packed need not be read whole: their records are walked in the file itself. Counts come
+from the file's summary. The time index comes from the heads of the chunks and the message indexes behind
+them, which also works where the summary leaves the index out.
 """
 
 import struct
@@ -41,15 +41,15 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05,
 STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
 FRAME = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-LOOSE = -1  # in a place: the message is in no chunk
+LOOSE = -1  # the chunk's offset in the place of a message that is in no chunk
 FOOTER_SIZE = FRAME.size + 20
-NOTE_BYTES = 1 << 20  # a metadata record of more is not a note about the episode
-RUN_BYTES = 1 << 20  # of messages outside of chunks that make one piece
-CODEC_BYTES = 32  # a codec's name is no longer
+NOTE_BYTES = 1 << 20  # most bytes of a metadata record that is read as a note about the episode
+RUN_BYTES = 1 << 20  # most bytes of messages outside of chunks that make one piece
+CODEC_BYTES = 32  # most bytes of a codec's name
 
 
 class McapFile:
-    """Read one MCAP file, its packed chunks kept unpacked in `chunks`; see Container."""
+    """Read one MCAP file; its packed chunks are kept unpacked in `chunks`. See Container."""
 
     def __init__(self, path: Path, chunks: ChunkCache | None = None) -> None:
         self.path = path
@@ -108,7 +108,7 @@ class McapFile:
                     yield message(self._chunk(file, offset), at)
 
     def _chunk(self, file: BinaryIO, at: int) -> memoryview:
-        """Return a chunk, unpacked; check its checksum the first time. Only packed ones are kept."""
+        """Return an unpacked chunk; check its checksum the first time. Only packed chunks are cached."""
         if chunk_at(file, at).plain:
             return memoryview(self._load(file, at))
         return self._chunks.get(self.path, at, partial(self._load, file, at))
@@ -124,7 +124,7 @@ class McapFile:
         return self._surveyed
 
     def _data_end(self, file: BinaryIO) -> int:
-        """Return where the footer begins, once both ends are what they must be."""
+        """Return the offset of the footer, after checking both ends of the file."""
         size = file.seek(0, 2)
         file.seek(0)
         if file.read(len(MAGIC)) != MAGIC:
@@ -141,14 +141,14 @@ class McapFile:
 
 
 class Declared:
-    """Keep the schemas and channels met so far."""
+    """Keep the schemas and channels read so far."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self.channels: dict[int, Channel] = {}
 
     def learn(self, opcode: int, data: Data) -> None:
-        """Take a schema or channel record."""
+        """Add a schema or channel record."""
         fields = Fields(data)
         number = fields.number(2)
         if opcode == SCHEMA:
@@ -168,7 +168,7 @@ class Declared:
 
 
 class ChunkHead(NamedTuple):
-    """Hold what a chunk says of itself; its records lie at `at`, `packed` bytes that unpack to `size`."""
+    """The head of a chunk; its records lie at `at`, as `packed` bytes that unpack to `size`."""
 
     first_ns: int
     last_ns: int
@@ -180,7 +180,7 @@ class ChunkHead(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """Check whether its records lie in the file as they are."""
+        """Check whether its records are stored uncompressed."""
         return self.codec in ("", "none") and self.packed == self.size
 
 
@@ -188,14 +188,14 @@ Load = Callable[[BinaryIO, int], Data]
 
 
 def frame(file: BinaryIO, at: int) -> tuple[int, int]:
-    """Return opcode and length of the record at `at`; the file stands at its content."""
+    """Return opcode and length of the record at `at`; leave the file at the record's content."""
     file.seek(at)
     opcode, length = FRAME.unpack(read_exact(file, FRAME.size))
     return opcode, length
 
 
 def frames(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """Yield (opcode, offset, length) of the records from `at` to `end`; the file stands at the content."""
+    """Yield (opcode, offset, length) of the records from `at` to `end`, with the file at the content."""
     while at < end:
         opcode, length = frame(file, at)
         following = at + FRAME.size + length
@@ -214,11 +214,11 @@ def between(
     load: Load,
     chunk: Place = (LOOSE, 0),
 ) -> Iterator[Record]:
-    """Yield the wanted messages from offset `at` to `end`; without reading more of others than their head.
+    """Yield the wanted messages from offset `at` to `end`; of other messages, read only the head.
 
     Args:
         load: unpacks a chunk.
-        chunk: the offset of the chunk that is walked, which is not packed, and of its records.
+        chunk: offsets of the chunk and of its records, where a chunk stored uncompressed is walked.
     """
     for opcode, offset, length in frames(file, at, end):
         if opcode in (DATA_END, FOOTER):
@@ -242,7 +242,7 @@ def message_head(body: Data) -> tuple[int, int]:
 
 
 def chunk_head(file: BinaryIO, length: int) -> ChunkHead:
-    """Return the head of the chunk whose content begins where the file stands."""
+    """Return the head of the chunk whose content begins at the file's position."""
     start = file.tell()
     fields = Fields(read_exact(file, min(length, 40 + CODEC_BYTES)))
     first_ns, last_ns = fields.number(8), fields.number(8)
@@ -256,7 +256,7 @@ def chunk_head(file: BinaryIO, length: int) -> ChunkHead:
 
 
 def load_chunk(file: BinaryIO, at: int, checked: bool = True) -> bytes:
-    """Return the records of the chunk at that offset, unpacked; `checked` against its checksum."""
+    """Return the unpacked records of the chunk at an offset; `checked` compares them with its checksum."""
     head = chunk_at(file, at)
     file.seek(head.at)
     chunk = decompress(head.codec, read_exact(file, head.packed), head.size)
@@ -266,7 +266,7 @@ def load_chunk(file: BinaryIO, at: int, checked: bool = True) -> bytes:
 
 
 def message(chunk: memoryview, at: int) -> memoryview:
-    """Return the data of the message at that place of a chunk."""
+    """Return the data of the message at a place in a chunk."""
     _, length = FRAME.unpack_from(chunk, at)
     end = at + FRAME.size + length
     if end > len(chunk):
@@ -275,13 +275,13 @@ def message(chunk: memoryview, at: int) -> memoryview:
 
 
 def loose(file: BinaryIO, at: int) -> Data:
-    """Return the data of the message outside of chunks at that offset."""
+    """Return the data of the message at an offset of the file."""
     _, length = frame(file, at)
     return memoryview(read_exact(file, length))[MESSAGE_HEAD.size :]
 
 
 def chunk_at(file: BinaryIO, at: int) -> ChunkHead:
-    """Return the head of the chunk at that offset."""
+    """Return the head of the chunk at an offset."""
     opcode, length = frame(file, at)
     if opcode != CHUNK:
         raise ValueError(f"there is no chunk at {at:,}")
@@ -299,7 +299,7 @@ def _in_chunk(
     for record in between(file, head.at, head.at + head.size, declared, wanted, load, (at, head.at)):
         heads.add(record.channel.topic in wanted.heads)
         yield record
-    if head.checksum and heads == {False}:  # a chunk with a picture is checked when that is read
+    if head.checksum and heads == {False}:  # a chunk with a picture is checked when the picture is read
         load(file, at)
 
 
@@ -321,7 +321,7 @@ def _in_records(chunk: memoryview, chunk_at: int, declared: Declared, wanted: Wa
 
 
 def _loose(file: BinaryIO, length: int, place: Place, declared: Declared, wanted: Wanted) -> Record | None:
-    """Return the message whose content begins where the file stands, if it is wanted."""
+    """Return the message whose content begins at the file's position, if it is wanted."""
     head = read_exact(file, min(length, MESSAGE_HEAD.size + HEAD))
     number, log_ns = message_head(head)
     channel = declared.channel(number)
@@ -336,7 +336,7 @@ def _loose(file: BinaryIO, length: int, place: Place, declared: Declared, wanted
 
 
 def stated_counts(file: BinaryIO, end: int) -> Counter[Channel] | None:
-    """Count the messages of each channel as the summary tells; None where it does not tell all of it."""
+    """Count the messages of each channel from the summary; None where it does not state all of them."""
     declared = Declared()
     counted = summary(file, end, declared)
     if counted is None or not counted.keys() <= declared.channels.keys():
@@ -348,13 +348,16 @@ def stated_counts(file: BinaryIO, end: int) -> Counter[Channel] | None:
 
 
 def summary(file: BinaryIO, end: int, declared: Declared) -> dict[int, int] | None:
-    """Learn what the summary repeats; return messages by channel number, None where it does not tell."""
+    """Learn the schemas and channels in the summary; return the messages by channel number.
+
+    None where the summary does not state them.
+    """
     start, counted = _summary_start(file, end), None
     for opcode, _, length in frames(file, start, end) if start else ():
         if opcode in (SCHEMA, CHANNEL):
             try:
                 declared.learn(opcode, read_exact(file, length))
-            except ValueError:  # it need not repeat schemas; the chunks tell what is missing
+            except ValueError:  # the summary need not repeat schemas; the chunks hold the missing ones
                 return None
         elif opcode == STATISTICS:
             counted = _counted(read_exact(file, length))
@@ -373,7 +376,7 @@ def _summary_start(file: BinaryIO, end: int) -> int:
 
 
 def _counted(data: bytes) -> dict[int, int] | None:
-    """Return the messages by channel number in a Statistics record; None where they are left out."""
+    """Return the messages by channel number in a Statistics record; None where it leaves them out."""
     fields = Fields(data)
     messages = fields.number(8)
     fields.take(2 + 4 + 4 + 4 + 4 + 8 + 8)
@@ -390,7 +393,7 @@ def _counted(data: bytes) -> dict[int, int] | None:
 
 @dataclass
 class _Part:
-    """Hold a piece while it is surveyed; `channels` by number."""
+    """A piece while it is surveyed, with its channels by number."""
 
     at: int
     end: int
@@ -402,7 +405,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class Survey:
-    """Hold every piece of the file, the channels of their messages, and what `notes` gives."""
+    """All pieces of the file, the channels of their messages, and the result of `notes`."""
 
     pieces: list[Piece]
     declared: Declared
@@ -410,7 +413,10 @@ class Survey:
 
 
 def survey(file: BinaryIO, end: int) -> Survey:
-    """Walk once over the file's records; chunks are unpacked only where no index tells what is in them."""
+    """Walk once over the file's records, and gather its pieces, channels and notes.
+
+    Chunks are unpacked only where no index states what they hold.
+    """
     declared = Declared()
     parts: list[_Part] = []
     noted: dict[str, str] = {}
@@ -437,7 +443,7 @@ def survey(file: BinaryIO, end: int) -> Survey:
 
 
 def _note(file: BinaryIO, length: int) -> dict[str, str]:
-    """Return the entries of the metadata record whose content begins where the file stands."""
+    """Return the entries of the metadata record whose content begins at the file's position."""
     if length > NOTE_BYTES:
         return {}
     fields = Fields(read_exact(file, length))
@@ -464,7 +470,7 @@ def _piece(file: BinaryIO, part: _Part, declared: Declared) -> Piece:
     if told or not part.chunk:
         topics = {declared.channel(number).topic for number in part.channels}
         return Piece(part.at, part.end, part.first_ns, part.last_ns, frozenset(topics))
-    first_ns, last_ns, topics = FOREVER, -1, set()  # no index: its channels may be declared nowhere else
+    first_ns, last_ns, topics = FOREVER, -1, set()  # no index: only the chunk may declare its channels
     for record in between(file, part.at, part.end, declared, Wanted(), load_chunk):
         first_ns, last_ns = min(first_ns, record.log_ns), max(last_ns, record.log_ns)
         topics.add(record.channel.topic)

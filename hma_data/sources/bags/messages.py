@@ -1,12 +1,12 @@
 """Read the fields of a message from its bytes: ROS 1, CDR, JSON and protobuf.
 
-ROS definitions come from inside the bag; ROS 2 bags before Iron carry none, then the standard
-types of Humble, and after them of the newest release, are used. Whatever the encoding, a message is
-read through `child` and `field_names`.
+ROS definitions come from the bag. ROS 2 bags before Iron have none; for them the standard types of Humble are
+used, and then those of the newest release. A message of any encoding is read through `child` and
+`field_names`.
 
-Service introspection publishes each call on `<service>/_service_event`; rosbag2 stores with it the
-definition of the service, not of the event (https://github.com/ros2/rosbag2, issue 2365), so the
-latter is put together here: info, and the request and response where contents are published.
+Service introspection publishes each call on `<service>/_service_event`. rosbag2 stores with it the definition
+of the service, not of the event (https://github.com/ros2/rosbag2, issue 2365). So the definition of the event
+is built here: info, and the request and response where contents are published.
 """
 
 import dataclasses
@@ -30,9 +30,9 @@ STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
 EVENT = re.compile(r"^(?P<package>\w+)/srv/(?P<name>\w+)_Event$")
 SEPARATOR = re.compile(r"^={80}\s*$", re.MULTILINE)
 REQUEST_SENT, REQUEST_RECEIVED, RESPONSE_SENT, RESPONSE_RECEIVED = range(4)
-# which event stands for a call: the first that is recorded of these
+# The event that stands for a call: the first of these that is recorded.
 OF_A_CALL = (REQUEST_RECEIVED, REQUEST_SENT, RESPONSE_SENT, RESPONSE_RECEIVED)
-STANDARD = {  # in bags that carry no definition
+STANDARD = {  # definitions for bags that hold none
     "std_srvs/srv/Empty": "---",
     "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message",
     "std_srvs/srv/Trigger": "---\nbool success\nstring message",
@@ -41,7 +41,7 @@ EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
 
 def decode(channel: Channel, data: Data, where: str) -> Any:
-    """Return the message.
+    """Return the decoded message.
 
     Raises:
         EpisodeError: its encoding or type is unknown, or the bytes do not fit it.
@@ -58,14 +58,14 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
 
 
 def head_stamp(channel: Channel) -> Callable[[Data], int] | None:
-    """Return what reads a ROS message's own time, in nanoseconds, from its first HEAD bytes.
+    """Return a function that reads a ROS message's own time, in nanoseconds, from its first HEAD bytes.
 
-    None where the time is not at a fixed place there; `decode` is needed then.
+    None where the time has no fixed place there; then `decode` is needed.
     """
     try:
         return _head_stamp(channel)
     except (*FAULTS, TypeError, AssertionError, SyntaxError, AttributeError):
-        return None  # `decode` meets it again and says what it is
+        return None  # `decode` raises it again
 
 
 @lru_cache(maxsize=256)
@@ -74,7 +74,7 @@ def _head_stamp(channel: Channel) -> Callable[[Data], int] | None:
         return None
     store, kind = ros_store(channel)
     fields = [(name, spec[1]) for name, spec in store.fielddefs[kind][1]]
-    at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes on its encoding
+    at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes that state its encoding
     if fields and fields[0] == ("header", "std_msgs/msg/Header"):
         fields = [(name, spec[1]) for name, spec in store.fielddefs["std_msgs/msg/Header"][1]]
         if fields[0][0] == "seq":
@@ -93,7 +93,7 @@ def _time_at(at: int, cdr: bool, data: Data) -> int:
 
 
 def _line(fault: BaseException) -> str:
-    """Tell a fault of a library in one short line."""
+    """Return a library's error as one short line."""
     return " ".join(str(fault.args[0] if fault.args else fault).split())[:200]
 
 
@@ -123,7 +123,7 @@ def _ros_decoder(channel: Channel) -> Decode:
 
 @lru_cache(maxsize=256)
 def ros_store(channel: Channel) -> tuple[Any, str]:
-    """Return a store that knows the channel's type, and its name there."""
+    """Return a type store that knows the channel's type, and the type's name in it."""
     from rosbags.typesys import Stores, TypesysError, get_typestore
     from rosbags.typesys.msg import normalize_msgtype
 
@@ -145,7 +145,7 @@ def ros_store(channel: Channel) -> tuple[Any, str]:
 
 
 def _telling(read: Decode, error: type[Exception]) -> Decode:
-    """Wrap `read`, with a library's own error told as ValueError."""
+    """Wrap `read`, so that a library's own error is raised as ValueError."""
 
     def told(data: Data) -> Any:
         try:
@@ -197,15 +197,15 @@ def _protobuf_decoder(channel: Channel) -> Decode:
 
 
 def is_service_event(channel: Channel) -> bool:
-    """Check whether its messages are events of a service."""
+    """Check whether a channel's messages are events of a service."""
     return channel.encoding == "cdr" and EVENT.match(channel.type) is not None
 
 
 def event_type(data: Data) -> int:
-    """Return which event of a call the message tells of, REQUEST_SENT to RESPONSE_RECEIVED.
+    """Return the event of a call that a message reports, REQUEST_SENT to RESPONSE_RECEIVED.
 
     Raises:
-        ValueError: the message is none.
+        ValueError: the message is not an event.
     """
     if len(data) < 5 or data[4] > RESPONSE_RECEIVED:
         raise ValueError("a message is no event of a service")
@@ -213,7 +213,7 @@ def event_type(data: Data) -> int:
 
 
 def event_definitions(stated: str, kind: str, text: str) -> dict[str, Any]:
-    """Return definitions for rosbags of an event's type and of those it holds.
+    """Return rosbags' definitions of an event's type and of the types in it.
 
     Args:
         stated: its name in the bag, `std_srvs/srv/SetBool_Event`.
@@ -221,7 +221,7 @@ def event_definitions(stated: str, kind: str, text: str) -> dict[str, Any]:
         text: the service's definition, or the event's own.
 
     Raises:
-        ValueError: the bag carries none, and the service is not a standard one.
+        ValueError: the bag holds no definition, and the service is not a standard one.
     """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -251,7 +251,7 @@ def event_definitions(stated: str, kind: str, text: str) -> dict[str, Any]:
 
 
 def _members(body: str) -> str:
-    """Return the fields of a request or response; one without any takes a byte in CDR."""
+    """Return the fields of a request or response; add the byte that CDR needs where there are none."""
     lines = [line.split("#")[0].strip() for line in body.splitlines()]
     fields = [line for line in lines if line and "=" not in line.replace("<=", "")]
     return body if fields else f"{body}\nuint8 structure_needs_at_least_one_member\n"
@@ -261,12 +261,12 @@ def _members(body: str) -> str:
 
 
 def is_message(value: Any) -> bool:
-    """Check whether it has fields."""
+    """Check whether a value has fields."""
     return isinstance(value, dict) or dataclasses.is_dataclass(value) or hasattr(value, "DESCRIPTOR")
 
 
 def field_names(message: Any) -> list[str]:
-    """Return the names of its fields, in order; constants (rosbags: fields with a default) are none."""
+    """Return the names of the fields in order, without constants (in rosbags: fields with a default)."""
     if isinstance(message, dict):
         return list(message)
     if dataclasses.is_dataclass(message):
@@ -280,7 +280,7 @@ def child(message: Any, name: str) -> Any:
     """Return the value of a field.
 
     Raises:
-        KeyError: there is none of that name.
+        KeyError: there is no field of that name.
     """
     if isinstance(message, dict):
         return message[name]
@@ -293,15 +293,15 @@ def child(message: Any, name: str) -> Any:
 
 
 def is_list(value: Any) -> bool:
-    """Check whether it is a list or an array, not text or bytes."""
+    """Check whether a value is a list or an array, not text or bytes."""
     return isinstance(value, np.ndarray | Sequence) and not isinstance(value, str | bytes)
 
 
 def numbers(value: Any) -> list[float]:
-    """Return all its numbers: an array's in order, a message's field by field.
+    """Return all numbers of a value: an array's in order, a message's field by field.
 
     Raises:
-        TypeError: something in it is not a number; the message says what.
+        TypeError: something in it is not a number; the error says what.
     """
     if isinstance(value, bool | int | float | np.number | np.bool_):
         return [float(value)]
@@ -326,7 +326,7 @@ def _field_numbers(message: Any, name: str) -> list[float]:
 
 
 def stamp_ns(message: Any) -> int:
-    """Return the time the message itself carries, in nanoseconds; 0 when it carries none."""
+    """Return the message's own time in nanoseconds; 0 where it has none."""
     for path in STAMPS:
         value = message
         try:

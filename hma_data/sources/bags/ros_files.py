@@ -1,10 +1,10 @@
 """Read ROS's own bag files: format 2.0 of ROS 1, and the sqlite3 files of ROS 2.
 
-ROS 1 as https://wiki.ros.org/Bags/Format/2.0 lays it out: indexed or not (a recorder that was killed
-leaves no index), chunks plain, bz2 or lz4.
+ROS 1 bags follow https://wiki.ros.org/Bags/Format/2.0. They may have an index or not (a killed recorder
+leaves none), and chunks that are plain, bz2 or lz4.
 
-sqlite3 is opened read-only; nothing is written beside the file. Definitions of the messages are inside
-the file since ROS 2 Iron; before it only their names are.
+sqlite3 files are opened read-only; nothing is written beside them. Since ROS 2 Iron they hold the definitions
+of the messages; before it, only the names of the definitions.
 """
 
 import sqlite3
@@ -37,15 +37,15 @@ from hma_data.sources.bags.time_index import Piece, last_before, overlapping, ta
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x05, 0x06, 0x07
-HEADER_BYTES = 1 << 16  # a record's header is no longer
+HEADER_BYTES = 1 << 16  # most bytes of a record's header
 TIME = struct.Struct("<II")
 Header = dict[str, memoryview]
 SQLITE_MAGIC = b"SQLite format 3\x00"
-LATEST = 2**63 - 1  # of an sqlite3 integer
+LATEST = 2**63 - 1  # largest sqlite3 integer
 
 
 class Ros1File:
-    """Read one ROS 1 bag, its unpacked chunks kept in `chunks`; see Container."""
+    """Read one ROS 1 bag; its unpacked chunks are kept in `chunks`. See Container."""
 
     def __init__(self, path: Path, chunks: ChunkCache | None = None) -> None:
         self.path = path
@@ -89,7 +89,7 @@ class Ros1File:
         return self._chunks.get(self.path, head.offset, partial(_load_chunk, file, head))
 
     def _survey(self, file: BinaryIO) -> "_Index":
-        """Return the index, made from the chunks where the recorder left none."""
+        """Return the index; make it from the chunks where the recorder left none."""
         if self._surveyed is None:
             self._surveyed = self._index(file) or _made_index(file)
         return self._surveyed
@@ -111,7 +111,7 @@ class Ros1File:
 
 
 class _ChunkHead(NamedTuple):
-    """Describe a chunk at `offset`: its content lies at `at`, `packed` bytes that unpack to `size`."""
+    """The head of the chunk at `offset`; its content lies at `at`, `packed` bytes that unpack to `size`."""
 
     offset: int
     codec: str
@@ -121,7 +121,7 @@ class _ChunkHead(NamedTuple):
 
     @property
     def plain(self) -> bool:
-        """Check whether its records lie in the file as they are."""
+        """Check whether its records are stored uncompressed."""
         return self.codec == "none"
 
 
@@ -130,21 +130,24 @@ Load = Callable[[BinaryIO, _ChunkHead], Data]
 
 @dataclass
 class _Index:
-    """Hold connections by number, how many messages each has, and a piece for each chunk, without its end."""
+    """Connections by number, the messages of each, and a piece for each chunk, without the piece's end."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: Counter[Channel] = field(default_factory=Counter)
     pieces: list[Piece] = field(default_factory=list)
 
     def add(self, at: int, first_ns: int, last_ns: int, counts: Counter[Channel]) -> None:
-        """Take the chunk at that offset."""
+        """Add the chunk at an offset."""
         self.counts.update(counts)
         topics = frozenset(channel.topic for channel in counts)
         self.pieces.append(Piece(at, at, first_ns, last_ns, topics))
 
 
 def _record(file: BinaryIO, at: int) -> tuple[Header, int, int]:
-    """Return the header of the record at `at`, size and place of its content; the file stands there."""
+    """Return the header of the record at `at`, and the size and offset of its content.
+
+    The file is left at the content.
+    """
     file.seek(at)
     length = int.from_bytes(read_exact(file, 4), "little")
     if length > HEADER_BYTES:
@@ -221,7 +224,7 @@ def _read_index(file: BinaryIO, at: int, count: int) -> _Index:
 
 
 def _made_index(file: BinaryIO) -> _Index:
-    """Make the index of a bag without one, from its messages; every chunk is unpacked for it."""
+    """Make the index of a bag that has none; every chunk is unpacked for it."""
     index, at, end = _Index(), len(ROS1_MAGIC), file.seek(0, 2)
     while at < end:
         header, size, content_at = _record(file, at)
@@ -243,7 +246,7 @@ def _made_index(file: BinaryIO) -> _Index:
 
 
 def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
-    """Return header and content of the record at `at` of a chunk, and where the next one begins."""
+    """Return header and content of the record at `at` of a chunk, and the offset of the next record."""
     parts = []
     for _ in range(2):
         size = int.from_bytes(view[at : at + 4], "little")
@@ -274,7 +277,7 @@ def _in_chunk(
 def _walk(
     file: BinaryIO, chunk_at: int, at: int, end: int, channels: dict[int, Channel], wanted: Wanted
 ) -> Iterator[Record]:
-    """Yield the messages of a chunk that is not packed, without reading more of them than is wanted."""
+    """Yield the messages of a chunk that is not packed; of other messages, read only the header."""
     begin = at
     while at < end:
         header, size, content_at = _record(file, at)
@@ -291,7 +294,7 @@ def _walk(
 def _take(
     header: Header, content: Data, channels: dict[int, Channel], wanted: Wanted
 ) -> tuple[Channel | None, int]:
-    """Return channel and time of a wanted message; learn a connection; None for anything else."""
+    """Return channel and time of a wanted message, else None; learn a connection record."""
     kind = _number(header, "op")
     if kind == CONNECTION:
         _learn(channels, header, content)
@@ -304,7 +307,7 @@ def _take(
 
 
 def _chunk_head(file: BinaryIO, offset: int) -> _ChunkHead:
-    """Return the head of the chunk at that offset; the file stands at its content."""
+    """Return the head of the chunk at an offset; leave the file at its content."""
     header, packed, at = _record(file, offset)
     if _number(header, "op") != CHUNK:
         raise ValueError(f"there is no chunk at {offset:,}, where the index says one is")
@@ -313,7 +316,7 @@ def _chunk_head(file: BinaryIO, offset: int) -> _ChunkHead:
 
 
 def _content(file: BinaryIO, head: _ChunkHead, at: int) -> bytes:
-    """Return the data of the message at that place of a chunk that is not packed."""
+    """Return the data of the message at a place in a chunk that is not packed."""
     _, size, begin = _record(file, head.at + at)
     if begin + size > head.at + head.packed:
         raise ValueError("a record reaches beyond its chunk")
@@ -329,7 +332,7 @@ def _load_chunk(file: BinaryIO, head: _ChunkHead) -> bytes:
 
 
 class SqliteFile:
-    """Read one .db3 file of rosbag2, any version of its tables; see Container."""
+    """Read one .db3 file of rosbag2, with any version of its tables; see Container."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -372,7 +375,10 @@ class SqliteFile:
     def _rows(
         self, base: sqlite3.Connection, channels: dict[int, Channel], wanted: Wanted
     ) -> Iterator[tuple[int, int, Any]]:
-        """Yield id, topic and time of the wanted messages; data is left out, for sorting would gather it."""
+        """Yield id, topic and time of the wanted messages.
+
+        The query leaves out the data, because sorting would hold it all in memory.
+        """
         ids = [number for number, channel in channels.items() if wanted.topic(channel.topic)]
         conditions, values = [], []
         if wanted.topics is not None:
@@ -385,7 +391,7 @@ class SqliteFile:
         return base.execute(f"SELECT id, topic_id, timestamp FROM messages{where} ORDER BY id", values)
 
     def _data(self, base: sqlite3.Connection, row_id: int, limit: int | None) -> bytes:
-        """Return a message's bytes, or the first of them, without reading the others."""
+        """Return a message's bytes, or only its first `limit` bytes."""
         if limit is None:
             return self._payload(base, row_id)
         with base.blobopen("messages", "data", row_id, readonly=True) as blob:
@@ -404,7 +410,7 @@ class SqliteFile:
                 yield self._payload(base, row_id)
 
     def _open(self) -> sqlite3.Connection:
-        """Connect without writing anything, not even a lock, unless there is a log still to be read."""
+        """Connect without writing anything, not even a lock, unless a write-ahead log must still be read."""
         self._check_size()
         log = self.path.with_name(self.path.name + "-wal")
         pending = log.is_file() and log.stat().st_size > 0
@@ -412,7 +418,7 @@ class SqliteFile:
         return sqlite3.connect(place, uri=True)
 
     def _check_size(self) -> None:
-        """Refuse a file that is cut off: sqlite3 notices a missing end only where it reads it."""
+        """Refuse a file that is cut off, because sqlite3 notices a missing end only where it reads it."""
         with self.path.open("rb") as file:
             head = file.read(100)
             size = file.seek(0, 2)

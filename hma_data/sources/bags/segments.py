@@ -1,13 +1,12 @@
-"""Find the episodes inside one bag, where they begin and end, without decoding a picture.
+"""Find the start and end of the episodes inside one bag, without decoding a picture.
 
-One pass over the primary camera's stamps and the markers' topics makes a table. A few bags and their
-tables are kept for the next of their episodes, as long as no file changes; an episode is then read by
-its own part of the recording's time. F pictures of the primary camera in order of receipt; an episode
-is a run of them.
+One pass over the primary camera's stamps and the markers' topics makes a table. The last bags and their
+tables are cached for the other episodes of the same bag, while no file changes; an episode is then read by
+its own time range. F pictures of the primary camera in order of receipt; an episode is a run of them.
 
-A marker is a message that begins or ends an episode: `source.segments.start` and `stop`. It counts by
-its arrival, or at the moments at which a field becomes a value; of a service every call counts once,
-whichever of its events were recorded. M messages of the marker's topic.
+A marker is a message that begins or ends an episode: `source.segments.start` and `stop`. It counts when it
+arrives, or when a field of it becomes a value. A service's call counts once, whichever of its events were
+recorded. M messages of the marker's topic.
 """
 
 import os
@@ -40,7 +39,7 @@ from hma_data.sources.bags.topic_track import TopicTrack
 
 SECOND_NS = 10**9
 SHOWN = 8  # values of a marker in an error
-MAX_DELAY_S = 10.0  # header stamps further from receipt than this are of another clock
+MAX_DELAY_S = 10.0  # header stamps further from receipt than this come from another clock
 KEPT_BAGS = 2
 KEPT_TABLES = 512
 Key = tuple[Any, ...]
@@ -48,11 +47,11 @@ Key = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class Segment:
-    """Describe one episode: pictures `first` to `stop` of the primary camera.
+    """One episode: pictures `first` to `stop` of the primary camera.
 
     Attributes:
         first_ns, last_ns: receipt of its first and last picture.
-        skip: pictures before it that were received at first_ns too.
+        skip: pictures before it that were also received at first_ns.
     """
 
     first: int
@@ -67,14 +66,15 @@ class Segment:
 
 @dataclass(frozen=True)
 class Table:
-    """List the episodes of a bag.
+    """The episodes of a bag.
 
     Attributes:
         frames: pictures of the primary camera in the whole bag.
         clock: of that camera, header or receive.
-        reach_ns: how far from an episode's receipt times a message of it may have been received.
-        empty: parts without a picture, which are no episodes.
-        keyframes: camera of video -> receipt of its key frames, ascending; empty where none can be told.
+        reach_ns: how far outside the episode's receipt times its messages may have been received.
+        empty: parts without a picture, which are not episodes.
+        keyframes: video camera -> ascending times of receipt of its key frames; of its first message where
+            the codec does not show them.
     """
 
     segments: tuple[Segment, ...]
@@ -90,13 +90,13 @@ class Table:
         return self.frames - sum(map(len, self.segments))
 
 
-# by process: a child that was forked must not clean up after its parent
+# By process id: a forked child must not clean up after its parent.
 _bags: dict[int, OrderedDict[Key, Bag]] = {}
 _tables: OrderedDict[Key, Table] = OrderedDict()
 
 
 def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -> tuple[Bag, Table]:
-    """Return the bag and its episodes, kept ones where no file changed.
+    """Return the bag and its episodes, from the cache where no file changed.
 
     Raises:
         EpisodeError: the bag cannot be read, or holds no episode.
@@ -118,7 +118,7 @@ def parted(path: Path, root: Path, embodiment: Embodiment, segments: Segments) -
 
 
 def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
-    """Return the table of that bag.
+    """Return the table of a bag.
 
     Raises:
         EpisodeError: the bag is damaged, lacks a topic, or no episode is in it.
@@ -127,7 +127,7 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> Table:
 
 
 def heads(channels: list[Channel]) -> frozenset[str]:
-    """Return the topics of pictures whose messages tell their time in their first bytes."""
+    """Return the topics of pictures whose messages hold their time in their first bytes."""
     still = {c.topic for c in channels if picture_kind(c.type) not in (None, VIDEO)}
     return frozenset(
         topic for topic in still if all(head_stamp(c) is not None for c in channels if c.topic == topic)
@@ -135,7 +135,7 @@ def heads(channels: list[Channel]) -> frozenset[str]:
 
 
 class _Pass:
-    """Pass over a bag once."""
+    """One pass over a bag."""
 
     def __init__(self, bag: Bag, embodiment: Embodiment, segments: Segments) -> None:
         self._bag, self._embodiment, self._segments = bag, embodiment, segments
@@ -205,7 +205,7 @@ class _Pass:
     def _running(
         self, times: NDArray[np.float64], received: NDArray[np.int64], clock: str
     ) -> list[tuple[int, int]]:
-        """Return runs of pictures from each start to what ends it; the whole recording without markers."""
+        """Return runs of pictures from each start to its end; the whole recording without markers."""
         began = 0 if self._start is None else None
         runs: list[tuple[int, int]] = []
         for _, starts, at in sorted(self._events(times, received, clock)):
@@ -217,9 +217,11 @@ class _Pass:
     def _events(
         self, times: NDArray[np.float64], received: NDArray[np.int64], clock: str
     ) -> list[tuple[int, bool, int]]:
-        """Return receipt of each marker, whether it begins an episode, and the first picture after it.
+        """Return the events of the markers.
 
-        Times of the same kind are compared: the messages' own where camera and marker both have them.
+        Each is a marker's time of receipt, whether it begins an episode, and the index of the first picture
+        after it. Times of the same clock are compared: the messages' own where camera and marker both have
+        them.
         """
         own = np.maximum.accumulate(times)
         events = []
@@ -234,7 +236,7 @@ class _Pass:
         return events
 
     def _at_gaps(self, times: NDArray[np.float64], begin: int, stop: int) -> list[tuple[int, int]]:
-        """Part a run where the camera pauses, or its clock jumps back as far."""
+        """Divide a run where the camera pauses, or where its clock jumps back as far."""
         gap_s = self._segments.gap_s
         if gap_s is None or stop - begin < 2:
             return [(begin, stop)]
@@ -259,7 +261,10 @@ def _segment(received: NDArray[np.int64], begin: int, stop: int) -> Segment:
 
 
 def _reach_ns(camera: TopicTrack, clock: str) -> int:
-    """Return a second, and as much as the camera's pictures come late, since other messages may not."""
+    """Return a second plus the largest delay of the camera's pictures, of which at most MAX_DELAY_S counts.
+
+    Other messages may arrive without that delay.
+    """
     late = np.abs(camera.seconds("receive") - camera.seconds(clock)).max()
     return SECOND_NS + int(min(float(late), MAX_DELAY_S) * SECOND_NS)
 
@@ -271,7 +276,7 @@ class MarkerTrack:
     """Follow a marker's topic over one pass.
 
     Attributes:
-        track: times of the messages, as they lie in the file.
+        track: times of the messages, in the file's order.
 
     Raises:
         EpisodeError: the bag has no such topic.
@@ -286,7 +291,7 @@ class MarkerTrack:
         self._seen: dict[str, None] = {}
 
     def add(self, place: Place, record: Record) -> None:
-        """Take the next message of the topic."""
+        """Add the next message of the topic."""
         self._service = self._service or is_service_event(record.channel)
         message = None
         if self.marker.equals is not None:
@@ -311,7 +316,7 @@ class MarkerTrack:
         return order
 
     def never(self) -> str:
-        """Say that the marker did not come, and what did."""
+        """Describe that the marker did not come, and the values that came instead."""
         if self.marker.equals is None:
             return f"{self.marker.key} never comes"
         known = f"it is {', '.join(list(self._seen)[:SHOWN])}" if self._seen else "it has no messages"
@@ -324,7 +329,10 @@ class MarkerTrack:
             raise EpisodeError(self._where, f"{self._field.topic}: {fault}") from fault
 
     def _decoded(self, record: Record) -> Any:
-        """Return the message for its stamp; a marker that only has to come need not be understood."""
+        """Decode a message for its stamp; None where it cannot be decoded.
+
+        A marker without a value to compare only has to arrive.
+        """
         try:
             return decode(record.channel, record.data, self._where)
         except EpisodeError:
@@ -356,7 +364,7 @@ class MarkerTrack:
             ) from fault
 
     def _value(self, message: Any) -> Any:
-        """Return what is at the key; None in an event of a service that holds no request or no response."""
+        """Return the value at the key; None for a service event without a request or response."""
         field = self._field
         if self._service and field.steps and field.steps[0] in ("request", "response"):
             held = child(message, str(field.steps[0]))

@@ -1,9 +1,9 @@
 """Read bags as a source: ROS 1, ROS 2 (sqlite3, MCAP) and plain MCAP, without ROS.
 
-A bag is an episode, or with `source.segments` several; a folder of bags holds many. One pass over
-an episode gathers times and numbers of the topics the embodiment names; pictures are read again when
-asked for, so memory does not grow with the size of a bag. Streams keep their own clocks; `align`
-brings them together. An episode inside a bag is read with what was said before it and is still in force.
+A bag is one episode, or several with `source.segments`; a folder of bags holds many. One pass over an episode
+gathers the times and numbers of the topics that the embodiment names. Pictures are read again on demand, so
+memory does not grow with the size of a bag. Streams keep their own clocks; `align` brings them to one clock.
+An episode inside a bag is read together with the earlier messages that are still in force.
 """
 
 import re
@@ -42,7 +42,7 @@ def open() -> "RosbagSource":
 
 
 class RosbagSource:
-    """See sources.base.Source."""
+    """Read bags; see sources.base.Source."""
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
@@ -50,9 +50,9 @@ class RosbagSource:
         return report(uri, local_path(uri), _bags(uri), episodes)
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """See Source. A bag that cannot be read has no frames here; `read` says why.
+        """See Source. A bag that cannot be read has no frames here; `read` raises its error.
 
-        With an embodiment that parts bags, an episode of the bag `run` is `run/0000`, `run/0001` …
+        Where the embodiment divides bags, the episodes of the bag `run` are `run/0000`, `run/0001` …
         """
         uri = as_text(uri)
         root = local_path(uri)
@@ -65,11 +65,11 @@ class RosbagSource:
         return found
 
     def episode_ids(self, uri: StrPath) -> list[str]:
-        """See Source: whole bags, whatever an embodiment may part them into."""
+        """See Source: return the ids of whole bags, even where an embodiment divides them."""
         return list(_bags(as_text(uri)))
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """See Source. A bag's own id reads the whole of it, also where the embodiment parts bags.
+        """See Source. A bag's own id reads the whole bag, even where the embodiment divides bags.
 
         Raises:
             SourceError: no such bag, or no such episode in it.
@@ -109,7 +109,7 @@ def _ref(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> Ep
         fingerprint = bag.fingerprint()
         frames = _frames(bag.counts(), embodiment)
     except (EpisodeError, OSError):
-        pass  # `read` meets it again and says what it is
+        pass  # `read` raises it again
     return EpisodeRef(name, frames, fingerprint=fingerprint)
 
 
@@ -118,7 +118,7 @@ def _part_id(name: str, number: int) -> str:
 
 
 def _part_of(episode_id: str) -> tuple[str, int]:
-    """Return the bag of that episode, and its number; -1 where it names none."""
+    """Return the bag's name of an episode id and the episode's number; -1 where it has none."""
     name, _, digits = episode_id.rpartition("/")
     return name, int(digits) if PART.fullmatch(digits) else -1
 
@@ -126,7 +126,7 @@ def _part_of(episode_id: str) -> tuple[str, int]:
 def _part_refs(
     name: str, path: Path, root: Path, embodiment: Embodiment, segments: Segments
 ) -> list[EpisodeRef]:
-    """List the episodes of one bag; one without frames where none can be told, of which `read` says why."""
+    """List the episodes of one bag; where they cannot be found, one without frames, and `read` raises why."""
     try:
         bag, table = parted(path, root, embodiment, segments)
         fingerprint = bag.fingerprint()
@@ -139,7 +139,7 @@ def _part_refs(
 
 
 def _frames(counts: Counter[Channel], embodiment: Embodiment | None) -> int:
-    """Count the pictures of the primary camera; without an embodiment, of the camera that has most."""
+    """Count the pictures of the primary camera; without an embodiment, of the camera with most pictures."""
     topics: Counter[str] = Counter()
     for channel, count in counts.items():
         if embodiment or picture_kind(channel.type):
@@ -151,10 +151,10 @@ def _frames(counts: Counter[Channel], embodiment: Embodiment | None) -> int:
 
 
 class _EpisodeReading:
-    """Pass once over a bag, or over one episode of it by its part of the recording's time.
+    """One pass over a bag, or over the time range of one episode in it.
 
     Args:
-        table, number: which of the bag's episodes; the whole bag without.
+        table, number: which of the bag's episodes; without a table, the whole bag.
     """
 
     def __init__(
@@ -172,7 +172,7 @@ class _EpisodeReading:
         self._said: list[tuple[int, str]] = []  # instructions and when they were received
 
     def episode(self) -> Episode:
-        """Make the pass; return what came of it.
+        """Make the pass; return the episode.
 
         Raises:
             EpisodeError: the bag is damaged, or lacks what the embodiment names.
@@ -262,7 +262,7 @@ class _EpisodeReading:
             self._said.append((log_ns, text))
 
     def _instruction(self) -> str:
-        """Return the first said; in an episode of a bag, what was said nearest to its beginning."""
+        """Return the first instruction; in an episode inside a bag, the one nearest to its beginning."""
         begins = self._segment.first_ns if self._segment else 0
         nearest = min(self._said, key=lambda said: abs(said[0] - begins), default=(0, ""))
         return nearest[1]
@@ -275,10 +275,10 @@ class _EpisodeReading:
                 fault = f"its index counts {self._counts[topic]} messages of {topic}, it holds {len(track)}"
                 raise damaged(self._bag.path, fault)
 
-    # -- what came of it
+    # -- results
 
     def _stream(self, camera: Camera, shown: Floats | None = None) -> Stream:
-        """Return a camera; of an episode in a bag its own pictures, or those around the times `shown`."""
+        """Return a camera; for an episode in a bag, its own pictures, or those around the times `shown`."""
         track, clock = self._tracks[camera.key], camera.stamp or self._embodiment.sync.stamp
         if self._segment is None or self._table is None:
             return camera_stream(self._bag, track, clock)
@@ -305,9 +305,11 @@ class _EpisodeReading:
         return Signal(times, component_values(column.component, column.values()[order], self._where))
 
     def _around(self, received: Rows, times: Floats, shown: Floats) -> tuple[int, int]:
-        """Return which samples in order of receipt: that in force at the first picture to one after the last.
+        """Return the range of samples, in order of receipt, that the pictures shown need.
 
-        Where a clock begins anew between two episodes, only the samples on this episode's side count.
+        It begins with the sample in force at the first picture, and ends with the first sample at or after
+        the last. Where a clock begins anew between two episodes, only the samples on this episode's side
+        count.
         """
         assert self._segment
         inside = np.searchsorted(received, [self._segment.first_ns, self._segment.last_ns + 1])
@@ -316,13 +318,13 @@ class _EpisodeReading:
         low = int(earlier[-1]) if len(earlier) else 0
         high = int(later[0]) if len(later) else len(times)
         if np.any(np.diff(times[low:high]) < 0):
-            return low, high  # `align` says where
+            return low, high  # `align` reports where the times go back
         begin = low + max(0, int(np.searchsorted(times[low:high], shown[0], side="right")) - 1)
         stop = low + int(np.searchsorted(times[low:high], shown[-1], side="left")) + 1
         return begin, min(max(stop, begin + 1), high)
 
     def _clocks(self) -> dict[str, str]:
-        """Return topic -> header or receive: whose times it has where none are forced."""
+        """Return topic -> header or receive: the clock of its times where the YAML forces none."""
         return {topic: "header" if track.stamped else "receive" for topic, track in self._tracks.items()}
 
     def _about(self) -> dict[str, dict[str, int]]:

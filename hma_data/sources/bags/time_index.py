@@ -1,7 +1,7 @@
-"""Find where in a bag file which messages are, so that a part of its time is read alone.
+"""Index where the messages of a bag file lie, so that a time range is read without the rest.
 
-A piece is a run of a file's records, a chunk or messages outside of chunks, of which is known when
-its messages were received and of which topics they are. A file has some thousands of them.
+A piece is a run of a file's records: one chunk, or messages outside of chunks. Its topics and its times of
+receipt are known. A file has some thousands of pieces.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -11,11 +11,11 @@ from hma_data.sources.bags.container import Record, Wanted
 
 
 class Piece(NamedTuple):
-    """Describe the records from offset `at` to `end`.
+    """The records from offset `at` to `end`.
 
     Attributes:
         first_ns, last_ns: earliest and latest receipt of its messages.
-        topics: of them.
+        topics: of its messages.
     """
 
     at: int
@@ -25,7 +25,7 @@ class Piece(NamedTuple):
     topics: frozenset[str]
 
     def holds(self, topics: frozenset[str] | None) -> bool:
-        """Check whether a message of those topics can be in it."""
+        """Check whether it can hold a message of those topics."""
         return topics is None or not self.topics.isdisjoint(topics)
 
 
@@ -33,7 +33,7 @@ Load = Callable[[Piece, Wanted], Iterator[Record]]
 
 
 def overlapping(pieces: Sequence[Piece], wanted: Wanted) -> Iterator[Piece]:
-    """Yield the pieces in which wanted messages can be, in the file's order."""
+    """Yield the pieces that can hold wanted messages, in the file's order."""
     for piece in pieces:
         within = piece.first_ns <= wanted.last_ns and piece.last_ns >= wanted.first_ns
         if within and piece.holds(wanted.topics):
@@ -43,7 +43,7 @@ def overlapping(pieces: Sequence[Piece], wanted: Wanted) -> Iterator[Piece]:
 def last_before(
     pieces: Sequence[Piece], topics: frozenset[str], log_ns: int, load: Load
 ) -> dict[str, Record]:
-    """Return each topic's last message received before that time; look back no further than needed."""
+    """Return each topic's last message received before a time; look back no further than needed."""
     found: dict[str, Record] = {}
     earlier = (piece for piece in pieces if piece.first_ns < log_ns and piece.holds(topics))
     for piece in sorted(earlier, key=lambda piece: piece.last_ns, reverse=True):

@@ -1,7 +1,7 @@
-"""Keep what one pass over a bag tells of a topic: times and places, a few bytes a message.
+"""Record the times and places of a topic's messages in one pass over a bag, a few bytes a message.
 
-Pictures of a camera are read again by these places when asked for. T messages of a topic, H×W pixels;
-times are float64 seconds, the clock of a topic is `header` or `receive`.
+A camera's pictures are read again by these places on demand. T messages of a topic, H×W pixels; times are
+float64 seconds; the clock of a topic is `header` or `receive`.
 """
 
 import struct
@@ -34,12 +34,12 @@ BLOCK = 64  # video messages fetched at a time
 
 
 class TopicTrack:
-    """Follow one topic over one pass.
+    """Record one topic over one pass.
 
     Attributes:
         columns: the components that read this topic; each takes its values as messages are added.
-        channels: on which the messages came, usually one.
-        codec: of video, empty for anything else.
+        channels: the channels of the messages, usually one.
+        codec: of video; empty for anything else.
     """
 
     def __init__(self, topic: str) -> None:
@@ -54,10 +54,10 @@ class TopicTrack:
         return len(self._log_ns)
 
     def add_head(self, channel: Channel, log_ns: int, place: Place, data: Data) -> None:
-        """Take the next message, of which only the time it carries in its first bytes is wanted.
+        """Add the next message, of which only the time in its first bytes is needed.
 
         Raises:
-            EpisodeError: there is none.
+            EpisodeError: its bytes hold no such time.
         """
         stamp = head_stamp(channel)
         try:
@@ -69,7 +69,7 @@ class TopicTrack:
         self._take(channel, log_ns, place, own_ns)
 
     def add(self, channel: Channel, log_ns: int, place: Place, message: Any) -> None:
-        """Take the next message; None for one that could not be decoded keeps its time of receipt."""
+        """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt."""
         for column in self.columns:
             column.add(message, len(self))
         if message is not None and picture_kind(channel.type) == VIDEO:
@@ -96,26 +96,26 @@ class TopicTrack:
         return np.argsort(received if rows is None else received[rows], kind="stable")
 
     def received(self) -> NDArray[np.int64]:
-        """Return (T,) nanoseconds of receipt, as the messages lie in the file."""
+        """Return (T,) nanoseconds of receipt, in the file's order."""
         return np.frombuffer(self._log_ns, np.int64)
 
     @property
     def stamped(self) -> bool:
-        """Check whether every message carries a time of its own, and these are not all one."""
+        """Check whether every message carries its own time, and these times are not all the same."""
         stamps = np.frombuffer(self._stamp_ns, np.int64)
         return bool(len(stamps) and np.all(stamps)) and not self.frozen
 
     @property
     def frozen(self) -> bool:
-        """Check whether the messages' own times never move: such stamps are no clock."""
+        """Check whether the messages' own times never change: such stamps are not a clock."""
         stamps = np.frombuffer(self._stamp_ns, np.int64)
         return bool(len(stamps) > 1 and stamps[0] and np.all(stamps == stamps[0]))
 
     def seconds(self, clock: str) -> Floats:
-        """Return (T,) in the file's order: `header` where the messages are stamped, else `receive`."""
+        """Return (T,) seconds in the file's order: `header` where messages are stamped, else `receive`."""
         stamps = self._stamp_ns if clock == "header" and self.stamped else self._log_ns
         nanoseconds = np.frombuffer(stamps, np.int64)
-        # the whole first: 61 bits do not fit a float
+        # Whole seconds are divided first, because 61 bits do not fit a float.
         return nanoseconds // 10**9 + (nanoseconds % 10**9) / 1e9
 
     def places(self) -> NDArray[np.int64]:
@@ -123,7 +123,7 @@ class TopicTrack:
         return np.frombuffer(self._places, np.int64).reshape(-1, 4)
 
     def keyframes(self) -> NDArray[np.bool_] | None:
-        """Return (T,) where decoding of the video can begin; None where the codec does not show it."""
+        """Return (T,) whether decoding can begin at a message; None where the codec does not show it."""
         if None in self._keyframes:
             return None
         return np.array(self._keyframes, bool)
@@ -133,12 +133,12 @@ class TopicTrack:
 
 
 def camera_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int] | None = None) -> Stream:
-    """Return the camera whose topic was tracked.
+    """Return the stream of a camera whose topic was recorded.
 
     Args:
         clock: header or receive.
-        shown: from which to before which of the pictures, in order of receipt; all by default. What video
-            needs to be decoded may come before.
+        shown: [from, to) of the pictures, in order of receipt; all by default. Video may need earlier
+            messages too, to be decoded.
 
     Raises:
         EpisodeError: the topic holds no pictures, or video that never begins.
@@ -170,12 +170,12 @@ def camera_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int
 def _decodable(
     track: TopicTrack, order: NDArray[np.int64], begin: int, where: str
 ) -> tuple[int, NDArray[np.bool_]]:
-    """Return where decoding begins for the message `begin`, and the key frames in order of receipt.
+    """Return where decoding must begin for the message `begin`, and the key frames in order of receipt.
 
-    What comes before the first key frame cannot be decoded.
+    Messages before the first key frame cannot be decoded.
     """
     keyframes = track.keyframes()
-    if keyframes is None:  # then only the beginning is sure to be one
+    if keyframes is None:  # only the first message is certain to be one
         return 0, np.arange(len(order)) == 0
     keyframes = keyframes[order]
     if not keyframes.any():
@@ -189,7 +189,7 @@ class Messages:
 
     Args:
         places: (T, 4) as TopicTrack keeps them, in order of receipt.
-        channels: what the last number of a place means.
+        channels: the channels that the last number of a place points into.
     """
 
     def __init__(self, bag: Bag, channels: list[Channel], places: NDArray[np.int64], where: str) -> None:
@@ -227,8 +227,8 @@ class VideoStream:
     """Serve a camera of video; see episode.Stream.
 
     Args:
-        timestamps: (T,) of the pictures shown, the last of the messages.
-        keyframes: (M,) of all messages; those before the pictures shown are there to be decoded.
+        timestamps: (T,) of the pictures shown, which are the last T messages.
+        keyframes: (M,) of all messages; the messages before those shown serve only for decoding.
     """
 
     def __init__(
@@ -254,7 +254,7 @@ class VideoStream:
 
 
 def _of_one_size(pictures: Iterator[Images], where: str) -> Iterator[Images]:
-    """Yield those pictures; EpisodeError once one has another size than the first."""
+    """Yield the pictures; raise EpisodeError at the first whose size differs."""
     first: tuple[int, ...] = ()
     for item in pictures:
         first = first or item.shape
@@ -265,7 +265,7 @@ def _of_one_size(pictures: Iterator[Images], where: str) -> Iterator[Images]:
 
 
 def _stack(pictures: Iterator[Images], count: int) -> Images:
-    """Return (count, H, W, 3); each is put in its place as it comes, so that one is held twice, not all."""
+    """Stack pictures to (count, H, W, 3), one at a time, so that only one picture is in memory twice."""
     first = next(pictures, None)
     if first is None:
         return np.zeros((0, 1, 1, 3), np.uint8)

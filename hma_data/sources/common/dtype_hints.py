@@ -1,4 +1,4 @@
-"""Guess what a recording does not state: grey pictures, the unit of a column of times; for `inspect`."""
+"""Guess what a recording does not state: whether pictures are grey, and the unit of times; for `inspect`."""
 
 import re
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-HEAD = 65536  # bytes in which a JPEG's start of frame is looked for
-UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # times since 1970 from, seconds a unit
+HEAD = 65536  # bytes that are searched for a JPEG's start of frame
+UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least time since 1970, seconds a unit
 TIMES = re.compile(r"(.*/)?(time_?stamps?|times?|stamps?|t)(_s|_sec|_ns)?")
 STEPS_S = (1e-4, 5.0)  # between samples of a recording
 
@@ -26,7 +26,9 @@ def one_channel(data: bytes) -> bool:
 
 
 def seconds_a_unit(values: NDArray[Any]) -> float | None:
-    """Return what one unit of a column of times is in seconds, by size and steps; None where it is not clear.
+    """Return the length in seconds of one unit of a column of times; None where it is not clear.
+
+    The unit follows from the size of the times and from their steps.
 
     Args:
         values: (T,) as recorded.
@@ -44,14 +46,14 @@ def seconds_a_unit(values: NDArray[Any]) -> float | None:
 
 
 def is_times(key: str, shape: tuple[int, ...]) -> bool:
-    """Check whether a key of one number a sample has the name of a column of times."""
+    """Check whether a key holds one number a sample and is named like a column of times."""
     return shape in ((), (1,)) and bool(TIMES.fullmatch(key.lower()))
 
 
 def seconds_of(values: NDArray[Any]) -> NDArray[np.float64] | None:
     """Return a column of times (T,) in seconds; None where its unit is not clear.
 
-    Stamps may repeat or go back here; the unit is taken from those in order.
+    Stamps may repeat or go back. The unit is found from the sorted, distinct stamps.
     """
     times = np.asarray(values).reshape(-1)
     if times.dtype.kind not in "fiu" or len(times) < 3:
@@ -60,6 +62,6 @@ def seconds_of(values: NDArray[Any]) -> NDArray[np.float64] | None:
     unit = seconds_a_unit(rising)
     if unit is None:
         return None
-    origin = rising[0]  # taken off before the numbers become floats: nanoseconds since 1970 do not fit one
+    origin = rising[0]  # subtracted while they are integers: float64 cannot hold nanoseconds since 1970
     shifted = times - origin if times.dtype.kind == "f" else times.astype(np.int64) - np.int64(origin)
     return shifted.astype(np.float64) * unit

@@ -1,4 +1,4 @@
-"""What a look at a recording or a shard set found, in a form programs can read."""
+"""Define a finding: one result of a check on a recording or a shard set, readable by programs."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -10,15 +10,15 @@ SEVERITIES: tuple[Severity, ...] = ("info", "warn", "error")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing a check found.
+    """One result of a check.
 
     Attributes:
         check: its name, stable for programs.
         severity: error: unusable or wrong; warn: look before training; info: good to know.
-        message: what was met, with the numbers.
+        message: what was found, with the numbers.
         remedy: what to do; may be empty.
-        key: of the recording it is about; empty where it is about all of it.
-        numbers: what the message says, as plain values.
+        key: the key of the recording that is affected; empty where the finding is about all of it.
+        numbers: the numbers in the message, as plain values.
     """
 
     check: str
@@ -29,7 +29,7 @@ class Finding:
     numbers: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+        """Return plain values for `--json`."""
         return asdict(self)
 
     def __str__(self) -> str:

@@ -1,10 +1,10 @@
 """Check a few pictures of a camera: still, blank, of several sizes, red and blue swapped.
 
-Two signs speak for swapped channels. Where pictures were decoded from JPEG or video and then kept
-without loss, every pixel is one that the conversion from YCbCr gives: only a quarter of all colours
-are, so that the order in which they all are is the right one. Otherwise only the scene speaks: indoors
-and outdoors, saturated pixels are warm (red > green > blue) far more often than cold. That is weak, a
-blue table speaks the same, and so it is only a hint.
+Two signs show that channels are swapped. The first holds for pictures that were decoded from JPEG or video
+and then stored without loss: every pixel is then a result of the conversion from YCbCr, which gives only a
+quarter of all colours. The channel order in which all pixels are such results is the right one. The second
+sign is the scene: indoors and outdoors, saturated pixels are warm (red > green > blue) far more often than
+cold. This sign is weak, because a blue table looks the same, so it gives only a hint.
 
 n pictures, H×W pixels, uint8 RGB.
 """
@@ -18,25 +18,25 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import Images
 from hma_data.sources.common.findings import Finding, Severity
 
-PAIRS = 16  # neighbouring pictures compared, of a camera over all its episodes
-PIXELS = 4096  # of a picture, whose colours are looked at
-DISTINCT = 1_000  # colours from which the YCbCr sign is trusted
-SURE, CHANCE = 0.98, 0.6  # shares of colours that YCbCr gives: in the right order, and at most in the other
-COLD = 0.15  # share of pixels, saturated and blue > green > red, from which a hint is given
-STILL, BLANK = 0.5, 2.0  # share of equal neighbours; standard deviation of all values
+PAIRS = 16  # pairs of neighbouring pictures compared, for a camera over all its episodes
+PIXELS = 4096  # pixels of a picture whose colours are checked
+DISTINCT = 1_000  # least number of distinct colours for the YCbCr sign
+SURE, CHANCE = 0.98, 0.6  # share of colours that YCbCr gives: least in the right order, most in the other
+COLD = 0.15  # share of cold pixels (saturated, blue > green > red) above which a hint is given
+STILL, BLANK = 0.5, 2.0  # limits: share of equal neighbours; standard deviation of all values
 
 
 @dataclass
 class Look:
-    """Gather what was seen of one camera.
+    """Statistics of one camera's pictures.
 
     Attributes:
-        lossless: whether they are stored without loss, so that their colours tell how they once were.
-        pictures: how many.
-        sizes: (height, width) met, and in how many episodes.
+        lossless: whether pictures are stored without loss, so that the YCbCr sign can be used.
+        pictures: how many were added.
+        sizes: (height, width) -> number of calls of `add` with it.
         changes: how often the size changes within an episode.
         neighbours, same: pairs of neighbouring pictures compared, and equal ones among them.
-        blank, episodes: episodes in which it shows one colour, of all looked at.
+        blank, episodes: episodes in which the camera shows one colour; all episodes looked at.
         red, blue: sums of the means, over `pictures`.
         warm, cold: shares of saturated pixels, summed over `pictures`.
         colours: some of the colours met.
@@ -59,9 +59,9 @@ class Look:
     _size: tuple[int, int] = (0, 0)
 
     def add(self, frames: Images, indices: NDArray[np.int64], again: bool = False) -> None:
-        """Take pictures (n, H, W, 3) of one episode, and which of its frames they are (n,) rising.
+        """Add pictures (n, H, W, 3) of one episode, and the rising indices (n,) of their frames.
 
-        `again` where they are of the same episode as those before.
+        `again` says that they are of the same episode as the pictures before.
         """
         if not again:
             self.episodes, self.blank, self._blank = self.episodes + 1, self.blank + 1, True
@@ -84,9 +84,9 @@ class Look:
             self.colours.append(pixels)
 
     def swapped(self) -> tuple[str, str]:
-        """Check whether red and blue changed places; return also the reason.
+        """Check whether red and blue are swapped; return the answer and its reason.
 
-        sure, hint, no (they are in order for sure), or nothing where it cannot be told.
+        The answer is sure, hint, no (they are certainly in order), or empty where it is unknown.
         """
         if self.lossless and self.colours:
             colours = np.unique(np.concatenate(self.colours), axis=0)
@@ -98,7 +98,7 @@ class Look:
                         f"{straight:.0%} as they stand"
                     )
                 if straight >= SURE and turned <= CHANCE:
-                    return "no", ""  # however blue the scene
+                    return "no", ""  # even where the scene is blue
         count = max(self.pictures, 1)
         cold, warm = self.cold / count, self.warm / count
         if cold > COLD and cold > 4 * warm and self.blue > 1.25 * self.red:
@@ -122,9 +122,9 @@ def _tones(pixels: NDArray[np.uint8]) -> tuple[float, float]:
 
 
 def ycbcr_share(colours: NDArray[np.uint8]) -> float | None:
-    """Return the share of RGB colours (m, 3) that JPEG's YCbCr can give; a quarter of all by chance.
+    """Return the share of the RGB colours (m, 3) that JPEG's YCbCr can give; chance alone gives a quarter.
 
-    None where there are too few distinct colours, neither grey nor at the edge of the range, to tell.
+    Colours that are grey or at the edge of the range do not count. None where too few colours remain.
     """
     spread = colours.max(axis=1, initial=0).astype(int) - colours.min(axis=1, initial=255)
     inside = ((colours > 0) & (colours < 255)).all(axis=1) if len(colours) else np.zeros(0, bool)
@@ -150,8 +150,8 @@ def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> 
     Args:
         length: of the episode.
         pairs: how many runs at most.
-        starts: for each frame where its decoding begins, where that costs; runs then begin there, and
-            are of three: with a keyframe every other frame, encoders often repeat it in between.
+        starts: for each frame the frame at which its decoding begins, for videos. Runs then begin there
+            and have three frames: where every other frame is a keyframe, encoders often repeat it between.
     """
     firsts = np.unique(np.linspace(0, max(length - 2, 0), max(pairs, 1)).astype(np.int64))
     run = 2
@@ -161,12 +161,12 @@ def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> 
 
 
 def runs(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Yield the chosen frames run by run, which bounds how many pictures are in memory."""
+    """Divide the chosen frames into runs of neighbours, so that only one run of pictures is in memory."""
     return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
 
 
 def stacked(pictures: list[Images]) -> Iterator[tuple[int, Images]]:
-    """Yield runs of pictures of one size as (n, H, W, 3), with the place each begins at."""
+    """Yield runs of pictures of one size as (n, H, W, 3), with the index at which each run begins."""
     start = 0
     for i in range(1, len(pictures) + 1):
         if i == len(pictures) or pictures[i].shape != pictures[start].shape:
@@ -188,7 +188,7 @@ def findings(looks: dict[str, Look]) -> Iterator[Finding]:
             said = f"{key}: shows nothing (one colour) in {look.blank} of {look.episodes} episodes looked at"
             severity: Severity = (
                 "info" if look.blank == look.episodes else "warn"
-            )  # a camera never plugged in
+            )  # info where every episode is blank: the camera was never plugged in
             yield Finding("blank", severity, said, "is it another camera's key?", key)
         share = look.same / max(look.neighbours, 1)
         if share > STILL and look.blank < look.episodes:

@@ -1,6 +1,7 @@
-"""Links that are not followed when a folder is searched for recordings, so that none is left out in silence.
+"""Report the links that are skipped when a folder is searched for recordings.
 
-A link to a folder may lead anywhere, and in circles. Recordings behind one are read when it is named itself.
+A link to a folder may lead anywhere, even in a circle, so it is not followed. A recording behind a link is
+read when the user names that recording.
 """
 
 import os
@@ -12,11 +13,11 @@ from hma_data.sources.common.findings import Finding
 
 
 def unfollowed(root: Path, told: Collection[Path] = ()) -> list[Finding]:
-    """One finding for each kind of link under a folder that is passed over.
+    """Return one finding for each kind of unfollowed link under a folder.
 
     Args:
-        root: of the recordings; a file has none.
-        told: paths that are spoken of elsewhere.
+        root: folder of the recordings; a file has no links.
+        told: paths that are reported elsewhere.
     """
     outside: list[Path] = []
     inside: list[Path] = []
@@ -44,7 +45,7 @@ def unfollowed(root: Path, told: Collection[Path] = ()) -> list[Finding]:
 
 
 def nothing_there(uri: str, root: Path, fault: str, remedy: str) -> SourceError:
-    """The error of a place without recordings; tells of a link that was not followed, where there is one."""
+    """Return the error for a place without recordings; mention a link that was not followed, if any."""
     passed = [finding for finding in unfollowed(root) if finding.severity != "info"]
     if not passed:
         return SourceError(uri, fault, remedy)

@@ -1,7 +1,7 @@
-"""What a sample of episodes shows, the same for every format: a source hands in what it has read.
+"""Gather what a sample of episodes shows; the same for every format.
 
-A source gives, episode by episode, the lengths of its keys, their numbers, a few pictures, and times
-where there are any; each defect becomes one finding a key, however many episodes have it.
+For each episode, a source hands in the lengths of the keys, their numbers, a few pictures, and times
+where there are any. A defect of a key becomes one finding, however many episodes have it.
 
 T samples of a key in an episode, A values a sample.
 """
@@ -24,7 +24,7 @@ from hma_data.sources.common.findings import Finding, Severity
 from hma_data.sources.common.image_checks import Look
 from hma_data.sources.common.timestamp_checks import Clock
 
-CHECKS = {  # what a look at a recording can check, in the order it is printed
+CHECKS = {  # the checks of an inspection, in the order they are printed
     "readable": "episodes that can be read",
     "files": "files and metadata",
     "keys": "the same keys in every episode",
@@ -45,7 +45,7 @@ CHECKS = {  # what a look at a recording can check, in the order it is printed
     "hands": "hands in the pictures",
 }
 LOSSY = ("jpeg", "h264", "av1", "hevc", "vp8", "vp9", "mpeg4", "mjpeg")
-SHOWN = 5  # faults and episodes named
+SHOWN = 5  # faults and episodes named at most
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 MAX_VALUES = 20_000_000  # numbers of one key of an episode
 _COMMANDS = re.compile(r"(^|[^a-z])(actions?|commands?|cmd|ctrl|control|targets?)([^a-z]|$)")
@@ -53,7 +53,7 @@ _COMMANDS = re.compile(r"(^|[^a-z])(actions?|commands?|cmd|ctrl|control|targets?
 
 @dataclass
 class _Numbers:
-    """One vector over the episodes; (A,) arrays."""
+    """The range of one vector over the episodes; `low` and `high` are (A,)."""
 
     low: NDArray[Any]
     high: NDArray[Any]
@@ -61,8 +61,8 @@ class _Numbers:
     infinite: int = 0
     values: int = 0
     episodes: int = 0
-    first: str = ""  # where one that is not finite was met
-    last: str = ""  # the episode in which one was met last
+    first: str = ""  # where the first value that is not finite was found
+    last: str = ""  # the last episode that has such a value
 
 
 @dataclass
@@ -75,12 +75,12 @@ class _Times:
 
 
 class Survey:
-    """Gathers what episodes show.
+    """Gather what the sampled episodes show.
 
     Args:
         episodes: how many the recording has.
-        alone: whether it is told without the episodes' names (a bag that is one episode).
-        by_field: whether a YAML takes single fields of a message, so that still ones do no harm.
+        alone: whether findings leave out the names of episodes (a bag that is one episode).
+        by_field: whether a YAML picks single fields of a message, so that constant ones do no harm.
     """
 
     def __init__(self, episodes: int, alone: bool = False, by_field: bool = False) -> None:
@@ -99,20 +99,20 @@ class Survey:
     # -- what sources hand in
 
     def episode(self, name: str) -> None:
-        """That episode is looked at."""
+        """Note that an episode is sampled."""
         self.looked.append(name)
 
     def fault(self, name: str, fault: HMAError | str) -> None:
-        """An episode, or a key of it, that cannot be read."""
+        """Note an episode, or a key of it, that cannot be read."""
         self._faults.setdefault(name, str(fault))
 
     def note(self, finding: Finding) -> None:
-        """Something only this format can know."""
+        """Add a finding that only this format can make."""
         self.made.add(finding.check)
         self._extra.append(finding)
 
     def lengths(self, name: str, length: int, sizes: Mapping[str, int], wanted: Sequence[str]) -> None:
-        """The rows of an episode's keys, and the keys it should have."""
+        """Note the rows of an episode's keys, and the keys that are missing."""
         self.made |= {"keys", "rows"}
         absent = [key for key in wanted if key not in sizes]
         for key in absent:
@@ -122,7 +122,7 @@ class Survey:
             self._odd.append((name, length, odd))
 
     def numbers(self, name: str, key: str, values: NDArray[Any], begin: int = 0) -> None:
-        """A vector (T, …) of an episode, or the part of it that begins at step `begin`."""
+        """Add a vector (T, …) of an episode, or the part of it that begins at step `begin`."""
         if values.dtype.kind not in "fiub" or not len(values):
             return
         self.made |= {"finite", "constant"}
@@ -134,7 +134,7 @@ class Survey:
         held = self._numbers.get(key)
         if held is None or held.low.shape[0] != flat.shape[1]:
             if held is not None:
-                return  # of another width than before; a source says so
+                return  # another width than before: the source reports it
             blank = np.full(flat.shape[1], np.nan)
             held = self._numbers[key] = _Numbers(blank, blank.copy())
         if infinite and not held.infinite:
@@ -152,21 +152,21 @@ class Survey:
     def pictures(
         self, name: str, key: str, frames: Images, indices: NDArray[np.int64], codec: str | None
     ) -> None:
-        """Some pictures (n, H, W, 3) of an episode's camera, and which of its frames they are."""
+        """Add some pictures (n, H, W, 3) of an episode's camera, and the indices of their frames."""
         self.made |= {"size", "blank", "colour"} | ({"still"} if (np.diff(indices) == 1).any() else set())
         look = self.looks.setdefault(key, Look(lossless=codec not in LOSSY))
         look.add(frames, indices, again=self._shown.get(key) == name)
         self._shown[key] = name
 
     def times(self, name: str, key: str, seconds: Floats, camera: bool = False) -> Clock:
-        """The times (T,) of one key of an episode, in the order of receipt."""
+        """Add the times (T,) of one key of an episode, in the order of receipt; return their clock."""
         self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
         held = self._times.setdefault(key, _Times(camera=camera))
         held.met[name] = timestamp_checks.clock_of(seconds)
         return held.met[name]
 
     def skew(self, key: str, found: tuple[float, float, float] | None, period_s: float) -> None:
-        """How far a stream is from the primary one's frames, whose median interval is `period_s`."""
+        """Note how far a stream is from the primary stream's frames; `period_s` is their median interval."""
         self.made.add("skew")
         held = self._times[key]
         held.skew = found
@@ -176,10 +176,10 @@ class Survey:
             numbers = dict(zip(("p50_ms", "p95_ms", "max_ms"), found, strict=True))
             self._extra.append(Finding("skew", "warn", said, "it pauses, or loses messages", key, numbers))
 
-    # -- what comes of it
+    # -- results
 
     def key(self, info: KeyInfo) -> KeyInfo:
-        """The key with what was measured of it."""
+        """Return the key with what was measured of it."""
         held, look = self._numbers.get(info.key), self.looks.get(info.key)
         times = self._times.get(info.topic.name if info.topic else info.key)
         if held is not None:
@@ -208,7 +208,7 @@ class Survey:
         return info
 
     def findings(self, keys: Sequence[KeyInfo]) -> tuple[Finding, ...]:
-        """Everything that was found, check by check."""
+        """Return all findings, check by check."""
         found = [
             *self._readable(), *_merged(self._extra), *self._keys(), *self._rows(), *self._clocks(),
             *self._finite(), *self._constant(keys), *image_checks.findings(self.looks),
@@ -217,7 +217,7 @@ class Survey:
         return tuple(sorted(found, key=lambda one: order.index(one.check) if one.check in order else 99))
 
     def checks(self) -> tuple[str, ...]:
-        """The checks that could be made, in their order."""
+        """Return the checks that could be made, in their order."""
         return tuple(check for check in CHECKS if check in self.made)
 
     def _readable(self) -> Iterator[Finding]:
@@ -307,7 +307,7 @@ class Survey:
 
 
 def _merged(found: list[Finding]) -> Iterator[Finding]:
-    """One finding for each check and key: the first, and how many more there are."""
+    """Yield one finding for each check and key: the first, with the number of the others."""
     together: dict[tuple[str, str, str], list[Finding]] = {}
     for one in found:
         together.setdefault((one.check, one.severity, one.key or one.message), []).append(one)
@@ -317,11 +317,11 @@ def _merged(found: list[Finding]) -> Iterator[Finding]:
 
 
 def sampled(count: int, wanted: int) -> list[int]:
-    """Places of so many episodes, spread evenly over all."""
+    """Return the indices of `wanted` episodes, spread evenly over all `count`."""
     return [int(i) for i in np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(np.int64))]
 
 
 def listed(words: Sequence[str], limit: int = 8) -> str:
-    """The first of the words, and how many more there are."""
+    """Return the first `limit` words, and how many more there are."""
     more = f" and {len(words) - limit} more" if len(words) > limit else ""
     return ", ".join(words[:limit]) + more

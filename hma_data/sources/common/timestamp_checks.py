@@ -1,4 +1,4 @@
-"""Check the timestamps of a stream: rate and jitter, stamps that repeat or go back, pauses, losses.
+"""Check the timestamps of a stream: rate, jitter, repeated stamps, stamps that go back, pauses, lost frames.
 
 T samples of a stream; times are float64 seconds in the order of receipt.
 """
@@ -12,24 +12,25 @@ from hma_data.episodes.align import nearest
 from hma_data.episodes.episode import Floats
 from hma_data.sources.common.findings import Finding
 
-PAUSE, PAUSE_S = 10, 0.5  # a pause is longer than so many median intervals, and than so many seconds
-REGULAR = 0.8  # share of intervals within a third of the median one, from which lost frames are counted
-STREAM = 0.5  # share from which a topic is a stream, whose pauses are worth a word, not one of events
-LOST = 0.01  # share of lost frames worth a look
-DRIFT = 0.02  # of the rate, between what is stated and what stamps say
+PAUSE, PAUSE_S = 10, 0.5  # a pause is longer than this many median intervals and this many seconds
+REGULAR = 0.8  # least share of intervals within a third of the median, for counting lost frames
+STREAM = 0.5  # least such share for reporting pauses; below it, the topic carries events
+LOST = 0.01  # share of lost frames above which they are reported
+DRIFT = 0.02  # share of the stated rate by which the measured rate may differ
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Hold what the timestamps of one stream in one episode say.
+    """The timing of one stream in one episode, measured from its timestamps.
 
     Attributes:
-        hz, jitter_ms: rate and standard deviation of the intervals; None for too few or bursts without sum.
-        repeated, back: stamps that are the one before again, or earlier than it.
-        gap_s, gap_at_s: the longest interval, and when after the first sample it begins.
+        hz, jitter_ms: rate and standard deviation of the intervals; None for fewer than two intervals, or
+            where their sum is not positive.
+        repeated, back: stamps equal to the one before, and stamps earlier than it.
+        gap_s, gap_at_s: the longest interval, and its start in seconds after the earliest sample.
         period_s: the median interval.
         regular: share of intervals within a third of the median one.
-        lost: frames missing by the rate, where it is regular; else None.
+        lost: frames missing at this rate, where the stream is regular; else None.
         infinite: stamps that are not finite.
     """
 
@@ -47,7 +48,7 @@ class Clock:
 
 
 def clock_of(times: Floats) -> Clock:
-    """Measure the clock of a stream on (T,) seconds."""
+    """Measure the clock of a stream from its times, (T,) seconds."""
     finite = np.isfinite(times)
     times = times[finite]
     steps = np.diff(times)
@@ -73,8 +74,8 @@ def clock_of(times: Floats) -> Clock:
 def rate(times: Floats) -> tuple[float | None, float | None]:
     """Return Hz and jitter_ms, the standard deviation of the intervals.
 
-    The rate is of the median interval, which a pause does not change; of the mean one where bursts
-    make them differ by half.
+    The rate comes from the median interval, which a pause does not change. Where bursts make the median and
+    the mean differ by half, it comes from the mean interval.
     """
     steps = np.diff(times)
     if len(steps) < 2 or steps.sum() <= 0:
@@ -85,7 +86,7 @@ def rate(times: Floats) -> tuple[float | None, float | None]:
 
 
 def _lost(steps: Floats, period: float) -> int:
-    """Count lost frames by intervals that are whole multiples of the median one, pauses left out."""
+    """Count lost frames from the intervals that are multiples of the median one; leave out pauses."""
     usual = steps[steps <= max(PAUSE * period, PAUSE_S)]
     return max(int(np.sum(np.rint(usual / period) - 1)), 0)  # a late frame is not a lost one
 
@@ -96,8 +97,8 @@ def findings(key: str, clock: Clock, camera: bool = False, episode: str = "") ->
     Args:
         key: the stream's name.
         clock: of the stream.
-        camera: whether frames are lost by it.
-        episode: where it was met, for the message; empty where there is only one.
+        camera: whether lost frames are reported.
+        episode: its name, for the message; empty where there is only one.
     """
     where = f"{episode}: {key}" if episode else key
 
@@ -122,7 +123,7 @@ def findings(key: str, clock: Clock, camera: bool = False, episode: str = "") ->
 def drift(
     key: str, measured_hz: float | None, stated_hz: float | None, source: str = "the recording states"
 ) -> Iterator[Finding]:
-    """Find stamps that tick at another rate than the recording states, or than `source` says was measured."""
+    """Yield a finding where the rates differ by more than DRIFT; `source` says who stated the rate."""
     if measured_hz and stated_hz and abs(measured_hz / stated_hz - 1) > DRIFT:
         said = f"{key}: ticks at {measured_hz:.4g} Hz, {source} {stated_hz:.4g}"
         numbers = {"measured_hz": measured_hz, "stated_hz": stated_hz}
@@ -132,7 +133,7 @@ def drift(
 def skew(times: Floats, primary: Floats) -> tuple[float, float, float] | None:
     """Return p50, p95 and max in ms from each frame of the primary stream to the sample nearest to it.
 
-    Only where both run; None where they never do together.
+    Only frames within the time span of `times` count; None where there are none.
     """
     times, primary = np.sort(times), np.sort(primary)
     if not len(times) or not len(primary):

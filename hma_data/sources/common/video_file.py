@@ -1,12 +1,12 @@
-"""Pictures out of a video file, by index, decoding only what is asked for.
+"""Read pictures of a video file by index, decoding only the frames that are needed.
 
-A first pass over the packets (nothing is decoded) gives the exact time of every frame and where
-the keyframes are. Reading then keeps one decoder positioned: it decodes on when the next frame
-asked for is ahead within its group, and seeks when it lies behind or past another keyframe. A file
-whose keyframes or times are not what the container says is decoded from its beginning.
+A first pass over the packets, without decoding, gives the exact time of every frame and the keyframes.
+Reading then keeps one decoder in position. It decodes on while the next frame asked for lies ahead within the
+same keyframe group; it seeks when that frame lies behind or after another keyframe. A file whose keyframes or
+times differ from what the container says is decoded from its beginning.
 
-PyAV's wheel brings its codecs, AV1 among them. OpenCV is not used here: it returns no frames
-for AV1 and no error.
+PyAV's wheel contains its codecs, AV1 among them. OpenCV is not used here, because for AV1 it returns no
+frames and no error.
 """
 
 import os
@@ -24,20 +24,20 @@ from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import MAX_PIXELS, Images
 from hma_data.errors import EpisodeError
 
-THREADS = 1  # of FFmpeg, for each decoder: the work is spread over episodes, not within one
-# A file is only itself: no playlist or list of files may pass for a video and open others.
+THREADS = 1  # of FFmpeg, for each decoder: the work is parallel over episodes, not within one
+# Allow plain files only: a playlist or list of files must not pass for a video and open other files.
 _OPTIONS = {
     "protocol_whitelist": "file",
     "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,gif,mpeg,mpegts,flv,ogg,asf",
 }
 
-_REFRESHED = ("h264", "hevc")  # codecs whose "keyframe" may be a frame from which a refresh begins
+_REFRESHED = ("h264", "hevc")  # codecs whose "keyframe" may only begin a gradual refresh
 _INTRA = 1  # FFmpeg's AV_PICTURE_TYPE_I
 
 
 @dataclass(frozen=True)
 class FrameTable:
-    """What the packets of a video say about its frames; N frames in the order they are shown.
+    """The frames of a video, as its packets describe them; N frames in the order they are shown.
 
     Attributes:
         times: (N,) seconds, rising.
@@ -46,9 +46,9 @@ class FrameTable:
         seek_stamps: (N,) ticks to seek to for that keyframe; may differ from when it is shown.
         width, height: pixels, as stored.
         codec: h264, av1, hevc, vp9, …
-        hz: rate the file states; None when it states none.
-        counted: the container's times are those of packets, not of frames (B-frames in AVI), so that
-            frames are known by the order they are decoded in alone.
+        hz: stated rate; None where the file states none.
+        counted: whether the container's times are those of packets, not of frames (B-frames in AVI);
+            frames are then identified only by the order in which they are decoded.
     """
 
     times: Floats
@@ -66,7 +66,7 @@ class FrameTable:
 
 
 def frame_table(path: Path) -> FrameTable:
-    """The frames of a video file, without decoding any.
+    """Return the frames of a video file, without decoding any.
 
     Raises:
         EpisodeError: there is no such file, no video in it, or it is damaged.
@@ -127,7 +127,7 @@ def _table(
 
 
 class VideoFile:
-    """A video file as an array of frames. Opens on first use, and again after a fork.
+    """A video file as an array of frames; it opens on first use, and again after a fork.
 
     Args:
         path: of the file.
@@ -142,9 +142,9 @@ class VideoFile:
         self._container: Any = None
         self._decoder: Iterator[Any] = iter(())
         self._next = 0  # index of the frame the decoder gives next
-        self._entry = -1  # index of the keyframe that was last sought
-        self._counts, self._seeks = False, True  # whether frames are counted; whether keyframes are sought
-        self._spoilt = False  # whether the last frame, or one it may be made from, is damaged
+        self._entry = -1  # index of the keyframe of the last seek
+        self._counts, self._seeks = False, True  # whether frames are counted; whether seeking is used
+        self._spoilt = False  # whether the last frame, or a frame it may depend on, is damaged
         self._reformatter: Any = None
 
     def __len__(self) -> int:
@@ -152,15 +152,15 @@ class VideoFile:
 
     @property
     def timestamps(self) -> Floats:
-        """(N,) seconds by the file's own clock."""
+        """Return (N,) seconds by the file's own clock."""
         return self.table.times
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """Pictures (n, H, W, 3) RGB uint8 of those frames; quickest when the indices rise.
+        """Return the pictures (n, H, W, 3) RGB uint8 of those frames; rising indices are fastest.
 
         Raises:
             EpisodeError: a frame cannot be decoded, or the pictures change size.
-            IndexError: an index outside the video.
+            IndexError: an index lies outside the video.
         """
         wanted = np.asarray(indices, np.int64).reshape(-1)
         if len(wanted) and not 0 <= wanted.min() <= wanted.max() < len(self):
@@ -200,7 +200,11 @@ class VideoFile:
         return self._to_rgb(frame)
 
     def _count(self) -> None:
-        """From here on know frames by their order alone, the file having as many as its packets tell."""
+        """Identify frames only by their decoding order from here on.
+
+        Raises:
+            EpisodeError: the file gives another number of frames than its packets state.
+        """
         self._reopen()
         given = sum(1 for _ in self._decoder)
         if given != len(self):
@@ -213,7 +217,7 @@ class VideoFile:
             self._count()
         self._position(index)
         frame = self._decode_up_to(index)
-        if frame is None:  # the file's seek went past it: once more from the beginning
+        if frame is None:  # the seek went past the frame: try again from the beginning
             self._reopen()
             frame = self._decode_up_to(index)
         if frame is None:
@@ -225,7 +229,7 @@ class VideoFile:
             self._spoilt = is_spoilt(frame, self._spoilt)
             found = self._next if self._counts else self._index_of(frame)
             if found == self._entry and self.table.codec in _REFRESHED and frame.pict_type != _INTRA:
-                self._seeks = False  # a refresh spread over many frames: what follows is not whole
+                self._seeks = False  # a refresh spread over many frames: the next frames are incomplete
                 return None
             self._next = found + 1
             if found >= index:
@@ -233,7 +237,7 @@ class VideoFile:
         return None
 
     def _position(self, index: int) -> None:
-        """Bring the decoder before that frame."""
+        """Move the decoder to a position before that frame."""
         if self._container is None or self._process != os.getpid():
             self._reopen()
         if not self._seeks:
@@ -248,17 +252,17 @@ class VideoFile:
     def _reopen(self) -> None:
         from av.video.reformatter import VideoReformatter
 
-        # A parent's decoder is let go unclosed: after a fork the two share the file's position.
+        # A parent's decoder is dropped without closing it: after a fork, both share the file's position.
         self._container, self._process = _open(str(self.path)), os.getpid()
         stream = _video_stream(self._container, str(self.path))
         stream.codec_context.thread_count = self._threads
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         self._decoder, self._next, self._entry = self._container.decode(stream), 0, -1
         self._spoilt = False
-        self._reformatter = VideoReformatter()  # one for all frames: making it costs a third of the time
+        self._reformatter = VideoReformatter()  # one for all frames: making one costs a third of the time
 
     def _index_of(self, frame: Any) -> int:
-        """The frame's index; one that comes before the first shown is -1."""
+        """Return the frame's index; -1 for a frame that comes before the first shown."""
         if frame.pts is None:
             raise EpisodeError(self.path, f"frame {self._next} comes without a time")
         index = int(np.searchsorted(self.table.stamps, frame.pts))
@@ -270,26 +274,26 @@ class VideoFile:
 
     def _to_rgb(self, frame: Any) -> Images:
         picture: Images = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
-        quarters = round(frame.rotation / 90) % 4  # a telephone's way to say it was held upright
+        quarters = round(frame.rotation / 90) % 4  # phones state here that they were held upright
         return np.ascontiguousarray(np.rot90(picture, quarters)) if quarters else picture
 
 
 def is_spoilt(frame: Any, before: bool) -> bool:
-    """Whether a decoded frame is damaged, or may be made from one that is.
+    """Check whether a decoded frame is damaged, or may depend on a damaged one.
 
     Args:
         frame: PyAV's.
-        before: the same of the frame that was decoded before it.
+        before: whether the frame decoded before it is spoilt.
     """
     return bool(frame.is_corrupt or (before and not frame.key_frame))
 
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
-    """A video file's container and its video stream; FFmpeg's errors become ours.
+    """Open a video file; yield its container and its video stream, and raise FFmpeg's errors as ours.
 
     Raises:
-        EpisodeError: it is no video, or damaged.
+        EpisodeError: it is not a video, or it is damaged.
     """
     with _explained(str(path)), _open(str(path)) as container:
         yield container, _video_stream(container, str(path))
@@ -298,7 +302,7 @@ def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
 def _open(path: str) -> Any:
     import av
 
-    return av.open(path, container_options=_OPTIONS)  # given to streams too, PyAV crashes on FLV
+    return av.open(path, container_options=_OPTIONS)  # passing them to streams too crashes PyAV on FLV
 
 
 def _video_stream(container: Any, path: str) -> Any:
@@ -314,7 +318,7 @@ def _video_stream(container: Any, path: str) -> Any:
 
 @contextmanager
 def _explained(path: str) -> Iterator[None]:
-    """Turns FFmpeg's errors into ours."""
+    """Raise FFmpeg's errors as ours."""
     from av.error import FFmpegError
 
     try:

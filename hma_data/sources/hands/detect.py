@@ -1,14 +1,14 @@
-"""Find hands in pictures: the detector's contract, and MediaPipe's pipeline over LiteRT.
+"""Find hands in pictures: the contract of a detector, and MediaPipe's pipeline over LiteRT.
 
-Palms are found in the whole picture; each gives a turned square that the landmark model looks
-at; its points give the square of the next picture, so that palms are looked for only while
-fewer than two hands are followed. Constants are those of MediaPipe's published graphs
-(palm_detection_cpu, palm_detection_detection_to_roi, hand_landmark_cpu,
-hand_landmark_landmarks_to_roi, hand_landmark_tracking_cpu).
+The palm model searches the whole picture. Each palm gives a rotated square for the landmark model, and the
+landmarks give the square of the next picture. So the palm model runs only while fewer than two hands are
+tracked. The constants are those of MediaPipe's published graphs (palm_detection_cpu,
+palm_detection_detection_to_roi, hand_landmark_cpu, hand_landmark_landmarks_to_roi,
+hand_landmark_tracking_cpu).
 
-Left and right are the person's own hands in a picture that is not mirrored. MediaPipe's graph
-takes pictures for mirrored, as front cameras show them, and so calls a right hand in a plain
-picture "Left"; the model's number itself is the chance of a right hand in a plain picture.
+Left and right are the person's own hands in a picture that is not mirrored. MediaPipe's graph assumes
+mirrored pictures, as front cameras show them, and so calls a right hand in a plain picture "Left". The
+model's number itself is the probability of a right hand in a plain picture.
 
 Geometry is in pixels, angles in radians, x to the right and y down.
 """
@@ -34,11 +34,11 @@ from hma_data.sources.hands.models import (
 
 Floats = NDArray[np.float64]
 
-HANDS = 2  # that are followed
+HANDS = 2  # tracked at most
 PALM_SCORE, SUPPRESSION, PRESENCE, SAME = 0.5, 0.3, 0.5, 0.5
-VERSION = 1  # rises when the same picture may give other points; part of the key of cached detections
-_KNUCKLES = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # the points that say where the hand will be next
-_SURE = 0.8  # of a side; a second hand that claims it with less is taken for the other hand
+VERSION = 1  # part of the key of cached detections: raise it when the same picture may give other points
+_KNUCKLES = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # the points that give the next picture's square
+_SURE = 0.8  # probability of a side; a second hand of that side with less becomes the other hand
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Hand:
 
     Attributes:
         side: left or right, the person's own.
-        score: how sure it is that there is a hand, 0..1.
+        score: probability that there is a hand, 0..1.
         points: (21, 2) x and y as fractions of the picture's width and height; may lie outside it.
-            Point 0 is the wrist, then four of each finger from the thumb on, tips at 4, 8, 12, 16, 20.
+            Point 0 is the wrist; four points of each finger follow, thumb first, tips at 4, 8, 12, 16, 20.
     """
 
     side: str
@@ -58,20 +58,20 @@ class Hand:
 
 
 class Detector(Protocol):
-    """Finds at most one left and one right hand in each picture of a video, in order."""
+    """Find at most one left and one right hand in each picture of a video, in order."""
 
     def reset(self) -> None:
         """Forget the pictures before: the next one is of another video."""
         ...
 
     def detect(self, picture: Images) -> list[Hand]:
-        """The hands in a picture (H, W, 3) RGB."""
+        """Return the hands in a picture (H, W, 3) RGB."""
         ...
 
 
 @dataclass(frozen=True)
 class Square:
-    """A turned square of a picture: centre, side and clockwise angle."""
+    """A rotated square of a picture: centre, side and clockwise angle."""
 
     x: float
     y: float
@@ -79,7 +79,7 @@ class Square:
     angle: float
 
     def to_picture(self, size: int) -> Floats:
-        """(2, 3) affine map from a picture of the square, `size` pixels wide, to the whole picture."""
+        """Return the (2, 3) affine map from a picture of the square, `size` pixels wide, to the picture."""
         scale = self.side / size
         cos, sin = math.cos(self.angle) * scale, math.sin(self.angle) * scale
         half = size / 2
@@ -93,10 +93,10 @@ class Square:
 
 @dataclass
 class Track:
-    """A hand that is followed.
+    """A tracked hand.
 
     Attributes:
-        square: where to look for it.
+        square: where the next picture is searched for it.
         right: sum of P(right) over the pictures it was seen in.
         seen: number of them.
     """
@@ -107,20 +107,20 @@ class Track:
 
     @property
     def p_right(self) -> float:
-        """Its handedness over all pictures so far: single ones flicker."""
+        """Return the mean P(right) over all pictures so far, because single values flicker."""
         return self.right / self.seen if self.seen else 0.5
 
 
 class MediaPipeHands:
-    """MediaPipe's palm and landmark models.
+    """Run MediaPipe's palm and landmark models.
 
     Args:
         models: their files; None takes $HMA_HAND_MODELS.
-        presence: scores below are no hand.
+        presence: least score of a hand.
         mirrored: the pictures are mirrored, as front cameras show them.
 
     Raises:
-        SourceError: no models, or other ones.
+        SourceError: there are no models, or they are other models.
         MissingDependencyError: LiteRT is not installed.
     """
 
@@ -164,7 +164,7 @@ class MediaPipeHands:
         return [Track(square) for square in squares if not any(_overlap(square, old) > SAME for old in known)]
 
     def palms(self, picture: Images) -> list[Floats]:
-        """Palms in a picture, the surest first: (9, 2) corner, corner and seven points in pixels."""
+        """Return the palms in a picture, the surest first: (9, 2) two corners and seven points in pixels."""
         height, width = picture.shape[:2]
         whole = Square(width / 2, height / 2, max(width, height), 0.0)
         values, scores = self._palm(cut(picture, whole, PALM_SIDE))
@@ -173,7 +173,7 @@ class MediaPipeHands:
         return [palm * PALM_SIDE @ matrix[:, :2].T + matrix[:, 2] for palm in found]
 
     def _look(self, picture: Images, square: Square) -> tuple[float, Floats, float]:
-        """Presence, points (21, 2) in pixels of the whole picture, and P(right)."""
+        """Return presence, points (21, 2) in pixels of the whole picture, and P(right)."""
         values, presence, handedness = self._hand(cut(picture, square, HAND_SIDE))
         matrix = square.to_picture(HAND_SIDE)
         points = values.reshape(21, 3)[:, :2].astype(np.float64) @ matrix[:, :2].T + matrix[:, 2]
@@ -182,10 +182,10 @@ class MediaPipeHands:
 
 
 def choose_sides(p_right: Sequence[float]) -> list[str | None]:
-    """A side for each hand, at most one hand a side; None for a hand that is one too many.
+    """Return a side for each hand, with at most one hand a side; None for a surplus hand.
 
     Args:
-        p_right: of at most two hands.
+        p_right: P(right) of at most two hands.
     """
     sides: list[str | None] = ["right" if p >= 0.5 else "left" for p in p_right]
     if len(sides) == 2 and sides[0] == sides[1]:
@@ -196,10 +196,10 @@ def choose_sides(p_right: Sequence[float]) -> list[str | None]:
 
 
 def cut(picture: Images, square: Square, size: int) -> NDArray[np.float32]:
-    """A square of a picture as (size, size, 3) float32 in 0..1; black beyond the edge."""
+    """Cut a square out of a picture as (size, size, 3) float32 in 0..1; black beyond the edge."""
     cv2: Any = opencv()
     matrix = square.to_picture(size)
-    # Pixel i covers i to i+1, and OpenCV counts from pixels' middles.
+    # Here pixel i covers i to i+1; OpenCV counts from the centres of pixels.
     matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     shown = cv2.warpAffine(picture, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_CONSTANT)
@@ -207,7 +207,7 @@ def cut(picture: Images, square: Square, size: int) -> NDArray[np.float32]:
 
 
 def palm_anchors() -> Floats:
-    """(2016, 2) x and y, 0..1, of the palm model's anchors: two a cell of 24×24, six a cell of 12×12."""
+    """Return the palm model's anchors, (2016, 2) x and y in 0..1: two a cell of 24×24, six of 12×12."""
     found = []
     for stride, copies in ((8, 2), (16, 6)):
         cells = PALM_SIDE // stride
@@ -218,7 +218,7 @@ def palm_anchors() -> Floats:
 
 
 def decode_palms(values: NDArray[Any], scores: NDArray[Any], anchors: Floats) -> list[Floats]:
-    """What the palm model found, overlapping finds merged, the surest first.
+    """Return the palms that the model found, the surest first, with overlapping ones merged.
 
     Args:
         values: (2016, 18) x, y, width, height and seven points, in pixels from the anchor.
@@ -239,7 +239,7 @@ def decode_palms(values: NDArray[Any], scores: NDArray[Any], anchors: Floats) ->
 
 
 def merge_overlapping(shapes: Floats, chances: Floats) -> list[Floats]:
-    """Weighted non-maximum suppression: a find takes in what overlaps it, each by its chance.
+    """Merge overlapping shapes by weighted non-maximum suppression; probabilities are the weights.
 
     Args:
         shapes: (n, 9, 2), the first two rows corners of a box; the surest first.
@@ -255,7 +255,7 @@ def merge_overlapping(shapes: Floats, chances: Floats) -> list[Floats]:
 
 
 def box_overlap(box: Floats, others: Floats) -> Floats:
-    """Intersection over union of a box (2, 2) of corners with others (n, 2, 2)."""
+    """Return the intersection over union of a box (2, 2) of corners with others (n, 2, 2)."""
     low, high = np.maximum(box[0], others[:, 0]), np.minimum(box[1], others[:, 1])
     shared = np.prod(np.maximum(high - low, 0), axis=1)
     areas = np.prod(others[:, 1] - others[:, 0], axis=1) + np.prod(box[1] - box[0])
@@ -263,14 +263,14 @@ def box_overlap(box: Floats, others: Floats) -> Floats:
 
 
 def square_of_palm(palm: Floats) -> Square:
-    """Where the whole hand of a palm (9, 2) is: from wrist to middle knuckle is upwards."""
+    """Return the square of the whole hand of a palm (9, 2); up is from the wrist to the middle knuckle."""
     centre, (width, height) = (palm[0] + palm[1]) / 2, palm[1] - palm[0]
     angle = _upright(palm[2], palm[4])
     return _grown(centre, width, height, angle, scale=2.6, up=0.5)
 
 
 def square_of_points(points: Floats) -> Square:
-    """Where the hand of those points (21, 2) will be in the next picture."""
+    """Return the square in which the hand of those points (21, 2) is expected in the next picture."""
     ahead = ((points[5] + points[13]) / 2 + points[9]) / 2
     angle = _upright(points[0], ahead)
     known = points[_KNUCKLES]
@@ -283,13 +283,13 @@ def square_of_points(points: Floats) -> Square:
 
 
 def _upright(start: Floats, end: Floats) -> float:
-    """The clockwise angle by which a hand that points from `start` to `end` is turned from upright."""
+    """Return the clockwise angle from upright of a hand that points from `start` to `end`."""
     dx, dy = end - start
     return math.remainder(math.pi / 2 - math.atan2(-dy, dx), 2 * math.pi)
 
 
 def _grown(centre: Floats, width: float, height: float, angle: float, scale: float, up: float) -> Square:
-    """The square round a turned box, moved `up` of its height along the hand and made larger."""
+    """Return the square round a rotated box, moved along the hand by `up` of its height and scaled."""
     return Square(
         float(centre[0] + height * up * math.sin(angle)),
         float(centre[1] - height * up * math.cos(angle)),
@@ -307,6 +307,6 @@ def _overlap(one: Square, other: Square) -> float:
 
 
 def _same(points: Floats, others: Floats) -> bool:
-    """Whether two sets of points are of one hand: no further apart than a third of its length."""
+    """Check whether two sets of points are of one hand: no further apart than a third of its length."""
     apart = float(np.linalg.norm(points - others, axis=1).mean())
     return apart < float(np.linalg.norm(np.ptp(points, axis=0))) / 3

@@ -1,12 +1,12 @@
-"""EPIC-KITCHENS-100's published hand-object detections, one file a video.
+"""Read EPIC-KITCHENS-100's published hand-object detections, one file a video.
 
-The published files are Python pickles of a list of byte strings, each a protobuf message of one
-frame. Nothing is unpickled here: the file's instructions are read one by one, and only those
-that make a list of byte strings are known; any other file is refused. A plain stream of the same
-messages, each after its length as a varint (`.pb`), is read too.
+The published files are Python pickles of a list of byte strings; each byte string is a protobuf message of
+one frame. Nothing is unpickled here: the file's instructions are read one by one, and only those that make a
+list of byte strings are accepted; any other file is refused. A plain stream of the same messages, each after
+its length as a varint (`.pb`), is read too.
 
-Format: types.proto of epic-kitchens/epic-kitchens-100-hand-object-bboxes. Boxes are fractions
-of the picture; frames count from 1.
+Format: types.proto of epic-kitchens/epic-kitchens-100-hand-object-bboxes. Boxes are fractions of the picture;
+frames count from 1.
 """
 
 import pickletools
@@ -31,7 +31,7 @@ _REMEDY = (
 
 
 def epic_labels(path: Path, layout: HandsLayout) -> HandLabels:
-    """The hands of one video.
+    """Return the hands of one video.
 
     Raises:
         EpisodeError: the file is damaged, or of another form.
@@ -68,8 +68,8 @@ def epic_labels(path: Path, layout: HandsLayout) -> HandLabels:
 
 
 def _pickled(content: bytes, path: Path) -> Iterator[bytes]:
-    """The byte strings of a pickled list, by reading its instructions; nothing in it is run."""
-    kept: dict[int, Any] = {}  # what the file remembers in order to name it again
+    """Yield the byte strings of a pickled list by reading its instructions; nothing in it is run."""
+    kept: dict[int, Any] = {}  # the pickle's memo: values that later instructions refer to
     last: Any = None
     try:
         for instruction, given, _ in pickletools.genops(content):
@@ -90,7 +90,7 @@ def _pickled(content: bytes, path: Path) -> Iterator[bytes]:
 
 
 def _stream(content: bytes, path: Path) -> Iterator[bytes]:
-    """Messages that each come after their length, seven bits a byte, low ones first."""
+    """Yield messages that each follow their length, seven bits a byte, low ones first."""
     at = 0
     while at < len(content):
         length = shift = 0
@@ -106,7 +106,7 @@ def _stream(content: bytes, path: Path) -> Iterator[bytes]:
 
 @cache
 def _message_class() -> Any:
-    """The class of a frame's detections; field numbers as types.proto has them."""
+    """Return the class of a frame's detections; its field numbers are those of types.proto."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # type: ignore[import-untyped]
 
     kinds = descriptor_pb2.FieldDescriptorProto

@@ -1,4 +1,4 @@
-"""What `hma inspect` says of hand videos: sizes, rates and codecs, and in how many frames hands are."""
+"""Inspect hand videos for `hma inspect`: sizes, rates, codecs, and the share of frames that show hands."""
 
 from collections import Counter
 
@@ -16,7 +16,7 @@ from hma_data.sources.hands.models import load_models
 from hma_data.sources.hands.runs import POINTS
 from hma_data.sources.hands.scan import scan
 
-LOOKED_AT, FRAMES = 5, 12  # videos that hands are looked for in, and frames of each
+LOOKED_AT, FRAMES = 5, 12  # most videos that are searched for hands, and frames of each
 LISTED = 1_000
 
 
@@ -77,7 +77,7 @@ def _keys(first: Header | None) -> list[KeyInfo]:
 
 
 def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -> None:
-    """One video's times and some pictures; its packets against the frames that its header states."""
+    """Hand one video's times and some pictures to the survey; compare its packets with its header."""
     survey.made |= {"frames", "rate"}
     try:
         file = VideoFile(video.path)
@@ -98,7 +98,7 @@ def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -
 
 
 def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> dict[str, str]:
-    """Shares of frames with hands in a sample; videos of it that have none are noted."""
+    """Return the shares of sampled frames with hands; note the sampled videos that show none."""
     from hma_data.sources.hands.detect import MediaPipeHands
 
     detector = MediaPipeHands(load_models())
@@ -109,7 +109,7 @@ def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> di
         try:
             file = VideoFile(videos[name].path)
             frames = np.unique(np.linspace(0, len(file) - 1, FRAMES).astype(np.int64))
-            # Far apart, so that nothing is followed from one to the next.
+            # The frames are far apart, so each is scanned alone and no hand is tracked between them.
             seen = [tuple(scan(file, detector, [index]).sides.tolist()) for index in frames.tolist()]
         except EpisodeError as fault:
             survey.fault(name, fault)

@@ -1,13 +1,13 @@
-"""Published and own annotations of hands in videos, by video.
+"""Read annotations of hands in videos, by video.
 
-- `landmarks`: a table of ours, see hands_table.
+- `landmarks`: the toolkit's own table, see hands_table.
 - `epic_kitchens_hand_objects`: EPIC-KITCHENS-100, one file a video, see hands_epic.
 - `ego4d_fho`: Ego4D's fho_main.json. Boxes (x, y, width, height in pixels) of left_hand and
   right_hand in a few frames of each narrated action; rejected and invalid actions are left out.
 - `egoexo4d_hand_pose`: Ego-Exo4D's ego_pose/<split>/hand/{automatic,annotation}/<take>.json: frame number ->
-  joints of one camera in pixels. A take's videos lie in a folder named as the take.
+  joints of one camera in pixels. A take's videos lie in a folder with the take's name.
 
-A file of another form is one clear error. JSON is parsed once and only arrays are kept.
+A file of another form raises one clear error. JSON is parsed once, and only arrays stay in memory.
 """
 
 import json
@@ -33,14 +33,14 @@ JOINTS = ("wrist", *(f"{finger}_{i}" for finger in _FINGERS for i in (1, 2, 3, 4
 
 
 class LabelSet(Protocol):
-    """Labels of a set of videos."""
+    """The labels of a set of videos."""
 
     def known(self) -> list[str]:
-        """What it calls the videos it has labels of."""
+        """Return the names that the labels use for their videos."""
         ...
 
     def of(self, video: Video) -> HandLabels | None:
-        """The labels of a video; None where it has none.
+        """Return the labels of a video; None where it has none.
 
         Raises:
             EpisodeError: they are damaged.
@@ -49,10 +49,10 @@ class LabelSet(Protocol):
 
 
 def open_labels(layout: HandsLayout, uri: str) -> LabelSet:
-    """The labels that belong to the videos of `uri`.
+    """Return the labels that belong to the videos of `uri`.
 
     Raises:
-        SourceError: there are none, or of another form.
+        SourceError: there are none, or they have another form.
     """
     folder = local_path(uri)
     folder = folder.parent if folder.is_file() else folder
@@ -84,10 +84,10 @@ def _one_file(root: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> 
 
 
 def _label_files(root: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
-    """Label files by stem; of two the one in a folder `automatic` (Ego-Exo4D's dense labels)."""
+    """Return label files by stem; of two, the one in a folder `automatic` (Ego-Exo4D's dense labels)."""
     files = sorted(path for path in (root.rglob("*") if root.is_dir() else [root]) if path.is_file())
     files = [path for path in files if path.suffix.lower() in suffixes]
-    hands = [path for path in files if "hand" in path.parts]  # beside it lie labels of bodies
+    hands = [path for path in files if "hand" in path.parts]  # other folders hold labels of bodies
     found: dict[str, Path] = {}
     for path in sorted(hands or files, key=lambda item: "automatic" not in item.parts):
         found.setdefault(path.stem, path)
@@ -99,7 +99,7 @@ def _label_files(root: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
 
 
 class EpicHands:
-    """EPIC-KITCHENS-100: `P01_01.MP4` has its labels in `P01_01.pkl`."""
+    """Labels of EPIC-KITCHENS-100: `P01_01.MP4` has its labels in `P01_01.pkl`."""
 
     def __init__(self, files: dict[str, Path], layout: HandsLayout, root: Path) -> None:
         self._files, self._layout = files, layout
@@ -119,7 +119,7 @@ class EpicHands:
 
 
 class Ego4dFho:
-    """Ego4D: a video is called by its uid."""
+    """Labels of Ego4D; a video's name is its uid."""
 
     def __init__(self, path: Path, layout: HandsLayout) -> None:
         content = read_json(path, _compact)
@@ -144,7 +144,10 @@ class Ego4dFho:
 
 
 def _compact(item: dict[str, Any]) -> Any:
-    """What is kept of an object while fho_main.json is parsed, innermost first: whole it would not fit."""
+    """Return what is kept of an object while fho_main.json is parsed, innermost objects first.
+
+    The whole file would not fit in memory.
+    """
     if "object_type" in item:
         box, kind = item.get("bbox"), item["object_type"]
         if not isinstance(box, dict) or kind not in ("left_hand", "right_hand"):
@@ -193,10 +196,10 @@ def _labels_of_actions(actions: list[Any], layout: HandsLayout) -> HandLabels | 
 
 
 class EgoExoHands:
-    """Ego-Exo4D: labels by take; the videos of a take lie in its folder, one a camera.
+    """Labels of Ego-Exo4D, by take; the videos of a take lie in its folder, one a camera.
 
-    The takes' names are in the label files, or in takes.json beside or above them; a video may
-    also be called as its take or the take's uid.
+    The names of the takes come from the label files, or from takes.json beside or above them. A video may
+    also have the name of its take or the take's uid.
     """
 
     def __init__(self, files: dict[str, Path], layout: HandsLayout, root: Path) -> None:
@@ -230,13 +233,13 @@ class EgoExoHands:
 
 
 def _take_name(path: Path) -> str:
-    """As its first labelled frame says; the file's own name where none does."""
+    """Return the take's name, as its first labelled frame states it; else the file's own name."""
     stated = re.search(rb'"take_name"\s*:\s*"([^"]{1,200})"', first_bytes(path, 1 << 16))
     return stated[1].decode(errors="replace") if stated else path.stem
 
 
 def egoexo_labels(path: Path, layout: HandsLayout) -> HandLabels:
-    """The hands of one take in one camera.
+    """Return the hands of one take in one camera.
 
     Raises:
         EpisodeError: the file is damaged, of another form, or has no such camera.
@@ -276,13 +279,13 @@ def egoexo_labels(path: Path, layout: HandsLayout) -> HandLabels:
 
 
 def read_json(path: Path, keep: Callable[[dict[str, Any]], Any] | None = None) -> Any:
-    """A JSON file.
+    """Return the content of a JSON file.
 
     Args:
-        keep: called with each object as it is parsed; what it returns takes its place.
+        keep: called with each parsed object; its result replaces the object.
 
     Raises:
-        SourceError: it is too large, damaged, or no JSON.
+        SourceError: it is too large, damaged, or not JSON.
     """
     size = path.stat().st_size
     if size > LARGEST:

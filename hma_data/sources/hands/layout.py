@@ -1,4 +1,4 @@
-"""What a YAML says about hand videos, and the videos of a folder.
+"""Read the layout of hand videos from a YAML, and find the videos of a folder.
 
 `source.layout` of an embodiment with format `hands`; all values are text, as in every layout:
 
@@ -8,18 +8,19 @@
 | annotations | file or folder of the labels, absolute or below the videos' folder | that folder |
 | models | of the detector: folder of .tflite files or a .task bundle | $HMA_HAND_MODELS |
 | missing | what a frame without a needed hand does, see below: split, hold, mask | split |
-| max_hold | labelled frames in a row for which the last place is kept | no limit; with mask 0 |
+| max_hold | most labelled frames in a row for which the last position is held | no limit; with mask 0 |
 | min_frames | runs with fewer frames (with hands) are left out | 12 |
-| min_score | labels below it are no hand | 0.5 |
-| max_gap_s | seconds between labels of one run, where labels are irregular | 3 |
+| min_score | labels with a lower score are ignored | 0.5 |
+| max_gap_s | most seconds between labels of one run, where labels are irregular | 3 |
 | pictures | labelled: frames with a label; every: all from the first to the last of a run | labelled |
 | first_frame | number of a video's first frame in the labels | 1 for EPIC-KITCHENS, else 0 |
-| label_size | WIDTHxHEIGHT of the pictures that pixel labels were made on | the video's |
+| label_size | WIDTHxHEIGHT of the pictures on which pixel labels were made | the video's |
 | camera | Ego-Exo4D: which camera's labels and videos | cam01 |
-| mirrored | true for mirrored pictures (front cameras): the detector's left and right change places | false |
+| mirrored | true for mirrored pictures (front cameras): swaps the detector's left and right | false |
 
-missing: split ends the run. hold keeps the hand's last place, for `max_hold` frames, and then ends the run.
-mask goes on with the run: the values that need the hand are not known, with `max_hold` from its end on.
+missing: `split` ends the run. `hold` keeps the hand's last position for at most `max_hold` frames, and then
+ends the run. `mask` continues the run: the values that need the hand are unknown; with `max_hold` they are
+held first, and unknown after that.
 """
 
 import os
@@ -46,7 +47,7 @@ _TEXTS = ("annotations", "models", "label_size", "camera")
 
 @dataclass(frozen=True)
 class HandsLayout:
-    """`source.layout`, read; see the module."""
+    """The values of `source.layout`; see the module."""
 
     labels: str = "detector"
     annotations: str | None = None
@@ -64,14 +65,14 @@ class HandsLayout:
 
     @property
     def frame_offset(self) -> int:
-        """What is taken from a label's frame number to give the frame's index."""
+        """Return the number to subtract from a label's frame number to get the frame's index."""
         if self.first_frame is not None:
             return self.first_frame
         return int(self.labels == "epic_kitchens_hand_objects")
 
 
 def layout_of(embodiment: Embodiment | None) -> HandsLayout:
-    """An embodiment's layout; all defaults without one.
+    """Return an embodiment's layout; all defaults without one.
 
     Raises:
         RegistryError: an unknown key, or a value that is not allowed.
@@ -121,7 +122,7 @@ class Video:
     Attributes:
         path: of the file.
         name: its path within the folder; the id of its episode.
-        aliases: what labels may call it, the most exact first.
+        aliases: names that labels may use for it, the most exact first.
     """
 
     path: Path
@@ -130,10 +131,10 @@ class Video:
 
 
 def videos_of(uri: str) -> dict[str, Video]:
-    """The videos of a file or folder by name, in natural order.
+    """Return the videos of a file or folder by name, in natural order.
 
     Raises:
-        SourceError: none there, or a link that leaves the folder.
+        SourceError: there are none, or a link leaves the folder.
     """
     root = local_path(uri)
     if root.is_file():
@@ -160,7 +161,7 @@ def videos_of(uri: str) -> dict[str, Video]:
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that puts clip_2 before clip_10."""
+    """Return a sort key that puts clip_2 before clip_10."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"([0-9]+)", name)]
 
 
@@ -175,11 +176,11 @@ def _aliases(name: str, short: Counter[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Header:
-    """What a video file's header says, without reading its packets.
+    """The facts of a video file's header, known without reading its packets.
 
     Attributes:
-        frames: how many; 0 where the header does not tell.
-        hz: rate it states; 0 where it states none.
+        frames: how many; 0 where the header does not state it.
+        hz: stated rate; 0 where none is stated.
         width, height: pixels, as stored.
         codec: h264, av1, …
     """
@@ -192,10 +193,10 @@ class Header:
 
 
 def header_of(path: Path) -> Header:
-    """The header of a video file.
+    """Return the header of a video file.
 
     Raises:
-        EpisodeError: it is no video, or damaged.
+        EpisodeError: it is not a video, or it is damaged.
     """
     from hma_data.sources.common.video_file import opened
 

@@ -1,8 +1,8 @@
-"""MediaPipe's two hand models, from .tflite files or a `hand_landmarker.task` bundle.
+"""Load and run MediaPipe's two hand models, from .tflite files or a `hand_landmarker.task` bundle.
 
-The palm model looks at the whole picture (192×192) and gives 2016 × 18 values and 2016 scores.
-The landmark model looks at one hand (224×224) and gives 21 points, the presence of a hand and
-its handedness. A bundle is a zip file of both. They run in LiteRT, on one thread.
+The palm model takes the whole picture (192×192) and gives 2016 × 18 values and 2016 scores. The landmark
+model takes one hand (224×224) and gives 21 points, the presence of a hand and its handedness. A bundle is a
+zip file of both. They run in LiteRT, on one thread.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from hma_data.errors import MissingDependencyError, SourceError
 from hma_data.storage.paths import StrPath, as_text
 
 ENVIRONMENT = "HMA_HAND_MODELS"
-PALM_SIDE, HAND_SIDE = 192, 224  # pixels of what each model looks at
+PALM_SIDE, HAND_SIDE = 192, 224  # pixels of each model's input
 ANCHORS = 2016
 LARGEST_MODEL = 256 << 20  # bytes; the real ones have 2 to 8 MB
 _PALM = ("palm_detection_full.tflite", "palm_detection_lite.tflite", "hand_detector.tflite")
@@ -47,18 +47,18 @@ class HandModels:
 
     @property
     def digest(self) -> str:
-        """Sixteen hex digits over both."""
+        """Return 16 hex digits hashed from both."""
         return hashlib.sha256(hashlib.sha256(self.palm).digest() + self.hand).hexdigest()[:16]
 
 
 def load_models(place: StrPath | None = None) -> HandModels:
-    """The models in a folder or a bundle; full before lite.
+    """Return the models in a folder or a bundle; full ones are preferred to lite ones.
 
     Args:
         place: str or path of a folder or .task file; None takes $HMA_HAND_MODELS.
 
     Raises:
-        SourceError: none given, none there, or files that are no such models.
+        SourceError: none are given, none are there, or the files are not such models.
     """
     place = place or os.environ.get(ENVIRONMENT)
     if not place:
@@ -115,7 +115,7 @@ class Network:
     Args:
         content: of the .tflite file.
         side: pixels of its square input.
-        widths: of the outputs that are wanted, each the product of its shape; equal ones in name order.
+        widths: of the wanted outputs, each the product of its shape; equal ones in the order of names.
         where: for errors.
 
     Raises:
@@ -146,19 +146,19 @@ class Network:
         self._input, self._outputs = inputs[0]["index"], chosen
 
     def __call__(self, picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        """Flat outputs for a picture (side, side, 3) of values 0..1."""
+        """Return the flat outputs for a picture (side, side, 3) of values 0..1."""
         self._interpreter.set_tensor(self._input, picture[None])
         self._interpreter.invoke()
         return [self._interpreter.get_tensor(index).reshape(-1) for index in self._outputs]
 
 
 def palm_network(models: HandModels) -> Network:
-    """Gives 2016 × 18 box values and 2016 scores."""
+    """Return the palm model, which gives 2016 × 18 box values and 2016 scores."""
     return Network(models.palm, PALM_SIDE, (ANCHORS * 18, ANCHORS), f"{models.where}: palm model")
 
 
 def hand_network(models: HandModels) -> Network:
-    """Gives 21 × 3 points in pixels of its picture, presence 0..1 and handedness 0..1."""
+    """Return the landmark model: 21 × 3 points in pixels of its input, presence 0..1 and handedness 0..1."""
     return Network(models.hand, HAND_SIDE, (63, 1, 1), f"{models.where}: landmark model")
 
 

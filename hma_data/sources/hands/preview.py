@@ -1,8 +1,8 @@
-"""Look at the hands that were found: a video with them drawn in.
+"""Draw the labelled hands of a video into an MP4.
 
-The left hand is orange with filled dots, the right one blue with rings. A frame that no run
-takes or that is masked, because a needed hand is missing, has a grey bar at its top. A cross
-without fingers is a place that is only held.
+The left hand is orange with filled dots, the right hand blue with rings. A grey bar at the top marks a frame
+that is in no run, or that is masked because a needed hand is missing. A cross without fingers is a held
+position.
 """
 
 from pathlib import Path
@@ -39,9 +39,9 @@ def preview(
     Args:
         uri: str or path of a video or a folder of videos.
         out: str or path of the file to write.
-        embodiment: says where labels are from; None takes `hand_video`, the detector.
-        video: its name in the folder; the first by default.
-        first, limit: frames shown.
+        embodiment: states the origin of the labels; None takes `hand_video`, the detector.
+        video: its name in the folder; the first video by default.
+        first, limit: index of the first frame shown, and most frames shown.
 
     Returns:
         out.
@@ -63,7 +63,7 @@ def preview(
 
 
 def annotated(picture: Images, runs: Runs, frame: int) -> Images:
-    """One picture (H, W, 3), at most 640 wide, with the hands of that frame of the video drawn in."""
+    """Return one picture (H, W, 3), at most 640 wide, with the hands of that video frame drawn in."""
     cv2: Any = opencv()
     scale = min(1.0, WIDEST / picture.shape[1])
     size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))

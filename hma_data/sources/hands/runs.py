@@ -1,8 +1,7 @@
-"""Labelled hands of a video, and the runs of frames in which the needed hands are there.
+"""Represent the labelled hands of a video, and cut them into runs of frames that have the needed hands.
 
-A point is a side and a part of the hand: `left/center`, `right/wrist`, `left/landmarks`. A key
-of a component is a point, with `/next` for its value at the next labelled frame of the run, or
-`/delta` for next minus current.
+A point is a side and a part of the hand: `left/center`, `right/wrist`, `left/landmarks`. A component's key is
+a point, with `/next` for its value at the next labelled frame of the run, or `/delta` for next minus current.
 
 N labelled frames of a video, n of a run, w values of a point (2, or 42 for landmarks).
 """
@@ -25,15 +24,15 @@ SIDES = ("left", "right")
 PARTS = {"center": 2, "wrist": 2, "landmarks": 42}
 POINTS = {f"{side}/{part}": width for side in SIDES for part, width in PARTS.items()}
 KEYS = tuple(point + suffix for point in POINTS for suffix in ("", "/next", "/delta"))
-BEYOND = 0.05  # of the picture's side, by which a label may leave it and is put on its edge
-LATE = 0.01  # of a video's frames, by which labels may go on after its end
+BEYOND = 0.05  # share of the picture's side by which a label may lie outside; it is moved to the edge
+LATE = 0.01  # share of a video's frames by which labels may continue after its end
 
 
 def point_of(key: str, where: str) -> str:
-    """The point a component's key is about.
+    """Return the point of a component's key.
 
     Raises:
-        SourceError: it is no key of hand videos.
+        SourceError: it is not a key of hand videos.
     """
     if key not in KEYS:
         near = get_close_matches(key, KEYS, n=3, cutoff=0.4)
@@ -44,14 +43,14 @@ def point_of(key: str, where: str) -> str:
 
 @dataclass(frozen=True)
 class HandLabels:
-    """Where the hands of one video are.
+    """The positions of the hands in one video.
 
     Attributes:
-        frames: (N,) indices of the video's frames that were labelled, rising.
-        points: point -> (N, w); NaN where there is no such hand. Every point is there.
-        pixels: values are pixels, not fractions.
-        irregular: labels are few, at any spacing; otherwise a frame that is left out has no hand.
-        texts: (frame, what is done from there on).
+        frames: (N,) rising indices of the labelled frames of the video.
+        points: point -> (N, w); NaN where there is no such hand. Every point is a key.
+        pixels: whether values are pixels, not fractions.
+        irregular: whether labels are few, at any spacing; otherwise a frame without a label has no hand.
+        texts: (frame, what the person does from this frame on).
     """
 
     frames: Frames
@@ -72,7 +71,7 @@ def labels_from_rows(
     looked_at: Iterable[int] = (),
     **facts: Any,
 ) -> HandLabels:
-    """Labels from a row a hand; of two left hands in a frame the higher score counts.
+    """Make labels from one row a hand; of two hands of one side in a frame, the higher score counts.
 
     Args:
         frames: (R,) index of the frame.
@@ -100,7 +99,10 @@ def labels_from_rows(
 
 
 def parts_of_landmarks(landmarks: NDArray[Any]) -> dict[str, Floats]:
-    """Landmarks (R, 42), put on the picture's edge where they lie outside; their box's centre; the wrist."""
+    """Return the center, wrist and landmarks of landmarks (R, 42).
+
+    Points outside the picture are moved to its edge. The center is that of the points' box.
+    """
     inside = np.clip(landmarks.astype(np.float64).reshape(-1, 21, 2), 0, 1)
     return {
         "center": (inside.min(axis=1) + inside.max(axis=1)) / 2,
@@ -111,14 +113,14 @@ def parts_of_landmarks(landmarks: NDArray[Any]) -> dict[str, Floats]:
 
 @dataclass(frozen=True)
 class Runs:
-    """A video's labels cut into runs.
+    """A video's labels, cut into runs.
 
     Attributes:
-        labels: as fractions, gaps of regular labels filled in, hands held.
+        labels: as fractions, with gaps of regular labels filled in and hands held.
         spans: [from, to) into the labels, one a run; the last frame of a run only ends it.
-        missing: (N,) labels that lack a needed hand, held ones not among them.
-        held: (N,) labels in which a needed hand keeps its last place.
-        counts: labelled, without_hands, outside, held, dropped: frames.
+        missing: (N,) whether a label lacks a needed hand; held ones do not count.
+        held: (N,) whether a needed hand keeps its last position.
+        counts: numbers of frames: labelled, without_hands, outside, held, dropped.
     """
 
     labels: HandLabels
@@ -128,7 +130,7 @@ class Runs:
     counts: dict[str, int] = field(default_factory=dict)
 
     def longest(self) -> int:
-        """Number of the longest run, the first of equals."""
+        """Return the index of the longest run, the first of equals."""
         lengths = [stop - start for start, stop in self.spans]
         return lengths.index(max(lengths))
 
@@ -136,15 +138,15 @@ class Runs:
 def cut_into_runs(
     labels: HandLabels, needed: Sequence[str], layout: HandsLayout, video: Header, where: str
 ) -> Runs:
-    """The runs of a video.
+    """Cut the labels of a video into runs.
 
     Args:
-        needed: points that must be there.
+        needed: points that a frame of a run must have.
         video: number, rate and size of its pictures.
         where: the video, for errors.
 
     Raises:
-        EpisodeError: labels that do not fit the video, or have none of a needed point.
+        EpisodeError: the labels do not fit the video, or never have a needed point.
     """
     labels = _within(labels, video.frames, where)
     size = (video.width, video.height)
@@ -180,14 +182,14 @@ def cut_into_runs(
 
 
 def episode_frames(labels: HandLabels, span: tuple[int, int], layout: HandsLayout) -> int:
-    """Pictures of the episode a run gives."""
+    """Count the pictures of the episode that a run gives."""
     start, stop = span
     every = layout.pictures == "every"
     return int(labels.frames[stop - 1] - labels.frames[start]) if every else stop - start - 1
 
 
 def find_spans(frames: Frames, there: NDArray[np.bool_], widest: int) -> list[tuple[int, int]]:
-    """Longest stretches [from, to) of labels that are there and no further apart than `widest` frames."""
+    """Return the longest stretches [from, to) of usable labels at most `widest` frames apart."""
     joined = there[1:] & there[:-1] & (np.diff(frames) <= widest)
     starts = np.flatnonzero(there & ~np.concatenate([[False], joined]))
     stops = np.flatnonzero(there & ~np.concatenate([joined, [False]])) + 1
@@ -195,9 +197,9 @@ def find_spans(frames: Frames, there: NDArray[np.bool_], widest: int) -> list[tu
 
 
 def values_of(key: str, points: dict[str, Floats], span: tuple[int, int]) -> Floats:
-    """(n - 1, w) values of a key over a run of n labels, NaN where a hand is missing that it needs.
+    """Return the (n - 1, w) values of a key over a run of n labels; NaN where a needed hand is missing.
 
-    The last label is only a next one.
+    The last label serves only as a next value.
     """
     start, stop = span
     values = points[point_of(key, key)][start:stop]
@@ -207,7 +209,7 @@ def values_of(key: str, points: dict[str, Floats], span: tuple[int, int]) -> Flo
 
 
 def _within(labels: HandLabels, frames: int, where: str) -> HandLabels:
-    """Labels of frames that the video has; a few may lie beyond its end."""
+    """Return the labels of frames that the video has; a few labels may lie beyond its end."""
     inside = (labels.frames >= 0) & (labels.frames < frames)
     beyond = labels.frames[~inside]
     if len(beyond) and (beyond.min() < 0 or beyond.max() > frames * (1 + LATE) + 2 or not inside.any()):
@@ -221,7 +223,7 @@ def _within(labels: HandLabels, frames: int, where: str) -> HandLabels:
 def _as_fractions(
     labels: HandLabels, needed: Sequence[str], size: tuple[int, int], where: str
 ) -> tuple[HandLabels, int]:
-    """Fractions of the picture; hands outside it are taken as missing, and counted."""
+    """Convert labels to fractions of the picture; treat hands outside it as missing, and count them."""
     points, lost = {}, np.zeros(len(labels), bool)
     for point, raw in labels.points.items():
         values = raw / np.tile(size, raw.shape[1] // 2) if labels.pixels else raw
@@ -243,7 +245,7 @@ def _as_fractions(
 
 
 def _gaps_filled(labels: HandLabels) -> tuple[HandLabels, int]:
-    """Regular labels with every frame of their rhythm, NaN where there was none; and the rhythm in frames.
+    """Fill the gaps of regular labels with NaN; return the labels, and their spacing in frames.
 
     Labels whose spacings are not multiples of the commonest one are irregular.
     """
@@ -263,7 +265,7 @@ def _gaps_filled(labels: HandLabels) -> tuple[HandLabels, int]:
 
 
 def _held(values: Floats, limit: int | None) -> Floats:
-    """Missing values replaced by the last ones there, for at most `limit` labels in a row."""
+    """Replace missing values by the last known ones, for at most `limit` labels in a row."""
     there = np.isfinite(values).all(axis=1)
     last = np.maximum.accumulate(np.where(there, np.arange(len(values)), -1))
     age = np.arange(len(values)) - last

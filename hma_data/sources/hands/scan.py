@@ -1,9 +1,8 @@
-"""Run a detector over whole videos, and keep what it found.
+"""Run a detector over whole videos, and store what it finds.
 
-`detect` writes the table of a folder once, which `labels: landmarks` then reads: one run after
-the other becomes an episode, and the table can be corrected by hand. `scan_cached` is what
-`labels: detector` does while it reads: its finds are kept in the cache folder by the video's and
-the models' content, so that a second conversion does not look again.
+`detect` writes a table for a folder once, and `labels: landmarks` then reads it: all runs become episodes,
+and the table can be corrected by hand. `scan_cached` is used by `labels: detector` while it reads: detections
+are cached by the content of the video and the models, so a second conversion does not run the detector again.
 """
 
 import hashlib
@@ -25,13 +24,13 @@ from hma_data.sources.hands.table import read_columns
 from hma_data.storage.files import atomic_path, cache_folder
 from hma_data.storage.paths import StrPath, as_path, as_text
 
-BATCH = 8  # frames decoded together: of 4K pictures 200 MB
-_LEAST = 0.5  # presence of a hand that is written down
+BATCH = 8  # frames decoded together: 200 MB of 4K pictures
+_LEAST = 0.5  # least presence of a hand that is stored
 
 
 @dataclass(frozen=True)
 class Found:
-    """Hands found in one video, a row a hand.
+    """Hands found in one video, one row a hand.
 
     Attributes:
         length: frames of the video.
@@ -48,7 +47,7 @@ class Found:
     landmarks: NDArray[np.float32]
 
     def labels(self, least: float = 0.0) -> HandLabels:
-        """As labels of every frame, without hands below a score."""
+        """Return labels of every frame, without hands below a score."""
         good = self.scores >= least
         parts = {"landmarks": self.landmarks[good]}
         every = range(self.length)
@@ -56,10 +55,10 @@ class Found:
 
 
 def scan(video: VideoFile, detector: Detector, frames: Iterable[int] | None = None) -> Found:
-    """Look at a video's frames in order.
+    """Run a detector over a video's frames in order.
 
     Args:
-        frames: which, all by default; the detector takes them for one after the other.
+        frames: which frames, all by default; the detector treats them as consecutive.
 
     Raises:
         EpisodeError: a frame cannot be decoded.
@@ -90,7 +89,7 @@ def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrore
         mirrored: the pictures are mirrored.
 
     Returns:
-        how many hands were found.
+        the number of hands found.
 
     Raises:
         SourceError: no videos, no models.
@@ -108,7 +107,7 @@ def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrore
 
 
 def scan_cached(path: Path, detector: Detector, models: HandModels, layout: HandsLayout) -> Found:
-    """The hands of a video, looked for once.
+    """Return the hands of a video; run the detector only where they are not cached.
 
     Raises:
         EpisodeError: the video is damaged.
@@ -126,7 +125,7 @@ def scan_cached(path: Path, detector: Detector, models: HandModels, layout: Hand
     try:
         _write(kept, {path.name: found})
     except OutputError:
-        return found  # a cache that cannot be written is done without
+        return found  # the cache cannot be written: continue without it
     return found
 
 

@@ -1,24 +1,25 @@
-"""Videos of human hands: where both hands are in the picture stands for the action.
+"""Read videos of human hands; the positions of both hands in the picture stand for the action.
 
-A uri is a video file or a folder of videos. An episode has the camera `video` and as values the
-places of the hands, as fractions of the picture's width and height (0..1, x to the right, y
-down), of the picture as it is decoded, before any flip, rotation or crop of the YAML:
+A uri is a video file or a folder of videos. An episode has the camera `video`. Its values are the positions
+of the hands, as fractions of the picture's width and height (0..1, x to the right, y down). They refer to the
+picture as it is decoded, before any flip, rotation or crop of the YAML:
 
     left/center, right/center        centre of the hand's box
     left/wrist, right/wrist
     left/landmarks, right/landmarks  42: x, y of 21 points, the wrist first
 
-with `/next` for the value at the next labelled frame, `/delta` for next minus current, and
-nothing for the current one. Left and right are the person's own.
+A key ends in `/next` for the value at the next labelled frame, in `/delta` for next minus current, and has no
+ending for the current value. Left and right are the person's own.
 
-Labels come from a detector or from annotations (`source.layout.labels`, see hands_layout). A
-frame without a needed hand ends a run, or its last place is held, or the run goes on and the values that
-need the hand are not known (`source.layout.missing`: split, hold, mask). With annotations each run of
-at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain name `clip.mp4` is
-the longest. Runs of one video share a group, so that they come into one split. The detector runs while an
-episode is read, not while episodes are counted, so there a video is one episode, `clip.mp4`: its longest
-run. What is held, masked and left out is counted in the episode's metadata and flags; `detect` writes a table
-with which all runs become episodes.
+Labels come from a detector or from annotations (`source.layout.labels`, see hands_layout).
+`source.layout.missing` says what a frame without a needed hand does: it ends the run (split), the hand's last
+position is held (hold), or the run goes on and the values that need the hand are unknown (mask).
+
+With annotations, each run of at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain
+name `clip.mp4` is the longest run. Runs of one video share a group, so that they come into one split. The
+detector runs while an episode is read, not while episodes are counted; with it, a video is one episode,
+`clip.mp4`: its longest run. `detect` writes a table of labels, with which all runs become episodes. The
+episode's metadata and flags count the frames that are held, masked and left out.
 
 T frames of an episode.
 """
@@ -59,11 +60,11 @@ __all__ = ["CAMERA", "HandsSource", "detect", "open"]
 
 CAMERA = "video"
 RATE_TOLERANCE = 0.01  # of the rate
-REGULAR = 0.1  # of the median interval, by which the others of a regular video may differ
+REGULAR = 0.1  # share of the median interval by which the others of a regular video may differ
 
 
 class HandsSource:
-    """See the module."""
+    """Read videos of hands; see the module."""
 
     def __init__(self) -> None:
         self._videos: dict[str, dict[str, Video]] = {}
@@ -71,18 +72,18 @@ class HandsSource:
         self._detector: tuple[int, HandsLayout, Any, HandModels] | None = None
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
-        """The videos, and the hands in a small sample of frames where there are models."""
+        """Return the videos, and where there are models, the hands in a small sample of frames."""
         return inspect_videos(as_text(uri), episodes)
 
     def episode_ids(self, uri: StrPath) -> list[str]:
-        """The videos' names; each is the longest run of its video."""
+        """Return the videos' names; each stands for the longest run of its video."""
         return list(self._find(as_text(uri), again=True))
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """Videos, or runs of them where there are annotations; no picture is decoded.
+        """Return the videos, or their runs where there are annotations; no picture is decoded.
 
         Raises:
-            SourceError: no videos, no models or labels, none that fit, or no run that is long enough.
+            SourceError: no videos, no models or labels, no labels that fit, or no run that is long enough.
             RegistryError: the YAML's layout is wrong.
         """
         uri, layout = as_text(uri), layout_of(embodiment)
@@ -99,11 +100,11 @@ class HandsSource:
         return found
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """One run of a video; its pictures are decoded when asked for.
+        """Return one run of a video; its pictures are decoded on demand.
 
         Raises:
             EpisodeError: the video or its labels are damaged, or no run is long enough.
-            SourceError: no such episode, or a key that is none of hand videos.
+            SourceError: no such episode, or a key that hand videos do not have.
             RegistryError: the YAML's layout is wrong.
         """
         uri, layout = as_text(uri), layout_of(embodiment)
@@ -118,11 +119,11 @@ class HandsSource:
         return _episode(episode_id, file, runs, number, embodiment, alone)
 
     def runs(self, uri: StrPath, name: str, embodiment: Embodiment) -> tuple[VideoFile, Runs]:
-        """A video and all its runs; see read."""
+        """Return a video and all its runs; see read."""
         uri, layout, needed = as_text(uri), layout_of(embodiment), _needed(embodiment)
         video = self._place(uri, name)[0]
         if layout.labels == "detector":
-            self._models(layout)  # what is missing is said before the video is opened
+            self._models(layout)  # missing models are reported before the video is opened
         file = VideoFile(video.path)
         labels = self._labels_of(uri, video, layout)
         return file, cut_into_runs(labels, needed, layout, _header(file.table), str(video.path))
@@ -157,7 +158,7 @@ class HandsSource:
         return found
 
     def _models(self, layout: HandsLayout) -> tuple[Any, HandModels]:
-        """The detector, made once in each process."""
+        """Return the detector, made once in each process, and its models."""
         from hma_data.sources.hands.detect import MediaPipeHands
 
         if self._detector is None or self._detector[:2] != (os.getpid(), layout):
@@ -185,12 +186,12 @@ class _Pictures:
 
 
 def open() -> HandsSource:
-    """The source."""
+    """Return the source."""
     return HandsSource()
 
 
 def _needed(embodiment: Embodiment) -> tuple[str, ...]:
-    """The points its vectors are made of; and its cameras are checked."""
+    """Return the points that the embodiment's vectors need; check its camera keys."""
     where = f"embodiment {embodiment.id}"
     for camera in embodiment.cameras:
         if camera.key != CAMERA:
@@ -204,7 +205,7 @@ def _whole(video: Video, digest: str) -> EpisodeRef:
     try:
         frames = header_of(video.path).frames
         mark = f"{file_fingerprint(video.path)} {digest}"
-    except (HMAError, OSError) as fault:  # read will say the same
+    except (HMAError, OSError) as fault:  # `read` raises it again
         frames, mark = 1, str(fault)
     return EpisodeRef(video.name, max(1, frames), None, _digest(mark))
 
@@ -212,7 +213,7 @@ def _whole(video: Video, digest: str) -> EpisodeRef:
 def _runs_of(
     video: Video, labels: LabelSet, needed: tuple[str, ...], layout: HandsLayout
 ) -> list[EpisodeRef]:
-    """A ref a run; a video with damaged labels is one ref, which reading refuses."""
+    """Return one ref a run; a video with damaged labels becomes one ref, which `read` refuses."""
     try:
         found = labels.of(video)
         if found is None:
@@ -251,7 +252,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _nothing(videos: dict[str, Video], labels: LabelSet, layout: HandsLayout) -> tuple[str, str]:
-    """Why no video gave an episode, and what to do."""
+    """Return why no video gave an episode, and what to do."""
     labelled = 0
     for video in videos.values():
         labelled += labels.of(video) is not None
@@ -272,7 +273,7 @@ def _no_run(runs: Runs, needed: tuple[str, ...], layout: HandsLayout) -> tuple[s
 def _episode(
     episode_id: str, file: VideoFile, runs: Runs, number: int, embodiment: Embodiment, alone: bool
 ) -> Episode:
-    """Run `number` of a video, which is all there is of it where it is `alone`."""
+    """Make the episode of run `number`; `alone` says that it is the only episode of its video."""
     span, labels, layout = runs.spans[number], runs.labels, layout_of(embodiment)
     marks = labels.frames[span[0] : span[1]]
     every = layout.pictures == "every"
@@ -301,7 +302,10 @@ def _episode(
 
 
 def _flags(runs: Runs, number: int, alone: bool) -> dict[str, int]:
-    """What is counted over episodes; what no run takes counts in the first, or in the one that is alone."""
+    """Return the counts that are summed over episodes.
+
+    Frames in no run count in the first run, or in the run that is `alone`.
+    """
     start, stop = runs.spans[number]
     own = slice(start, stop - 1)
     dropped = 0 if number else runs.counts["dropped"]
@@ -318,7 +322,7 @@ def _flags(runs: Runs, number: int, alone: bool) -> dict[str, int]:
 def _signal(
     vector: Vector, file: VideoFile, labels: HandLabels, span: tuple[int, int], to_last: bool = False
 ) -> Signal:
-    """A vector over a run of n labels: n - 1 values; n to the last, where all are current ones."""
+    """Make a vector over a run of n labels: n - 1 values, or n with `to_last` where all are current."""
     keys = [part.key for part in vector.components]
     if to_last and all(key in POINTS for key in keys):
         pieces = [labels.points[key][slice(*span)] for key in keys]

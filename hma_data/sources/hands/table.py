@@ -1,23 +1,23 @@
-"""Hand positions in a table of ours: parquet, CSV or JSON, a row a hand.
+"""Read hand positions from the toolkit's own table: parquet, CSV or JSON, one row a hand.
 
 | column | meaning |
 |---|---|
 | video | the video's path below the folder, with or without its suffix, or its bare name |
-| frame | index of the frame in the video, from 0 (source.layout.first_frame where it is another) |
-| side | left or right, the person's own hand; L, R and any case too |
-| score | optional: rows below source.layout.min_score are no hand |
+| frame | index of the frame in the video, from 0 (or from source.layout.first_frame) |
+| side | left or right, the person's own hand; also L and R, in upper or lower case |
+| score | optional: rows below source.layout.min_score are ignored |
 
 and one of these, as fractions of the picture's width and height (x to the right, y down):
 
 | columns | gives |
 |---|---|
 | landmarks | 42 numbers, x and y of MediaPipe's 21 points (0 is the wrist): landmarks, center, wrist |
-| x0, y0, … x20, y20 | the same, a column a number, for CSV |
+| x0, y0, … x20, y20 | the same, one column a number, for CSV |
 | left, top, right, bottom | a box: center |
-| x, y | center; wrist_x, wrist_y beside them or alone: wrist |
+| x, y | center; with wrist_x, wrist_y beside them or alone: wrist |
 
-JSON is a list of such rows as objects. `video_id` and `frame_number` are taken for `video` and
-`frame`. A value that is not finite says that there is no hand.
+JSON is a list of such rows as objects. `video_id` and `frame_number` are accepted for `video` and `frame`. A
+value that is not finite says that there is no hand.
 """
 
 import csv
@@ -77,11 +77,11 @@ class HandTable:
         }
 
     def known(self) -> list[str]:
-        """The videos it has rows of."""
+        """Return the videos that have rows."""
         return list(self._rows)
 
     def of(self, video: Video) -> HandLabels | None:
-        """The hands of a video; None where the table does not know it."""
+        """Return the hands of a video; None where the table does not have it."""
         name = next((alias for alias in video.aliases if alias in self._rows), None)
         if name is None:
             return None
@@ -93,10 +93,10 @@ class HandTable:
 
 
 def read_columns(path: Path) -> dict[str, Any]:
-    """Columns of a parquet, CSV or JSON file by name: lists, or arrays.
+    """Return the columns of a parquet, CSV or JSON file by name: lists, or arrays.
 
     Raises:
-        SourceError: it is none of these, or damaged.
+        SourceError: it is none of these, too large, damaged, or without rows.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -129,7 +129,7 @@ def read_columns(path: Path) -> dict[str, Any]:
 
 
 def _plain(column: Any) -> Any:
-    """A parquet column as a list, or as an array where its values are numbers."""
+    """Return a parquet column as a list, or as an array where its values are numbers."""
     import pyarrow as pa
 
     if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
@@ -164,7 +164,7 @@ def _side_numbers(values: Any, path: Path) -> NDArray[np.int64]:
 
 
 def _parts(columns: dict[str, Any], path: Path) -> dict[str, NDArray[np.float64]]:
-    """center, wrist or landmarks -> (rows, 2 or 42), by the columns there are."""
+    """Return center, wrist or landmarks -> (rows, 2 or 42), by the columns there are."""
     for part, names in _FORMS[:2]:
         if all(name in columns for name in names):
             if len(names) > 1:

@@ -1,7 +1,7 @@
-"""HDF5 files: opened lazily in each process, read a few rows at a time, trusted with nothing.
+"""Open HDF5 files lazily in each process, read a few rows at a time, and trust none of their claims.
 
-Only what lies in the file itself is read: links to other files, external storage and virtual
-datasets are refused, as are sizes no recording has.
+Only data in the file itself is read. Links to other files, external storage and virtual datasets are refused,
+and so are sizes that no recording has.
 """
 
 import os
@@ -22,7 +22,7 @@ from hma_data.errors import EpisodeError, HMAError
 
 OPEN_FILES = 8
 CHUNK_CACHE = 16 << 20  # bytes a dataset, where its chunks are not larger
-HELD_BYTES = 512 << 20  # of chunks kept inflated, over all datasets of pictures
+HELD_BYTES = 512 << 20  # of decompressed chunks in memory, over all datasets of pictures
 MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
 MAX_ROW = 1 << 28  # values of a row: more than any picture has
@@ -30,9 +30,9 @@ MAX_KEYS, MAX_DEPTH = 5_000, 16
 
 
 class OpenFiles:
-    """The files open in this process, the least recently used closed first; none outlives a fork.
+    """Keep the files open in this process; close the least recently used first. None stays open after a fork.
 
-    Datasets of pictures are kept open too, so that a chunk that several calls want is inflated once.
+    Datasets of pictures stay open too, so that a chunk that several calls need is decompressed once.
     """
 
     def __init__(self) -> None:
@@ -41,10 +41,10 @@ class OpenFiles:
         self._held: OrderedDict[tuple[Path, str, str], tuple[int, h5py.Dataset]] = OrderedDict()
 
     def get(self, path: Path) -> h5py.File:
-        """The open file, opened anew where it has changed.
+        """Return the open file; open it again where it has changed.
 
         Raises:
-            OSError: it is not HDF5, or is cut off; `explained` says so in our words.
+            OSError: it is not HDF5, or is cut off; `explained` raises that as our error.
         """
         if self._process != os.getpid():
             self._files, self._held, self._process = OrderedDict(), OrderedDict(), os.getpid()
@@ -61,7 +61,7 @@ class OpenFiles:
         return self._files[path][1]
 
     def cached(self, path: Path, group: h5py.Group, key: str, where: str) -> h5py.Dataset:
-        """The dataset at `key` of a group of that open file, with room for the chunks beside each other.
+        """Return the dataset at `key` of a group of an open file; its cache has room for the chunks of a row.
 
         Raises:
             EpisodeError: see `dataset`.
@@ -77,7 +77,7 @@ class OpenFiles:
 
 
 def _with_room(group: h5py.Group, key: str, where: str) -> tuple[int, h5py.Dataset]:
-    """Bytes of its cache, and the dataset."""
+    """Return the bytes of the dataset's cache, and the dataset."""
     found = dataset(group, key, where)
     room = min(max(band_bytes(found), CHUNK_CACHE), HELD_BYTES) if found.chunks else 0
     if room <= CHUNK_CACHE:
@@ -90,7 +90,7 @@ def _with_room(group: h5py.Group, key: str, where: str) -> tuple[int, h5py.Datas
 
 
 def band_bytes(found: h5py.Dataset) -> int:
-    """Bytes, inflated, of all chunks that hold a row; 0 without chunks."""
+    """Return the decompressed bytes of all chunks that hold a row; 0 without chunks."""
     if not found.chunks:
         return 0
     sides = [-(-side // chunk) * chunk for side, chunk in zip(found.shape[1:], found.chunks[1:], strict=True)]
@@ -98,9 +98,9 @@ def band_bytes(found: h5py.Dataset) -> int:
 
 
 def _open(path: Path) -> h5py.File:
-    """As HDF5 does by itself; else without locks, which network file systems refuse; else with them.
+    """Open a file with HDF5's own locking; where that fails on locks, without them; at last with them.
 
-    A file this process already holds otherwise opens only in the way it is held.
+    A file that this process already holds open can be opened again only with the same locking.
     """
     for locking in (None, False):
         try:
@@ -113,7 +113,7 @@ def _open(path: Path) -> h5py.File:
 
 @contextmanager
 def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[None]:
-    """Turns what h5py raises on damaged files into one line of ours."""
+    """Raise h5py's errors on damaged files as `error`, in one line."""
     try:
         yield
     except (
@@ -136,10 +136,10 @@ def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[N
 
 
 def member(group: h5py.Group, key: str, where: str) -> Any:
-    """The group or dataset at a path inside `group`.
+    """Return the group or dataset at a path inside `group`.
 
     Raises:
-        EpisodeError: it is not there (with the nearest keys), or lies in another file.
+        EpisodeError: it is not there (the error names the nearest keys), or it lies in another file.
     """
     found: Any = group
     for part in key.strip("/").split("/"):
@@ -155,7 +155,7 @@ def member(group: h5py.Group, key: str, where: str) -> Any:
 
 
 def child(group: h5py.Group, name: str) -> Any:
-    """The direct member of that name, or None where there is none in this file."""
+    """Return the direct member of a name; None where there is none in this file."""
     link = group.get(name, getlink=True)
     found = None if link is None or isinstance(link, h5py.ExternalLink) else group.get(name)
     return None if found is None or _strays(found, group) else found
@@ -166,7 +166,7 @@ def _strays(found: Any, group: h5py.Group) -> bool:
 
 
 def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
-    """The dataset at a path inside `group`, known to lie in this file and to have rows.
+    """Return the dataset at a path inside `group`; check that it lies in this file and has rows.
 
     Raises:
         EpisodeError: see `member`; or it is a group, a single value, empty, or of a size no recording has.
@@ -189,12 +189,12 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
 
 
 def chunk_bytes(found: h5py.Dataset) -> float:
-    """Bytes of a chunk when it is unpacked; 0 without chunks."""
+    """Return the decompressed bytes of a chunk; 0 without chunks."""
     return float(np.prod(found.chunks, dtype=float) * found.dtype.itemsize) if found.chunks else 0.0
 
 
 def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
-    """All values (T, …) of a dataset of numbers."""
+    """Return all values (T, …) of a dataset of numbers."""
     found = dataset(group, key, where)
     if np.prod(found.shape, dtype=float) > MAX_NUMBERS:
         raise EpisodeError(where, f"{key!r} has shape {found.shape}, too large for numbers over time")
@@ -204,12 +204,12 @@ def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
 
 
 def check_lengths(found: h5py.Dataset) -> None:
-    """That no row of varying length claims more bytes than its file has; HDF5 would make room for them.
+    """Check that no row of varying length claims more bytes than its file has; HDF5 would allocate them.
 
-    Rows that are compressed by anything but gzip are taken as they are.
+    Rows that are compressed by anything but gzip are not checked.
 
     Raises:
-        OSError: one does; `explained` says so in our words.
+        OSError: a row claims more; `explained` raises that as our error.
     """
     if not found.dtype.hasobject or not found.size or h5py.check_ref_dtype(found.dtype):
         return
@@ -221,7 +221,7 @@ def check_lengths(found: h5py.Dataset) -> None:
 
 
 def _row_heads(found: h5py.Dataset) -> Iterator[NDArray[np.uint32]]:
-    """The lengths in front of rows of varying length, a chunk at a time."""
+    """Yield the lengths stored in front of rows of varying length, chunk by chunk."""
     width = found.id.get_type().get_size()
     if not found.chunks:
         offset = found.id.get_offset()
@@ -245,12 +245,14 @@ def _row_heads(found: h5py.Dataset) -> Iterator[NDArray[np.uint32]]:
 
 
 def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
-    """The rows of those indices (n, …), in the order asked for.
+    """Return the rows (n, …) of the given indices, in the order asked for.
 
-    Neighbours are read as one slice. So are rows of one chunk too large for the cache, to inflate it once.
+    Neighbours are read as one slice. Rows of one chunk that is too large for the cache are also read as one
+    slice, so that it is decompressed once.
 
     Raises:
         EpisodeError: a row or a chunk is larger than any picture.
+        IndexError: an index lies outside the dataset.
     """
     if np.prod(found.shape[1:], dtype=float) > MAX_ROW or chunk_bytes(found) > MAX_BYTES:
         fault = f"has rows of {found.shape[1:]} in chunks of {found.chunks}, too large to read"
@@ -279,7 +281,7 @@ def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDA
 
 
 def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Every dataset below `group`, by path; links are not followed."""
+    """Yield every dataset below `group` with its path; do not follow links."""
     pending: list[tuple[str, h5py.Group]] = [("", group)]
     seen = 0
     while pending:
@@ -298,7 +300,7 @@ def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
 
 
 def text(value: Any) -> str:
-    """An attribute or a dataset's value as text; empty when it is none."""
+    """Return an attribute or a dataset's value as text; empty when it is not text."""
     if isinstance(value, h5py.Empty):
         return ""
     if isinstance(value, np.ndarray):

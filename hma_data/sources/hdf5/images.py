@@ -1,7 +1,7 @@
-"""Pictures in HDF5: raw arrays of several shapes and number types, or a JPEG or PNG a row.
+"""Read pictures from HDF5: raw arrays of several shapes and number types, or one JPEG or PNG a row.
 
-Colour pictures of 8 bits are taken as they lie, with their axes seen from the shape. Others are
-taken only where `source.layout` says what their numbers mean:
+Colour pictures of 8 bits are read as they are, with their axes found from the shape. Other arrays are read as
+pictures only where `source.layout` says what their numbers mean:
 
     layout: {axes: TCHW, pixels: 0-1}
 
@@ -22,17 +22,17 @@ from hma_data.sources.hdf5.file import OpenFiles, dataset, explained, rows
 from hma_data.sources.hdf5.layout import PIXELS, Layout, Place, Places
 
 _CHANNELS = (1, 3, 4)
-_SLACK = 1e-3  # of the range, by which resizing may have left it
+_SLACK = 1e-3  # share of the range by which values may exceed it, as resizing can cause
 
 
 class PictureRows:
-    """A camera's Stream: pictures of one dataset.
+    """A camera's Stream: the pictures of one dataset.
 
     Args:
         places, files: of the source; the dataset is kept open in `files`.
         place, key: the episode, and the dataset in it.
-        layout: what the YAML says of pictures.
-        times: (T,) seconds of the frames; rows after them are not shown.
+        layout: of the source, from the YAML.
+        times: (T,) seconds of the frames; rows after the last one are not used.
 
     Raises:
         EpisodeError: the dataset is missing, or holds no colour pictures.
@@ -47,7 +47,7 @@ class PictureRows:
         self._raw = self._check(dataset(places.group(place), key, str(place)))
 
     def _check(self, found: h5py.Dataset) -> bool:
-        """Whether they are raw."""
+        """Check whether the pictures are raw, not encoded."""
         kind = picture_kind(found, self._layout)
         if kind == "raw" and np.prod(found.shape[1:], dtype=float) <= 4 * MAX_PIXELS:
             axes_of(found.shape, self._layout, f"{self._place} {self._key}")
@@ -77,7 +77,7 @@ class PictureRows:
 
 
 def picture_kind(found: h5py.Dataset, layout: Layout | None = None) -> str | None:
-    """`raw`, `encoded`, or None for what cannot be pictures, by dtype and shape."""
+    """Return `raw` or `encoded` by dtype and shape; None where the dataset cannot hold pictures."""
     shape: tuple[int, ...] = found.shape or ()
     if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
         channels_first = layout.axes == "TCHW" if layout and layout.axes else shape[1:2] in ((1,), (3,))
@@ -89,10 +89,10 @@ def picture_kind(found: h5py.Dataset, layout: Layout | None = None) -> str | Non
 
 
 def axes_of(shape: tuple[int, ...], layout: Layout, where: str) -> str:
-    """THW, THWC or TCHW: as the YAML says, else by where a number of channels stands.
+    """Return THW, THWC or TCHW: from the YAML, else by the axis whose size is a number of channels.
 
     Raises:
-        EpisodeError: both could be, or what the YAML says does not fit.
+        EpisodeError: both axes could be channels, or the YAML does not fit the shape.
     """
     if len(shape) == 3:
         return "THW"
@@ -109,10 +109,10 @@ def axes_of(shape: tuple[int, ...], layout: Layout, where: str) -> str:
 
 
 def as_bytes(pictures: NDArray[Any], layout: Layout, where: str) -> NDArray[np.uint8]:
-    """Pictures of other numbers as uint8, by the range `layout.pixels` names.
+    """Convert pictures of another number type to uint8, by the range in `layout.pixels`.
 
     Raises:
-        EpisodeError: values outside the range, or not finite.
+        EpisodeError: values lie outside the range, or are not finite.
     """
     if pictures.dtype == np.uint8:
         return pictures
@@ -126,7 +126,7 @@ def as_bytes(pictures: NDArray[Any], layout: Layout, where: str) -> NDArray[np.u
 
 
 def as_rgb(pictures: NDArray[np.uint8], axes: str | None = None) -> Images:
-    """(n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) -> (n, H, W, 3)."""
+    """Convert (n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) to (n, H, W, 3)."""
     if pictures.ndim == 3:
         pictures = pictures[..., None]
     elif axes == "TCHW" or (axes is None and pictures.shape[3] not in _CHANNELS):
@@ -137,7 +137,7 @@ def as_rgb(pictures: NDArray[np.uint8], axes: str | None = None) -> Images:
 
 
 def encoded(row: Any, where: str = "a picture") -> NDArray[np.uint8]:
-    """One encoded picture's bytes; zeros after its end are harmless.
+    """Return the bytes of one encoded picture; zeros after its end do no harm.
 
     Raises:
         EpisodeError: the row is something else.
@@ -150,7 +150,7 @@ def encoded(row: Any, where: str = "a picture") -> NDArray[np.uint8]:
 
 
 def _is_bytes(dtype: np.dtype[Any]) -> bool:
-    """Whether rows of varying length are bytes or text, not references or numbers."""
+    """Check whether rows of varying length are bytes or text, not references or other numbers."""
     inner = h5py.check_vlen_dtype(dtype)
     if inner is None:
         return h5py.check_string_dtype(dtype) is not None

@@ -1,4 +1,4 @@
-"""What is in HDF5 recordings, without an embodiment: keys, lengths, what looks wrong."""
+"""Inspect HDF5 recordings without an embodiment: their keys, their lengths, and what looks wrong."""
 
 import math
 from collections import Counter
@@ -32,16 +32,16 @@ from hma_data.sources.hdf5.file import (
 from hma_data.sources.hdf5.layout import WHOLE_FILE, Place, Places
 from hma_data.sources.hdf5.source import TEXT_KEYS, as_rgb, encoded, environment, picture_kind
 
-LENGTHS = 1_000  # episodes whose length is told and whose keys are compared
+LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
-_BESIDE = ("compress_len",)  # no rows over time: bytes of ALOHA's JPEGs, (cameras, T)
+_BESIDE = ("compress_len",)  # not rows over time: the bytes of ALOHA's JPEGs, (cameras, T)
 _MEASURED = "measured from"
 _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
 
 
 @dataclass
 class _First:
-    """What the first episode that can be read says of all."""
+    """The facts of the first readable episode, which stand for all."""
 
     name: str = ""
     keys: dict[str, KeyInfo] = field(default_factory=dict)
@@ -54,7 +54,7 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
     """See Source.inspect.
 
     Raises:
-        SourceError: nothing that can be read.
+        SourceError: nothing can be read.
     """
     found = places.all(uri)
     order = list(found)
@@ -117,7 +117,7 @@ def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: Place) -> N
 
 
 def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: int) -> None:
-    """One episode's numbers, times and some pictures."""
+    """Hand one episode's numbers, times and some pictures to the survey."""
     for key, info in first.keys.items():
         item = group.get(key)
         if not isinstance(item, h5py.Dataset) or not item.shape or not item.shape[0]:
@@ -159,7 +159,7 @@ def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Su
 
 
 def _length(sizes: dict[str, int]) -> int:
-    """The rows most keys agree on."""
+    """Return the rows of the actions; without actions, the row count that most keys share."""
     for key in ("actions", "action"):
         if key in sizes:
             return sizes[key]
@@ -167,7 +167,7 @@ def _length(sizes: dict[str, int]) -> int:
 
 
 def _facts(group: h5py.Group, said: dict[str, Any], place: Place) -> dict[str, str]:
-    """What is worth a line: the simulator and its controller, where episodes and words are."""
+    """Return facts about the recording: simulator, controller, layout, and the key of the instruction."""
     data = child(group.file, "data")
     words = (name for name in TEXT_KEYS if name in group.attrs and text(group.attrs[name]))
     simulated = [group.attrs.get("sim"), group.file.attrs.get("sim")]
@@ -188,7 +188,10 @@ def _facts(group: h5py.Group, said: dict[str, Any], place: Place) -> dict[str, s
 
 
 def _controller(said: dict[str, Any]) -> str:
-    """robosuite's, e.g. OSC_POSE; with `absolute` where it takes poses, not changes of them."""
+    """Return robosuite's controller, e.g. OSC_POSE.
+
+    `absolute` is added where it takes poses instead of changes of poses.
+    """
     found: Any = said.get("controller_configs")
     if isinstance(found, list) and found:
         found = found[0]
@@ -205,7 +208,7 @@ def _controller(said: dict[str, Any]) -> str:
 def _rate(
     group: h5py.Group, said: dict[str, Any], keys: dict[str, KeyInfo], where: str
 ) -> tuple[float | None, str, str]:
-    """Hz, what says so, and the key of times in seconds where there is one."""
+    """Return Hz, what states it, and the key of times in seconds; empty where there is no such key."""
     stated, holder = _stated_rate(group, said)
     key = next(
         (key for key, info in keys.items() if info.kind == "vector" and is_times(key, info.shape)), None
@@ -243,7 +246,7 @@ def _keys(group: h5py.Group, place: Place) -> Iterator[KeyInfo]:
 
 
 def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | None]:
-    """Kind, shape of one sample, codec."""
+    """Return kind, shape of one sample, and codec."""
     shape = item.shape or ()
     small = np.prod(shape[1:], dtype=float) <= MAX_ROW and chunk_bytes(item) <= MAX_BYTES
     pictures = picture_kind(item) if shape and shape[0] and small else None
@@ -265,5 +268,5 @@ def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | N
 
 
 def _is_grey(shape: tuple[int, ...]) -> bool:
-    """Of raw pictures (T, H, W), (T, H, W, C) or (T, C, H, W)."""
+    """Check whether raw pictures (T, H, W), (T, H, W, C) or (T, C, H, W) have one channel."""
     return len(shape) == 3 or (shape[3] if shape[3] in (1, 3, 4) else shape[1]) == 1

@@ -1,8 +1,8 @@
-"""Where the episodes of HDF5 recordings are: in which file, in which group, under which id.
+"""Find the episodes of HDF5 recordings: their file, their group in it, and their id.
 
-A uri is a file or a folder of files. A pattern such as `data/*` names the groups that are
-episodes; `/` says that each file is one. Without one it is seen from the file. `Layout` is all
-that `source.layout` may say.
+A uri is a file or a folder of files. A pattern such as `data/*` names the groups that are episodes; `/` says
+that each file is one episode. Without a pattern, the file itself shows it. `Layout` holds every key that
+`source.layout` may have.
 """
 
 import re
@@ -28,15 +28,15 @@ _EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
 
 @dataclass(frozen=True)
 class Layout:
-    """What `source.layout` says of HDF5.
+    """The values of `source.layout` for HDF5.
 
     Attributes:
-        episodes: pattern of the groups that are episodes, `/` for whole files; None: seen from the file.
-        timestamps: key of the seconds; None: frames tick at the embodiment's rate.
-        axes: of pictures; None: seen from the shape.
-        pixels: range of pictures that are not uint8; None: such are no pictures.
-        last_observation: `drop` where pictures and states have one row more than the actions, taken after
-            the last of them.
+        episodes: pattern of the groups that are episodes, `/` for whole files; None: found from the file.
+        timestamps: key of the seconds; None: frames come at the embodiment's rate.
+        axes: of pictures; None: found from the shape.
+        pixels: range of pictures that are not uint8; None: such arrays are not pictures.
+        last_observation: `drop` where pictures and states have one row more than the actions, observed after
+            the last action.
     """
 
     episodes: str | None = None
@@ -51,7 +51,7 @@ _ALLOWED = {"axes": AXES, "pixels": tuple(PIXELS), "last_observation": ("drop",)
 
 @dataclass(frozen=True)
 class Place:
-    """Where an episode is: a file and the group in it."""
+    """The place of an episode: a file and the group in it."""
 
     file: Path
     group: str
@@ -61,7 +61,7 @@ class Place:
 
 
 class Places:
-    """Finds episodes, remembering what it has seen of each file."""
+    """Find episodes, and remember the episodes of each file."""
 
     def __init__(self, files: OpenFiles) -> None:
         self._files = files
@@ -69,12 +69,12 @@ class Places:
         self._seen: dict[tuple[Path, str | None], dict[str, Place]] = {}
 
     def all(self, uri: str, pattern: str | None = None) -> dict[str, Place]:
-        """Every episode by its id, in natural order.
+        """Return every episode by its id, in natural order.
 
-        A damaged file in a folder counts as one episode, so that it ends in quarantine by its name.
+        A damaged file in a folder counts as one episode, so that it is quarantined by its name.
 
         Raises:
-            SourceError: a damaged file that is alone, no episodes, or two with one id.
+            SourceError: the only file is damaged, there are no episodes, or two have one id.
         """
         found: dict[str, Place] = {}
         for _, places in self.by_file(uri, pattern):
@@ -82,7 +82,9 @@ class Places:
         return found
 
     def by_file(self, uri: str, pattern: str | None = None) -> Iterator[tuple[Path, dict[str, Place]]]:
-        """The same, a file at a time, while it is open: opening many once more takes as long again.
+        """Yield each file with its episodes, while the file is open.
+
+        Opening many files a second time would take as long again.
 
         Raises:
             SourceError: as `all`.
@@ -110,7 +112,7 @@ class Places:
             raise SourceError(uri, "holds no episodes", f"looked for groups {pattern or 'data/*'}")
 
     def find(self, uri: str, episode_id: str, pattern: str | None = None) -> Place:
-        """The place of an id, opening only the file it is in.
+        """Return the place of an id; open only the file that holds it.
 
         Raises:
             SourceError: no such episode.
@@ -134,7 +136,7 @@ class Places:
         raise SourceError(uri, f"has no episode {episode_id!r}", "hma inspect lists what it has")
 
     def group(self, place: Place) -> h5py.Group:
-        """The episode's group, in the open file."""
+        """Return the episode's group, in the open file."""
         handle = self._files.get(place.file)
         found = handle if place.group == WHOLE_FILE else member(handle, place.group, str(place))
         if not isinstance(found, h5py.Group):
@@ -142,7 +144,7 @@ class Places:
         return found
 
     def _inside(self, file: Path, pattern: str | None) -> dict[str, Place]:
-        """Episodes of one file by name within it; the name of a whole file is empty."""
+        """Return the episodes of one file by name within it; the name of a whole file is empty."""
         if (file, pattern) not in self._seen:
             with explained(file, SourceError):
                 self._seen[file, pattern] = _episodes(self._files.get(file), file, pattern)
@@ -150,15 +152,15 @@ class Places:
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that puts demo_2 before demo_10."""
+    """Return a sort key that puts demo_2 before demo_10."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def layout_of(embodiment: Embodiment | None) -> Layout:
-    """What the YAML says of the layout; nothing without an embodiment.
+    """Return the layout that the YAML states; all defaults without an embodiment.
 
     Raises:
-        SourceError: a key or a value that HDF5 does not know.
+        SourceError: a key or a value is not known for HDF5.
     """
     said = (embodiment.source.layout or {}) if embodiment else {}
     where = f"embodiment {embodiment.id}" if embodiment else ""
@@ -203,7 +205,7 @@ def _guess_pattern(handle: h5py.File) -> str:
 
 
 def _matching(group: h5py.Group, parts: list[str]) -> list[str]:
-    """Paths of the groups that match a pattern, one part a level."""
+    """Return the paths of the groups that match a pattern, one part a level."""
     found = []
     for name in group:
         if fnmatchcase(name, parts[0]) and isinstance(group.get(name, getlink=True), h5py.HardLink):
@@ -220,7 +222,7 @@ def _safe(name: str) -> str:
 
 
 def _stems(uri: str) -> dict[str, Path]:
-    """The HDF5 files of a uri by name without suffix, relative to the folder."""
+    """Return the HDF5 files of a uri by their names without suffix, relative to the folder."""
     path = local_path(uri)
     if path.is_file():
         return {_safe(path.stem): path}

@@ -1,16 +1,16 @@
-"""HDF5 recordings: robomimic, LIBERO, raw robosuite, ALOHA/ACT, and layouts a YAML describes.
+"""Read HDF5 recordings: robomimic, LIBERO, raw robosuite, ALOHA/ACT, and layouts that a YAML describes.
 
-An episode is a group (`data/demo_0`) or a whole file. Which of the two is seen from the file, or
-said by `source.layout`:
+An episode is a group (`data/demo_0`) or a whole file. The file itself shows which of the two, or
+`source.layout` states it:
 
     source:
       format: hdf5
       layout: {episodes: "data/*", timestamps: obs/time}   # "/" means one file an episode
 
-A uri is a file or a folder of files. Keys are paths inside the episode's group. HDF5 keeps no
-rate: it is the embodiment's `frequency_hz`, unless `layout.timestamps` names seconds. Where
-pictures and states have one row more than the actions (ManiSkill), `last_observation: drop`
-leaves out the row after the last action.
+A uri is a file or a folder of files. Keys are paths inside the episode's group. HDF5 stores no rate: the rate
+is the embodiment's `frequency_hz`, unless `layout.timestamps` names a key of seconds. Where pictures and
+states have one row more than the actions (ManiSkill), `last_observation: drop` leaves out the row after the
+last action.
 
 T frames of an episode.
 """
@@ -52,7 +52,7 @@ _SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "va
 
 
 class Hdf5Source:
-    """See the module."""
+    """Read HDF5 recordings; see the module."""
 
     def __init__(self) -> None:
         self._files = OpenFiles()
@@ -65,14 +65,14 @@ class Hdf5Source:
         return inspect(as_text(uri), self._places, self._files, episodes)
 
     def episode_ids(self, uri: StrPath) -> list[str]:
-        """Their ids, files by name and `demo_2` before `demo_10`."""
+        """Return the episode ids, with files by name and `demo_2` before `demo_10`."""
         return list(self._places.all(as_text(uri)))
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """The episodes. A damaged file among others is one that `read` will refuse.
+        """Return the episodes. A damaged file among others becomes one episode, which `read` refuses.
 
         Raises:
-            SourceError: nothing there, a single file that is damaged, or no mask of the name `source.split`.
+            SourceError: nothing is there, the only file is damaged, or no mask has the name `source.split`.
         """
         uri, chosen = as_text(uri), embodiment.source.split if embodiment else None
         refs: list[EpisodeRef] = []
@@ -95,7 +95,7 @@ class Hdf5Source:
         return refs
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """One episode; its pictures are read when asked for.
+        """Return one episode; its pictures are read on demand.
 
         Raises:
             EpisodeError: a damaged file, a missing key, a wrong width, an empty episode.
@@ -143,7 +143,7 @@ class Hdf5Source:
         return PictureRows(self._places, self._files, place, key, layout, series.times)
 
     def _length(self, place: Place, embodiment: Embodiment | None) -> int:
-        """T as the action's rows, or the most rows of any dataset; 0 when it cannot be read."""
+        """Return T, the rows of the action or else the most rows of any dataset; 0 when it cannot be read."""
         keys = [part.key for part in embodiment.action.components] if embodiment else ["actions", "action"]
         try:
             with explained(place):
@@ -158,7 +158,7 @@ class Hdf5Source:
             return 0
 
     def _masks(self, file: Path) -> dict[str, set[str]]:
-        """robomimic's filter keys: name -> names of demos."""
+        """Return robomimic's filter keys: name -> names of demos."""
         with explained(file, SourceError):
             mask = child(self._files.get(file), "mask")
             if not isinstance(mask, h5py.Group):
@@ -174,17 +174,17 @@ class Hdf5Source:
 
 
 def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
-    """Ours, by robomimic's masks, where they tell both."""
+    """Return train or val by robomimic's masks; None where the masks do not tell both."""
     if not {_SPLITS.get(mask) for mask in masks} >= {"train", "val"}:
         return None
     return next((ours for mask, ours in _SPLITS.items() if demo in masks.get(mask, ())), None)
 
 
 class _Series:
-    """The lengths and times of an episode's series; its own times where the YAML names them.
+    """The lengths and times of an episode's series; its own times where the YAML names their key.
 
     Args:
-        length: of the actions, which all others must have.
+        length: of the actions; all other series must have it too.
     """
 
     def __init__(self, group: h5py.Group, embodiment: Embodiment, length: int, where: str) -> None:
@@ -204,7 +204,7 @@ class _Series:
             self.times = rate_times(length, hz)
 
     def check(self, key: str, length: int) -> None:
-        """That a series is as long as the actions, or ends with the observation that is dropped.
+        """Check that a series is as long as the actions; one row more is allowed where the last is dropped.
 
         Raises:
             EpisodeError: it is not.
@@ -219,7 +219,7 @@ class _Series:
         raise EpisodeError(self._where, f"differ in length: actions {self._length}, {key} {length}", remedy)
 
     def trimmed(self, key: str, values: NDArray[Any]) -> NDArray[Any]:
-        """(T, …) values without the observation after the last action."""
+        """Return (T, …) values without the observation after the last action."""
         self.check(key, len(values))
         return values[: self._length]
 
@@ -232,7 +232,7 @@ def _times(group: h5py.Group, key: str, where: str) -> Floats:
 
 
 def open() -> Hdf5Source:
-    """The source."""
+    """Return the source."""
     return Hdf5Source()
 
 
@@ -250,7 +250,7 @@ def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32
 
 
 def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
-    """What was asked: at the key the YAML names, else in the places robomimic and LIBERO use."""
+    """Return the instruction: at the YAML's key, else where robomimic and LIBERO store it."""
     if key and key in group.attrs:
         return text(group.attrs[key])
     if key:
@@ -272,7 +272,7 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
 
 
 def _text_row(holder: h5py.Group, name: str) -> str:
-    """The text of a dataset of one value; empty where there is none."""
+    """Return the text of a dataset of one value; empty where there is none."""
     found = child(holder, name)
     if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
         return ""
@@ -283,7 +283,10 @@ def _text_row(holder: h5py.Group, name: str) -> str:
 
 
 def _success(group: h5py.Group) -> bool | None:
-    """By the last `success` or reward; by the last `done` only without them, for time-outs are done too."""
+    """Return whether the episode succeeded, from its last `success` or reward; None where it is unknown.
+
+    The last `done` counts only where both are missing, because a time-out is done too.
+    """
     if "success" in group.attrs:
         return bool(np.all(group.attrs["success"]))
     for key in ("success", "rewards", "dones"):
@@ -294,7 +297,7 @@ def _success(group: h5py.Group) -> bool | None:
 
 
 def _metadata(group: h5py.Group) -> dict[str, Any]:
-    """Short plain attributes of the episode; models and other long texts stay behind."""
+    """Return short plain attributes of the episode; leave out models and other long texts."""
     found: dict[str, Any] = {}
     for name in group.attrs:
         value = group.attrs[name]
@@ -305,7 +308,7 @@ def _metadata(group: h5py.Group) -> dict[str, Any]:
 
 
 def environment(handle: h5py.File) -> dict[str, Any]:
-    """What robomimic (`env_args`) or robosuite (`env_info`) say of the simulator."""
+    """Return the simulator's facts, stated by robomimic (`env_args`) or robosuite (`env_info`)."""
     data = child(handle, "data")
     if not isinstance(data, h5py.Group):
         return {}

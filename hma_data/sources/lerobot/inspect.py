@@ -1,7 +1,7 @@
-"""What is in a LeRobotDataset, without an embodiment: its metadata held against the files that are there.
+"""Inspect a LeRobotDataset without an embodiment: check its metadata against the files that are there.
 
-Metadata is looked at whole; numbers, times and a few pictures of a sample of the episodes whose files
-are there. What is on the Hub is not fetched to be looked at.
+All of the metadata is checked. Numbers, times and a few pictures are checked for a sample of the episodes
+whose files are there. Nothing is fetched from the Hub for this.
 """
 
 import os
@@ -18,8 +18,8 @@ from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
 from hma_data.sources.lerobot.rows import Rows, StillPictures, rows_of
 
-LENGTHS = 1_000  # told
-LOOKED_FOR = 20_000  # episodes whose files are looked for, spread over all
+LENGTHS = 1_000  # most lengths in the inspection
+LOOKED_FOR = 20_000  # most episodes whose files are looked for, spread over all
 CAMERA_BUDGET = 64  # videos opened at most, over all cameras
 
 
@@ -58,7 +58,7 @@ def _totals(meta: Metadata, survey: Survey) -> None:
 
 
 class _Looking:
-    """A look at the files of a local dataset."""
+    """Check the files of a local dataset."""
 
     def __init__(self, meta: Metadata, survey: Survey, episodes: int) -> None:
         self._meta, self._survey, self._episodes = meta, survey, episodes
@@ -69,7 +69,7 @@ class _Looking:
         self._indices = [indices[i] for i in sampled(len(indices), LOOKED_FOR)]
 
     def look(self) -> None:
-        """Which files are there, then into a sample of the episodes that have all of theirs."""
+        """Find which files are there; then sample the episodes that have all of their files."""
         whole = self._with_rows()
         for key in self._videos:
             whole &= self._with_video(key)
@@ -104,7 +104,7 @@ class _Looking:
         return self._present(f"videos of {key}", paths, key)
 
     def _present(self, what: str, paths: dict[int, str], key: str = "") -> set[int]:
-        """Episodes whose file is there; the missing ones are one finding."""
+        """Return the episodes whose file is there; report the missing files as one finding."""
         distinct = list(dict.fromkeys(paths.values()))
         missing = {path for path in distinct if not self._there.has(path)}
         if missing:
@@ -116,7 +116,7 @@ class _Looking:
         return {index for index, path in paths.items() if path not in missing}
 
     def _rows(self, index: int, pairs: int) -> None:
-        """One episode's numbers, times and pictures kept in parquet."""
+        """Hand one episode's numbers, times and parquet pictures to the survey."""
         meta, name = self._meta, episode_name(index)
         try:
             rows = rows_of(meta.folder.path(meta.data_path(index)), index)
@@ -154,7 +154,7 @@ class _Looking:
             self._survey.pictures(name, key, stream.frames(run), run, codec)
 
     def _video(self, key: str, index: int, pairs: int) -> None:
-        """Counts an episode's video against its rows, and looks at some pictures."""
+        """Compare the frames of an episode's video with its rows; hand some pictures to the survey."""
         meta, name, span = self._meta, episode_name(index), self._spans[key][index]
         self._survey.made.add("frames")
         try:
@@ -178,14 +178,14 @@ class _Looking:
 
 
 class _Files:
-    """Which files a folder has, each directory listed once: datasets have a hundred thousand."""
+    """The files of a folder, each directory listed once: datasets have a hundred thousand files."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
         self._listed: dict[str, set[str]] = {}
 
     def has(self, relative: str) -> bool:
-        """Whether that file is there."""
+        """Check whether a file is there."""
         parent, _, name = relative.rpartition("/")
         if parent not in self._listed:
             try:
@@ -197,7 +197,7 @@ class _Files:
 
 
 def _part(file: VideoFile, span: Span, fps: float) -> tuple[int, int]:
-    """Indices of the video's frames [from, to) that are the episode's."""
+    """Return the indices [from, to) of the video's frames that belong to the episode."""
     if span.stop is None:
         return 0, len(file)
     half = 0.5 / fps
@@ -228,7 +228,7 @@ def _keys(meta: Metadata) -> tuple[KeyInfo, ...]:
 
 
 def _codec(meta: Metadata, key: str) -> str | None:
-    """As the first episode has it; None where it cannot be seen."""
+    """Return the codec of the first episode; None where it cannot be read."""
     index = next(iter(meta.episodes))
     try:
         if meta.features[key].dtype == "video":

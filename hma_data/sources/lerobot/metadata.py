@@ -1,8 +1,8 @@
-"""The metadata of a LeRobotDataset: versions 2.0, 2.1 and 3.0 brought to one form.
+"""Read the metadata of a LeRobotDataset; bring versions 2.0, 2.1 and 3.0 to one form.
 
-Version 2 keeps a parquet and, for each camera, a video an episode; `meta/episodes.jsonl` and
-`meta/tasks.jsonl` list them. Version 3 packs many episodes in each file; `meta/episodes/*.parquet`
-says which file and, within a video, from when to when.
+Version 2 stores one parquet file an episode, and one video an episode and camera; `meta/episodes.jsonl` and
+`meta/tasks.jsonl` list them. Version 3 packs many episodes into each file; `meta/episodes/*.parquet` names
+the file of an episode and, within a video, its start and end.
 """
 
 import json
@@ -40,13 +40,13 @@ class Feature:
 
     @property
     def is_camera(self) -> bool:
-        """Whether it holds colour pictures."""
+        """Check whether the feature holds colour pictures."""
         return self.dtype in ("video", "image") and not self.depth
 
 
 @dataclass(frozen=True)
 class Span:
-    """Where the frames of an episode lie in a video: seconds of its clock; None means the whole file."""
+    """The part of a video that holds an episode, in seconds of its clock; the whole file without `stop`."""
 
     path: str
     start: float = 0.0
@@ -54,7 +54,7 @@ class Span:
 
 
 class Folder:
-    """The files of a dataset, local or fetched from the Hub one by one as they are needed."""
+    """The files of a dataset, local or fetched from the Hub one by one on demand."""
 
     def __init__(self, uri: str) -> None:
         self.uri = uri
@@ -66,7 +66,7 @@ class Folder:
             raise SourceError(uri, there, "give the folder of a LeRobotDataset, or its name on the Hub")
 
     def path(self, relative: str) -> Path:
-        """The local path of a file, which need not exist.
+        """Return the local path of a file, which need not exist.
 
         Raises:
             SourceError: the path leads out of the folder.
@@ -100,7 +100,7 @@ class Folder:
             try:
                 found = hf_hub_download(repo, relative, repo_type="dataset", revision=self.revision)
             except EntryNotFoundError:
-                return self.root / relative  # missing, as a file of a folder may be
+                return self.root / relative  # missing: callers treat it as a missing local file
         return Path(found)
 
     @contextmanager
@@ -116,10 +116,10 @@ class Folder:
 
 
 class Metadata:
-    """What meta/ says.
+    """The content of meta/.
 
     Attributes:
-        fps: frames a second, of rows and videos alike.
+        fps: frames a second, of both rows and videos.
         features: by name.
         episodes: by index, rows of plain values with at least `length`.
         tasks: text by task index.
@@ -149,12 +149,12 @@ class Metadata:
             raise SourceError(folder.uri, "has no episodes", "record some, or check meta/")
 
     def data_path(self, index: int) -> str:
-        """The parquet an episode's rows are in, relative to the folder."""
+        """Return the path of the parquet file with an episode's rows, relative to the folder."""
         template = self.info.get("data_path") or _DATA_PATHS[self.version[1]]
         return self._filled(template, index, "data", {})
 
     def video(self, index: int, key: str) -> Span:
-        """Where an episode's frames of one camera are."""
+        """Return the part of a video that holds an episode's frames of one camera."""
         template = self.info.get("video_path")
         if not template:
             raise SourceError(
@@ -170,7 +170,7 @@ class Metadata:
         return Span(path, start, stop)
 
     def _filled(self, template: Any, index: int, prefix: str, values: dict[str, Any]) -> str:
-        """A path template of info.json with the episode's numbers in it."""
+        """Fill a path template of info.json with the episode's numbers."""
         if self.version == "v3.0":
             row = self.episodes[index]
             for name in ("chunk_index", "file_index"):
@@ -183,7 +183,7 @@ class Metadata:
         return fill(template, values, self.folder.root / "meta" / "info.json")
 
     def split_of(self, index: int) -> str | None:
-        """train or val, where the dataset tells both apart."""
+        """Return train or val; None where the dataset does not have both."""
         ours = {name: _SPLIT_NAMES[name] for name in self.splits if name in _SPLIT_NAMES}
         if set(ours.values()) != {"train", "val"}:
             return None
@@ -191,15 +191,15 @@ class Metadata:
 
 
 def episode_name(index: int) -> str:
-    """An episode's id."""
+    """Return an episode's id."""
     return f"episode_{index:06d}"
 
 
 def fill(template: Any, values: dict[str, Any], where: object) -> str:
-    """A path template with its values in.
+    """Fill a path template with its values.
 
     Raises:
-        SourceError: it is not a template of ours, or leads out of the folder.
+        SourceError: the template cannot be filled, or its path leads out of the folder.
     """
     try:
         for _, name, spec, conversion in Formatter().parse(template):
@@ -217,7 +217,7 @@ def fill(template: Any, values: dict[str, Any], where: object) -> str:
 
 @contextmanager
 def parquet_explained(where: object, error: type[HMAError]) -> Iterator[None]:
-    """Turns pyarrow's errors into one line of ours."""
+    """Raise pyarrow's errors as `error`, in one line."""
     import pyarrow as pa
 
     try:
@@ -239,7 +239,7 @@ def parquet_explained(where: object, error: type[HMAError]) -> Iterator[None]:
 
 
 def _hub_name(uri: str) -> tuple[str | None, str | None]:
-    """Repository and revision, or None and None for a folder."""
+    """Return repository and revision, or None and None for a folder."""
     match = _HUB.fullmatch(uri.rstrip("/"))
     if uri.startswith("hf://"):
         if not match:
@@ -316,13 +316,16 @@ def _features(found: Any, where: object) -> dict[str, Feature]:
 
 
 def _names(found: Any, count: int) -> tuple[str, ...] | None:
-    """Names of a vector's values; recorders nest them in lists, or by `motors`, `left`, …, or number them."""
+    """Return the names of a vector's values; None where they do not fit their count.
+
+    Recorders nest them in lists, or in mappings by `motors`, `left`, …, or map each name to its number.
+    """
     if isinstance(found, dict):
         if sorted(map(str, found.values())) == sorted(map(str, range(count))):  # {"x": 0, "gripper": 1}
             return tuple(str(name) for name in sorted(found, key=lambda name: int(found[name])))
         groups = {name: _flat(inner) for name, inner in found.items()}
         names = [name for inner in groups.values() for name in inner]
-        if len(set(names)) < len(names):  # both arms name their joints alike
+        if len(set(names)) < len(names):  # both arms use the same names
             names = [f"{group}_{name}" for group, inner in groups.items() for name in inner]
     else:
         names = _flat(found)
@@ -330,7 +333,7 @@ def _names(found: Any, count: int) -> tuple[str, ...] | None:
 
 
 def _flat(found: Any, depth: int = 0) -> list[str]:
-    """The texts of a list of lists; empty where there is anything else in it."""
+    """Return the texts of a list of lists; empty where it holds anything else."""
     if isinstance(found, str):
         return [found]
     inner = [_flat(item, depth + 1) for item in found] if isinstance(found, list) and depth < 8 else []
@@ -338,7 +341,7 @@ def _flat(found: Any, depth: int = 0) -> list[str]:
 
 
 def _splits(found: Any) -> dict[str, range]:
-    """Ranges of episodes by the split's name; others forms than `from:to` are not used by lerobot."""
+    """Return ranges of episodes by the split's name; lerobot uses no other form than `from:to`."""
     splits = {}
     for name, text in (found if isinstance(found, dict) else {}).items():
         if match := re.fullmatch(r"(\d{1,12}):(\d{1,12})", str(text)):

@@ -1,4 +1,4 @@
-"""Rows of a LeRobotDataset's parquet files: one episode's columns, and pictures kept in them.
+"""Read rows of a LeRobotDataset's parquet files: one episode's columns, and the pictures stored in them.
 
 T rows of an episode.
 """
@@ -21,7 +21,7 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.lerobot.metadata import Folder, parquet_explained
 
 MAX_BYTES = 1 << 30  # of one column of a row group, as stored
-MAX_VALUES = 1 << 26  # of the same: a run of equal values may be stored as one
+MAX_VALUES = 1 << 26  # of such a column: a run of equal values may be stored as one value
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Rows:
         return len(self.places)
 
     def column(self, key: str) -> pa.Array:
-        """One column over the episode.
+        """Return one column over the episode.
 
         Raises:
             EpisodeError: the file has no such column, or cannot be read.
@@ -57,7 +57,7 @@ class Rows:
             return joined.combine_chunks() if isinstance(joined, pa.ChunkedArray) else joined
 
     def numbers(self, key: str) -> NDArray[Any]:
-        """A column of numbers, (T,) or (T, …).
+        """Return a column of numbers, (T,) or (T, …).
 
         Raises:
             EpisodeError: values are missing, of several widths, or no numbers.
@@ -89,7 +89,7 @@ class Rows:
 
 
 def rows_of(path: Path, index: int) -> Rows:
-    """The rows of an episode, found by their `episode_index`; all rows where the file has none.
+    """Return the rows of an episode, found by `episode_index`; all rows where the file has no such column.
 
     Raises:
         EpisodeError: the file is missing or damaged, or has no such rows.
@@ -116,7 +116,7 @@ def rows_of(path: Path, index: int) -> Rows:
 
 
 class StillPictures:
-    """A Stream over pictures kept in a parquet column, as bytes or as the path of a file."""
+    """A Stream of pictures stored in a parquet column, as bytes or as the path of a file."""
 
     def __init__(self, rows: Rows, key: str, timestamps: Floats, folder: Folder) -> None:
         self.timestamps = timestamps
@@ -133,7 +133,7 @@ class StillPictures:
         return np.stack(pictures) if pictures else np.zeros((0, 1, 1, 3), np.uint8)
 
     def codec(self) -> str | None:
-        """png or jpeg, by the first picture."""
+        """Return png or jpeg, from the first picture; None for anything else."""
         start = self._bytes(0)[:4]
         return "png" if start == b"\x89PNG" else "jpeg" if start[:2] == b"\xff\xd8" else None
 
@@ -174,7 +174,7 @@ def _column_of_group(path: Path, changed: int, group: int, key: str) -> pa.Array
 
 
 def _read(path: Path, group: int, key: str) -> pa.Array:
-    """A column of a row group, whole, if it is of a size that recordings have."""
+    """Return a whole column of a row group, if its size is plausible for a recording."""
     with pq.ParquetFile(path) as file:
         held = file.metadata.row_group(group)
         columns = [held.column(i) for i in range(held.num_columns)]
@@ -188,7 +188,10 @@ def _read(path: Path, group: int, key: str) -> pa.Array:
 
 
 def _only(table: pa.Table, key: str) -> pa.Array:
-    """A table's column in one piece; as plain lists where a library has registered a type for matrices."""
+    """Return a table's column in one piece.
+
+    It is returned as plain lists where another library has registered a type for matrices.
+    """
     column = table.column(key).combine_chunks()
     column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     return column.storage if isinstance(column, pa.ExtensionArray) else column
@@ -199,7 +202,7 @@ def _changed(path: Path) -> int:
 
 
 def _may_hold(metadata: Any, group: int, index: int) -> bool:
-    """Whether a row group can hold rows of the episode, by its statistics."""
+    """Check by its statistics whether a row group can hold rows of the episode."""
     held = metadata.row_group(group)
     for i in range(held.num_columns):
         column = held.column(i)

@@ -1,8 +1,8 @@
-"""LeRobotDataset versions 2.0, 2.1 and 3.0, read with pyarrow and PyAV alone.
+"""Read LeRobotDataset versions 2.0, 2.1 and 3.0 with pyarrow and PyAV alone.
 
-A uri is a folder, `hf://datasets/NAME/DATASET[@REVISION]`, or `NAME/DATASET` on the Hub, from
-where only the files of the episodes read are fetched. Keys are feature names (`action`,
-`observation.images.cam_high`). The rate is `fps` of info.json, and the embodiment must agree.
+A uri is a folder, `hf://datasets/NAME/DATASET[@REVISION]`, or `NAME/DATASET` on the Hub. From the Hub, only
+the files of the episodes that are read are fetched. Keys are feature names (`action`,
+`observation.images.cam_high`). The rate is `fps` of info.json, and the embodiment's rate must agree with it.
 
 T frames of an episode.
 """
@@ -28,28 +28,28 @@ from hma_data.sources.lerobot.rows import Rows, StillPictures, rows_of
 from hma_data.storage.paths import StrPath, as_text
 
 RATE_TOLERANCE = 0.01  # of the rate
-TIME_TOLERANCE = 0.25  # of a frame's period, between a row's time and its picture's
-_SAMPLE = 4096  # bytes of a video, at each end, that its fingerprint looks at
+TIME_TOLERANCE = 0.25  # of a frame's period, between the time of a row and the time of its picture
+_SAMPLE = 4096  # bytes at each end of a video that its fingerprint covers
 
 
 class LeRobotSource:
-    """See the module."""
+    """Read LeRobotDatasets; see the module."""
 
     def __init__(self) -> None:
         self._opened: dict[str, Metadata] = {}
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
-        """What is in the dataset: its metadata, checked against the files that are there."""
+        """Return what the dataset holds: its metadata, checked against the files that are there."""
         from hma_data.sources.lerobot.inspect import inspect
 
         return inspect(as_text(uri), self._open(as_text(uri), again=True), episodes)
 
     def episode_ids(self, uri: StrPath) -> list[str]:
-        """Their ids, `episode_000000` and on."""
+        """Return the episode ids, from `episode_000000` on."""
         return [episode_name(index) for index in self._open(as_text(uri), again=True).episodes]
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
-        """The episodes by metadata; a missing video is found when the episode is read.
+        """Return the episodes from the metadata; a missing video is found only when its episode is read.
 
         Raises:
             SourceError: damaged metadata, another rate than the embodiment's, or no such split.
@@ -76,7 +76,7 @@ class LeRobotSource:
         ]
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
-        """One episode; its pictures are decoded when asked for.
+        """Return one episode; its pictures are decoded on demand.
 
         Raises:
             EpisodeError: a video is missing or has another number of frames, rows are damaged.
@@ -115,11 +115,11 @@ class LeRobotSource:
 
 
 class _Video:
-    """A camera's Stream: an episode's part of a video file.
+    """A camera's Stream: one episode's part of a video file.
 
     Args:
         path: of the file.
-        span: the part of it.
+        span: the episode's part of the file.
         times: (T,) seconds of the rows, from the episode's first frame.
         fps: of the dataset.
     """
@@ -146,7 +146,7 @@ class _Video:
 
 
 def open() -> LeRobotSource:
-    """The source."""
+    """Return the source."""
     return LeRobotSource()
 
 
@@ -202,7 +202,7 @@ def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Float
 
 
 def _tasks(meta: Metadata, index: int, rows: Rows) -> list[str]:
-    """What was asked, in the order of the rows; by the episode's own list where rows do not say."""
+    """Return the tasks in the order of the rows; the episode's own list where rows state none."""
     if "task_index" in rows.columns and meta.tasks:
         numbers = rows.numbers("task_index").reshape(-1).tolist()
         return [meta.tasks[number] for number in dict.fromkeys(numbers) if number in meta.tasks]
@@ -221,7 +221,7 @@ def _success(rows: Rows) -> bool | None:
 
 
 def _fingerprint(meta: Metadata, index: int, samples: dict[str, str]) -> str:
-    """Over samples of the episode's files; each file is looked at once, however many episodes it has."""
+    """Hash samples of the episode's files; each file is sampled once, however many episodes it has."""
     parts = [str(meta.folder.revision or ""), episode_name(index), str(meta.episodes[index]["length"])]
     try:
         spans = [meta.video(index, key) for key, item in meta.features.items() if item.dtype == "video"]
@@ -232,7 +232,7 @@ def _fingerprint(meta: Metadata, index: int, samples: dict[str, str]) -> str:
             if relative not in samples:
                 samples[relative] = sample(path) if path.is_file() else "missing"
             parts.append(samples[relative])
-    except EpisodeError as fault:  # read will say the same
+    except EpisodeError as fault:  # `read` raises it again
         parts.append(str(fault))
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 

@@ -1,6 +1,7 @@
 """Read ArrayRecord files as TFDS writes them, with the `array_record` package.
 
-The package reads local files only. Records have no stated offset: a record's place is its number.
+The package reads local files only. It does not tell the offset of a record, so a record is found by its
+number.
 """
 
 from pathlib import Path
@@ -16,9 +17,10 @@ RANDOM_ACCESS = "readahead_buffer_size:0,max_parallelism:0"
 
 
 def scan(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
-    """Return the number, lengths and CRC-32C of a file's records; all other arguments change nothing.
+    """Return the numbers, lengths and CRC-32C of a file's records.
 
-    Every record is read once. One that is damaged has length 0, and fails when it is read.
+    Every record is read once. A damaged record gets length 0, and fails when it is read. The arguments
+    `files`, `size`, `known` and `limit` are ignored.
 
     Raises:
         SourceError: the file cannot be opened.
@@ -39,13 +41,13 @@ def scan(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = 
 
 
 def read_record(files: Any, path: str, frames: Framing, index: int, where: str) -> bytes:
-    """Return the data of one record, checked against its chunk's hash and against the framing.
+    """Return the data of one record; check it against its chunk's hash and against the framing.
 
     Args:
         where: the episode, for the error.
 
     Raises:
-        EpisodeError: it is damaged, or not what the framing says.
+        EpisodeError: it is damaged, or does not match the framing.
     """
     try:
         [data] = _open(path).read([index])
@@ -71,7 +73,7 @@ def _open(path: str) -> Any:
 
 
 def _fault(reader: Any) -> str:
-    """Return why a reader is not ok, as its first read says."""
+    """Return why a reader is not ok, from the error of its first read."""
     try:
         reader.read([0])
     except RuntimeError as fault:

@@ -1,10 +1,10 @@
-"""What the records of a TFDS folder hold: features.json read, and columns decoded by it.
+"""Read features.json of a TFDS folder, and decode the columns of its records.
 
-TensorFlow Datasets flattens nested features to names joined by "/". A feature inside one
-sequence (RLDS' `steps`) is stored back to back over the steps; inside two or more it is ragged:
-`<name>/ragged_flat_values` and `<name>/ragged_row_lengths_<i>`. Numbers are stored as float32 or
-int64 whatever their dtype, unless the tensor is encoded to bytes. (Source: tensorflow_datasets
-4.9, features and example_serializer.)
+TensorFlow Datasets joins the names of nested features with "/". A feature inside one sequence (RLDS'
+`steps`) is stored as one flat list over the steps. A feature inside two or more sequences is ragged:
+`<name>/ragged_flat_values` and `<name>/ragged_row_lengths_<i>`. Numbers are stored as float32 or int64
+whatever their dtype, unless the tensor is encoded to bytes. (Source: tensorflow_datasets 4.9, features and
+example_serializer.)
 
 T steps of an episode.
 """
@@ -22,8 +22,8 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.rlds.tf_example import Example
 
 Shape = tuple[int | None, ...]
-BFLOAT16 = "bfloat16"  # NumPy has none: given as the float32 of the same value
-MAX_TENSOR_BYTES = 1 << 28  # one value that claims more is a bomb or an error
+BFLOAT16 = "bfloat16"  # NumPy lacks this dtype: values become float32
+MAX_TENSOR_BYTES = 1 << 28  # most bytes of one value, against decompression bombs and errors
 
 # Content keys of a feature in features.json -> the class that wrote it; legacy files name the class only.
 CONTENT = {
@@ -40,11 +40,11 @@ class Feature:
     Attributes:
         name: flattened, as records name it: steps/observation/image.
         kind: number, text, picture or other (stored in a way that is not read here).
-        shape: of one value, None where it varies; pictures (H, W, C).
+        shape: of one value, with None where a size varies; pictures are (H, W, C).
         dtype: of one value, e.g. float32; "string" for text.
-        nesting: lengths of the sequences around it, outermost first, None where they vary.
+        nesting: lengths of the sequences around it, outermost first, with None where they vary.
         encoding: none, bytes or zlib.
-        codec: of pictures, png or jpeg; as stated, pictures may differ.
+        codec: png or jpeg for pictures, as stated; the pictures themselves may differ.
     """
 
     name: str
@@ -57,13 +57,13 @@ class Feature:
 
     @property
     def width(self) -> int | None:
-        """Values a step; None where it varies."""
+        """Return the number of values a step; None where it varies."""
         sizes = self.nesting[1:] + self.shape
         return None if None in sizes else math.prod(size for size in sizes if size is not None)
 
 
 def read_features(text: str, where: str) -> dict[str, Feature]:
-    """The leaves of a features.json by name, in its order.
+    """Return the leaves of a features.json by name, in its order.
 
     Raises:
         SourceError: it is not JSON, or not what TFDS writes.
@@ -126,7 +126,7 @@ def _tensor(name: str, shape: Shape, dtype: str, nesting: Shape, encoding: str) 
 
 
 def _content(node: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """(class, its values) of a feature as written by any version of TFDS."""
+    """Return (class, its values) of a feature as written by any version of TFDS."""
     if "type" in node:  # before 4.6
         kind, content = str(node["type"]).rsplit(".", 1)[-1], node.get("content") or {}
         if isinstance(content, str):
@@ -155,7 +155,7 @@ def _size(value: Any) -> int | None:
 
 
 def step_count(example: Example, features: dict[str, Feature], where: str) -> int:
-    """T, from the first feature that tells it.
+    """Return T, from the first feature that tells it.
 
     Args:
         features: those inside steps.
@@ -173,7 +173,7 @@ def step_count(example: Example, features: dict[str, Feature], where: str) -> in
 
 
 def _rows(example: Example, feature: Feature) -> int | None:
-    """How many steps a feature has, if that is to be known without the others."""
+    """Return the number of steps of a feature, if it can be known without the other features."""
     lengths = f"{feature.name}/ragged_row_lengths_0"
     if lengths in example:
         return len(example.ints(lengths))
@@ -186,7 +186,7 @@ def _rows(example: Example, feature: Feature) -> int | None:
 
 
 def column(example: Example, feature: Feature, steps: int, where: str) -> NDArray[Any]:
-    """A feature of numbers over the steps: (T, …) in its dtype.
+    """Return a feature of numbers over the steps: (T, …) in its dtype.
 
     Raises:
         EpisodeError: the feature is missing, of another kind, ragged, or has not T rows.
@@ -207,7 +207,7 @@ def column(example: Example, feature: Feature, steps: int, where: str) -> NDArra
 
 
 def column_blobs(example: Example, feature: Feature, steps: int, where: str) -> list[memoryview]:
-    """A feature of byte strings over the steps: T views.
+    """Return a feature of byte strings over the steps: T views.
 
     Raises:
         EpisodeError: the feature is missing, of another kind, or has not one string a step.
@@ -220,7 +220,7 @@ def column_blobs(example: Example, feature: Feature, steps: int, where: str) -> 
 
 
 def scalar(example: Example, feature: Feature) -> Any:
-    """A feature outside the steps as a plain bool, int, float or str; None where it is not one value."""
+    """Return a feature outside the steps as a bool, int, float or str; None where it is not one value."""
     if feature.name not in example or feature.nesting or feature.shape or feature.encoding != "none":
         return None
     if feature.kind == "text":
@@ -231,7 +231,7 @@ def scalar(example: Example, feature: Feature) -> Any:
 
 
 def _stored(example: Example, feature: Feature, steps: int, where: str) -> tuple[str, list[int]]:
-    """(name under which the values lie, sizes of the sequences around each value, T first)."""
+    """Return (name that holds the values, sizes of the sequences around each value, T first)."""
     if f"{feature.name}/ragged_flat_values" not in example:
         inner = [-1 if size is None else size for size in feature.nesting[1:]]
         dynamic = f"{feature.name}/value"  # a tensor of several unknown sizes keeps its shape beside it
@@ -250,12 +250,12 @@ def _stored(example: Example, feature: Feature, steps: int, where: str) -> tuple
 
 
 def _given(feature: Feature) -> np.dtype:
-    """The dtype its values are given in."""
+    """Return the dtype in which the values are returned."""
     return np.dtype(np.float32 if feature.dtype == BFLOAT16 else feature.dtype)
 
 
 def _decoded(example: Example, feature: Feature, name: str, where: str) -> NDArray[Any]:
-    """Tensors kept as bytes or zlib, (n, …)."""
+    """Decode the tensors that are stored as bytes or zlib; return (n, …)."""
     blobs = example.blobs(name)
     shapes: Any = [feature.shape] * len(blobs)
     if name.endswith("/value"):
@@ -270,7 +270,7 @@ def _decoded(example: Example, feature: Feature, name: str, where: str) -> NDArr
 
 
 def tensor(blob: memoryview, feature: Feature, shape: Any, where: str) -> NDArray[Any]:
-    """One tensor encoded to bytes.
+    """Decode one tensor that is encoded to bytes.
 
     Args:
         shape: its sizes, at most one of them None.

@@ -1,8 +1,8 @@
-"""A TFDS folder: its version, splits, shards, and where in them each episode lies.
+"""Open a TFDS folder: its version, its splits, its shards, and the place of each episode in them.
 
-`dataset_info.json` says how many records each shard of a split has, so the place of an episode is
-known without opening the others; shards that it does not list are found by name and counted.
-Paths are of an fsspec file system, local unless the URI names another.
+`dataset_info.json` gives the number of records of each shard of a split, so an episode is found without
+opening the other shards. Shards that it does not list are found by name and counted. Paths are of an fsspec
+file system, which is local unless the URI names another.
 """
 
 import json
@@ -24,8 +24,8 @@ from hma_data.sources.rlds.shard_files import FORMATS, Shard, named_shards, stat
 from hma_data.sources.rlds.tf_example import Example
 from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
 
-LISTED = 10_000  # records missing from a shard that are still listed, to be quarantined one by one
-LONGEST_JSON = 64 << 20  # bytes of a description; more is a mistake
+LISTED = 10_000  # most missing records of a shard that are listed and quarantined one by one
+LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Folder:
         root: the folder, on it.
         features: leaves of features.json by name.
         splits: name -> the shards that are there, in order.
-        name, version: of the dataset, empty when not stated.
-        problems: what does not fit together, a sentence each.
+        name, version: of the dataset; empty when not stated.
+        problems: contradictions in the dataset, one sentence each.
     """
 
     uri: str
@@ -53,7 +53,7 @@ class Folder:
 
     @cached_property
     def step_features(self) -> dict[str, Feature]:
-        """Features over the steps by their path inside a step; by their name where there is no `steps`."""
+        """Return the features over the steps by their path in a step; without `steps`, by their name."""
         inside = {
             name.removeprefix("steps/"): leaf
             for name, leaf in self.features.items()
@@ -63,11 +63,11 @@ class Folder:
 
     @property
     def remote(self) -> bool:
-        """Whether every look into a file is a request over the network."""
+        """Check whether every read of a file is a request over the network."""
         return not is_local(self.files)
 
     def framing(self, shard: Shard, limit: int = -1) -> Framing:
-        """Where the shard's records lie; of a remote shard the first `limit` at least, -1 for all.
+        """Return where the shard's records lie; for a remote shard at least the first `limit`, -1 for all.
 
         Raises:
             SourceError: it cannot be read, or has more records than dataset_info.json says.
@@ -85,10 +85,10 @@ class Folder:
         return frames
 
     def believe(self, shard: Shard, most: int) -> None:
-        """Refuse what dataset_info.json says of a shard that cannot have so many records.
+        """Refuse a record count in dataset_info.json that is too high for the shard.
 
         Raises:
-            SourceError: it says more than `most`.
+            SourceError: it states more than `most` records, and more than 10,000.
         """
         if shard.records is not None and shard.records > max(most, LISTED):
             raise SourceError(
@@ -98,7 +98,7 @@ class Folder:
             )
 
     def records(self, shard: Shard) -> RecordFile:
-        """The shard's file.
+        """Return the shard's file.
 
         Raises:
             SourceError: it is not there, or the file system does not answer.
@@ -106,11 +106,11 @@ class Folder:
         return open_records(self.files, shard.path)
 
     def leaves(self, shard: Shard) -> bool:
-        """Whether the shard is a link to something outside the dataset's folder."""
+        """Check whether the shard is a link to a file outside the dataset's folder."""
         return not self.remote and leaves(Path(shard.path), Path(self.root))
 
     def example(self, episode_id: str) -> tuple[Example, str]:
-        """The record of an episode, parsed; and the path of its shard.
+        """Return an episode's parsed record and the path of its shard.
 
         Raises:
             EpisodeError: there is no such episode, or its bytes are damaged or missing.
@@ -132,7 +132,7 @@ class Folder:
         return Example(self.records(shard).read(position, episode_id), episode_id), shard.path
 
     def counted(self, shard: Shard) -> int:
-        """How many episodes the shard should have; a record cut off at the end counts."""
+        """Count the episodes that the shard should have; a record cut off at the end counts."""
         if shard.records is not None:
             return shard.records
         frames = self.framing(shard)
@@ -140,14 +140,15 @@ class Folder:
 
 
 def episode_id(split: str, index: int) -> str:
-    """For example train/000012."""
+    """Return an episode's id, for example train/000012."""
     return f"{split}/{index:06d}"
 
 
 def open_folder(uri: str) -> Folder:
-    """The TFDS dataset at `uri`: its version folder, a folder above with one version, or one of its shards.
+    """Open the TFDS dataset at `uri`, which is cached for the process.
 
-    Kept for the process: a local one while its descriptions stay the same, a remote one for good.
+    The URI is a version folder, a folder above with one version, or one shard of the dataset. A local folder
+    is cached while its descriptions stay the same, a remote one for good.
 
     Raises:
         SourceError: there is none, or its description cannot be read.
@@ -173,7 +174,7 @@ def _find(uri: str) -> Folder:
 
 
 def _file_system(uri: str) -> tuple[Any, str]:
-    if "://" not in uri:  # a path, whatever signs of a chain of file systems stand in it
+    if "://" not in uri:  # a plain path, even where it contains fsspec's signs for chained file systems
         return fsspec.filesystem("file"), str(Path(uri).expanduser().absolute())
     try:
         files, path = file_system(uri)
@@ -183,7 +184,7 @@ def _file_system(uri: str) -> tuple[Any, str]:
 
 
 def _stamp(files: Any, path: str) -> str:
-    """Changes when a local file or folder does."""
+    """Return a text that changes when a local file or folder does; empty for a remote one."""
     try:
         return str(Path(path).stat().st_mtime_ns) if is_local(files) else ""
     except FileNotFoundError:
@@ -191,7 +192,7 @@ def _stamp(files: Any, path: str) -> str:
 
 
 def _version_folder(uri: str, files: Any, path: str) -> str:
-    """The folder with features.json, at most two below `path` (configuration and version)."""
+    """Return the folder with features.json, at most two levels below `path` (configuration and version)."""
     if _is_described(files, path):
         return path
     if not files.exists(path) and not is_listless(files):
@@ -212,7 +213,7 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
 def _is_described(files: Any, path: str) -> bool:
     if not is_listless(files):
         return bool(files.isfile(f"{path}/features.json"))
-    try:  # isfile() of a web server takes a lost connection for a missing file
+    try:  # on a web server, isfile() reports a lost connection as a missing file
         files.cat_file(f"{path}/features.json", start=0, end=1)
     except FileNotFoundError:
         return False
@@ -220,18 +221,18 @@ def _is_described(files: Any, path: str) -> bool:
 
 
 def _described(files: Any, path: str) -> list[str]:
-    """Every features.json one or two folders below `path`."""
+    """Return the paths of all features.json one or two folders below `path`."""
     patterns = ("*/features.json", "*/*/features.json")
     if is_listless(files):
         return []
-    if is_local(files):  # the signs of patterns may stand in its name
+    if is_local(files):  # its name may contain the wildcards of patterns
         return [str(found) for pattern in patterns for found in sorted(Path(path).glob(pattern))]
     return [str(found) for pattern in patterns for found in files.glob(f"{path}/{pattern}")]
 
 
 @lru_cache(maxsize=64)
 def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], pid: int) -> Folder:
-    """See `open_folder`; kept while the folder is unchanged, and not across a fork."""
+    """Make the folder of `open_folder`; the cache holds while the folder is unchanged, not across a fork."""
     described = _text(files, root, "features.json")
     if described is None:
         raise SourceError(uri, "has no features.json", "copy it from where the records are from")
@@ -251,7 +252,7 @@ def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], p
         raise SourceError(
             uri, "holds ArrayRecord files, which are read from this machine's disks only", "copy it here"
         )
-    if only:  # the others were left out on purpose
+    if only:  # the user chose one shard: the others are not missing
         problems = []
     folder = Folder(
         uri,
@@ -272,7 +273,7 @@ def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], p
 
 
 def _text(files: Any, root: str, name: str) -> str | None:
-    """A description in the folder, None where it has none."""
+    """Return the text of a description in the folder; None where there is no such file."""
     path = f"{root}/{name}"
     if is_local(files) and leaves(Path(path), Path(root)):
         raise SourceError(path, "is a link to a file outside its folder", "copy the file in")
@@ -284,7 +285,7 @@ def _text(files: Any, root: str, name: str) -> str | None:
 
 
 def _info(files: Any, root: str) -> dict[str, Any]:
-    """dataset_info.json, empty when there is none."""
+    """Return the content of dataset_info.json; empty where there is none."""
     path = f"{root}/dataset_info.json"
     text = _text(files, root, "dataset_info.json")
     try:
@@ -302,7 +303,7 @@ def _info(files: Any, root: str) -> dict[str, Any]:
 
 
 def _are_splits(splits: Any) -> bool:
-    """Whether they have the form TFDS gives them; what they say is not looked at."""
+    """Check whether the splits have the form that TFDS writes; their values are not checked."""
     return isinstance(splits, list) and all(
         isinstance(split, dict)
         and isinstance(split.get("filepathTemplate") or split.get("filepath_template") or "", str)
@@ -312,7 +313,7 @@ def _are_splits(splits: Any) -> bool:
 
 
 def _placed(folder: Folder, shards: list[Shard]) -> tuple[Shard, ...]:
-    """The shards with `first` set, counting where dataset_info.json does not say."""
+    """Return the shards with `first` set; count the records where dataset_info.json does not state them."""
     if all(shard.records is not None for shard in shards):
         return tuple(shards)
     placed, first = [], 0

@@ -1,4 +1,4 @@
-"""What is in RLDS folders, without an embodiment: keys, lengths, what looks wrong."""
+"""Inspect RLDS folders without an embodiment: their keys, their lengths, and what looks wrong."""
 
 import math
 
@@ -11,11 +11,11 @@ from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.rlds.folder import Folder, open_folder
 from hma_data.sources.rlds.steps import MAX_VECTOR, Steps, is_camera
 
-INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20  # whose lengths are told
+INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20  # most episodes and bytes read for their lengths
 
 
 def inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
-    """See Source.inspect. Lengths are those of up to 1,000 episodes or 256 MiB.
+    """See Source.inspect. The lengths are those of up to 1,000 episodes or 256 MiB.
 
     Raises:
         SourceError: nothing readable there.
@@ -47,7 +47,7 @@ def inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
 def _survey(
     folder: Folder, refs: list[EpisodeRef], chosen: list[int], survey: Survey
 ) -> tuple[tuple[int, ...], Steps | None]:
-    """Lengths of the episodes read, and the first of them; those chosen are looked into."""
+    """Sample the chosen episodes; return the lengths of the episodes read, and the first of them."""
     wanted = set(chosen)
     others = (
         [] if folder.remote else [i for i in range(min(len(refs), INSPECTED_EPISODES)) if i not in wanted]
@@ -77,7 +77,7 @@ def _survey(
 
 
 def _look(steps: Steps, survey: Survey, pairs: int) -> None:
-    """One episode's numbers, times and some pictures."""
+    """Hand the numbers, times and some pictures of one episode to the survey."""
     for key, feature in steps.features.items():
         try:
             if is_camera(feature):
@@ -107,7 +107,7 @@ def _why(survey: Survey, folder: Folder) -> str:
 
 
 def facts(folder: Folder) -> dict[str, str]:
-    """What is worth a line about the dataset."""
+    """Return facts about the dataset: name, version, splits, and the keys outside the steps."""
     found = {"dataset": folder.name, "version": folder.version}
     found["splits"] = ", ".join(
         f"{name} {sum(folder.counted(shard) for shard in shards)}" for name, shards in folder.splits.items()
@@ -118,7 +118,7 @@ def facts(folder: Folder) -> dict[str, str]:
 
 
 def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
-    """One key as this episode holds it; as features.json states it where it cannot be read."""
+    """Describe one key as this episode holds it; as features.json states it where it cannot be read."""
     feature = steps.features[key]
     shape = tuple(size or 0 for size in (*feature.nesting[1:], *feature.shape))
     kind, codec = "other", None
@@ -133,7 +133,7 @@ def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
             shape = steps.numbers(key).shape[1:]
             kind = "vector" if math.prod(shape) <= MAX_VECTOR else "other"
     except EpisodeError as fault:
-        if feature.kind == "number" and feature.width is None:  # of any length, which is no fault
+        if feature.kind == "number" and feature.width is None:  # may have any length: not a fault
             survey.note(Finding("rows", "info", str(fault), key=key))
         else:
             survey.fault(f"{steps.name} {key}", fault)
@@ -141,7 +141,10 @@ def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
 
 
 def _codec(steps: Steps, key: str) -> str:
-    """By the first bytes of the first picture; TFDS keeps files as given, whatever features.json states."""
+    """Return the codec of a key's pictures, from the first bytes of the first one.
+
+    TFDS stores the files as they were given, whatever features.json states.
+    """
     if steps.features[key].kind != "picture":
         return "raw"
     head = bytes(steps.blobs(key)[0][:8])

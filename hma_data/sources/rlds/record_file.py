@@ -1,6 +1,6 @@
-"""A file of records, TFRecord or ArrayRecord: how many, and the bytes of any of them.
+"""Read a file of records, TFRecord or ArrayRecord: count the records, and return any of them.
 
-The index is made once, kept on disk (see `record_index`) and grown as far as is asked for.
+The index is made once and kept on disk (see `record_index`); it grows only as far as it is needed.
 """
 
 import os
@@ -18,12 +18,12 @@ from hma_data.sources.rlds.array_record import scan as scan_array_record
 from hma_data.sources.rlds.record_index import EMPTY, Framing, drop_index, load_index, save_index
 from hma_data.storage.fetch import attempt, info, is_local, mark, protocol
 
-KEPT_FROM = 64  # records of a local file; fewer are found again as fast as an index is read
-KEPT_EVERY = 32  # records by which the index of a remote file has grown
+KEPT_FROM = 64  # least records of a local file for an index on disk; fewer are scanned just as fast
+KEPT_EVERY = 32  # new records after which the index of a remote file is written again
 
 
 class RecordFile:
-    """One file, as long as its size and date stay the same.
+    """One record file in one state: the object is valid while the file's size and date stay the same.
 
     Args:
         files: the fsspec file system.
@@ -41,10 +41,10 @@ class RecordFile:
         self._lock = RLock()
 
     def framing(self, limit: int = -1) -> Framing:
-        """Where the records lie; of a remote file the first `limit` at least, -1 for all.
+        """Return where the records lie; for a remote file at least the first `limit`, -1 for all.
 
         Raises:
-            SourceError: the file cannot be read, or is none of its format.
+            SourceError: the file cannot be read, or is not of its format.
         """
         with self._lock:
             if not self._enough(limit) and not self._asked:
@@ -56,7 +56,7 @@ class RecordFile:
             return self._frames
 
     def read(self, index: int, where: str) -> bytes:
-        """The data of a record, its checksum verified.
+        """Return the data of a record, with its checksum verified.
 
         Args:
             where: the episode, for the error.
@@ -107,7 +107,7 @@ class RecordFile:
 
     @property
     def _mark(self) -> str:
-        """With a sample of content, where that costs little."""
+        """Return the file's stamp; for a local file also a sample of its content, which costs little."""
         if not is_local(self._files):
             return self._stamp
         return f"{self._stamp} {attempt(self._files, self._path, self._sample)}"
@@ -117,12 +117,14 @@ class RecordFile:
 
 
 def is_array_record(path: str) -> bool:
-    """By its name: toy-train.array_record-00000-of-00001."""
+    """Check for an ArrayRecord file by its name, such as toy-train.array_record-00000-of-00001."""
     return re.search(r"\.array_?record\b", path.rsplit("/", 1)[-1]) is not None
 
 
 def open_records(files: Any, path: str) -> RecordFile:
-    """The file, kept for the process: a local one while size and date stay the same, a remote one for good.
+    """Return the record file at a path.
+
+    It is cached for the process: a local file while its size and date stay the same, a remote one for good.
 
     Raises:
         SourceError: it is not there, or the file system does not answer.

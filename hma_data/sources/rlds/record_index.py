@@ -1,9 +1,9 @@
-"""Where the records of a file lie, and the same kept on disk for the next process that opens it.
+"""Keep on disk where the records of a file lie, for the next process that opens the file.
 
-An index is derived and never trusted blindly: it is bound to the file's path, size and mark
-(date, ETag, and of local files a sample of content), carries its own checksum, and each record read by it is
-checked against the file. A damaged, stale or foreign one is made again. It lies in
-`$HMA_CACHE/rlds`, by default `~/.cache/hma/rlds`; deleting it costs a scan.
+An index is derived data and is always verified. It is bound to the file's path, size and mark (date, ETag,
+and for local files a sample of the content). It carries its own checksum, and each record read through it
+is checked against the file. A damaged, stale or foreign index is made again. Indexes lie in
+`$HMA_CACHE/rlds`, by default `~/.cache/hma/rlds`; deleting one costs a new scan.
 
 N records.
 """
@@ -33,13 +33,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Framing:
-    """Where the records of a file lie.
+    """The positions of the records of a file.
 
     Attributes:
         offsets: (N,) int64, first byte of each record's data; in an ArrayRecord file the record's number.
         lengths: (N,) int64, bytes of data.
         checks: (N,) uint32, checksum of the data as stored.
-        fault: why nothing could be read after the last record; empty when the file ends there.
+        fault: why reading stopped after the last record; empty where the file ends there.
         whole: whether the file was read to its end (or to `fault`).
     """
 
@@ -53,7 +53,7 @@ class Framing:
         return len(self.offsets)
 
     def fingerprint(self, index: int) -> str:
-        """Twenty-four hex digits that change with the record's content."""
+        """Return 24 hex digits that change with the record's content."""
         return f"{int(self.lengths[index]):016x}{int(self.checks[index]):08x}"
 
 
@@ -61,7 +61,7 @@ EMPTY = Framing(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uin
 
 
 def index_path(path: str, mark: str) -> Path:
-    """Where the index of a file is kept.
+    """Return the path at which the index of a file is kept.
 
     Args:
         path: of the file, with its protocol.
@@ -72,7 +72,7 @@ def index_path(path: str, mark: str) -> Path:
 
 
 def load_index(path: str, mark: str, size: int) -> Framing | None:
-    """The index kept of a file; None when there is none that fits and is whole.
+    """Return the index kept for a file; None where there is none that is whole and fits the file.
 
     Args:
         size: bytes of the file.
@@ -92,7 +92,7 @@ def load_index(path: str, mark: str, size: int) -> Framing | None:
 
 
 def save_index(path: str, mark: str, frames: Framing) -> None:
-    """Keep an index; what cannot be written is not kept."""
+    """Write an index to disk; log a failure and continue without it."""
     place = index_path(path, mark)
     about = json.dumps(
         {"path": path, "mark": mark, "fault": frames.fault, "whole": frames.whole}, sort_keys=True
@@ -112,7 +112,7 @@ def save_index(path: str, mark: str, frames: Framing) -> None:
 
 
 def drop_index(path: str, mark: str) -> None:
-    """Forget what was kept of a file."""
+    """Delete the index kept for a file."""
     try:
         index_path(path, mark).unlink(missing_ok=True)
     except OSError as fault:
@@ -143,7 +143,7 @@ def _parse(data: bytes, path: str, mark: str) -> Framing | None:
 
 
 def _fits(frames: Framing, size: int) -> bool:
-    """Whether every record lies inside a file of that size, and they ascend."""
+    """Check whether the records ascend and all lie inside a file of that size."""
     if not len(frames):
         return True
     inside = frames.offsets.min() >= 0 and frames.lengths.min() >= 0 and frames.offsets.max() < size

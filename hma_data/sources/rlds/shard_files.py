@@ -1,7 +1,7 @@
-"""Which files are the shards of a TFDS dataset's splits, and how many records each should have.
+"""Find the shards of a TFDS dataset's splits, and how many records each should have.
 
-`dataset_info.json` names them by a template and says how many records each has; without it, and in a
-dataset that was renamed, they are known by their names.
+`dataset_info.json` names the shards by a template and gives the number of records of each. Without that file,
+or in a renamed dataset, shards are found by their file names.
 """
 
 import re
@@ -14,7 +14,7 @@ from hma_data.errors import SourceError
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 FORMATS = ("tfrecord", "array_record")
 NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
-NAMED = (  # the suffix after the number, or before it as TFDS writes it
+NAMED = (  # forms of file names: the suffix after the number, or before it as TFDS writes it
     re.compile(rf"(?P<stem>.+?)[-_]{NUMBER[1:]}\.(?:tfrecord|array_record)"),
     re.compile(rf"(?P<stem>.+)\.(?:tfrecord|array_record)(?:{NUMBER})?"),
 )
@@ -27,7 +27,7 @@ class Shard:
     Attributes:
         path: on the folder's file system.
         number: its place in the split.
-        records: how many dataset_info.json states, None where it does not.
+        records: how many dataset_info.json states; None where it states none.
         first: index within the split of its first record.
     """
 
@@ -40,7 +40,7 @@ class Shard:
 def stated_shards(
     root: str, info: dict[str, Any], listing: list[str] | None
 ) -> tuple[dict[str, list[Shard]], list[str]]:
-    """The shards dataset_info.json names, with `first` set; those that are not there are left out."""
+    """Return the existing shards that dataset_info.json names, with `first` set, and what is missing."""
     there = None if listing is None else set(listing)
     shards: dict[str, list[Shard]] = {}
     problems, absent = [], []
@@ -97,7 +97,10 @@ def _missing(split: str, missing: int, shards: int) -> str:
 def named_shards(
     root: str, listing: Iterable[str], info: dict[str, Any]
 ) -> tuple[dict[str, list[Shard]], list[str]]:
-    """Shards found by their names alone: a dataset renamed, or without dataset_info.json."""
+    """Return the shards found by their names alone, and what is missing.
+
+    This serves a renamed dataset, or one without dataset_info.json.
+    """
     stated = {str(split.get("name")): _counts(split) for split in info.get("splits", [])}
     shards: dict[str, list[Shard]] = {}
     totals: dict[str, int] = {}
@@ -122,7 +125,7 @@ def named_shards(
 
 
 def _split_of(stem: str, info: dict[str, Any], stated: Iterable[str]) -> str:
-    """The split a file's name tells, train of toy-train; it may have hyphens itself."""
+    """Return the split in a file's name, e.g. train of toy-train; a split's name may have hyphens itself."""
     for split in sorted(stated, key=len, reverse=True):
         if stem == split or stem.endswith(f"-{split}"):
             return split

@@ -1,9 +1,8 @@
-"""RLDS / Open X-Embodiment: TFDS folders read without TensorFlow.
+"""Read RLDS / Open X-Embodiment datasets: TFDS folders, without TensorFlow.
 
-An episode is one record, a tf.train.Example whose `steps/…` features run over the steps. Keys of
-an embodiment are paths inside a step (`observation/image`, `action/world_vector`); an episode's id is
-its split and its place there (`train/000012`). Pictures are decoded when asked for, numbers when
-an episode is read.
+An episode is one record, a tf.train.Example whose `steps/…` features run over the steps. The keys of an
+embodiment are paths inside a step (`observation/image`, `action/world_vector`). An episode's id is its split
+and its index in the split (`train/000012`). Numbers are decoded when an episode is read, pictures on demand.
 
 T steps, H×W pixels.
 """
@@ -33,18 +32,18 @@ from hma_data.sources.rlds.tf_example import Example
 from hma_data.storage.fetch import info, mark
 from hma_data.storage.paths import StrPath, as_text
 
-SAMPLED_SHARDS, SAMPLED_REMOTE = 16, 2  # whose first record is read to estimate lengths
+SAMPLED_SHARDS, SAMPLED_REMOTE = 16, 2  # shards whose first record is read to estimate lengths
 
 log = logging.getLogger(__name__)
 
 
 def open() -> "RldsSource":
-    """The source; see `hma_data.sources.base.Source`."""
+    """Return the source; see `hma_data.sources.base.Source`."""
     return RldsSource()
 
 
 class RldsSource:
-    """Reads TFDS folders in the RLDS form."""
+    """Read TFDS folders in the RLDS form."""
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """See Source."""
@@ -53,11 +52,11 @@ class RldsSource:
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """See Source. Frames are estimated from the records' bytes.
 
-        With `source.split` only that split is indexed and refs carry no split; so they do where the
-        dataset has one split only. Otherwise `train` is "train" and any other "val".
+        With `source.split`, only that split is indexed and refs carry no split. They carry none either where
+        the dataset has only one split. Otherwise `train` becomes "train" and every other split "val".
 
         Raises:
-            SourceError: nothing readable there, no such split, or the embodiment's keys are not there.
+            SourceError: nothing readable is there, no such split, or the embodiment's keys are not there.
         """
         uri = as_text(uri)
         folder = open_folder(uri)
@@ -119,7 +118,7 @@ class RldsSource:
 
 
 def _refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
-    """The episodes of a shard; those that are cut off or missing have no fingerprint."""
+    """Return the episodes of a shard; an episode that is cut off or missing has no fingerprint."""
     if folder.remote and shard.records:
         return _remote_refs(folder, split, shard, own, rate)
     frames = folder.framing(shard)
@@ -133,7 +132,7 @@ def _refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float
 
 
 def _remote_refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
-    """Without a look at each record, from what the file system knows of the shard."""
+    """Return the episodes of a remote shard from its size and mark alone; no record is read."""
     found = info(folder.files, shard.path)
     folder.believe(shard, found["size"])
     fingerprint = hashlib.sha256(mark(found).encode()).hexdigest()[:24]
@@ -146,7 +145,7 @@ def _remote_refs(folder: Folder, split: str, shard: Shard, own: str | None, rate
 
 
 def steps_per_byte(folder: Folder, split: str) -> float:
-    """Steps a byte of record, from the first record of some of a split's shards; 0 when none can be read."""
+    """Return steps a byte, from the first record of some of a split's shards; 0 when none can be read."""
     shards = folder.splits[split]
     steps = size = 0
     sampled = SAMPLED_REMOTE if folder.remote else SAMPLED_SHARDS
@@ -159,7 +158,7 @@ def steps_per_byte(folder: Folder, split: str) -> float:
             steps += Steps(folder, Example(data, name), name).count
             size += len(data)
         except EpisodeError as fault:
-            log.warning("%s: %s", folder.uri, fault)  # counted again, and quarantined, when it is read
+            log.warning("%s: %s", folder.uri, fault)  # reading it fails again, and it is quarantined
     return steps / size if size else 0.0
 
 
@@ -167,7 +166,7 @@ def steps_per_byte(folder: Folder, split: str) -> float:
 
 
 def check_keys(folder: Folder, embodiment: Embodiment) -> None:
-    """That features.json has what the embodiment names, as wide as it says.
+    """Check that features.json has the embodiment's keys, with the stated widths.
 
     Raises:
         SourceError: a key is missing, of another kind, or of another width.

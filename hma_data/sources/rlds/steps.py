@@ -1,4 +1,4 @@
-"""What one RLDS episode holds: its columns, pictures, words and outcome.
+"""Read one RLDS episode: its columns, pictures, instruction and outcome.
 
 Keys are paths inside a step. T steps, H×W pixels.
 """
@@ -20,7 +20,7 @@ from hma_data.sources.rlds.folder import Folder
 from hma_data.sources.rlds.tf_example import Example
 
 INSTRUCTIONS = ("language_instruction", "natural_language_instruction")
-MAX_VECTOR = 4096  # wider than this is no action or state
+MAX_VECTOR = 4096  # most values of an action or a state
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +29,7 @@ class Steps:
     """One record and its columns over the steps.
 
     Args:
-        folder: it comes from.
+        folder: of the record.
         example: the record.
         name: the episode's id, for errors.
     """
@@ -40,28 +40,28 @@ class Steps:
         self.count = step_count(example, self.features, name)
 
     def numbers(self, key: str) -> NDArray[Any]:
-        """(T, …) of a key."""
+        """Return the values (T, …) of a key."""
         return column(self.example, self.features[key], self.count, self.name)
 
     def blobs(self, key: str) -> list[memoryview]:
-        """T byte strings of a key."""
+        """Return the T byte strings of a key."""
         return column_blobs(self.example, self.features[key], self.count, self.name)
 
     def text(self, key: str) -> str:
-        """The first text of a key; empty where the steps have none."""
+        """Return the first text of a key; empty where the steps have none."""
         feature = self.features[key]
         name = f"{feature.name}/ragged_flat_values"
         blobs = self.example.blobs(name) if name in self.example else self.blobs(key)
         return bytes(blobs[0]).decode(errors="replace") if blobs else ""
 
     def decoder(self, key: str) -> Decode:
-        """Step -> (H, W, 3) picture of a key."""
+        """Return a function that maps a step to the picture (H, W, 3) of a key."""
         feature = self.features[key]
         return _Encoded(self, key) if feature.kind == "picture" else _Raw(self, key)
 
 
 class _Encoded:
-    """Pictures kept as JPEG or PNG."""
+    """Pictures stored as JPEG or PNG."""
 
     def __init__(self, steps: Steps, key: str) -> None:
         self._blobs = steps.blobs(key)
@@ -72,7 +72,7 @@ class _Encoded:
 
 
 class _Raw:
-    """Pictures kept as tensors of uint8."""
+    """Pictures stored as tensors of uint8."""
 
     def __init__(self, steps: Steps, key: str) -> None:
         self._steps, self._key, self._feature = steps, key, steps.features[key]
@@ -91,7 +91,7 @@ class _Raw:
 
 
 def is_camera(feature: Feature) -> bool:
-    """Whether it gives a colour picture a step, encoded or as a tensor."""
+    """Check whether a feature holds a colour picture a step, encoded or as a tensor."""
     if feature.dtype != "uint8" or len(feature.nesting) != 1:
         return False
     return feature.kind == "picture" or (
@@ -100,17 +100,17 @@ def is_camera(feature: Feature) -> bool:
 
 
 def described(feature: Feature) -> str:
-    """What it is, for an error."""
+    """Return what a feature is, in words for an error."""
     if feature.kind == "picture":
         return "a sequence of pictures a step" if len(feature.nesting) > 1 else "a picture"
     return {"number": "a tensor", "text": "text"}.get(feature.kind, "a feature")
 
 
 def step_feature(folder: Folder, key: str) -> Feature:
-    """The feature of that path inside a step.
+    """Return the feature at a path inside a step.
 
     Raises:
-        SourceError: there is none, with the nearest keys.
+        SourceError: there is none; the error names the nearest keys.
     """
     found = folder.step_features
     if key in found:
@@ -124,15 +124,15 @@ def step_feature(folder: Folder, key: str) -> Feature:
 
 
 def listed(keys: Iterable[str]) -> str:
-    """At most forty keys, for an error."""
+    """Return at most forty keys, for an error."""
     return ", ".join(list(keys)[:40]) or "none"
 
 
-# -- words, success, metadata
+# -- instruction, success, metadata
 
 
 def text_feature(folder: Folder, key: str) -> Feature:
-    """The instruction's feature: inside the steps or, of the whole episode, outside them.
+    """Return the feature of the instruction, from inside the steps or from the whole episode.
 
     Raises:
         SourceError: there is none, or it is not text.
@@ -147,7 +147,7 @@ def text_feature(folder: Folder, key: str) -> Feature:
 
 
 def instruction(folder: Folder, steps: Steps, key: str | None) -> str:
-    """What was asked at the first step."""
+    """Return the instruction of the first step."""
     if key is None:
         places = [f"{place}{name}" for place in ("", "observation/") for name in INSTRUCTIONS]
         outside = [f"episode_metadata/{name}" for name in INSTRUCTIONS]
@@ -165,7 +165,10 @@ def instruction(folder: Folder, steps: Steps, key: str | None) -> str:
 
 
 def success(folder: Folder, steps: Steps) -> bool | None:
-    """As the episode says; else True where it ends in a rewarded terminal step; else unknown."""
+    """Return whether the episode succeeded, as it states itself; None where it is unknown.
+
+    Without a statement, an episode succeeds where its last step is terminal and has a positive reward.
+    """
     stated = folder.features.get("episode_metadata/success")
     if stated:
         value = scalar(steps.example, stated)
@@ -177,7 +180,7 @@ def success(folder: Folder, steps: Steps) -> bool | None:
 
 
 def metadata(folder: Folder, example: Example) -> dict[str, Any]:
-    """Single values outside the steps."""
+    """Return the single values outside the steps."""
     found = {
         name.removeprefix("episode_metadata/"): scalar(example, feature)
         for name, feature in folder.features.items()

@@ -1,8 +1,8 @@
-"""tf.train.Example read off its protobuf wire format, feature by feature, when asked for.
+"""Read a tf.train.Example from its protobuf wire format, one feature at a time, on demand.
 
-An Example maps names to lists of bytes, float32 or int64. Parsing finds where each list lies;
-numbers are decoded by NumPy and bytes stay views into the record, so what nobody asks for costs
-nothing. (Format: protobuf encoding; messages Example, Features, Feature of TensorFlow.)
+An Example maps names to lists of bytes, float32 or int64. Parsing only finds where each list lies. NumPy
+decodes the numbers, and byte strings stay views into the record, so a feature that is not read costs nothing.
+(Format: protobuf encoding; messages Example, Features, Feature of TensorFlow.)
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ Span = tuple[int, int]
 
 
 class WireError(ValueError):
-    """The bytes are not the protobuf message they should be."""
+    """Raised where bytes are not the protobuf message they should be."""
 
 
 class Example:
@@ -45,30 +45,30 @@ class Example:
 
     @property
     def size(self) -> int:
-        """Bytes of the record."""
+        """Return the number of bytes of the record."""
         return len(self._data)
 
     def names(self) -> list[str]:
-        """Of all features."""
+        """Return the names of all features."""
         return list(self._lists)
 
     def blobs(self, name: str) -> list[memoryview]:
-        """The byte strings of a feature, as views into the record."""
+        """Return the byte strings of a feature, as views into the record."""
         view = memoryview(self._data)
         return [view[start:stop] for _, (start, stop) in self._items(name, "bytes")]
 
     def count(self, name: str) -> int:
-        """How many byte strings a feature has."""
+        """Count the byte strings of a feature."""
         return len(self._items(name, "bytes"))
 
     def numbers(self, name: str) -> NDArray[np.float32] | NDArray[np.int64]:
-        """The (n,) numbers of a feature, float32 or int64 as stored."""
+        """Return the (n,) numbers of a feature, float32 or int64 as stored."""
         if self._list(name)[0] == "float":
             return self._joined(name, "float", FIXED32, np.dtype("<f4"))
         return self.ints(name)
 
     def ints(self, name: str) -> NDArray[np.int64]:
-        """The (n,) integers of a feature."""
+        """Return the (n,) integers of a feature."""
         return self._joined(name, "int", VARINT, np.dtype(np.int64))
 
     def _joined(self, name: str, kind: str, single: int, dtype: np.dtype) -> NDArray:
@@ -108,10 +108,10 @@ class Example:
 
 
 def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Packed varints -> int64, without a loop over them.
+    """Decode packed varints to int64, without a loop over them.
 
     Raises:
-        ValueError: the last is cut off, or one is longer than ten bytes.
+        WireError: the last is cut off, or one is longer than ten bytes.
     """
     last = np.flatnonzero(data < 0x80)
     if len(last) == len(data):
@@ -131,7 +131,7 @@ def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def _features(data: bytes) -> Iterator[tuple[str, tuple[str, Span]]]:
-    """(name, (kind, where its list lies)) of each feature: Example.features.feature entries."""
+    """Yield (name, (kind, span of its list)) of each feature: the entries of Example.features.feature."""
     for number, wire, (start, stop) in fields(data, 0, len(data)):
         if number != 1 or wire != BYTES:
             continue
@@ -141,7 +141,7 @@ def _features(data: bytes) -> Iterator[tuple[str, tuple[str, Span]]]:
 
 
 def _entry(data: bytes, start: int, stop: int) -> tuple[str, tuple[str, Span]]:
-    """A map entry: key 1, value 2."""
+    """Parse a map entry: key 1, value 2."""
     name, value = "", ("empty", (start, start))
     for number, wire, span in fields(data, start, stop):
         if wire == BYTES and number == 1:
@@ -154,7 +154,7 @@ def _entry(data: bytes, start: int, stop: int) -> tuple[str, tuple[str, Span]]:
 
 
 def fields(data: bytes, position: int, end: int) -> Iterator[tuple[int, int, Span]]:
-    """(field number, wire type, span of its payload) of each field of a message.
+    """Yield (field number, wire type, span of its payload) of each field of a message.
 
     Raises:
         WireError: it is no message.
@@ -177,7 +177,7 @@ def fields(data: bytes, position: int, end: int) -> Iterator[tuple[int, int, Spa
 
 
 def varint(data: bytes, position: int, end: int) -> tuple[int, int]:
-    """(value, position after it).
+    """Return (value, position after it).
 
     Raises:
         WireError: it is cut off, or longer than ten bytes.

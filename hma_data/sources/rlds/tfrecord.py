@@ -1,9 +1,9 @@
-"""TFRecord files: where each record lies, and its bytes, checked.
+"""Find and read the records of TFRecord files, with their checksums verified.
 
-A record is its length (uint64), the masked CRC-32C of those eight bytes, the data, and the
-masked CRC-32C of the data; all little endian (format: TensorFlow's TFRecord). Scanning reads
-28 bytes a record, so any record of a large file is found without reading those before it; of a
-remote file it reads no further than the record that is asked for.
+A record is its length (uint64), the masked CRC-32C of those eight bytes, the data, and the masked CRC-32C
+of the data; all little endian (format: TensorFlow's TFRecord). A scan needs only the length and the
+checksums, 16 bytes a record, so any record of a large file is found without reading the data of the
+others. A remote file is read no further than the record that is asked for.
 """
 
 import os
@@ -21,25 +21,25 @@ from hma_data.storage.fetch import attempt, fetch, is_local
 
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
-READ_AHEAD = 32 << 10  # bytes a request brings while records are shorter than that
+READ_AHEAD = 32 << 10  # bytes of one request, while records are shorter than that
 MAX_RECORD = 2**31  # protobuf's own limit
-Read = Callable[[int, int], bytes]  # (start, end) -> the bytes there are
+Read = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
 
 
 def masked_crc(data: Any) -> int:
-    """CRC-32C of the data, rotated by 15 bits and shifted by a constant as TFRecord stores it."""
+    """Return TFRecord's masked CRC-32C: rotated right by 15 bits, with a constant added."""
     crc = google_crc32c.value(data)
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
 def scan(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
-    """The framing of a file, from where `known` ends.
+    """Return the framing of a file; begin where `known` ends.
 
     Args:
         files: the fsspec file system.
         path: on it.
         size: bytes of the file.
-        limit: stop after so many records; -1 for none.
+        limit: stop after this many records; -1 for all.
 
     Raises:
         SourceError: the file cannot be read, or is not a TFRecord file at all.
@@ -62,7 +62,7 @@ def scan(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = 
 def _walk(
     read: Read, position: int, size: int, limit: int, found: tuple[list[int], list[int], list[int]], path: str
 ) -> str:
-    """Append offset, length and checksum of each record from `position` on; why it ended early."""
+    """Append the offset, length and checksum of each record from `position` on; return why it ended early."""
     offsets, lengths, checks = found
     header = read(position, position + HEADER.size) if position < size else b""
     if not position and header[:2] == b"\x1f\x8b":
@@ -84,7 +84,7 @@ def _walk(
 
 @contextmanager
 def reader(files: Any, path: str, size: int) -> Iterator[Read]:
-    """Small reads of a file: of a local one at any place, of a remote one with some read-ahead."""
+    """Yield a function that reads parts of a file: a local one directly, a remote one with read-ahead."""
     if not is_local(files):
         yield _Window(files, path, size)
         return
@@ -96,7 +96,7 @@ def reader(files: Any, path: str, size: int) -> Iterator[Read]:
 
 
 class _Window:
-    """Reads of a remote file, through the last range that was fetched."""
+    """Read a remote file through the last range that was fetched."""
 
     def __init__(self, files: Any, path: str, size: int) -> None:
         self._files, self._path, self._size = files, path, size
@@ -112,7 +112,7 @@ class _Window:
 
 
 def _record_length(header: bytes, position: int, size: int) -> tuple[int, str]:
-    """Length of the record that begins at `position`, or why it cannot be known."""
+    """Return the length of the record at `position`, and why it cannot be known (else empty)."""
     if len(header) < HEADER.size:
         return 0, f"cut off at byte {size}, within the header of the record at byte {position}"
     length, check = HEADER.unpack(header)
@@ -126,13 +126,13 @@ def _record_length(header: bytes, position: int, size: int) -> tuple[int, str]:
 
 
 def read_record(files: Any, path: str, frames: Framing, index: int, where: str) -> bytes:
-    """The data of one record, its length and its bytes checked against what the file says itself.
+    """Return the data of one record; check its length and data against the checksums in the file.
 
     Args:
         where: the episode, for the error.
 
     Raises:
-        EpisodeError: it is not where the framing says, or fails its checksum.
+        EpisodeError: no record is where the framing says, or its checksum fails.
         SourceError: the network fails.
     """
     offset, length = int(frames.offsets[index]), int(frames.lengths[index])
