@@ -1,1 +1,1 @@
-"""How work units are run: here, in processes, on a cluster. The units and their outputs are the same."""
+"""Run work units: in this process, in several, or on a cluster. Units and outputs are the same in each."""
