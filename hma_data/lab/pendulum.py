@@ -64,7 +64,7 @@ class Pendulum:
         environment, surface, clock = _simulator()
         self._env = environment(render_mode="rgb_array")
         self._env.screen_dim = DRAWN
-        self._env.screen, self._env.clock = surface((DRAWN, DRAWN)), clock()  # otherwise it opens a display
+        self._env.screen, self._env.clock = surface((DRAWN, DRAWN)), clock()  # or it looks for a display
         self._env.reset(seed=0)
         self._env.state = np.array([angle, speed])
 

@@ -65,7 +65,7 @@ class Tee:
 
     @cached_property
     def contacts(self) -> tuple[Floats, Floats]:
-        """Return points (C, 2) on the outline that a pusher can reach, and their inward normals (C, 2)."""
+        """Return points (C, 2) on the outline with room for a pusher, and their inward normals (C, 2)."""
         points, normals = [], []
         for low, high in self.boxes:
             for axis in (0, 1):
@@ -253,7 +253,7 @@ class Planned:
         self._phases: list[tuple[Floats, bool]] = []  # remaining way points, and whether the pusher is up
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Return setpoint and height; see Policy."""
+        """Return the setpoint and whether the pusher is up; see Policy."""
         if not self._phases:
             push = plan(self._tee, pose, self._goal, agent, self._speed, self._fly, self._rng)
             self._phases = [(push.path, self._fly), (push.end[None], False), (push.retreat[None], False)]
@@ -275,7 +275,7 @@ class Wandering:
         self._speed, self._up = 0.0, False
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Return setpoint and height; see Policy."""
+        """Return the setpoint and whether the pusher is up; see Policy."""
         if not len(self._way):
             near = self._rng.random() < 0.7
             point = pose[:2] + self._rng.normal(0, 60, 2) if near else self._rng.uniform(LOW, HIGH, 2)

@@ -250,9 +250,9 @@ _NUMPY = {"halffloat": "float16", "float": "float32", "double": "float64"}  # wh
 
 
 def _flat(array: pa.Array) -> NDArray[Any]:
-    """Convert as array.to_numpy does, but without pandas.
+    """Convert as array.to_numpy does, but avoid its import of pandas for plain numbers and bools.
 
-    If pandas is installed, array.to_numpy imports it, which takes a second, and 50 MB in each worker.
+    If pandas is installed, that import takes a second, and 50 MB in each worker.
     """
     name = str(array.type)
     plain = pa.types.is_integer(array.type) or pa.types.is_floating(array.type)

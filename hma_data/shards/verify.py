@@ -95,7 +95,7 @@ def check_shard(folder: Path, shard: ShardFile, manifest: Manifest, quick: bool)
 
 
 def _whose(path: Path, manifest: Manifest) -> str:
-    """Return a phrase that says a shard is of another run; empty if it is of this one or cannot be read."""
+    """Return a phrase that marks a shard of another run; empty if it is of this run or cannot be read."""
     try:
         plan = read_footer(path, str(path))[0].plan
     except HMAError:

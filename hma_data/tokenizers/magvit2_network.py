@@ -1,8 +1,8 @@
 """Define the network of Open-MAGVIT2: a convolutional autoencoder whose latents are reduced to their signs.
 
 Parameter names are those of the released checkpoints, so that the checkpoints load unchanged. The first
-checkpoints (1X's among them) have a plain decoder. In later ones, the mean and spread of the code
-normalise each stage of the decoder (`adaptive`). Lookup-free quantisation: Yu et al. 2024.
+checkpoints (1X's among them) have a plain decoder. In later ones (`adaptive`), each stage of the decoder
+has a group norm whose scale and shift come from the code. Lookup-free quantisation: Yu et al. 2024.
 
 B pictures, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
 """

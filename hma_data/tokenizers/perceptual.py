@@ -41,7 +41,7 @@ def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
         )
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # its use of torchvision's old arguments
+            warnings.simplefilter("ignore")  # it uses torchvision's old arguments
             network = lpips.LPIPS(net="alex", verbose=False).to(device).eval()
     except OSError as fault:
         raise MissingDependencyError(

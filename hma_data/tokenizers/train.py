@@ -232,7 +232,7 @@ def _optimizers(network: Autoencoder, recipe: TrainingRecipe) -> list[torch.opti
 def _latent_penalty(latents: Tensor) -> Tensor:
     """Return a penalty that keeps latents at zero mean, unit variance and short tails.
 
-    There the squashing still has a gradient.
+    In that range the squashing still has a gradient.
     """
     per_channel = latents.transpose(0, 1).flatten(1)
     spread = (per_channel.var(1) - 1).square().mean() + per_channel.mean(1).square().mean()
