@@ -1,8 +1,9 @@
-"""Benchmarks: `hma bench NAME [key=value …]`, one module each.
+"""Run benchmarks: `hma bench NAME [key=value …]`, one module each.
 
-A module of a benchmark states `ABOUT` (a line), `DEFAULTS` (its settings) and
-`run(settings) -> results`: one mapping for each case, with what differs and the figures, each named with
-its unit (`frames_per_second`, `peak_rss_mib`). Input is generated; nothing is downloaded.
+The module of a benchmark defines `ABOUT` (one line), `DEFAULTS` (its settings) and
+`run(settings) -> results`. The results are one mapping for each case: the values that distinguish the case,
+and the figures, each named with its unit (`frames_per_second`, `peak_rss_mib`). Input is
+generated; nothing is downloaded.
 """
 
 import os
@@ -26,21 +27,21 @@ BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
 
 
 class Bench(Protocol):
-    """What a module of a benchmark has."""
+    """The attributes of a benchmark's module."""
 
     ABOUT: str
     DEFAULTS: dict[str, Any]
 
     def run(self, settings: dict[str, Any]) -> list[dict[str, Any]]:
-        """Measure; `settings` are DEFAULTS with what was asked for."""
+        """Measure and return the results; `settings` are DEFAULTS with the user's changes."""
         ...
 
 
 def load(name: str) -> Bench:
-    """The benchmark of that name.
+    """Return the benchmark of that name.
 
     Raises:
-        UsageError: there is none.
+        UsageError: there is no such benchmark.
     """
     if name not in BENCHES:
         raise UsageError(
@@ -51,10 +52,10 @@ def load(name: str) -> Bench:
 
 
 def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, Any]:
-    """DEFAULTS with `key=value` words, each value of its default's type.
+    """Return DEFAULTS changed by `key=value` words; each value has the type of its default.
 
     Raises:
-        UsageError: no such setting, or a value that is not of its type.
+        UsageError: there is no such setting, or a value is not of its type.
     """
     from hma_data.storage.yaml_io import parse_yaml
 
@@ -74,12 +75,12 @@ def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, 
 
 
 def report(name: str, settings: dict[str, Any], results: list[dict[str, Any]]) -> dict[str, Any]:
-    """What `--json` prints."""
+    """Return what `--json` prints."""
     return {"bench": name, "machine": machine(), "settings": settings, "results": results}
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
+    """Describe the machine on which the figures were measured."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "processor": _processor(),
@@ -102,7 +103,7 @@ def _processor() -> str:
 
 
 def peak_rss_mib() -> float:
-    """The most memory this process has held, in MiB; not what its parent held before it was started."""
+    """Return the most memory this process has held, in MiB, without what its parent held before."""
     import resource
 
     try:

@@ -1,4 +1,4 @@
-"""What `hma convert` costs beside its tokenizer, and whether its workers' memory stays flat."""
+"""Measure the cost of `hma convert` beside its tokenizer, and whether its workers' memory stays constant."""
 
 import tempfile
 import threading
@@ -31,7 +31,7 @@ source: {{format: hdf5, uri: {uri}}}
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """The tokenizer alone over as many frames, then the conversion, watched from outside."""
+    """Time the tokenizer alone on as many frames, then run the conversion and measure its processes."""
     from hma_data.conversion.engines.base import Limits
     from hma_data.conversion.job import convert
     from hma_data.conversion.plan import Settings
@@ -57,7 +57,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
                 on_progress=watch.mark,
             )
             seconds = time.perf_counter() - began
-        after = 1 - watch.starting.frames / rows  # of the frames, what was made since the first were told
+        after = 1 - watch.starting.frames / rows  # share of frames made after the first report
         working_s = (seconds - watch.starting.seconds) * max(settings["workers"], 1)
         working_cpu_s = watch.worker_cpu_s - watch.starting.worker_cpu_s
         return [
@@ -85,7 +85,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _record(path: Path, settings: dict[str, Any]) -> None:
-    """Episodes of JPEG pictures: a texture that moves, so that they compress as pictures do."""
+    """Write episodes of JPEG pictures: crops of a texture, so that they compress as real pictures do."""
     import cv2
     import h5py
 
@@ -108,7 +108,7 @@ def _record(path: Path, settings: dict[str, Any]) -> None:
 
 
 def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]:
-    """Seconds and CPU seconds for `rows` frames in a worker's batches, measured on a part of them."""
+    """Return seconds and CPU seconds for `rows` frames in a worker's batches, measured on a part of them."""
     import sys
 
     from hma_data.conversion.worker import BATCH
@@ -130,7 +130,7 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]
 
 @dataclass(frozen=True)
 class _Starting:
-    """What had been used when the first frames were told."""
+    """The figures at the first report of finished frames."""
 
     seconds: float = 0.0
     frames: int = 0
@@ -141,20 +141,20 @@ class _Starting:
 
 @dataclass
 class _Watch:
-    """Memory and CPU time of this process and of those it started, while the conversion goes on."""
+    """Memory and CPU time of this process and of those it started, sampled while the conversion runs."""
 
     workers: int
     engine: str
     share: float = 0.0  # of the frames that are done
     starting: _Starting = field(default_factory=_Starting)
-    worker_cpu_s: float = 0.0  # as last seen; Ray's actors count as workers
-    parent_cpu_s: float = 0.0  # less what the watching takes
+    worker_cpu_s: float = 0.0  # last sample; Ray's actors count as workers
+    parent_cpu_s: float = 0.0  # without the CPU time of the sampling itself
     other_cpu_s: float = 0.0  # Ray's own processes
     samples: list[tuple[float, dict[str, float]]] = field(default_factory=list)  # share, MiB by role
     _stop: threading.Event = field(default_factory=threading.Event)
 
     def mark(self, progress: Any) -> None:
-        """Where the conversion stands."""
+        """Record the progress of the conversion."""
         if progress.frames and not self.starting.frames:
             self.starting = _Starting(
                 time.perf_counter() - self._began,
@@ -176,7 +176,7 @@ class _Watch:
         self._thread.join()
 
     def memory(self) -> dict[str, float | None]:
-        """Resident MiB of the largest worker, of the largest of Ray's actors, and of this process."""
+        """Return the resident MiB of the largest worker, the largest of Ray's actors, and this process."""
         points = {"a_tenth": 0.1, "half": 0.5, "the_end": 1.0}
         return {
             f"{role}_rss_mib_at_{name}": self._at(role, share)
@@ -198,7 +198,7 @@ class _Watch:
             if not roles["worker"] and self.workers == 0:
                 roles["worker"] = [pid]
             if not roles["worker"] and self.samples and "worker" in self.samples[-1][1]:
-                continue  # the workers are gone, the manifest is being written
+                continue  # the workers have ended; the manifest is being written
             self.worker_cpu_s = max(self.worker_cpu_s, _cpu_s(roles["worker"] + roles["actor"]))
             self.other_cpu_s = max(self.other_cpu_s, _cpu_s(roles["other"]))
             self.parent_cpu_s = time.process_time() - time.thread_time()
@@ -208,7 +208,7 @@ class _Watch:
 
 
 def _roles(pid: int, engine: str) -> dict[str, list[int]]:
-    """Processes by what they are for: workers, the actors that watch over them, what else `pid` started."""
+    """Group processes by role: workers, the actors that watch over them, and others that `pid` started."""
     parents: dict[int, int] = {}
     commands: dict[int, bytes] = {}
     for entry in Path("/proc").glob("[0-9]*"):
@@ -219,7 +219,7 @@ def _roles(pid: int, engine: str) -> dict[str, list[int]]:
             continue
     ours = _descendants(pid, parents)
     actors = {other for other, command in commands.items() if command.startswith(b"ray::Worker")}
-    if engine != "ray" or actors & ours:  # those of a cluster that runs already are not descendants
+    if engine != "ray" or actors & ours:  # actors of a running cluster are not descendants
         actors &= ours
     workers = {
         other
@@ -239,7 +239,7 @@ def _descendants(pid: int, parents: dict[int, int]) -> set[int]:
 
 
 def _cpu_s(pids: list[int]) -> float:
-    """CPU seconds of processes, their threads included."""
+    """Return the CPU seconds of processes, including their threads."""
     import os
 
     ticks = 0

@@ -1,7 +1,7 @@
-"""How fast a LeRobotDataset v3.0 is read: by our source, and by lerobot's own reader over PyAV.
+"""Measure how fast a LeRobotDataset v3.0 is read: by our source, and by lerobot's own reader over PyAV.
 
-lerobot writes the dataset. Either reader gives every row with its picture, in order and then in random order;
-to start is to import the reader and open the dataset, in a process of its own.
+lerobot writes the dataset. Each reader returns every row with its picture, first in order and then in random
+order. The start time is the CPU time of a new process that imports the reader and opens the dataset.
 """
 
 import os
@@ -22,7 +22,7 @@ from hma_data.registry.embodiment import Embodiment
 
 ABOUT = "a LeRobotDataset read by our source and by lerobot's own reader"
 DEFAULTS: dict[str, Any] = {"episodes": 4, "frames": 400, "height": 480, "width": 640, "seed": 0}
-CAMERA, DIMS, BATCH = "observation.images.main", 7, 32  # BATCH: frames asked for at once, in order
+CAMERA, DIMS, BATCH = "observation.images.main", 7, 32  # BATCH: frames requested at once, in order
 OPEN = {
     "hma": "from hma_data.sources.base import open_source; open_source('lerobot').index(sys.argv[1])",
     "lerobot": "from lerobot.datasets.lerobot_dataset import LeRobotDataset; "
@@ -68,7 +68,7 @@ def _episodes(settings: dict[str, Any]) -> Iterator[LeRobotEpisode]:
 
 
 def _orders(settings: dict[str, Any]) -> dict[str, list[list[int]]]:
-    """Rows of the whole dataset: in order, asked for in batches; and one by one, shuffled."""
+    """Return the rows to read in each order: all in batches in order, and a quarter one by one, shuffled."""
     total = settings["frames"] // settings["episodes"] * settings["episodes"]
     shuffled = np.random.default_rng(settings["seed"]).permutation(total)[: max(1, total // 4)]
     return {

@@ -1,7 +1,7 @@
-"""Windows a second out of shards, how long opening them takes, and how much memory it holds.
+"""Measure the loader: windows read from shards a second, the time to open the shards, and memory.
 
-The shards hold random tokens. One shard of an embodiment is written; its others are hard links of it, so
-that a large set is there at once and lies in the page cache. Each case runs in a process of its own.
+The shards hold random tokens. Only one shard of each embodiment is written; the others are hard links to it,
+so that a large set is made at once and stays in the page cache. Each case runs in a process of its own.
 """
 
 import os
@@ -47,7 +47,7 @@ source: {{format: hdf5}}
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """`mixture` streams shuffled batches of all sets; `random` asks one set for windows in any order."""
+    """Run the cases: `mixture` streams shuffled batches of all sets; `random` reads one set in any order."""
     with tempfile.TemporaryDirectory() as folder:
         sets = [make_set(Path(folder) / str(i), i, settings) for i in range(settings["embodiments"])]
         results = []
@@ -58,7 +58,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
-    """A shard set of random tokens and actions; only its first shard is a file of its own."""
+    """Write a shard set of random tokens and actions; only its first shard is a file of its own."""
     from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.manifest import Derived, Gathered, Manifest, ShardFile, plan_hash, split_totals
     from hma_data.shards.schema import Footer, read_footer
@@ -177,7 +177,7 @@ def _random(sets: list[Path], settings: dict[str, Any]) -> dict[str, Any]:
     opened = time.perf_counter() - began
     after = _memory()
     rng = np.random.default_rng(0)
-    near = min(len(data), 8 * 2048)  # what the cache holds: small data
+    near = min(len(data), 8 * 2048)  # as many as the cache holds: small data
 
     def batches() -> Iterator[Any]:
         while True:
@@ -215,7 +215,7 @@ def _opening(
 
 
 def _speed(batches: Iterator[Any], settings: dict[str, Any]) -> dict[str, Any]:
-    """The best of several runs: other work on the machine only ever slows one down."""
+    """Return the best of several runs, because other work on the machine only ever slows a run down."""
     wall, cpu = [], []
     for _ in range(settings["runs"]):
         made, began, worked = 0, time.perf_counter(), time.process_time()
@@ -236,7 +236,7 @@ def _peak() -> dict[str, Any]:
 
 
 def _memory() -> float:
-    """Resident MiB now."""
+    """Return the resident memory in MiB."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except OSError:

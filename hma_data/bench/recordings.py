@@ -1,4 +1,4 @@
-"""Recordings of realistic size for `hma bench sources`, one of each format, and the YAML that reads each.
+"""Write recordings of realistic size for `hma bench sources`, one of each format, and their YAML.
 
 A writer takes (folder, episodes, length, seed) and returns the recording's path. Pictures are those of
 `hma_data.bench.scenes`; the actions are seven smooth numbers a frame.
@@ -35,16 +35,16 @@ Writer = Callable[[Path, int, int, int], Path]
 
 @dataclass(frozen=True)
 class Case:
-    """One recording to measure.
+    """A recording to measure.
 
     Attributes:
-        name: format and how pictures are kept.
-        format: of the source.
+        name: the format, and how pictures are stored.
+        format: format of the source.
         size: (height, width) of the pictures.
-        write: makes the recording.
+        write: function that makes the recording.
         action, camera: keys of the embodiment.
-        stride: of the frames asked for; 1 for all.
-        extra: more of the YAML, by its top-level keys.
+        stride: stride between the frames that are read; 1 for all frames.
+        extra: further top-level keys of the YAML.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Case:
     extra: dict[str, Any] | None = None
 
     def embodiment(self) -> Embodiment:
-        """What reads it."""
+        """Return the embodiment that reads it."""
         values: dict[str, Any] = {
             "id": f"bench_{self.name.replace('-', '_')}",
             "kind": "simulation",
@@ -71,7 +71,7 @@ class Case:
 
 
 def actions(length: int, seed: int) -> NDArray[np.float32]:
-    """(length, A) that change at every frame."""
+    """Return (length, A) actions that change at every frame."""
     phase = np.arange(length)[:, None] / 20 + np.random.default_rng(seed).uniform(0, 6, A)
     return np.sin(phase).astype(np.float32)
 
@@ -103,7 +103,7 @@ def _hdf5(size: tuple[int, int], kept: str) -> Writer:
                 pictures = scene(*size, length, seed + i)
                 if kept == "jpeg":
                     files = encoded(pictures, "jpeg")
-                    widest = max(map(len, files))  # padded to one width, as ALOHA's recorder does
+                    widest = max(map(len, files))  # padded to one width, as in ALOHA's recorder
                     padded = [np.frombuffer(data.ljust(widest, b"\0"), np.uint8) for data in files]
                     group.create_dataset("obs/image", data=np.stack(padded), chunks=(1, widest))
                     continue
@@ -118,7 +118,7 @@ def _hdf5(size: tuple[int, int], kept: str) -> Writer:
 
 
 def _bags(kind: str, kept: str) -> Writer:
-    """One bag an episode; `kind` is ros1, mcap or sqlite3."""
+    """Return a writer of one bag an episode; `kind` is ros1, mcap or sqlite3."""
 
     def write(folder: Path, episodes: int, length: int, seed: int) -> Path:
         for i in range(episodes):
@@ -185,7 +185,7 @@ def _picture(store: Any, kept: str, at: int, data: NDArray[np.uint8]) -> Any:
 
 
 def packets(pictures: Iterator[Images], encoder: str, gop: int = HZ) -> Iterator[bytes]:
-    """Frames of H.264 with start codes, without B-frames, as recorders put them into messages."""
+    """Yield frames of H.264 with start codes, without B-frames, as recorders put them into messages."""
     import av
 
     context: Any = None
@@ -219,7 +219,7 @@ def _video(path: Path, pictures: Iterator[Images], encoder: str, gop: int) -> No
 
 
 def _lerobot(encoder: str, gop: int) -> Writer:
-    """A LeRobotDataset v2.1, a video an episode."""
+    """Return a writer of a LeRobotDataset v2.1, one video an episode."""
 
     def write(folder: Path, episodes: int, length: int, seed: int) -> Path:
         import pyarrow as pa
@@ -264,7 +264,7 @@ def _lerobot(encoder: str, gop: int) -> Writer:
 
 
 def _hands(folder: Path, episodes: int, length: int, seed: int) -> Path:
-    """Videos with a table of both hands' landmarks."""
+    """Write videos with a table of both hands' landmarks."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

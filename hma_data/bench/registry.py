@@ -1,4 +1,4 @@
-"""How long commands take that look at every YAML of a large registry, nothing cached and all of it cached."""
+"""Measure commands that read every YAML of a large registry, with nothing or everything cached."""
 
 import os
 import subprocess
@@ -32,7 +32,7 @@ provenance: {{frequency_hz: generated, action: generated}}
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Cold, then warm: a new process each, as a user starts it."""
+    """Run each command once cold, then warm, each time in a new process, as a user starts it."""
     with tempfile.TemporaryDirectory() as folder:
         registry = Path(folder) / "registry"
         for i in range(settings["embodiments"]):

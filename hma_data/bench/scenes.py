@@ -1,4 +1,4 @@
-"""Pictures that cost a codec what real ones do: textures at every scale, sensor noise, things that move."""
+"""Draw pictures that are as hard for a codec as real ones: textures at every scale, sensor noise, motion."""
 
 from collections.abc import Iterator
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from hma_data.episodes.images import Images
 
 NOISE = 2.0  # standard deviation of the sensor's noise, of 255
-QUALITY = 92  # of JPEG; 0.20 to 0.28 bytes a pixel, where photographs give 0.11 to 0.26
+QUALITY = 92  # of JPEG; gives 0.20 to 0.28 bytes a pixel; photographs give 0.11 to 0.26
 
 
 def scene(height: int, width: int, frames: int, seed: int) -> Iterator[Images]:
-    """(H, W, 3) pictures of one still camera before which two textured things move."""
+    """Yield (H, W, 3) pictures of a still camera; two textured things move in front of it."""
     draw = np.random.default_rng(seed)
     back = texture(draw, height, width)
     size = height // 3
@@ -30,7 +30,7 @@ def scene(height: int, width: int, frames: int, seed: int) -> Iterator[Images]:
 
 
 def texture(draw: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
-    """(height, width, 3) with power at every scale, less at the finer ones, mostly of one hue."""
+    """Return (height, width, 3) with power at every scale, less at finer scales, mostly of one hue."""
     total = np.zeros((height, width, 3), np.float32)
     cells, strength = 3, 60.0
     while cells < min(height, width):
@@ -42,7 +42,7 @@ def texture(draw: np.random.Generator, height: int, width: int) -> NDArray[np.fl
 
 
 def encoded(pictures: Iterator[Images], codec: str) -> list[bytes]:
-    """As JPEG or PNG files."""
+    """Encode pictures as JPEG or PNG files."""
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if codec == "jpeg" else []
     ending = ".jpg" if codec == "jpeg" else ".png"
     return [cv2.imencode(ending, picture[..., ::-1], options)[1].tobytes() for picture in pictures]

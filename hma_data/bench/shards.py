@@ -1,4 +1,4 @@
-"""Writing, reading and verifying shards of generated tokens: how fast, how large, in how much memory."""
+"""Measure writing, reading and verifying shards of generated tokens: speed, size and memory."""
 
 import subprocess
 import sys
@@ -27,7 +27,7 @@ source: {format: hdf5}
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Each step in a process of its own, so that its memory is its own."""
+    """Run each step in a process of its own, so that its memory is measured alone."""
     with tempfile.TemporaryDirectory() as folder:
         results = []
         for step in ("write", "read", "verify", "verify --quick"):
@@ -44,7 +44,7 @@ def _figures(text: str) -> dict[str, float]:
 
 
 def _teleoperated(rng: np.random.Generator, length: int) -> NDArray[np.float32]:
-    """(length, 7) commands like a person's: smooth, in hundredths, still for half of the time."""
+    """Return (length, 7) commands like a person's: smooth, in hundredths, zero for half of the time."""
     smooth = np.cumsum(rng.normal(scale=0.05, size=(length, 7)), axis=0)
     moving = np.repeat(rng.random((length // 10 + 1, 7)) < 0.5, 10, axis=0)[:length]
     return np.where(moving, np.clip(smooth, -1, 1), 0).round(2).astype(np.float32)

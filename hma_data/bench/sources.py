@@ -1,7 +1,7 @@
-"""How fast each format becomes 256×256 pictures, by the road that `hma convert` takes, tokenizer aside.
+"""Measure how fast each format becomes 256×256 pictures, by the steps of `hma convert` without the tokenizer.
 
-Every process opens the source for itself and takes its share of the episodes: read, align, decode,
-resize. Time is from when all have read one frame, so that imports do not count.
+Every process opens the source for itself and takes its share of the episodes: read, align, decode, resize.
+Timing starts when every process has read one frame, so imports do not count.
 """
 
 import os
@@ -22,15 +22,15 @@ from hma_data.errors import UsageError
 
 ABOUT = "recordings of every format to 256×256 RGB, with one process and with all cores"
 DEFAULTS: dict[str, Any] = {"formats": ["all"], "frames": 600, "episodes": 6, "seed": 0}
-SIZE, BATCH = 256, 32  # pixels of a side; frames asked for at once
+SIZE, BATCH = 256, 32  # pixels of a side; frames requested at once
 DEADLINE_S = 1800
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """One result for each format and number of processes.
+    """Return one result for each format and number of processes.
 
     Raises:
-        UsageError: no such format.
+        UsageError: there is no such format.
     """
     wanted = list(CASES) if settings["formats"] == ["all"] else settings["formats"]
     unknown = [name for name in wanted if name not in CASES]
@@ -39,7 +39,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     episodes = max(1, min(settings["episodes"], settings["frames"]))
     length = max(2, settings["frames"] // episodes)
     results: list[dict[str, Any]] = []
-    os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder tells its settings otherwise
+    os.environ.setdefault("SVT_LOG", "1")  # otherwise the AV1 encoder prints its settings
     for name in wanted:
         folder = Path(tempfile.mkdtemp(prefix="hma-bench-"))
         try:
@@ -56,7 +56,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def measure(name: str, uri: str, processes: int) -> dict[str, Any]:
-    """Frames a second of wall and of CPU time, and the most memory one process held.
+    """Return frames per second of wall time and of CPU time, and the most memory that one process held.
 
     Raises:
         UsageError: a process died or never answered.
@@ -93,7 +93,7 @@ def measure(name: str, uri: str, processes: int) -> dict[str, Any]:
 def _work(
     name: str, uri: str, share: int, shares: int, start: Barrier, answers: "Queue[dict[str, float]]"
 ) -> None:
-    """Every `shares`th episode, from the `share`th on."""
+    """Read every `shares`th episode from the `share`th on, and put the figures into `answers`."""
     import cv2
 
     from hma_data.sources.base import open_source
@@ -111,7 +111,7 @@ def _work(
 
 
 def _episode(source: Any, uri: str, name: str, robot: Any, limit: int | None = None) -> int:
-    """Frames of one episode brought to the tokenizer's square."""
+    """Bring one episode to pictures of the tokenizer's size; return the number of frames."""
     from hma_data.episodes.align import to_clip
     from hma_data.episodes.images import prepared
 

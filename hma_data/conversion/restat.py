@@ -42,16 +42,16 @@ def restat(
     workers: int | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Manifest:
-    """Write the manifest and what else follows from the shards; the shards are not touched.
+    """Write the manifest and the other derived files from the shards; do not change the shards.
 
-    A manifest that is whole says which shards belong and what they hash to; without one, the shards
+    An undamaged manifest states which shards belong to the set and their hashes. Without one, the shards
     themselves must show that none is missing.
 
     Args:
         folder: str or path of the set, or its URI.
 
     Raises:
-        ShardError: a shard is missing or damaged, or nothing tells whether all are there; nothing is written.
+        ShardError: a shard is missing or damaged, or nothing shows whether all are there; nothing is written.
     """
     folder = place(folder)
     if not folder.is_dir():
@@ -66,7 +66,7 @@ def restat(
         if problems:
             more = f", and {len(problems) - 1} more problems" if len(problems) > 1 else ""
             raise ShardError("", problems[0] + more)
-        if plan.get("frames") != "strided":  # else footers know the steps after an episode's last row too
+        if plan.get("frames") != "strided":  # footers of strided sets also count steps that are not rows
             stats = {name: merged.summary() for name, merged in rows.items()}
             derived = replace(derived, manifest=replace(manifest, stats=stats or manifest.stats))
         return derived.write(folder)
@@ -95,7 +95,7 @@ def _as_stated(folder: Path, manifest: Manifest) -> Found:
 
 
 def _as_found(folder: Path) -> Found:
-    """What the shards say where there is no manifest to believe."""
+    """Return what the shards state if there is no manifest to trust."""
     named = [(path, SHARD_NAME.fullmatch(path.relative_to(folder).as_posix())) for path in folder.glob("*/*")]
     order = sorted((SPLITS.index(name[1]), int(name[2]), name[0]) for _, name in named if name)
     names = [name for _, _, name in order]
@@ -119,13 +119,13 @@ def _as_found(folder: Path) -> Found:
 
 
 def _planned(names: list[str], footers: list[Footer], plan: dict[str, Any]) -> bool:
-    """Whether the cut is the plan's; an episode in quarantine hides it."""
+    """Check whether the episodes are cut into shards as planned; False if one is in quarantine."""
     cut = [(name, [row.episode_index for row in footer.episodes]) for name, footer in zip(names, footers)]
     return plan.get("shards") == digest(cut)
 
 
 def _listed(folder: Path, footers: list[Footer], source: str) -> bool:
-    """Whether episodes.parquet lists these shards' episodes and no others."""
+    """Check whether episodes.parquet lists these shards' episodes and no others."""
     gathered = Gathered(source)
     for footer in footers:
         gathered.add(footer)
@@ -136,7 +136,7 @@ def _listed(folder: Path, footers: list[Footer], source: str) -> bool:
 
 
 def _source(folder: Path, footers: list[Footer]) -> str:
-    """The URI the recordings came from: of files beside the shards, which do not state it."""
+    """Return the URI the recordings came from, read from files beside the shards; shards do not state it."""
     own = {row.episode_index for footer in footers for row in footer.episodes if not row.source}
     try:
         for row in pq.read_table(

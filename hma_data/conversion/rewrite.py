@@ -1,7 +1,7 @@
-"""Make a shard set of episodes that are tokenized already: merge sets, split a set anew.
+"""Make a shard set from episodes that are already tokenized: merge sets, or divide a set anew.
 
-The plan is made as a conversion makes it, so the outcome depends on the episodes and the settings
-alone. A shard is whole or absent, the manifest comes last, and running it again continues.
+The plan is made as in a conversion, so the result depends only on the episodes and the settings. A shard
+is complete or absent, and the manifest is written last. To continue after an interruption, run it again.
 
 T frames of an episode, A values of an action.
 """
@@ -45,9 +45,9 @@ class Ready:
     """An episode whose tokens exist.
 
     Attributes:
-        row: what episodes.parquet says of it; its split is kept when it has one, its place is made anew.
-        key: where `Job.open` finds it.
-        together: episodes that share it go into one split; its own id where empty.
+        row: its row of episodes.parquet. A split in it is kept; its shard and its place there are set anew.
+        key: value by which the function of `Job.open` finds it.
+        together: episodes that share this text go into one split; empty means the episode's own id.
     """
 
     row: EpisodeRow
@@ -57,13 +57,15 @@ class Ready:
 
 @dataclass(frozen=True)
 class Job:
-    """A shard set to be made.
+    """The description of a shard set to make.
 
     Attributes:
         episodes: in the order of their new numbers.
-        open: called once for each shard; gives a function from an episode to its columns, (N,) or (N, width).
-        refused: what its quarantine lists.
-        made_by: what was done, for the plan; empty when a conversion could have made the same.
+        open: called once for each shard; returns a function that maps an episode to its columns, (N,) or
+            (N, width).
+        refused: the episodes that its quarantine lists.
+        made_by: the operation that made the set, recorded in the plan; empty if a conversion could have
+            made the same set.
     """
 
     embodiment: Embodiment
@@ -77,23 +79,23 @@ class Job:
 
     @property
     def cameras(self) -> list[str]:
-        """Names, in row order within an episode."""
+        """Return the names of the cameras, in row order within an episode."""
         return list(self.settings.cameras) or [self.embodiment.primary_camera.name]
 
     @property
     def frame_stride(self) -> int:
-        """Recorded steps a row."""
+        """Return the number of recorded steps a row."""
         return self.embodiment.stride if self.settings.frames == "strided" else 1
 
 
 def remake(
     job: Job, out: StrPath, workers: int = 1, on_progress: OnProgress = lambda done, total: None
 ) -> Manifest:
-    """Write the set; shards that are there already are kept.
+    """Write the set; keep shards that are already there.
 
     Args:
         out: str or path of the new set, or its URI.
-        workers: threads, each at a shard of its own.
+        workers: threads, each of which writes its own shard.
         on_progress: called with (frames written, frames in all) after each shard.
 
     Raises:
@@ -206,16 +208,16 @@ def merge(
     workers: int = 1,
     on_progress: OnProgress = lambda done, total: None,
 ) -> Manifest:
-    """One set of several of the same embodiment and tokenizer; every episode keeps its split.
+    """Merge several sets of the same embodiment and tokenizer into one; every episode keeps its split.
 
-    An id that stands in several sets is given the number of its set in front, `2/demo_0`.
+    An id that occurs in several sets is prefixed with the number of its set: `2/demo_0`.
 
     Args:
         folders: str or path of each set, or its URI.
-        out: of the new one.
+        out: str or path of the new set, or its URI.
 
     Raises:
-        ShardError: the sets do not go together.
+        ShardError: the sets cannot be merged.
         OutputError: see `remake`.
     """
     sets = [ShardSet(folder) for folder in folders]
@@ -257,15 +259,15 @@ def split(
     workers: int = 1,
     on_progress: OnProgress = lambda done, total: None,
 ) -> Manifest:
-    """The set with its episodes divided anew into train and val, as a conversion divides them.
+    """Divide the episodes of a set anew into train and val, as a conversion divides them.
 
     Args:
         folder: str or path of the set, or its URI.
-        out: of the new one.
+        out: str or path of the new set, or its URI.
         by: what stays together: episode (and its recording), instruction or source.
 
     Raises:
-        UsageError: a fraction or `by` that is not allowed.
+        UsageError: a fraction or `by` is not allowed.
         OutputError: see `remake`.
     """
     shards = ShardSet(folder)
@@ -275,7 +277,7 @@ def split(
         raise UsageError("--by", f"{by!r} is not known", "allowed: episode, instruction, source")
     settings = replace(_settings(shards), val_fraction=val_fraction, seed=seed)
     if settings.limit is not None and settings.limit < len(rows):
-        settings = replace(settings, limit=None)  # of a set that was extended beyond it
+        settings = replace(settings, limit=None)  # the set was extended beyond its limit
     together = [row.group for row in rows] if by == "episode" else _together(rows, by)
     episodes = [Ready(row, (0, old), key) for row, old, key in zip(rows, _rows(shards), together)]
     made_by = {} if by == "episode" else {"split_by": by}
@@ -294,7 +296,7 @@ def split(
 
 
 def _together(rows: Sequence[EpisodeRow], by: str) -> list[str]:
-    """A name for each episode, shared by those linked through `by` or through their recording."""
+    """Return a name for each episode; episodes linked through `by` or through their recording share it."""
     leader: dict[tuple[str, str], tuple[str, str]] = {}
 
     def find(key: tuple[str, str]) -> tuple[str, str]:
@@ -343,7 +345,7 @@ def _check_unique(ids: Sequence[str]) -> None:
 
 
 def _settings(shards: ShardSet) -> Settings:
-    """The settings the set was made with."""
+    """Return the settings that the set was made with."""
     plan = shards.manifest.plan
     said = plan.get("settings", {})
     known = {key: said[key] for key in ("val_fraction", "seed", "limit", "shard_frames") if key in said}
@@ -351,7 +353,7 @@ def _settings(shards: ShardSet) -> Settings:
 
 
 def _rows(shards: ShardSet) -> list[EpisodeRow]:
-    """episodes.parquet as it was in the footers, each with its own source."""
+    """Return the rows of episodes.parquet as they were in the footers, each with its own source."""
     return [EpisodeRow(**row) for row in shards.episodes.to_pylist()]
 
 
@@ -361,7 +363,7 @@ def _refused(shards: ShardSet) -> Iterator[Refused]:
 
 
 def _opener(sets: Sequence[ShardSet]) -> Callable[[], Read]:
-    """Reads episodes of several sets; a function of its own for each shard that is written."""
+    """Return a function that opens a reader of episodes of several sets, called once for each shard."""
 
     def open_sets() -> Read:
         readers = [EpisodeReader(shards, shards.columns()) for shards in sets]

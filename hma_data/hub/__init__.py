@@ -1,4 +1,4 @@
-"""Repositories of the Hugging Face Hub: names and bytes, moved by the hub's own client.
+"""Move files to and from repositories of the Hugging Face Hub, with the hub's own client.
 
-Nothing here knows checkpoints or shard sets.
+This package deals with names and bytes only; it knows neither checkpoints nor shard sets.
 """

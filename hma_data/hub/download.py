@@ -1,7 +1,7 @@
-"""Download files by the hub's own client, and keep none that is not what the listing states.
+"""Download files with the hub's own client, and return none whose content differs from the listing.
 
-The client writes each download to a file of its own and renames it, and compares no digests. So a file of its
-cache that was damaged is fetched once anew in place: at every moment there is a whole file of that name.
+The client writes each download to a file of its own and renames it, and compares no digests. A damaged file
+in its cache is therefore downloaded once more in place: at every moment there is a whole file of that name.
 """
 
 import hashlib
@@ -25,8 +25,8 @@ class Entry:
     Attributes:
         name: path in the repository.
         size: bytes.
-        sha256: of a file that the hub keeps by LFS; None of any other.
-        blob_id: git's name of its content, where `sha256` is None; empty where the hub does not say.
+        sha256: SHA-256 of a file that the hub keeps by LFS; None for any other file.
+        blob_id: git's name of its content, if `sha256` is None; empty if the hub does not state it.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Entry:
     blob_id: str
 
     def states(self, content: Path | bytes) -> bool:
-        """Check whether a file or bytes are this file's content; False where there is no such file."""
+        """Check whether a file or bytes have this entry's content; False if there is no such file."""
         try:
             with io.BytesIO(content) if isinstance(content, bytes) else content.open("rb") as file:
                 size = file.seek(0, io.SEEK_END)
@@ -53,12 +53,12 @@ class Entry:
 
 
 def fetch(repo: str, kind: str, commit: str, entry: Entry, folder: Path | None = None) -> Path:
-    """Download a file unless it is there with the content that is stated.
+    """Download a file, unless it is already there with the stated content.
 
     Args:
         repo: organisation/name.
         kind: model or dataset.
-        commit: the one that was listed.
+        commit: the commit that was listed.
         entry: the file.
         folder: where to put it; None for the client's cache.
 
@@ -66,7 +66,7 @@ def fetch(repo: str, kind: str, commit: str, entry: Entry, folder: Path | None =
         Its path.
 
     Raises:
-        HubError: its content is not the stated one, even after it was fetched anew.
+        HubError: its content is not the stated one, even after a second download.
     """
     from huggingface_hub import hf_hub_download
 

@@ -1,4 +1,4 @@
-"""The errors of the hub's client as HubErrors: what happened, and what to do. None of them shows a token."""
+"""Turn errors of the hub's client into HubErrors that state what happened and what to do, without a token."""
 
 import re
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ _SECRET = re.compile(r"(?i)\b(hf_|bearer )\w+")
 
 @contextmanager
 def explained(where: str) -> Iterator[None]:
-    """Raise what the client raises in the block as a HubError."""
+    """Raise what the client raises in the `with` block as a HubError."""
     try:
         yield
     except HubError:
@@ -59,20 +59,20 @@ def explain(where: str, fault: BaseException) -> HubError:
             return HubError(where, fault_text, AGAIN)
         case errors.FileMetadataError():
             return HubError(where, "was not answered by a hub", "check HF_ENDPOINT and your proxy")
-    wrapped = isinstance(fault, RuntimeError | ValueError)  # of an upload, or of a download made anew
+    wrapped = isinstance(fault, RuntimeError | ValueError)  # of an upload, or of a repeated download
     if wrapped and isinstance(cause, httpx.HTTPError | errors.OfflineModeIsEnabled):
         return explain(where, cause)
     return _plain(where, fault)
 
 
 def status(fault: BaseException) -> int | None:
-    """Return the HTTP status that an error came from; None where it came from none."""
+    """Return the HTTP status that an error came from; None if it came from none."""
     found = _response(fault)
     return None if found is None else int(found.status_code)
 
 
 def waiting(fault: BaseException, attempt: int) -> float | None:
-    """Return seconds to wait before trying again; None where that would not help."""
+    """Return the seconds to wait before the next attempt; None if waiting would not help."""
     import httpx
 
     response = _response(fault)
@@ -88,10 +88,10 @@ def waiting(fault: BaseException, attempt: int) -> float | None:
 
 
 def failed_by_xet(fault: BaseException) -> bool:
-    """Check whether an upload in chunks failed; from then on this process uploads by plain LFS.
+    """Check whether an upload in chunks failed; if so, make this process upload by plain LFS from now on.
 
-    The client uploads by its Xet protocol to every hub, also to one that does not know it and through a
-    firewall that lets none of it pass. Every hub takes files by LFS.
+    The client uploads to every hub by its Xet protocol. Some hubs do not support it, and some firewalls block
+    it. Every hub takes files by LFS.
     """
     import httpx
     from huggingface_hub import constants
@@ -105,7 +105,7 @@ def failed_by_xet(fault: BaseException) -> bool:
 
 
 def raised() -> tuple[type[BaseException], ...]:
-    """Return what the client raises when something goes wrong."""
+    """Return the types of error that the client raises."""
     import httpx
     from huggingface_hub import errors
 
@@ -148,7 +148,7 @@ def _plain(where: str, fault: BaseException) -> HubError:
     if isinstance(fault, OSError):
         return HubError(where, f"did not come whole: {text}", AGAIN)
     library = isinstance(fault, RuntimeError) and not isinstance(fault, RecursionError)
-    if library:  # of the hub, for transfers
+    if library:  # of the hub's library for transfers
         return HubError(where, f"the transfer failed: {text}", "run it again; HF_HUB_DISABLE_XET=1 may help")
     return _strange(where, fault)
 
@@ -158,7 +158,7 @@ def _strange(where: str, fault: BaseException) -> HubError:
 
 
 def shown(text: str) -> str:
-    """Return what a stranger said as one short line without a token."""
+    """Return text from outside as one short printable line without a token."""
     plain = "".join(c if c.isprintable() else " " for c in text)
     return _hidden(" ".join(plain.split()))[:300]
 
@@ -171,7 +171,7 @@ def _hidden(text: str) -> str:
 
 
 def without_token(fault: BaseException) -> BaseException:
-    """Return the error without the token, which the hub may have put into its text or its causes'."""
+    """Return the error after removing the token from its text and from the texts of its causes."""
     for link in causes(fault):
         if any(isinstance(part, str) and part != _hidden(part) for part in link.args):
             link.args = tuple(_hidden(part) if isinstance(part, str) else part for part in link.args)

@@ -1,4 +1,4 @@
-"""Names of unfinished files: they say whose they are, so that those of the dead can be told."""
+"""Name unfinished files after the process that writes them, to recognise those of dead processes."""
 
 import hashlib
 import os
@@ -11,27 +11,27 @@ from pathlib import Path
 from hma_data.storage.files import PART
 from hma_data.storage.remote_lock import Holder, is_running
 
-STALE = 86_400.0  # seconds after which a file of another machine's process is nobody's
+STALE = 86_400.0  # seconds after which a file of another machine's process counts as abandoned
 _NAME = re.compile(r"\.partial-(?:([0-9a-f]{8})-(\d{1,10})-)?[0-9a-f]{12}")
 
 
 def beside(path: Path) -> Path:
-    """A name next to a file's, for this process to write to before the file gets its own."""
+    """Return a name beside a file's, for this process to write to before it renames to the final name."""
     mark = f"{_machine()}-{os.getpid()}-" if _machine() else ""
     return path.with_name(f".{path.name}.partial-{mark}{uuid.uuid4().hex[:12]}")
 
 
 def is_partial(name: str) -> bool:
-    """Whether a name is one of `beside`, or was of an older release."""
+    """Check whether a name is one that `beside` gives, or one of an older release."""
     return ".partial-" in name
 
 
 def is_abandoned(name: str, modified: float | None) -> bool:
-    """Whether nobody will finish a file: its process has ended, or nothing was heard of it for a day.
+    """Check whether a file is abandoned: its process has ended, or it has not changed for a day.
 
     Args:
         name: with or without its folder.
-        modified: Unix seconds; None where the store does not tell.
+        modified: Unix seconds; None if the store does not state it.
     """
     found = _NAME.search(name)
     if not found or found.end() != len(name):
@@ -42,21 +42,21 @@ def is_abandoned(name: str, modified: float | None) -> bool:
 
 
 def remove_abandoned(path: Path) -> None:
-    """Delete what dead processes left of a file on this machine."""
+    """Delete unfinished versions of a file that dead processes left on this machine."""
     for left in path.parent.glob(f".{path.name}.partial-*"):
         if not left.is_dir() and is_abandoned(left.name, left.lstat().st_mtime):
             left.unlink(missing_ok=True)
 
 
 def remove_abandoned_folders(root: Path) -> None:
-    """Delete folders in which dead processes were putting something together."""
+    """Delete temporary folders that dead processes left."""
     for left in root.glob(".*.partial-*"):
         if left.is_dir() and not left.is_symlink() and is_abandoned(left.name, left.stat().st_mtime):
             shutil.rmtree(left, ignore_errors=True)
 
 
 def remove_dead_parts(path: Path) -> None:
-    """Delete what dead processes of this machine left where they wrote a file by `write_atomic`."""
+    """Delete the temporary files of `write_atomic` that dead processes of this machine left beside a file."""
     for left in path.parent.glob(f".{path.name}.*{PART}"):
         pid = left.name.removesuffix(PART).rpartition(".")[2]
         if pid.isdecimal() and not is_running(int(pid)):
@@ -64,6 +64,6 @@ def remove_dead_parts(path: Path) -> None:
 
 
 def _machine() -> str:
-    """Of those who can see each other's processes, the same eight digits; empty where it cannot be told."""
+    """Return eight hex digits, the same for all processes that see each other; empty if it cannot be told."""
     machine = Holder.me().machine
     return hashlib.sha256(machine.encode()).hexdigest()[:8] if machine else ""

@@ -1,7 +1,7 @@
-"""A repository of the Hugging Face Hub: what it holds at one commit, how to pull and how to push.
+"""List, pull and push a repository of the Hugging Face Hub at one commit.
 
-A push is one commit on top of the commit it was prepared for; when somebody else has committed in between, it
-is prepared again. What is pulled lies in the cache of the hub's client, which works offline.
+A push is one commit on top of the commit it was prepared for. If somebody else has committed in between, the
+push is prepared again. Pulled files are in the cache of the hub's client, which works offline.
 """
 
 import logging
@@ -21,10 +21,10 @@ from hma_data.hub.download import Entry, fetch
 from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, waiting
 from hma_data.hub.partial import beside, remove_abandoned_folders
 
-ATTEMPTS = 8  # to commit; half as many for anything else
-LISTING_S, SILENCE_S = 30.0, 300.0  # a commit of many files takes the hub minutes
-AT_ONCE = 4  # downloads
-MOST_READ = 16_000_000  # bytes of a file that is read rather than pulled
+ATTEMPTS = 8  # attempts to commit; half as many for any other call
+LISTING_S, SILENCE_S = 30.0, 300.0  # seconds; the hub needs minutes for a commit of many files
+AT_ONCE = 4  # downloads at a time
+MOST_READ = 16_000_000  # largest size in bytes of a file that `read` takes
 CARD = "README.md"
 _ABSENT = object()
 _CONFLICTS = (409, 412)
@@ -34,22 +34,26 @@ log = logging.getLogger(__name__)
 
 
 class Repository:
+<<<<<<< HEAD
     """See `hma_model.hub.publish.Store`.
+=======
+    """A repository of the hub; see `hma_model.hub.Store`.
+>>>>>>> doc-parts
 
     Args:
         repo: organisation/name.
         revision: branch, tag or commit; None for main.
-        write: make the repository where it is not there.
+        write: whether to make the repository if it does not exist.
         kind: model or dataset.
-        private: make it a private one.
-        name: for errors, instead of its URI.
+        private: whether to make it private.
+        name: name for errors, instead of its URI.
 
     Attributes:
-        address: of its page.
-        from_cache: the hub was out of reach, so `files` told what the cache has.
+        address: address of its page.
+        from_cache: whether the hub was out of reach, so that `files` listed the cache.
 
     Raises:
-        HubError: it is to be written, and there is no token.
+        HubError: the repository is to be written, and there is no token.
     """
 
     def __init__(
@@ -81,9 +85,9 @@ class Repository:
     # -- what is there
 
     def files(self) -> dict[str, int]:
-        """Return sizes by name at the newest commit; out of the hub's reach, of what the cache has.
+        """Return sizes by name at the newest commit; if the hub is out of reach, those of the cache.
 
-        Of a repository that is to be written and is not there yet there are none.
+        For a repository that is to be written and does not exist yet, return an empty mapping.
         """
         info = self._info()
         self._absent = info is _ABSENT
@@ -98,10 +102,10 @@ class Repository:
         return {name: entry.size for name, entry in self._entries.items()}
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
-        """Check whether the commit that `files` saw has this content under this name.
+        """Check whether the commit that `files` listed has this content under this name.
 
         Args:
-            sha256: of the content, where it is known.
+            sha256: SHA-256 of the content, if it is known.
         """
         entry = self.stated(name)
         if entry and entry.sha256 and sha256:
@@ -109,11 +113,11 @@ class Repository:
         return entry is not None and entry.states(content)
 
     def stated(self, name: str) -> Entry | None:
-        """Return what the listing that `files` saw states of a file; None where there is none."""
+        """Return the entry of a file in the listing of `files`; None if there is none."""
         return (self._entries or {}).get(name)
 
     def _info(self) -> Any:
-        """Return the client's facts; None out of the hub's reach, `_ABSENT` where it is to be made."""
+        """Return the client's facts; None if the hub is out of reach, `_ABSENT` if the repository is new."""
         import httpx
         from huggingface_hub import errors
 
@@ -127,7 +131,7 @@ class Repository:
                     raise
                 return None
             except errors.HfHubHTTPError as fault:
-                # some hubs answer 404 without the code that tells what is missing
+                # some hubs answer 404 without the code that states what is missing
                 missing = isinstance(fault, errors.RepositoryNotFoundError) or status(fault) == 404
                 there = isinstance(fault, errors.GatedRepoError | errors.RevisionNotFoundError)
                 if there or not (missing and self._write):
@@ -155,7 +159,7 @@ class Repository:
         }
 
     def _of_cache(self) -> dict[str, Entry]:
-        """Return what the client's cache has of the revision."""
+        """Return the files of the revision in the client's cache."""
         from huggingface_hub import snapshot_download
 
         with explained(self.name):
@@ -174,24 +178,24 @@ class Repository:
     # -- pulling
 
     def read(self, name: str) -> bytes:
-        """Return a file of at most 16 MB at the commit that `files` saw."""
+        """Return the content of a file of at most 16 MB at the commit that `files` listed."""
         if self._known()[name].size > MOST_READ:
             fault = f"is larger than {MOST_READ:,} bytes"
             raise HubError(f"{self.name}/{name}", fault, "this is not a file of ours")
         return self._brought([name])[0].read_bytes()
 
     def warm(self, names: Iterable[str]) -> None:
-        """Bring small files to the cache together, for `read`."""
+        """Download small files to the cache together, for later calls of `read`."""
         known = self._known()
         if not self.from_cache:
             self._brought([name for name in names if name in known and known[name].size <= MOST_READ])
 
     def pull(self, names: list[str], out: Path | None = None) -> Path:
-        """Bring files to the client's cache, whatever `out`; return their folder there."""
+        """Download files to the client's cache and return their folder there; `out` has no effect."""
         return _snapshot(self._brought(names)[0], names[0])
 
     def download(self, names: list[str], out: Path) -> None:
-        """Bring files to a folder, past the client's cache; each gets its name once it is whole."""
+        """Download files to a folder, not to the client's cache; each gets its name when it is complete."""
         known = self._known()
         if self.from_cache:
             raise HubError(self.name, "is out of reach", "go online and pull again")
@@ -216,7 +220,7 @@ class Repository:
         return self._entries or {}
 
     def _brought(self, names: Sequence[str]) -> list[Path]:
-        """Return paths of files in the cache, which are fetched unless they are there and whole."""
+        """Return paths of files in the cache; download those that are missing or damaged."""
         known = self._known()
         if (folder := self._cached) is not None:
             if missing := [name for name in names if name not in known]:
@@ -230,7 +234,7 @@ class Repository:
         return paths
 
     def _remember(self, snapshot: Path) -> None:
-        """Note in the cache which commit the revision is, for who asks for it by this name offline."""
+        """Record in the cache which commit the revision is, so that it can be found by this name offline."""
         named = self._revision or "main"
         ref = snapshot.parent.parent / "refs" / named
         with explained(self.name):
@@ -241,7 +245,7 @@ class Repository:
                 new.replace(ref)
 
     def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
-        """Return what an action gives for each file, a few at once; the first error ends it."""
+        """Return the results of an action for each file, a few files at a time; the first error ends it."""
         pool = ThreadPoolExecutor(AT_ONCE, "hub")
         try:
             return list(pool.map(lambda name: self._ask(lambda: act(name), f"{self.name}/{name}"), names))
@@ -251,7 +255,7 @@ class Repository:
     # -- pushing
 
     def prepare(self, name: str) -> None:
-        """Make the repository and its branch where they are not there.
+        """Make the repository and its branch if they do not exist.
 
         Raises:
             HubError: the token may not write a file of this name.
@@ -264,7 +268,7 @@ class Repository:
         self._ask(lambda: self._upload_modes([name]))
 
     def check_card(self, page: bytes) -> None:
-        """Raise HubError where the hub would not take a card."""
+        """Raise HubError if the hub would refuse a card."""
         asked = {"content": page.decode(), "repoType": self.kind}
         answered = self._ask(lambda: self._posted("validate-yaml", asked, (400,)).get("errors"))
         if said := shown("; ".join(str(fault.get("message")) for fault in answered or ())):
@@ -272,21 +276,21 @@ class Repository:
             raise HubError(self.name, f"the hub refuses the card: {said}", remedy)
 
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
-        """Commit changes, prepared again while others commit first; return the page's address.
+        """Commit changes and return the page's address; prepare them again if others commit first.
 
         Args:
-            changes: gives contents by name, None to delete; it calls `files`.
-            message: of the commit.
+            changes: returns contents by name, None to delete; it calls `files`.
+            message: message of the commit.
 
         Raises:
-            HubError: the hub refuses it, or others keep committing.
+            HubError: the hub refuses the commit, or others keep committing.
         """
         files = changes()
         if isinstance(page := files.get(CARD), bytes):
             self.check_card(page)
         if self._absent:
             self._make()
-            files = changes()  # somebody else may have been there meanwhile
+            files = changes()  # somebody else may have written in the meantime
         for attempt in range(ATTEMPTS):
             try:
                 with explained(self.name):
@@ -302,7 +306,7 @@ class Repository:
         raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
 
     def _pause(self, fault: HubError, attempt: int) -> float | None:
-        """Return seconds to wait before a commit is prepared again; None where that would not help."""
+        """Return the seconds to wait before a commit is prepared again; None if waiting would not help."""
         if failed_by_xet(fault):
             return 0.0
         if status(fault) in _CONFLICTS:
@@ -310,7 +314,7 @@ class Repository:
         return waiting(fault, attempt) if attempt < ATTEMPTS // 2 else None
 
     def _commit_changes(self, files: Mapping[str, Path | bytes | None], message: str) -> None:
-        """Commit what the listed commit does not have like this, all of it or nothing."""
+        """Commit what differs from the listed commit, all of it or nothing."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
         added = {name: new for name, new in files.items() if new is not None and not self.has(name, new)}
@@ -332,7 +336,7 @@ class Repository:
         )
 
     def _refuse_ignored(self, names: Iterable[str]) -> None:
-        """Raise HubError where a .gitignore there would leave files out of the commit without a word."""
+        """Raise HubError if a .gitignore there would silently leave files out of the commit."""
         if not any(PurePosixPath(name).name == ".gitignore" for name in self._known()):
             return
         for some in batched(names, 256):
@@ -342,7 +346,7 @@ class Repository:
                 raise HubError(self.name, fault, "delete that line there, and push again")
 
     def _upload_modes(self, names: Iterable[str]) -> list[dict[str, Any]]:
-        """Return how the hub would take files, which it tells only those who may write."""
+        """Return how the hub would take files; it answers only those who may write."""
         branch = quote(self._revision or "main", safe="")
         asked = {"files": [{"path": name, "size": 1, "sample": "ew=="} for name in names]}
         return list(self._posted(f"{self.kind}s/{self.repo}/preupload/{branch}", asked)["files"])
@@ -356,7 +360,7 @@ class Repository:
     # -- asking
 
     def _posted(self, place: str, value: Any, accepted: tuple[int, ...] = ()) -> Any:
-        """Return the JSON that the hub answers to JSON; other states than success may be accepted."""
+        """Post JSON to the hub and return the JSON of its answer; `accepted` lists error states to accept."""
         from huggingface_hub import get_session
         from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
 
@@ -367,7 +371,7 @@ class Repository:
         return answer.json()
 
     def _ask[T](self, call: Callable[[], T], where: str = "") -> T:
-        """Return what a call of the client returns; it is made again where the hub is busy or was cut off."""
+        """Return the result of a client's call; repeat it if the hub is busy or the connection was cut."""
         for attempt in range(ATTEMPTS // 2):
             self._limit_silence()
             try:
@@ -382,7 +386,7 @@ class Repository:
         raise AssertionError("the last attempt returns or raises")
 
     def _limit_silence(self) -> None:
-        """Let the client's session, which waits for ever by default, wait for an answer only so long."""
+        """Limit the time that the client's session waits for an answer; by default it waits without limit."""
         from huggingface_hub import get_session
 
         session = get_session()
@@ -391,5 +395,5 @@ class Repository:
 
 
 def _snapshot(path: Path, name: str) -> Path:
-    """Return the folder of the client's cache in which a file of this name lies."""
+    """Return the folder of the client's cache that holds a file of this name."""
     return path.parents[len(PurePosixPath(name).parts) - 1]

@@ -1,4 +1,4 @@
-"""The laboratory: third-party simulators recorded as robots would be, for demo, tests and experiments.
+"""Record third-party simulators as if they were robots, for the demo, tests and experiments.
 
 A recorder is a module with `record(out, robot, episodes, seed, on_progress)`; it is imported on use.
 Every robot of RECORDERS has its embodiment in the registry under the same id.
@@ -33,17 +33,17 @@ def record(
 
     Args:
         robot: a key of RECORDERS.
-        out: str or path of the folder to put the recording in; made when absent.
-        episodes: how many, at least one.
+        out: str or path of the folder to put the recording in; made if it does not exist.
+        episodes: number of episodes, at least one.
         seed: the same seed gives the same recording.
         on_progress: called after each episode with (episodes done, episodes in all).
 
     Returns:
-        The recording: what `hma convert --source` takes.
+        The path of the recording, which `hma convert --source` takes.
 
     Raises:
-        UsageError: no such robot, or no episodes asked for.
-        OutputError: the recording is there already, or cannot be written.
+        UsageError: there is no such robot, or fewer than one episode was requested.
+        OutputError: the recording is already there, or cannot be written.
         MissingDependencyError: the simulator, or the writer of the format, is not installed.
     """
     if robot not in RECORDERS:
@@ -56,10 +56,10 @@ def record(
 
 @contextmanager
 def written_beside(final: Path) -> Iterator[Path]:
-    """A path to write a file or folder to; it becomes `final` at the end, or vanishes on failure.
+    """Give a path to write a file or folder to; rename it to `final` at the end, or delete it on failure.
 
     Raises:
-        OutputError: `final` is there already, or the disk refuses.
+        OutputError: `final` is already there, or cannot be written.
     """
     if final.exists():
         raise OutputError(final, "exists already", "remove it or record into another folder")
@@ -78,11 +78,11 @@ def imported(package: str, install: str) -> Iterator[None]:
     """Import a third-party package, without pygame's greeting and the warnings that imports make.
 
     Args:
-        package: its name, for the error.
+        package: name of the package, for the error.
         install: the command that installs it.
 
     Raises:
-        MissingDependencyError: something of it cannot be imported.
+        MissingDependencyError: a module of the package cannot be imported.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:

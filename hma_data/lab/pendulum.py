@@ -1,12 +1,11 @@
-"""Record gymnasium's Pendulum-v1 into RLDS: a rod on an axle, driven by a torque at 20 Hz.
+"""Record gymnasium's Pendulum-v1 to RLDS: a rod on an axle, driven by a torque at 20 Hz.
 
-The physics and the picture are the environment's own; the camera is zoomed in on the rod, and an arrow
-round the axle shows the torque that was last applied. The torque in a step is applied between its
-picture and the next.
+The physics and the picture are the environment's own. The camera is zoomed in on the rod, and an arrow round
+the axle shows the last torque. The torque in a step is applied between its picture and the next.
 
-Who drives changes from episode to episode, in the order of DRIVERS: swinging up and balancing, smooth
-random torques, full torque one way or the other, random torques held for a while. Episodes begin at
-random angles and speeds and last 5 s.
+The driver changes from episode to episode, in the order of DRIVERS: swing up and balance, smooth random
+torques, full torque one way or the other, random torques held for a while. Episodes begin at random angles
+and speeds and last 5 s.
 
 Angles are radians from upright, speeds rad/s, torques N·m. T frames.
 """
@@ -23,18 +22,18 @@ from hma_data.lab import Progress, imported, written_beside
 from hma_data.lab.write_rlds import RldsEpisode, write_rlds
 
 Floats = NDArray[np.float64]
-Driver = Callable[[float, float], float]  # torque at an angle and a speed
+Driver = Callable[[float, float], float]  # (angle, speed) -> torque
 
 ROBOT = "pendulum"
 STEPS, PERIOD_S = 100, 0.05
 TORQUE = 2.0  # the environment's limit
-SIZE, ZOOMED, DRAWN = 128, 256, 464  # of the picture, of the square about the axle it is of, of the whole
+SIZE, ZOOMED, DRAWN = 128, 256, 464  # pixels: the picture, the square that it shows, the whole drawing
 
 
 def record(out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
     """Record the pendulum as the TFDS folder `out/pendulum`.
 
-    Same arguments, same bytes. See `hma_data.lab.record`.
+    The same arguments give the same bytes. See `hma_data.lab.record`.
     """
     if robot != ROBOT:
         raise UsageError(robot, "is not this recorder's robot", f"known: {ROBOT}")
@@ -55,7 +54,7 @@ class Pendulum:
     """The environment at a given start.
 
     Args:
-        angle, speed: to begin with.
+        angle, speed: angle and speed at the start.
 
     Raises:
         MissingDependencyError: gymnasium or pygame is not installed.
@@ -65,28 +64,28 @@ class Pendulum:
         environment, surface, clock = _simulator()
         self._env = environment(render_mode="rgb_array")
         self._env.screen_dim = DRAWN
-        self._env.screen, self._env.clock = surface((DRAWN, DRAWN)), clock()  # else it looks for a display
+        self._env.screen, self._env.clock = surface((DRAWN, DRAWN)), clock()  # or it looks for a display
         self._env.reset(seed=0)
         self._env.state = np.array([angle, speed])
 
     @property
     def angle(self) -> float:
-        """From upright, within ±π."""
+        """Return the angle from upright, within ±π."""
         angle = float(self._env.state[0])
         return (angle + np.pi) % (2 * np.pi) - np.pi
 
     @property
     def speed(self) -> float:
-        """Of turning."""
+        """Return the angular speed."""
         return float(self._env.state[1])
 
     @property
     def observation(self) -> NDArray[np.float32]:
-        """(3,) cosine and sine of the angle, and the speed: the environment's own."""
+        """Return (3,) cosine and sine of the angle, and the speed: the environment's observation."""
         return np.array([np.cos(self.angle), np.sin(self.angle), self.speed], dtype=np.float32)
 
     def picture(self) -> NDArray[np.uint8]:
-        """(SIZE, SIZE, 3) RGB."""
+        """Render the rod; (SIZE, SIZE, 3) RGB."""
         import cv2
 
         edge = (DRAWN - ZOOMED) // 2
@@ -97,12 +96,12 @@ class Pendulum:
         return small
 
     def advance(self, action: NDArray[np.float32]) -> None:
-        """One period under a torque (1,)."""
+        """Simulate one period under a torque (1,)."""
         self._env.step(action)
 
 
 def start(seed: int, episode: int) -> tuple[Pendulum, np.random.Generator]:
-    """The pendulum as an episode finds it, and the generator of its driver."""
+    """Return the pendulum at the start of an episode, and the generator of its driver."""
     rng = np.random.default_rng((seed, 2, episode))
     return Pendulum(rng.uniform(-np.pi, np.pi), rng.uniform(-4, 4)), rng
 
@@ -126,7 +125,7 @@ def _episode(seed: int, episode: int) -> RldsEpisode:
 
 
 def _simulator() -> tuple[Any, Any, Any]:
-    """The environment's class, pygame's Surface and its Clock."""
+    """Return the environment's class, pygame's Surface and its Clock."""
     with imported("gymnasium's Pendulum-v1", "pip install gymnasium pygame"):
         from gymnasium.envs.classic_control.pendulum import PendulumEnv
         from pygame import Surface
@@ -138,7 +137,7 @@ def _simulator() -> tuple[Any, Any, Any]:
 
 
 def _upward(rng: np.random.Generator) -> Driver:
-    """Pumps energy until the rod can stand, then balances it; now and then it is knocked off."""
+    """Return a driver that swings the rod up and balances it, disturbed by random knocks."""
     gain, noise, clumsy = rng.uniform(0.5, 2.0), rng.uniform(0.05, 0.4), rng.uniform(0.0, 0.04)
     knock = [0, 0.0]  # steps left, torque
 
@@ -157,7 +156,7 @@ def _upward(rng: np.random.Generator) -> Driver:
 
 
 def _smooth(rng: np.random.Generator) -> Driver:
-    """Three sine waves of random frequency."""
+    """Return a driver that sums three sine waves of random frequency."""
     hz, phase = rng.uniform(0.1, 1.5, 3), rng.uniform(0, 2 * np.pi, 3)
     strength = rng.uniform(0.4, 1.6, 3)
     seconds = iter(np.arange(STEPS) * PERIOD_S)
@@ -165,7 +164,7 @@ def _smooth(rng: np.random.Generator) -> Driver:
 
 
 def _held(torque: Callable[[], float], shortest: int, longest: int, rng: np.random.Generator) -> Driver:
-    """A torque for some steps, then another."""
+    """Return a driver that holds a torque for some steps, then another."""
     values: list[float] = []
 
     def drive(angle: float, speed: float) -> float:

@@ -1,15 +1,15 @@
 """Record a two-joint arm seen from above: physics by pymunk, driven by joint velocities at 30 Hz.
 
-`planar_arm` goes into HDF5; `planar_arm_lerobot`, the same arm, into a LeRobotDataset.
+`planar_arm` is recorded to HDF5; `planar_arm_lerobot`, the same arm, to a LeRobotDataset.
 
-The arm stands in the middle of a walled square and shoves three loose blocks about. Each joint has a
-motor of limited torque, and the elbow has stops; blocks are slowed by the table. The velocities in a
-frame are applied between its picture and the next. Recorded beside them are joint angles and
-velocities; the reward is how far the blocks moved, in px, and success that some block ended 20 px or
-more from where it lay.
+The arm stands in the middle of a walled square and pushes three loose blocks. Each joint has a motor of
+limited torque, and the elbow has stops; friction with the table slows the blocks. The velocities in a
+frame are applied between its picture and the next. Joint angles and velocities are recorded beside them.
+The reward is the distance that the blocks moved, in px. An episode is a success if some block ends 20 px
+or more from its first place.
 
-A driver strings manoeuvres together at random: going to a point or to a block, weaving, holding
-a velocity, resting.
+A driver runs random manoeuvres one after another: go to a point or to a block, weave, hold a velocity,
+rest.
 
 Lengths are pixels of the 512 × 512 arena with y downward, angles radians (the shoulder's clockwise from
 +x, the elbow's from the upper arm on), velocities rad/s. J = 2 joints, B = 3 blocks, T frames.
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from hma_data.lab.write_lerobot import LeRobotEpisode
 
 Floats = NDArray[np.float64]
-Manoeuvre = Callable[["Arm"], Floats]  # velocities (J,) now
+Manoeuvre = Callable[["Arm"], Floats]  # returns velocities (J,)
 
 TASK = "shove the blocks about"
 STEPS, HZ, TICKS = 96, 30, 8  # frames of an episode, their rate, ticks of the physics a frame
@@ -40,8 +40,8 @@ ARENA, BASE = 512.0, np.array([256.0, 256.0])
 UPPER, FORE, RADIUS = 122.0, 102.0, 21.0  # lengths of the links, and half their width
 BLOCK = 46.0  # edge
 SPEED = 2.6  # fastest command
-ELBOW_STOP, ELBOW_TURN = 2.5, 2.2  # where the elbow cannot go on, and where drivers turn it back
-MOVED = 20.0  # of a block, for success
+ELBOW_STOP, ELBOW_TURN = 2.5, 2.2  # angles: limit of the elbow, and where drivers turn it back
+MOVED = 20.0  # distance that a block must move for success
 
 SIZE, DRAWN, SHIFT = 128, 256, 4  # of the picture; of the drawing; its coordinates' fractional bits
 TABLE, DARK = (226, 226, 220), (45, 45, 50)  # colours are RGB
@@ -52,7 +52,7 @@ BLOCK_COLORS = ((200, 40, 50), (30, 150, 90), (140, 60, 170))
 def record(out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
     """Record the arm as `out/planar_arm.hdf5`, or as the LeRobotDataset `out/planar_arm_lerobot`.
 
-    Same arguments, same bytes. See `hma_data.lab.record`.
+    The same arguments give the same bytes. See `hma_data.lab.record`.
     """
     if robot not in _WRITERS:
         raise UsageError(robot, "is not this recorder's robot", f"known: {', '.join(_WRITERS)}")
@@ -100,8 +100,8 @@ class Arm:
     """The arm and its blocks.
 
     Args:
-        joints: (J,) angles to begin with.
-        blocks: (B, 3) x, y, angle of each block.
+        joints: (J,) angles at the start.
+        blocks: (B, 3) x, y, angle of each block at the start.
 
     Raises:
         MissingDependencyError: pymunk is not installed.
@@ -122,7 +122,7 @@ class Arm:
     def _link(self, start: Floats, angle: float, length: float) -> "pymunk.Body":
         munk = _pymunk()
         body = munk.Body(1.0, munk.moment_for_segment(1.0, (-length / 2, 0), (length / 2, 0), RADIUS))
-        body.center_of_gravity = (length / 2, 0)  # turning is about it, so the place comes last
+        body.center_of_gravity = (length / 2, 0)  # rotation is about it, so the position is set last
         body.angle, body.position = float(angle), (float(start[0]), float(start[1]))
         shape = munk.Segment(body, (0, 0), (length, 0), RADIUS)
         shape.filter, shape.friction = munk.ShapeFilter(group=1), 0.4
@@ -157,35 +157,35 @@ class Arm:
 
     @property
     def joints(self) -> Floats:
-        """(J,) angles; the shoulder's within ±π."""
+        """Return the (J,) angles; the shoulder's is within ±π."""
         shoulder = (self._upper.angle + np.pi) % (2 * np.pi) - np.pi
         return np.array([shoulder, self._fore.angle - self._upper.angle])
 
     @property
     def velocities(self) -> Floats:
-        """(J,) of the joints."""
+        """Return the (J,) velocities of the joints."""
         upper, fore = self._upper.angular_velocity, self._fore.angular_velocity
         return np.array([upper, fore - upper])
 
     @property
     def blocks(self) -> Floats:
-        """(B, 3) x, y, angle of each block."""
+        """Return (B, 3) x, y, angle of each block."""
         return np.array([[*body.position, body.angle] for body in self._blocks])
 
     @property
     def state(self) -> Floats:
-        """(2·J + 3·B,) joint angles and velocities, poses of the blocks."""
+        """Return (2·J + 3·B,): joint angles and velocities, poses of the blocks."""
         return np.concatenate([self.joints, self.velocities, self.blocks.ravel()])
 
     def advance(self, action: NDArray[np.float32]) -> None:
-        """One frame with the motors set to velocities (J,)."""
+        """Simulate one frame with the motors set to velocities (J,)."""
         for motor, velocity in zip(self._motors, action, strict=True):
-            motor.rate = -float(velocity)  # pymunk's rate is of the first body against the second
+            motor.rate = -float(velocity)  # pymunk's rate is that of the first body relative to the second
         for _ in range(TICKS):
             self._space.step(1 / (HZ * TICKS))
 
     def picture(self) -> NDArray[np.uint8]:
-        """(SIZE, SIZE, 3) RGB."""
+        """Draw the arm and the blocks; (SIZE, SIZE, 3) RGB."""
         import cv2
 
         image = np.full((DRAWN, DRAWN, 3), TABLE, dtype=np.uint8)
@@ -204,14 +204,14 @@ class Arm:
 
 
 def elbow_and_tip(joints: Floats) -> tuple[Floats, Floats]:
-    """Where the elbow and the tip are, (2,) each."""
+    """Return the positions of the elbow and the tip, (2,) each."""
     shoulder, whole = joints[0], joints[0] + joints[1]
     elbow = BASE + UPPER * np.array([np.cos(shoulder), np.sin(shoulder)])
     return elbow, elbow + FORE * np.array([np.cos(whole), np.sin(whole)])
 
 
 def joints_at(tip: Floats, bend: int) -> Floats:
-    """(J,) angles that bring the tip to a point (2,), or as near as the arm reaches, bent +1 or -1."""
+    """Return (J,) angles that bring the tip to a point (2,), or as near as possible, bent +1 or -1."""
     x, y = tip - BASE
     cos = (x * x + y * y - UPPER**2 - FORE**2) / (2 * UPPER * FORE)
     elbow = bend * np.arccos(np.clip(cos, np.cos(ELBOW_TURN), 1.0))
@@ -220,7 +220,7 @@ def joints_at(tip: Floats, bend: int) -> Floats:
 
 
 def start(seed: int, episode: int) -> tuple[Arm, np.random.Generator]:
-    """The arm as an episode finds it, blocks clear of it and of each other, and its driver's generator."""
+    """Return the arm at the start of an episode, with the blocks apart, and the generator of its driver."""
     rng = np.random.default_rng((seed, 3, episode))
     joints = np.array([rng.uniform(-np.pi, np.pi), rng.uniform(-ELBOW_TURN, ELBOW_TURN)])
     elbow, tip = elbow_and_tip(joints)
@@ -272,7 +272,7 @@ def _distances(before: Floats, after: Floats) -> Floats:
 
 
 def _fixed(points: Floats | float) -> NDArray[np.int32]:
-    """Arena to drawing, in OpenCV's fixed point; pixel centres are whole there."""
+    """Convert arena coordinates to the drawing's, in OpenCV's fixed point; pixel centres are whole there."""
     scaled = np.asarray(points) * (DRAWN / ARENA)
     return np.rint((scaled - 0.5 * (scaled.ndim > 0)) * 2**SHIFT).astype(np.int32)
 
@@ -297,7 +297,7 @@ def _pymunk() -> Any:
 
 
 def _driver(rng: np.random.Generator) -> Manoeuvre:
-    """One manoeuvre after another, each for 0.3 to 1.5 s; never on into the elbow's stops."""
+    """Return a driver that runs manoeuvres of 0.3 to 1.5 s and turns the elbow back before its stops."""
     left = 0
     manoeuvre: Manoeuvre = _rest
 
@@ -322,7 +322,7 @@ def _rest(arm: Arm) -> Floats:
 
 
 def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
-    """To a block, and through it, or to any point in reach."""
+    """Return a manoeuvre that goes to a block, and through it, or to any point in reach."""
     angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(60, 220)
     point = BASE + far * np.array([np.cos(angle), np.sin(angle)])
     if rng.random() < 0.6:
@@ -340,14 +340,14 @@ def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
 
 
 def _weave(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
-    """Each joint at its own slow sine."""
+    """Return a manoeuvre that moves each joint by its own slow sine."""
     strength, hz, phase = rng.uniform(0.8, 2.4, 2), rng.uniform(0.2, 0.9, 2), rng.uniform(0, 2 * np.pi, 2)
     seconds = iter(np.arange(STEPS) / HZ)
     return lambda arm: strength * np.sin(2 * np.pi * hz * next(seconds) + phase)
 
 
 def _hold(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
-    """One velocity; now and then of one joint alone."""
+    """Return a manoeuvre that holds one velocity; sometimes only one joint moves."""
     velocities = rng.uniform(-SPEED, SPEED, 2)
     if rng.random() < 0.4:
         velocities[rng.integers(2)] = 0.0

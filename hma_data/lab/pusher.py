@@ -1,8 +1,8 @@
-"""Who moves the pusher: a planner that pushes the T home, or smooth wandering.
+"""Move the pusher: by a planner that pushes the T to its goal, or by smooth random motion.
 
-The planner picks a contact on the T's outline and a push length whose predicted outcome brings the
-T nearest to its goal for the time it costs, walks round the T (or flies over it, for a pusher that
-can lift) and pushes. Contact is quasi-static and frictionless as in gym-pusht: the arena forgets
+The planner chooses a contact on the T's outline and a push length. It takes those whose predicted outcome
+brings the T nearest to its goal for the time they cost. Then the pusher walks round the T (or flies over
+it, if it can lift) and pushes. Contact is quasi-static and frictionless as in gym-pusht: the arena damps
 all velocity, so a push at point c along the inward normal n with speed s moves the T by
 
     v = n·j/m,  ω = (r × n)·j/I,  j = s / (1/m + (r × n)²/I),  r = c − centre of mass.
@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-LOW, HIGH = 22.0, 490.0  # where the pusher's centre may be: its radius inside the walls
-GAP = 11.0  # between pusher and T before a push
-CLEARANCE = 3.0  # kept when walking past the T
+LOW, HIGH = 22.0, 490.0  # range of the pusher's centre: its radius inside the walls
+GAP = 11.0  # distance between pusher and T before a push
+CLEARANCE = 3.0  # distance kept when walking past the T
 STEPS = np.array([1.0, 1.0, 1.5, 1.5, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7, 8, 8, 8, 8])  # of a predicted push
 LENGTHS = np.cumsum(STEPS)
 
 
 def rotation(angle: float) -> Floats:
-    """(2, 2) matrix that turns a column vector by `angle`."""
+    """Return the (2, 2) matrix that rotates a column vector by `angle`."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s], [s, c]])
 
@@ -40,8 +40,8 @@ class Tee:
     Attributes:
         boxes: (2, 2, 2) lower and upper corner of its two bars.
         center: (2,) centre of mass.
-        mass, moment: of the body.
-        radius: of the pusher.
+        mass, moment: mass and moment of inertia of the body.
+        radius: radius of the pusher.
     """
 
     boxes: Floats
@@ -51,7 +51,7 @@ class Tee:
     radius: float
 
     def distance(self, points: Floats) -> Floats:
-        """(...,) signed distance of points (..., 2) to the outline, negative inside."""
+        """Return the (...,) signed distance of points (..., 2) to the outline, negative inside."""
         middle, half = self.boxes.mean(axis=1), (self.boxes[:, 1] - self.boxes[:, 0]) / 2
         over = np.abs(points[..., None, :] - middle) - half
         outside = np.linalg.norm(np.maximum(over, 0), axis=-1)
@@ -60,12 +60,12 @@ class Tee:
 
     @cached_property
     def keypoints(self) -> Floats:
-        """(8, 2) corners of the bars; their mean distance from home is the planner's cost."""
+        """Return the (8, 2) corners of the bars; their mean distance from the goal is the planner's cost."""
         return np.array([[box[i, 0], box[j, 1]] for box in self.boxes for i in (0, 1) for j in (0, 1)])
 
     @cached_property
     def contacts(self) -> tuple[Floats, Floats]:
-        """Points (C, 2) on the outline that a pusher can stand before, and their inward normals (C, 2)."""
+        """Return points (C, 2) on the outline with room for a pusher, and their inward normals (C, 2)."""
         points, normals = [], []
         for low, high in self.boxes:
             for axis in (0, 1):
@@ -82,47 +82,47 @@ class Tee:
 
     @cached_property
     def standoffs(self) -> Floats:
-        """(C, 2) where the pusher's centre waits before each contact."""
+        """Return (C, 2) places where the pusher's centre waits before each contact."""
         points, normals = self.contacts
         return points - normals * (self.radius + GAP)
 
     @cached_property
     def corners(self) -> Floats:
-        """(N, 2) way points round the T."""
+        """Return (N, 2) way points round the T."""
         signs = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
         nodes = self.keypoints + np.tile(signs, (2, 1)) * (self.radius + GAP) * 0.9
         return nodes[self.distance(nodes) > self.radius + CLEARANCE]
 
     @cached_property
     def between_corners(self) -> Floats:
-        """(N, N), see `legs`."""
+        """Return the (N, N) lengths between corners, see `legs`."""
         return self.legs(self.corners, self.corners)
 
     @cached_property
     def to_standoffs(self) -> Floats:
-        """(N, C), see `legs`."""
+        """Return the (N, C) lengths from corners to standoffs, see `legs`."""
         return self.legs(self.corners, self.standoffs)
 
     def legs(self, start: Floats, stop: Floats) -> Floats:
-        """(len(start), len(stop)) length of each straight way, infinite where the T is in it."""
+        """Return the (len(start), len(stop)) length of each straight way, infinite if the T blocks it."""
         share = np.linspace(0, 1, 20)[:, None]
         way = start[:, None, None] * (1 - share) + stop[None, :, None] * share
         clear = self.distance(way).min(axis=-1) > self.radius + CLEARANCE
         return np.where(clear, np.linalg.norm(start[:, None] - stop, axis=-1), np.inf)
 
     def placed(self, pose: Floats) -> Floats:
-        """(8, 2) keypoints in the arena."""
+        """Return the (8, 2) keypoints in the arena, for a pose of the T."""
         return self.keypoints @ rotation(pose[2]).T + pose[:2]
 
 
 @dataclass(frozen=True)
 class Push:
-    """A way to walk and a push at its end.
+    """A walk and a push at its end.
 
     Attributes:
         path: (n, 2) way points; the last is the standoff.
-        end: (2,) where the pusher's centre stops pushing.
-        retreat: (2,) where it steps back to.
+        end: (2,) place of the pusher's centre at the end of the push.
+        retreat: (2,) place to which the pusher steps back.
     """
 
     path: Floats
@@ -133,15 +133,17 @@ class Push:
 def plan(
     tee: Tee, pose: Floats, goal: Floats, agent: Floats, speed: float, fly: bool, rng: np.random.Generator
 ) -> Push:
-    """The next push: most progress for its time; one in ten is a blunder, any that is reachable.
+    """Return the next push: the one with the most progress for its time.
+
+    One push in ten is a blunder: any that is reachable.
 
     Args:
         tee: the T.
         pose, goal: (3,) x, y, angle of the T's frame.
         agent: (2,) centre of the pusher.
         speed: px/s.
-        fly: passes over the T instead of round it.
-        rng: of the blunders.
+        fly: whether the pusher passes over the T instead of round it.
+        rng: generator of the blunders.
     """
     turn = rotation(pose[2])
     standoffs = tee.standoffs @ turn.T + pose[:2]
@@ -151,7 +153,7 @@ def plan(
         lengths, before = _walks(tee, agent, pose)
     lengths = np.where(_inside(standoffs), lengths, np.inf)
     reachable = np.flatnonzero(np.isfinite(lengths))
-    if not len(reachable):  # hemmed in: go somewhere else first
+    if not len(reachable):  # no standoff is reachable: go somewhere else first
         away = rng.uniform(LOW, HIGH, 2)
         return Push(away[None], away, away)
 
@@ -169,10 +171,10 @@ def plan(
 
 
 def predicted_costs(tee: Tee, pose: Floats, goal: Floats) -> Floats:
-    """(C, L) mean distance of the keypoints from home after pushing each contact by each of LENGTHS."""
+    """Return the (C, L) mean distance of the keypoints from the goal after each contact's pushes."""
     points, normals = tee.contacts
     home = tee.placed(goal)
-    push = normals @ rotation(pose[2]).T  # the direction in the arena stays, the T turns under it
+    push = normals @ rotation(pose[2]).T  # the direction in the arena is constant, the T turns
     angle = np.full(len(points), pose[2])
     center = np.tile(rotation(pose[2]) @ tee.center + pose[:2], (len(points), 1))
     touch = points - tee.center
@@ -191,7 +193,7 @@ def predicted_costs(tee: Tee, pose: Floats, goal: Floats) -> Floats:
 
 
 def _walks(tee: Tee, agent: Floats, pose: Floats) -> tuple[Floats, Callable[[int], list[int]]]:
-    """(C,) length of the shortest walk to each standoff, and the corners on the way to one of them."""
+    """Return the (C,) length of the shortest walk to each standoff, and a function that lists its corners."""
     turn = rotation(pose[2])
     local = ((agent - pose[:2]) @ turn)[None]
     usable = _inside(tee.corners @ turn.T + pose[:2])
@@ -227,31 +229,31 @@ def _inside(points: Floats) -> Any:
 
 
 class Policy(Protocol):
-    """Moves the pusher's setpoint."""
+    """A driver of the pusher's setpoint."""
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Setpoint (2,) `seconds` from now, and whether the pusher is up.
+        """Return the setpoint (2,) `seconds` from now, and whether the pusher is up.
 
         Args:
-            pose: (3,) of the T.
+            pose: (3,) pose of the T.
             agent: (2,) centre of the pusher.
-            seconds: until the next call.
+            seconds: time until the next call.
         """
         ...
 
 
 class Planned:
-    """Plans a push, walks, pushes, steps back, plans again."""
+    """A driver that plans a push, walks, pushes, steps back, and plans again."""
 
     def __init__(
         self, tee: Tee, goal: Floats, agent: Floats, speed: float, fly: bool, rng: np.random.Generator
     ) -> None:
         self._tee, self._goal, self._speed, self._fly, self._rng = tee, goal, speed, fly, rng
         self._setpoint = agent.copy()
-        self._phases: list[tuple[Floats, bool]] = []  # way points still to go, and up or down
+        self._phases: list[tuple[Floats, bool]] = []  # remaining way points, and whether the pusher is up
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """See Policy."""
+        """Return the setpoint and whether the pusher is up; see Policy."""
         if not self._phases:
             push = plan(self._tee, pose, self._goal, agent, self._speed, self._fly, self._rng)
             self._phases = [(push.path, self._fly), (push.end[None], False), (push.retreat[None], False)]
@@ -265,7 +267,7 @@ class Planned:
 
 
 class Wandering:
-    """Smooth motion from one random point to the next, often through the T."""
+    """A driver that moves smoothly from one random point to the next, often through the T."""
 
     def __init__(self, agent: Floats, fly: bool, rng: np.random.Generator) -> None:
         self._setpoint, self._fly, self._rng = agent.copy(), fly, rng
@@ -273,7 +275,7 @@ class Wandering:
         self._speed, self._up = 0.0, False
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """See Policy."""
+        """Return the setpoint and whether the pusher is up; see Policy."""
         if not len(self._way):
             near = self._rng.random() < 0.7
             point = pose[:2] + self._rng.normal(0, 60, 2) if near else self._rng.uniform(LOW, HIGH, 2)
@@ -285,7 +287,7 @@ class Wandering:
 
 
 def advance(point: Floats, way: Floats, length: float) -> tuple[Floats, Floats]:
-    """The point `length` further along the way (n, 2), and what is left of it; never past a way's end."""
+    """Return the point `length` further along the way (n, 2), at most its end, and the rest of the way."""
     while len(way):
         step = way[0] - point
         distance = float(np.linalg.norm(step))

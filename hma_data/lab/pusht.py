@@ -1,15 +1,15 @@
-"""Record gym-pusht as two robots: one position-controlled into HDF5, one velocity-controlled into MCAP.
+"""Record gym-pusht as two robots: one position-controlled to HDF5, one velocity-controlled to MCAP.
 
-Both push a T toward its goal pose in the environment's own physics and are seen by its own
-renderer. They share nothing else:
+Both push a T toward its goal pose in the environment's own physics, and its own renderer draws the pictures.
+They share nothing else:
 
     pusht_fast  10 Hz   action (x, y): target of the pusher in px, the environment's native action
     pusht_slow   5 Hz   action (vx, vy, lift): velocity in px/s; lift 1 raises the pusher over the T,
                         which it then no longer touches. Camera 12.5 Hz, joint states 20 Hz
 
-Three episodes in five are planned pushes from near the goal, one is planned from anywhere, one
-wanders at random. Success is the environment's own: the T covers more than 95 % of the goal.
-An episode ends soon after success, else after a fixed time.
+Of five episodes, three are planned pushes from near the goal, one is planned from anywhere, and one moves
+at random. Success is the environment's own: the T covers more than 95 % of the goal. An episode ends soon
+after success, or else after a fixed time.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,19 +24,19 @@ from hma_data.errors import UsageError
 from hma_data.lab import Progress, imported, written_beside
 from hma_data.lab.pusher import Floats, Planned, Policy, Tee, Wandering, rotation
 
-TICK_S = 0.01  # of the physics
-LAG_S = 0.2  # the pusher's spring (k_v / k_p of the environment) trails a moving target by this
+TICK_S = 0.01  # step of the physics
+LAG_S = 0.2  # delay of the pusher's spring (k_v / k_p of the environment) behind a moving target
 SPEED = 300.0  # px/s of planned motion
 STARTS = ("near", "random", "near", "far", "near")
-EPOCH_NS = 1_700_000_000_000_000_000  # of the first bag's stamps; a minute between episodes
+EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episodes are a minute apart
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a robot's arena is drawn.
+    """The colours and the size of a robot's pictures.
 
     Attributes:
-        size: of the square pictures in px.
+        size: side of the square pictures in px.
         block, pusher, raised: colour names.
     """
 
@@ -57,7 +57,7 @@ def record_pusht(
 ) -> Path:
     """Record `pusht_fast` as `out/pusht_fast.hdf5`, or `pusht_slow` as MCAP files in `out/pusht_slow/`.
 
-    Same arguments, same bytes. See `hma_data.lab.record`.
+    The same arguments give the same bytes. See `hma_data.lab.record`.
     """
     if robot not in _WRITERS:
         raise UsageError(robot, "is not a robot of gym-pusht", f"known: {', '.join(_WRITERS)}")
@@ -71,12 +71,12 @@ record = record_pusht
 
 
 class Arena:
-    """The environment, and the little of its state that the robots need.
+    """The environment, with the parts of its state that the robots need.
 
     Args:
         look: colours and picture size.
         start: near, far or random, see STARTS.
-        rng: of the episode.
+        rng: generator of the episode.
 
     Raises:
         MissingDependencyError: gym-pusht is not installed.
@@ -87,7 +87,7 @@ class Arena:
         self._env = environment(obs_type="state", observation_width=look.size, observation_height=look.size)
         self._colors = {True: color(look.raised), False: color(look.pusher)}
         self._env.reset(seed=int(rng.integers(2**31)))
-        bars = sorted(sorted(shape.get_vertices()) for shape in self._env.block.shapes)  # they come as a set
+        bars = sorted(sorted(shape.get_vertices()) for shape in self._env.block.shapes)  # a set has no order
         boxes = [(np.min(corners, axis=0), np.max(corners, axis=0)) for corners in bars]
         body, (pusher,) = self._env.block, self._env.agent.shapes
         self.tee = Tee(
@@ -103,10 +103,10 @@ class Arena:
         self.ticks, self.reward, self.success = 0, 0.0, False
 
     def _near_goal(self, rng: np.random.Generator) -> Floats:
-        """State (5,) with the T within some 50 px and 0.5 rad of its goal.
+        """Return a state (5,) with the T within about 50 px and 0.5 rad of its goal.
 
-        The environment sets the angle after the position and turns about the centre of mass, which
-        moves the T; that is undone beforehand.
+        The environment sets the angle after the position and rotates about the centre of mass, which moves
+        the T. The position returned here compensates for that.
         """
         x, y, angle = self.goal + rng.normal(0, (35, 35, 0.5))
         place = np.array([x, y]) - self.tee.center + rotation(angle) @ self.tee.center
@@ -114,33 +114,33 @@ class Arena:
 
     @property
     def pose(self) -> Floats:
-        """(3,) x, y, angle of the T."""
+        """Return (3,) x, y, angle of the T."""
         return np.array([*self._env.block.position, self._env.block.angle])
 
     @property
     def agent(self) -> Floats:
-        """(2,) centre of the pusher."""
+        """Return the (2,) centre of the pusher."""
         return np.array(self._env.agent.position)
 
     @property
     def velocity(self) -> Floats:
-        """(2,) of the pusher in px/s."""
+        """Return the (2,) velocity of the pusher in px/s."""
         return np.array(self._env.agent.velocity)
 
     @property
     def state(self) -> Floats:
-        """(5,) pusher x, y, T x, y, angle: the environment's observation."""
+        """Return (5,) pusher x, y, T x, y, angle: the environment's observation."""
         return np.asarray(self._env.get_obs(), dtype=np.float64)
 
     def picture(self) -> NDArray[np.uint8]:
-        """(size, size, 3) RGB."""
+        """Render the arena; (size, size, 3) RGB."""
         self._env.obs_type = "pixels"
         pixels: NDArray[np.uint8] = self._env.get_obs()
         self._env.obs_type = "state"
         return pixels
 
     def lift(self, up: bool) -> None:
-        """Raise or lower the pusher; over the T it stays up."""
+        """Raise or lower the pusher; it cannot be lowered over the T."""
         local = (self.agent - self.pose[:2]) @ rotation(self.pose[2])
         over = float(self.tee.distance(local)) < self.tee.radius
         self.raised = up or (self.raised and over)
@@ -148,7 +148,7 @@ class Arena:
         shape.sensor, shape.color = self.raised, self._colors[self.raised]
 
     def advance(self, target: Floats, ticks: int) -> None:
-        """Run the physics with the pusher drawn to `target` (2,)."""
+        """Run the physics for `ticks` while a spring pulls the pusher to `target` (2,)."""
         self._env.control_hz = 1 / (TICK_S * (ticks + 0.5))  # the environment rounds down to ticks
         _, reward, _, _, info = self._env.step(target)
         self.reward = round(float(reward), 9)  # the last digits depend on the order of the T's set of bars
@@ -157,7 +157,7 @@ class Arena:
 
 
 def _environment() -> tuple[Any, Any]:
-    """The environment's class and pygame's Color."""
+    """Return the environment's class and pygame's Color."""
     with imported("gym-pusht", "pip install 'gym-pusht>=0.1.8'"):
         from gym_pusht.envs.pusht import PushTEnv
         from pygame import Color
@@ -240,7 +240,7 @@ def _write_slow(path: Path, episodes: int, seed: int, on_progress: Progress | No
 
 
 def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
-    """(tick, event) in order. Camera and commands jitter by a tick; stamps say when it really was."""
+    """Return (tick, event) in order; camera and commands jitter by a tick, and stamps give the true time."""
     events = [(tick, "joints") for tick in range(0, SLOW_TICKS, 5)]
     events += [(tick + int(rng.integers(-1, 2)), "command") for tick in range(2, SLOW_TICKS, 20)]
     events += [(tick + int(rng.integers(-1, 2)), "camera") for tick in range(3, SLOW_TICKS, 8)]

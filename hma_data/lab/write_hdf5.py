@@ -7,7 +7,7 @@
         states rewards dones
     mask/train mask/valid   names of demos
 
-What is at index t of `obs` was seen before `actions[t]`; `rewards[t]` and `dones[t]` came after it.
+`obs` at index t was observed before `actions[t]`; `rewards[t]` and `dones[t]` came after it.
 """
 
 import json
@@ -28,10 +28,10 @@ class Demo:
     Attributes:
         actions: (T, A) float32.
         observations: key -> (T, …); uint8 (T, H, W, 3) are pictures.
-        states: (T, S) float64, the simulator's own.
-        rewards: (T,) float64.
-        success: whether the task was done at the end.
-        facts: plain values kept as attributes.
+            states: (T, S) float64, the states of the simulator.
+            rewards: (T,) float64.
+            success: whether the task was done at the end.
+            facts: plain values that are stored as attributes.
     """
 
     actions: NDArray[np.float32]
@@ -43,9 +43,9 @@ class Demo:
 
 
 def write_demos(path: Path, demos: Iterable[Demo], env_args: Mapping[str, Any]) -> None:
-    """Write one file; demos are taken one by one, so that only one is in memory.
+    """Write one file; demos are read one by one, so that only one is in memory.
 
-    Every tenth demo is for validation, and the last when there are two to nine.
+    Every tenth demo is for validation; with two to nine demos, the last one is.
     """
     with h5py.File(path, "w") as file:
         data = file.create_group("data")

@@ -30,7 +30,7 @@ class LeRobotEpisode:
         pictures: camera feature -> (T, H, W, 3) uint8 RGB.
         action: (T, A) float32, the command issued at each frame.
         state: (T, S) float32, seen at each frame.
-        task: what was asked, in words.
+            task: the task in words.
     """
 
     pictures: Mapping[str, NDArray[np.uint8]]
@@ -40,12 +40,12 @@ class LeRobotEpisode:
 
 
 def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRobotEpisode]) -> None:
-    """Write one dataset; episodes are taken one by one, so that only one is in memory.
+    """Write one dataset; episodes are read one by one, so that only one is in memory.
 
     Args:
-        folder: made here.
-        embodiment: with a state, and a whole number of frames a second.
-        episodes: with the embodiment's cameras and widths each.
+        folder: folder to make.
+        embodiment: an embodiment that has a state, and a whole number of frames a second.
+        episodes: the episodes; each has the embodiment's cameras and widths.
 
     Raises:
         MissingDependencyError: lerobot cannot be imported.
@@ -63,16 +63,16 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
         robot_type=embodiment.robot,
         video_backend="pyav",
         rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=18),
-        encoder_threads=1,  # the bytes depend on their number
+        encoder_threads=1,  # the output bytes depend on the number of threads
     )
     with _quiet():
         try:
             for episode in episodes:
                 for frame in _frames(episode):
                     writer.add_frame(frame)
-                writer.save_episode(parallel_encoding=False)  # else it forks this process, one for a camera
+                writer.save_episode(parallel_encoding=False)  # otherwise it forks this process, once a camera
         finally:
-            writer.finalize()  # after a failure too: else it writes when collected, into a removed folder
+            writer.finalize()  # after a failure too; else it would write to a removed folder when collected
 
 
 def _frames(episode: LeRobotEpisode) -> Iterable[dict[str, Any]]:
@@ -83,7 +83,7 @@ def _frames(episode: LeRobotEpisode) -> Iterable[dict[str, Any]]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep FFmpeg's report on each video and the progress bar of `datasets` off the terminal."""
+    """Hide FFmpeg's report on each video and the progress bar of `datasets`."""
     import av.logging
     import datasets
 

@@ -1,7 +1,7 @@
-"""Write an episode to MCAP as a ROS 2 recorder would: CDR messages with their definitions beside them.
+"""Write an episode to MCAP as a ROS 2 recorder would: CDR messages, and the definitions of their types.
 
-A message has two times: its header's stamp, when the thing happened, and the later time at which
-the recorder received it. Messages lie in the file in the order of receipt.
+A message has two times: its header's stamp, which is the time of the event, and the later time at which the
+recorder received it. Messages are in the file in the order of receipt.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,13 +20,13 @@ DISTRO = "jazzy"
 
 @dataclass(frozen=True)
 class Message:
-    """One message on its way into the file.
+    """A message to write.
 
     Attributes:
-        topic: with leading slash.
-        stamp_ns, received_ns: nanoseconds since 1970.
-        type: e.g. sensor_msgs/msg/JointState.
-        content: of that type, from `picture`, `joints` or `twist`.
+            topic: name with leading slash.
+            stamp_ns, received_ns: nanoseconds since 1970.
+            type: e.g. sensor_msgs/msg/JointState.
+            content: value of that type, from `picture`, `joints` or `twist`.
     """
 
     topic: str
@@ -37,7 +37,7 @@ class Message:
 
 
 def picture(topic: str, stamp_ns: int, received_ns: int, image: NDArray[np.uint8], frame: str) -> Message:
-    """A sensor_msgs/CompressedImage; image (H, W, 3) RGB is stored as PNG, without loss."""
+    """Return a sensor_msgs/CompressedImage; image (H, W, 3) RGB is stored as PNG, without loss."""
     import cv2
 
     _, png = cv2.imencode(".png", image[..., ::-1])
@@ -55,7 +55,7 @@ def joints(
     velocity: NDArray[np.float64],
     frame: str,
 ) -> Message:
-    """A sensor_msgs/JointState of (n,) positions and velocities."""
+    """Return a sensor_msgs/JointState of (n,) positions and velocities."""
     kind = "sensor_msgs/msg/JointState"
     content = _types().types[kind](
         header=_header(stamp_ns, frame),
@@ -68,7 +68,7 @@ def joints(
 
 
 def twist(topic: str, stamp_ns: int, received_ns: int, linear: NDArray[np.float64], frame: str) -> Message:
-    """A geometry_msgs/TwistStamped with linear (3,) and no rotation."""
+    """Return a geometry_msgs/TwistStamped with linear (3,) and no rotation."""
     kind, types = "geometry_msgs/msg/TwistStamped", _types().types
     vector = types["geometry_msgs/msg/Vector3"]
     x, y, z = (float(value) for value in linear)
@@ -79,7 +79,7 @@ def twist(topic: str, stamp_ns: int, received_ns: int, linear: NDArray[np.float6
 
 
 def write_messages(path: Path, messages: Sequence[Message], facts: Mapping[str, str]) -> None:
-    """Write one MCAP file, ROS 2 profile; `facts` become its metadata record "episode"."""
+    """Write one MCAP file in the ROS 2 profile; `facts` become its metadata record "episode"."""
     store = _types()
     channels: dict[str, int] = {}
     schemas: dict[str, int] = {}

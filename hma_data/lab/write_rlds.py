@@ -2,7 +2,7 @@
 
     features.json dataset_info.json <name>-train.tfrecord-00000-of-00001
 
-Only what `Step` holds is written: pictures as files, vectors of float32, a text. T steps of an episode.
+Only the features of `RldsEpisode` are written: pictures as files, vectors of float32, a text. T steps.
 """
 
 import json
@@ -25,7 +25,7 @@ class RldsEpisode:
     Attributes:
         pictures: path inside a step -> T files, JPEG or PNG.
         vectors: path inside a step -> (T, A) float32.
-        instruction: what was asked.
+            instruction: the task in words.
     """
 
     pictures: Mapping[str, list[bytes]]
@@ -36,14 +36,14 @@ class RldsEpisode:
 def write_rlds(
     folder: Path, name: str, sizes: Mapping[str, tuple[int, int]], codec: str, episodes: Iterable[RldsEpisode]
 ) -> None:
-    """A folder of one split with one shard; episodes are taken one by one.
+    """Write a folder of one split with one shard; episodes are read one by one.
 
     Args:
-        folder: made here.
-        name: of the dataset.
+        folder: folder to make.
+        name: name of the dataset.
         sizes: path of each camera -> (height, width).
         codec: jpeg or png.
-        episodes: with the same keys each.
+        episodes: the episodes; all have the same keys.
     """
     folder.mkdir(parents=True)
     count, widths = 0, {}
@@ -84,7 +84,7 @@ def _dict(items: dict[str, Any]) -> dict[str, Any]:
 
 
 def _example(episode: RldsEpisode) -> bytes:
-    """tf.train.Example: a map from names to lists, in protobuf's wire form."""
+    """Return a tf.train.Example, a map from names to lists, in protobuf's wire format."""
     length = len(next(iter(episode.pictures.values())))
     lists: dict[str, bytes] = {
         f"steps/{key}": _field(1, b"".join(_field(1, data) for data in files))

@@ -1,1 +1,1 @@
-"""Tokenized parquet shards: schema, writer, reader, manifest, verification. The format is docs/format.md."""
+"""Write, read and verify tokenized parquet shards and their manifest. The format is docs/format.md."""

@@ -1,7 +1,7 @@
-"""Actions as curves: a strip for each value, drawn with OpenCV so that a video of them is quick.
+"""Draw actions as curves, one strip for each value, with OpenCV so that a video of them is quick to make.
 
-T rows, A values. Each strip spans the value's own range; a line marks zero, grey the rows whose values are
-not known.
+T rows, A values. Each strip spans the range of its value. A line marks zero; grey marks the rows whose values
+are not known.
 """
 
 from dataclasses import dataclass
@@ -14,21 +14,21 @@ from hma_data.episodes.images import opencv
 from hma_data.episodes.sheets import INK, PAPER, Images, write_text
 
 LINE, CURSOR, ZERO, UNKNOWN = (0, 114, 178), (213, 94, 0), (200, 200, 200), (225, 225, 225)
-MOST = 16  # strips; more values than these are counted
+MOST = 16  # strips; of further values only the number is shown
 LABELS, FOOT = 136, 16  # pixels left of the strips and below them
 
 
 @dataclass(frozen=True)
 class Curves:
-    """The actions of one episode, to be drawn.
+    """The actions of one episode, and how to draw them.
 
     Attributes:
         values: (T, A).
         known: (T,) bool, or None.
         low, high: (A,) range of each value, over the whole set.
-        names: A.
-        seconds: from the first row to the last.
-        width, height: of the picture in pixels.
+        names: A names.
+        seconds: time from the first row to the last.
+        width, height: size of the picture in pixels.
     """
 
     values: NDArray[np.float32]
@@ -42,7 +42,7 @@ class Curves:
 
     @cached_property
     def panel(self) -> Images:
-        """(height, width, 3) without a cursor."""
+        """Draw all curves without a cursor; (height, width, 3)."""
         picture = np.full((self.height, self.width, 3), PAPER, np.uint8)
         shown = min(self.values.shape[1], MOST)
         rest = self.values.shape[1] - shown
@@ -54,14 +54,14 @@ class Curves:
         return picture
 
     def at(self, row: int) -> Images:
-        """The panel with a cursor at a row."""
+        """Return the panel with a cursor at a row."""
         picture = self.panel.copy()
         x = self._x(np.array([row]))[0]
         picture[: self.height - FOOT, max(x - 1, 0) : x + 1] = CURSOR
         return picture
 
     def marked(self, rows: NDArray[np.int64]) -> Images:
-        """The panel with a tick below each of these rows."""
+        """Return the panel with a tick below each of these rows."""
         picture = self.panel.copy()
         for x in self._x(rows):
             picture[self.height - FOOT - 2 : self.height - FOOT + 3, x - 1 : x + 2] = CURSOR

@@ -1,4 +1,4 @@
-"""What a shard set holds, in figures: of its manifest and episodes.parquet, without opening a shard."""
+"""Describe a shard set in figures from its manifest and episodes.parquet, without opening a shard."""
 
 from typing import Any
 
@@ -10,11 +10,11 @@ from hma_data.shards.schema import flag_counts
 from hma_data.shards.windows import WindowIndex
 from hma_data.storage.paths import StrPath
 
-WINDOW = 12  # frames, the model's
+WINDOW = 12  # frames of the model's window
 
 
 def describe(folder: StrPath) -> dict[str, Any]:
-    """Plain values for `hma shards info --json`.
+    """Return plain values for `hma shards info --json`.
 
     Args:
         folder: str or path of the set, or its URI.

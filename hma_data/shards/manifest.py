@@ -1,4 +1,4 @@
-"""The manifest, episodes.parquet and quarantine.jsonl of a shard set: all derived from the shards' footers.
+"""Derive the manifest, episodes.parquet and quarantine.jsonl of a shard set from the shards' footers.
 
 They are written last, so a shard set without a manifest is one whose job has not finished.
 """
@@ -35,8 +35,12 @@ MANIFEST, EPISODES, QUARANTINE, EMBODIMENT = (
     "embodiment.yaml",
 )
 SPLITS = ("train", "val")
+<<<<<<< HEAD
 WORKING = (".lock", ".journal", ".plan")  # names of what a conversion keeps in the folder begin with these
 HASHERS = 4  # threads; hashing leaves the interpreter alone
+=======
+HASHERS = 4  # threads; hashing releases the interpreter lock
+>>>>>>> doc-parts
 SHARD_NAME = re.compile(r"(train|val)/shard-([0-9]{5,9})\.parquet")
 _SEAL = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')
 _UNSEALED = "0" * 64
@@ -71,7 +75,7 @@ class ShardFile:
     """A shard as the manifest lists it.
 
     Attributes:
-        row_groups: rows of each; a reader plans with them without opening the file.
+        row_groups: number of rows of each row group; a reader plans with it without opening the file.
     """
 
     path: str
@@ -83,7 +87,7 @@ class ShardFile:
     row_groups: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        named = SHARD_NAME.fullmatch(self.path)  # keeps paths inside the folder, whoever wrote the manifest
+        named = SHARD_NAME.fullmatch(self.path)  # keeps paths inside the folder, even in a forged manifest
         if not named or named[1] != self.split:
             raise ValueError(f"{self.path!r} is not the name of a shard of split {self.split!r}")
         if not all(map(is_count, (self.rows, self.episodes, self.bytes, *self.row_groups))):
@@ -92,15 +96,15 @@ class ShardFile:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a shard set holds.
+    """The content of a shard set.
 
     Attributes:
         plan: what it was made from; the same in every footer.
-        embodiment, tokenizer: snapshots.
+        embodiment, tokenizer: copies from the time of the conversion.
         shards: in plan order.
         splits: split -> {episodes, frames, rows, shards}.
         stats: "action", "state" -> summary over train (see Stats.summary).
-        quarantined: refused episodes.
+        quarantined: number of refused episodes.
         files: name -> sha256 of the other files of the set.
     """
 
@@ -122,16 +126,16 @@ class Manifest:
 
     @property
     def frame_stride(self) -> int:
-        """Recorded steps a row: 1, or the embodiment's stride when only the grid's frames are kept."""
+        """Return the recorded steps a row: 1, or the embodiment's stride if only grid frames are kept."""
         return int(self.plan["frame_stride"])
 
     @property
     def cameras(self) -> list[str]:
-        """Cameras in the shards, in row order within an episode."""
+        """Return the cameras in the shards, in row order within an episode."""
         return list(self.plan["cameras"])
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values of manifest.json."""
+        """Return the plain values of manifest.json."""
         return {
             "schema_version": SCHEMA_VERSION,
             "plan": self.plan,
@@ -151,7 +155,7 @@ class Manifest:
         }
 
     def to_text(self) -> str:
-        """manifest.json: sealed by the sha256 of its own text with zeros in the seal's place."""
+        """Return manifest.json, sealed by the sha256 of its text with zeros in place of the seal."""
         values = self.to_json()
         shards = [f"  {json.dumps(shard)}" for shard in values.pop("shards")]
         sealed = {"schema_version": values.pop("schema_version"), "manifest_sha256": _UNSEALED, **values}
@@ -161,13 +165,13 @@ class Manifest:
 
     @classmethod
     def load(cls, folder: StrPath) -> "Manifest":
-        """The manifest of a shard set.
+        """Read the manifest of a shard set.
 
         Args:
             folder: str or path of the set, or its URI.
 
         Raises:
-            ShardError: there is none, or it is damaged.
+            ShardError: there is no manifest, or it is damaged.
         """
         folder = place(folder)
         path = folder / MANIFEST
@@ -207,7 +211,7 @@ class Manifest:
 
 
 def damaged_files(folder: Path, manifest: Manifest) -> list[Path]:
-    """Files derived from the shards that are missing, or not what the manifest says of them."""
+    """Return the derived files that are missing, or whose sha256 is not the one in the manifest."""
 
     def is_whole(path: Path) -> bool:
         return path.is_file() and file_sha256(path) == manifest.files.get(path.name)
@@ -216,7 +220,7 @@ def damaged_files(folder: Path, manifest: Manifest) -> list[Path]:
 
 
 def stored_embodiment(folder: Path) -> Embodiment:
-    """The embodiment.yaml of a shard set.
+    """Read the embodiment.yaml of a shard set.
 
     Raises:
         RegistryError: it is damaged.
@@ -229,7 +233,7 @@ def stored_embodiment(folder: Path) -> Embodiment:
 
 
 def seal_problem(text: bytes) -> str:
-    """What is wrong with the seal of a manifest's bytes; empty when it holds."""
+    """Return what is wrong with the seal of a manifest's bytes; empty if the seal is right."""
     found = _SEAL.search(text)
     if not found:
         return "carries no manifest_sha256"
@@ -241,13 +245,13 @@ def seal_problem(text: bytes) -> str:
 
 
 def plan_hash(plan: dict[str, Any]) -> str:
-    """Sixteen hex digits over everything in a plan but its hash."""
+    """Return sixteen hex digits of the SHA-256 over everything in a plan except its hash."""
     facts = {key: value for key, value in plan.items() if key != "hash"}
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
 
 class Gathered:
-    """What the footers of a set say together; they are added in the manifest's order, and not kept."""
+    """The combined facts of a set's footers, added in the manifest's order; the footers are not kept."""
 
     def __init__(self, source: str) -> None:
         self.source = source
@@ -256,7 +260,7 @@ class Gathered:
         self._tables: list[pa.Table] = []
 
     def add(self, footer: Footer) -> None:
-        """Take in the next shard's footer."""
+        """Add the next shard's footer."""
         self._tables.append(_episode_table(footer.episodes, self.source))
         self.refused += footer.quarantine
         for name, stats in footer.stats.items():
@@ -265,14 +269,14 @@ class Gathered:
                 merged.merge(stats)
 
     def episodes(self) -> pa.Table:
-        """episodes.parquet, in order of episode_index."""
+        """Return the table of episodes.parquet, in order of episode_index."""
         tables = self._tables or [_episode_table((), self.source)]
         table = pa.concat_tables(tables).combine_chunks().sort_by("episode_index")
         known = pc.any(pc.not_equal(table["content"], "")).as_py()
-        return table if known else table.drop_columns("content")  # as sets were written before there was one
+        return table if known else table.drop_columns("content")  # sets of older releases lack this column
 
     def quarantine(self) -> str:
-        """quarantine.jsonl, in order of the ids."""
+        """Return the text of quarantine.jsonl, in order of the ids."""
         lines = []
         for item in sorted(self.refused, key=lambda item: item.id):
             values = asdict(item)
@@ -280,18 +284,18 @@ class Gathered:
         return "".join(lines)
 
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """The manifest's `stats`, over train."""
+        """Return the manifest's `stats`, over train."""
         return {name: stats.summary() for name, stats in self.stats.items()}
 
 
 @dataclass(frozen=True)
 class Derived:
-    """Everything of a set that follows from its shards, before it is written.
+    """Everything of a set that is derived from its shards, before it is written.
 
     Attributes:
-        manifest: its `files` are filled in when the others are written.
-        episodes: episodes.parquet.
-        quarantine: quarantine.jsonl.
+        manifest: the manifest; its `files` are filled in when the other files are written.
+        episodes: content of episodes.parquet.
+        quarantine: content of quarantine.jsonl.
     """
 
     manifest: Manifest
@@ -299,7 +303,7 @@ class Derived:
     quarantine: str
 
     def write(self, folder: Path) -> Manifest:
-        """All files but the shards; the manifest comes last."""
+        """Write all files except the shards, the manifest last, and return the manifest."""
         with atomic_path(folder / EPISODES) as part:
             pq.write_table(self.episodes, part, compression="zstd")
         write_atomic(folder / QUARANTINE, self.quarantine)
@@ -319,13 +323,13 @@ def derive(
     source: str,
     hashes: Mapping[str, str] | None = None,
 ) -> Derived:
-    """What a set's shards say together; nothing is written.
+    """Derive the other files of a set from its shards; write nothing.
 
     Args:
-        folder: of the shard set.
-        names: of the shards, in plan order; all are there.
-        source: URI the recordings came from.
-        hashes: sha256 of shards that need not be read for it.
+        folder: folder of the shard set.
+        names: names of the shards, in plan order; all exist.
+        source: URI that the recordings came from.
+        hashes: sha256 of shards whose sha256 is known, by name; they are not computed again.
 
     Raises:
         ShardError: a shard is damaged, or of another plan.
@@ -372,7 +376,7 @@ def finish(
 def _described(
     folder: Path, names: Sequence[str], hashes: Mapping[str, str]
 ) -> Iterator[tuple[ShardFile, Footer]]:
-    """Each shard as the manifest lists it, with its footer; a few are hashed at a time."""
+    """Yield each shard as the manifest lists it, with its footer; hash a few shards at a time."""
 
     def describe(name: str) -> tuple[ShardFile, Footer]:
         path = folder / name
@@ -389,12 +393,12 @@ def _described(
         return file, footer
 
     with ThreadPoolExecutor(HASHERS) as pool:
-        for start in range(0, len(names), 4 * HASHERS):  # a few footers in memory, however many shards
+        for start in range(0, len(names), 4 * HASHERS):  # few footers are in memory at a time
             yield from pool.map(describe, names[start : start + 4 * HASHERS])
 
 
 def split_totals(episodes: pa.Table, files: Sequence[ShardFile], split: str) -> dict[str, int]:
-    """Counts of one split, as the manifest states them."""
+    """Return the counts of one split, as the manifest states them."""
     rows = episodes.filter(pc.equal(episodes["split"], split))
     return {
         "episodes": len(rows),

@@ -1,12 +1,12 @@
-"""The layout of the paper's code: whole splits as flat files that numpy maps into memory.
+"""Export a shard set to the layout of the paper's code: flat files that numpy maps into memory.
 
     <out>/<split>/video.bin            (N, h, w) uint32 ids, (N, c, h, w) float16 latents, or
                                        (N, H, W, 3) uint8 pixels
                   actions/actions.bin  (N, A) float32
                   segment_ids.bin      (N,) int32: the episode of each row, rising
                   metadata.json        shapes, dtype, rate and name, as liruiw/HMA writes and reads them
-                  hma/                 what that layout has no place for: episodes.parquet, embodiment.yaml,
-                                       timestamp.bin, state.bin, masks
+                                hma/                 data that this layout has no place for: episodes.parquet,
+                                                     embodiment.yaml, timestamp.bin, state.bin, masks
 
 N rows of a split; all numbers little-endian.
 """
@@ -36,7 +36,7 @@ OnProgress = Callable[[int, int], None]
 
 
 def quiet(done: int, total: int) -> None:
-    """No progress display."""
+    """Show no progress."""
 
 
 def export(
@@ -47,20 +47,21 @@ def export(
     camera: str | None = None,
     on_progress: OnProgress = quiet,
 ) -> list[Path]:
-    """Write the splits of a shard set as flat files; each folder appears when it is whole.
+    """Write the splits of a shard set as flat files; each folder appears when it is complete.
 
     Args:
         folder: str or path of the set, or its URI.
         out: str or path of a new folder.
-        split: only this one, into `out` itself; None writes each split that has episodes into a folder below.
-        camera: which, where the set has several; None takes the first.
+        split: write only this split, into `out` itself; None writes each split that has episodes into a
+            folder below `out`.
+        camera: name of the camera, if the set has several; None takes the first.
 
     Returns:
-        the folders written.
+        The folders written.
 
     Raises:
-        UsageError: no such split or camera.
-        OutputError: a folder is there already, or cannot be written.
+        UsageError: there is no such split or camera.
+        OutputError: a folder is already there, or cannot be written.
     """
     shards, out = ShardSet(folder), as_path(out)
     cameras = shards.manifest.cameras
@@ -85,7 +86,7 @@ def export(
 
 
 def _export_split(shards: ShardSet, split: str, place: Path, camera: int) -> Iterator[int]:
-    """Write beside, then rename; yields the rows of each episode."""
+    """Write to a folder beside the final one, then rename it; yield the number of rows of each episode."""
     part = place.with_name(f".{place.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
@@ -94,7 +95,7 @@ def _export_split(shards: ShardSet, split: str, place: Path, camera: int) -> Ite
         yield from _write_rows(shards, split, part, camera)
         sync_folder(part)
         if place.exists():
-            place.rmdir()  # empty, as was seen before
+            place.rmdir()  # empty, as checked before
         part.rename(place)
     except OSError as fault:
         reason = fault.strerror or str(fault)
@@ -137,14 +138,14 @@ def _write_rows(shards: ShardSet, split: str, part: Path, camera: int) -> Iterat
 
 
 def video_dtype(spec: TokenizerSpec) -> str:
-    """Of video.bin: what the paper's loaders expect."""
+    """Return the dtype of video.bin that the paper's loaders expect."""
     if spec.kind == "discrete":
         return "<u4"
     return "|u1" if spec.dtype == "uint8" else "<f2"
 
 
 def _as_video(rows: NDArray[Any], spec: TokenizerSpec) -> NDArray[Any]:
-    """(N, width) -> (N, h, w), (N, c, h, w); pixels (N, H, W, 3)."""
+    """Reshape (N, width) rows to (N, h, w) ids or (N, c, h, w) latents; pixels to (N, H, W, 3)."""
     h, w = spec.grid
     if spec.kind == "discrete":
         return rows.reshape(-1, h, w)
@@ -153,7 +154,7 @@ def _as_video(rows: NDArray[Any], spec: TokenizerSpec) -> NDArray[Any]:
 
 
 def _metadata(shards: ShardSet, rows: int, camera: int) -> dict[str, Any]:
-    """metadata.json: the paper's fields, then ours."""
+    """Return the values of metadata.json: the paper's fields, then ours."""
     spec, embodiment, plan = shards.spec, shards.embodiment, shards.manifest.plan
     h, w = spec.grid
     discrete = spec.kind == "discrete"

@@ -1,4 +1,4 @@
-"""Look at a shard set: pictures decoded from its tokens, with the actions drawn as curves."""
+"""Show a shard set: decode pictures from its tokens and draw the actions as curves."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from hma_data.shards.schema import mask_columns, token_column
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
-THUMB, GAP, LABEL, STRIPS, FILM = 144, 4, 18, 22, 256  # pixels; a strip's height in the sheet
-DECODED = 16  # frames at a time
+THUMB, GAP, LABEL, STRIPS, FILM = 144, 4, 18, 22, 256  # pixels; STRIPS is the height of a strip in the sheet
+DECODED = 16  # frames decoded at a time
 
 
 @dataclass(frozen=True)
 class Preview:
-    """What was written."""
+    """The files that were written, and the ids of the episodes in them."""
 
     sheet: Path
     video: Path
@@ -31,13 +31,13 @@ class Preview:
 
 
 def tokenizer_of(shards: ShardSet, weights: StrPath | None = None, device: str = "cpu") -> Tokenizer:
-    """The tokenizer that made a shard set.
+    """Return the tokenizer that made a shard set.
 
     Args:
         weights: str or path, as `get_tokenizer` takes them.
 
     Raises:
-        TokenizerError: the one here would give other tokens.
+        TokenizerError: the tokenizer on this machine would give other tokens.
     """
     tokenizer = get_tokenizer(shards.spec.name, weights=weights, device=device)
     if tokenizer.spec != shards.spec:
@@ -61,21 +61,21 @@ def preview(
     frames: int = 300,
     tokenizer: Tokenizer | None = None,
 ) -> Preview:
-    """Write `sheet.png` and `preview.mp4` for episodes from all over a shard set.
+    """Write `sheet.png` and `preview.mp4` for episodes spread evenly over a shard set.
 
     Args:
         folder: str or path of the set, or its URI.
         out: str or path of the folder to write to.
         weights: str or path, as `get_tokenizer` takes them.
-        episodes: how many, evenly spaced from the first to the last.
-        columns: pictures of each in the sheet.
-        camera: which; None takes the first.
-        frames: at most so many of each episode in the video.
-        tokenizer: None takes the set's own.
+        episodes: number of episodes, evenly spaced from the first to the last.
+        columns: number of pictures of each episode in the sheet.
+        camera: name of the camera; None takes the first.
+        frames: largest number of frames of each episode in the video.
+        tokenizer: tokenizer that decodes; None takes the set's own.
 
     Raises:
-        ShardError: it holds no episodes.
-        UsageError: no such camera.
+        ShardError: the set holds no episodes.
+        UsageError: there is no such camera.
     """
     shards, out = ShardSet(folder), as_path(out)
     if camera is not None and camera not in shards.manifest.cameras:
@@ -96,7 +96,7 @@ def preview(
 
 
 class _Seen:
-    """One episode as one camera saw it; tokens are decoded when they are drawn."""
+    """One episode as one camera recorded it; tokens are decoded when they are drawn."""
 
     def __init__(
         self, shards: ShardSet, tokenizer: Tokenizer, row: dict[str, Any], camera: str | None
@@ -108,7 +108,7 @@ class _Seen:
         names = [token_column(shards.spec)[0], "action", "timestamp", *masks]
         values = shards.episode_rows(row["episode_index"], names)
         self._tokens = values[names[0]][own]
-        self._actions = values["action"][own, : shards.embodiment.action_dim]  # of a chunk the first command
+        self._actions = values["action"][own, : shards.embodiment.action_dim]  # the first command of a chunk
         self._known = values["action_known"][own] if masks else None
         self._seconds = float(values["timestamp"][own][-1])
         words = [
@@ -132,7 +132,7 @@ class _Seen:
         return Curves(self._actions, known, low, high, names, self._seconds, width, height)
 
     def sheet(self, columns: int) -> Images:
-        """(H, W, 3): the label, pictures in a row, and below them the actions of the whole episode."""
+        """Return (H, W, 3): the label, pictures in a row, and below them the actions of the whole episode."""
         picks = np.unique(np.linspace(0, len(self._tokens) - 1, columns).astype(int))
         width = columns * (THUMB + GAP) + GAP
         shown = min(self._actions.shape[1], 16)
@@ -145,7 +145,7 @@ class _Seen:
         return np.concatenate([strip, curves.marked(picks), np.full((2, width, 3), INK, np.uint8)])
 
     def film(self, most: int) -> Iterator[Images]:
-        """(H, W, 3) a frame: the picture, beside it the actions with a cursor at its time."""
+        """Yield (H, W, 3) for each frame: the picture, and the actions with a cursor at its time."""
         curves = self._curves(FILM + 128, FILM)
         for start in range(0, min(len(self._tokens), most), DECODED):
             rows = np.arange(start, min(start + DECODED, len(self._tokens), most))

@@ -1,7 +1,7 @@
-"""Publish a shard set: its shards first, in commits of bounded size, and the manifest in the last.
+"""Publish a shard set: its shards first, in commits of bounded size, and the manifest in the last commit.
 
-Who finds no manifest finds no shard set. What is there already with the same content is left out, so the same
-call goes on with an upload that was cut off.
+A place without a manifest holds no shard set. Files that are already there with the same content are left
+out, so the same call continues an upload that was interrupted.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,15 +11,15 @@ from typing import Protocol
 
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SHARD_NAME, Manifest
 
-FILES, BYTES = 50, 5 * 10**9  # of a commit
+FILES, BYTES = 50, 5 * 10**9  # largest numbers of files and bytes in a commit
 SMALL = (EMBODIMENT, EPISODES, QUARANTINE)
 
 
 class Place(Protocol):
-    """Where a shard set is published: a `Repository`, or the `FolderStore` of `hma_model`."""
+    """A place to publish a shard set: a `Repository`, or the `FolderStore` of `hma_model`."""
 
     def files(self) -> dict[str, int]:
-        """Return sizes by name of what is there."""
+        """Return the sizes of the place's files, by name."""
         ...
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
@@ -27,8 +27,10 @@ class Place(Protocol):
         ...
 
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
-        """Put files in place, delete where None, and return the address; `changes` is asked again where
-        somebody else was faster."""
+        """Write files, delete those whose value is None, and return the place's address.
+
+        If somebody else changed the place first, `changes` is called again.
+        """
         ...
 
 
@@ -42,11 +44,11 @@ def publish(
     """Put a shard set into a repository or folder.
 
     Args:
-        place: where; its `files` were asked for.
-        folder: of the set on this machine.
-        require: asks for the place's `files` and returns them; raises where they must not be changed.
+        place: where to publish; its `files` were already called.
+        folder: folder of the set on this machine.
+        require: calls the place's `files` and returns them; raises if they must not be changed.
         below: folder in the place; empty for its top.
-        page: README.md, where there shall be one.
+        page: content of README.md, if there is to be one.
 
     Returns:
         The place's address.
@@ -59,7 +61,7 @@ def publish(
 
     def part(batch: Sequence[str]) -> dict[str, Path | bytes | None]:
         there = begin + MANIFEST in require()
-        stale = there and not place.has(begin + MANIFEST, folder / MANIFEST)  # it would name other shards
+        stale = there and not place.has(begin + MANIFEST, folder / MANIFEST)  # it names other shards
         files: dict[str, Path | bytes | None] = {begin + path: folder / path for path in batch}
         return files | ({begin + MANIFEST: None} if stale else {})
 
@@ -77,7 +79,7 @@ def publish(
 
 
 def _batches(sizes: Sequence[tuple[str, int]]) -> list[list[str]]:
-    """Return names in groups of a commit; at least one group, which may be empty."""
+    """Divide names into groups, one for each commit; there is at least one group, which may be empty."""
     groups: list[list[str]] = [[]]
     total = 0
     for name, size in sizes:

@@ -1,4 +1,4 @@
-"""Read a shard set: its episodes, its rows, a row group at a time.
+"""Read a shard set: its episodes and its rows, one row group at a time.
 
 N rows, S tokens a frame, A values of an action.
 """
@@ -28,13 +28,13 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class EpisodeIndex:
-    """Where the episodes of a split lie; one entry an episode and camera, arrays of one length.
+    """The places of a split's episodes; one entry for each episode and camera, in arrays of one length.
 
     Attributes:
-        episode_index: as in the plan.
+        episode_index: number of the episode in the plan.
         shard: index into `ShardSet.shards(split)`.
         start: first row in the shard.
-        length: rows.
+        length: number of rows.
     """
 
     episode_index: Ints
@@ -44,16 +44,17 @@ class EpisodeIndex:
 
 
 class ShardSet:
-    """A folder that `hma convert` wrote, here or in a store (`s3://bucket/set`).
+    """A folder that `hma convert` wrote, on this machine or in a store (`s3://bucket/set`).
 
-    Opening it reads the manifest only; episodes and rows are read when asked for.
+    Opening it reads the manifest only; episodes and rows are read on request.
 
     Args:
         folder: path or URI.
-        cache: of a set in a store, keep whole shards on this machine while they fit; else read by ranges.
+        cache: for a set in a store, whether to keep whole shards on this machine if they fit; otherwise
+            shards are read by ranges.
 
     Raises:
-        ShardError: there is none, or its manifest is damaged.
+        ShardError: there is no shard set, or its manifest is damaged.
         StorageError: the store refuses to read it.
     """
 
@@ -68,15 +69,15 @@ class ShardSet:
 
     @property
     def row_stride(self) -> int:
-        """Rows from one frame of the model's grid to the next."""
+        """Return the number of rows from one frame of the model's grid to the next."""
         return self.embodiment.stride // self.manifest.frame_stride
 
     @cached_property
     def episodes(self) -> pa.Table:
-        """episodes.parquet.
+        """Read episodes.parquet.
 
         Raises:
-            ShardError: it is not there or damaged.
+            ShardError: it is missing or damaged.
         """
         return self._episodes()
 
@@ -92,10 +93,10 @@ class ShardSet:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
 
     def refused(self) -> list[dict[str, Any]]:
-        """quarantine.jsonl, a mapping a refused episode.
+        """Read quarantine.jsonl; return one mapping for each refused episode.
 
         Raises:
-            ShardError: it is not there or damaged.
+            ShardError: it is missing or damaged.
         """
         path = self.folder / QUARANTINE
         try:
@@ -106,20 +107,20 @@ class ShardSet:
             ) from fault
 
     def columns(self) -> list[str]:
-        """What `read` gives, without the camera's name and the frame's number, which follow from the rest."""
+        """Return the columns to `read`, without `camera` and `frame_index`, which follow from the others."""
         names = [token_column(self.spec)[0], "episode_index", "timestamp", "action"]
         return [*names, *(["state"] if self.embodiment.state else []), *mask_columns(self.embodiment)]
 
     def shards(self, split: str) -> list[str]:
-        """Names of a split's shards, in order."""
+        """Return the names of a split's shards, in order."""
         return [shard.path for shard in self.manifest.shards if shard.split == split]
 
     def row_groups(self, split: str) -> list[tuple[int, ...]]:
-        """Rows of each row group of each shard of a split."""
+        """Return the rows of each row group of each shard of a split."""
         return [shard.row_groups for shard in self.manifest.shards if shard.split == split]
 
     def index(self, split: str, cameras: int | None = None) -> EpisodeIndex:
-        """The split's episodes, in row order; an episode seen by several cameras counts once for each."""
+        """Return the split's episodes, in row order; an episode with several cameras counts once for each."""
         cameras = cameras or len(self.manifest.cameras)
         table = self._episodes(["episode_index", "split", "shard", "row_start", "length"])
         splits, names = _words(table["split"]), _words(table["shard"])
@@ -135,7 +136,7 @@ class ShardSet:
         return EpisodeIndex(repeat(index), repeat(shard), starts, repeat(length))
 
     def read(self, shard: str, row_groups: Sequence[int], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Columns of some row groups of a shard: (N,) or (N, width) each.
+        """Read columns of some row groups of a shard, (N,) or (N, width) each.
 
         Raises:
             ShardError: the shard is missing or damaged.
@@ -173,10 +174,10 @@ class ShardSet:
     def episode_rows(
         self, episode_index: int, columns: Sequence[str] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """All rows of one episode, cameras one after the other.
+        """Read all rows of one episode, cameras one after the other.
 
         Raises:
-            ShardError: no such episode.
+            ShardError: there is no such episode.
         """
         wanted = pa.scalar(episode_index)  # for a plain number pyarrow would import pandas
         found = self.episodes.filter(pc.equal(self.episodes["episode_index"], wanted)).to_pylist()
@@ -187,7 +188,7 @@ class ShardSet:
         return reader.rows(row["shard"], row["row_start"], row["rows"])
 
     def tokens(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """(N, width) of the token column -> (N, h, w) or (N, c, h, w)."""
+        """Reshape (N, width) values of the token column to (N, h, w) or (N, c, h, w)."""
         h, w = self.spec.grid
         return (
             rows.reshape(-1, h, w)
@@ -198,12 +199,12 @@ class ShardSet:
 
 @lru_cache(maxsize=64)
 def _footer(path: RemotePath, size: int, sha256: str) -> pq.FileMetaData:
-    """Of a shard in a store: asked for once, while its sha256 stays."""
+    """Read the footer of a shard in a store; it is read once for each sha256."""
     return pq.read_metadata(RangeFile(path, size))
 
 
 class EpisodeReader:
-    """Rows of whole episodes, one after another; the last row groups stay decoded.
+    """A reader of whole episodes that keeps the last row groups decoded.
 
     Reading episodes in their order decodes every row group once.
     """
@@ -216,7 +217,7 @@ class EpisodeReader:
         self._groups: OrderedDict[tuple[str, int], dict[str, NDArray[Any]]] = OrderedDict()
 
     def rows(self, shard: str, row_start: int, rows: int) -> dict[str, NDArray[Any]]:
-        """Columns of `rows` rows of a shard from `row_start` on: (rows,) or (rows, width) each.
+        """Read columns of `rows` rows of a shard from `row_start` on, (rows,) or (rows, width) each.
 
         Raises:
             ShardError: the shard has no such rows, is missing or damaged.
@@ -250,7 +251,7 @@ class EpisodeReader:
 
 
 class RowGroupCache:
-    """The last row groups read, decoded; shared by whoever reads one shard set in this process."""
+    """The last row groups that were read, decoded; shared by all readers of one shard set in this process."""
 
     def __init__(self, shards: ShardSet, split: str, columns: Sequence[str], size: int) -> None:
         self._set, self._split, self._columns, self._size = shards, split, list(columns), size
@@ -258,7 +259,7 @@ class RowGroupCache:
         self._names = shards.shards(split)
 
     def get(self, shard: int, row_group: int) -> dict[str, NDArray[Any]]:
-        """Columns of one row group."""
+        """Return the columns of one row group."""
         key = (shard, row_group)
         if key not in self._kept:
             self._kept[key] = self._set.read(self._names[shard], [row_group], self._columns)
@@ -269,9 +270,9 @@ class RowGroupCache:
 
 
 def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:
-    """A dictionary-encoded column -> which word each row holds (N,), and the words.
+    """Return the index of each row's word (N,) and the words of a dictionary-encoded column.
 
-    pyarrow's own functions for it would import pandas where it is installed, which takes a second.
+    pyarrow's own functions for this import pandas if it is installed, which takes a second.
     """
     codes = column.unify_dictionaries().combine_chunks()
     if isinstance(codes, pa.ChunkedArray):

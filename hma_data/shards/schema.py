@@ -1,6 +1,6 @@
-"""The columns and the footer of a shard.
+"""Define the columns and the footer of a shard.
 
-S = h·w tokens a frame, c channels, A values of an action. docs/format.md states all of this.
+S = h·w tokens a frame, c channels, A values of an action. docs/format.md specifies all of this.
 """
 
 import json
@@ -25,7 +25,7 @@ SCHEMA_VERSION = 1
 ROW_GROUP = 2048
 GROUP_VALUES = (
     1 << 24
-)  # of tokens or latents in a row group: Parquet writes small integers from four bytes each
+)  # values of a row group's tokens; Parquet's writer holds small integers in four bytes each
 _FOOTER = b"hma"
 
 
@@ -33,22 +33,29 @@ _FOOTER = b"hma"
 class EpisodeRow:
     """One row of episodes.parquet.
 
-    Attributes:
-        episode_index: place in the plan; the same number stands in the shard's rows.
-        id: of the source.
-        split: train or val.
-        shard: its path below the shard set.
-        row_start: of its first row in the shard.
-        rows: in the shard: frames times cameras.
-        length: frames.
-        skew_p50_ms, skew_p95_ms, skew_max_ms: of the stream that was moved furthest.
-        skew: stream -> [p50, p95, max] in ms, as JSON.
-        trimmed: frames cut at the ends, where not every stream ran.
-        flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
-        group: shared by episodes of one recording, which belong into one split; empty for one of its own.
-        source: where it is another than the set's.
-        content: hash over what was read of it (`hma_data.conversion.episode_hash`); empty where it was not
-            noted.
+        Attributes:
+            episode_index: place in the plan; the same number is in the shard's rows.
+            id: id of the episode in its source.
+            split: train or val.
+            shard: path of its shard below the shard set.
+            row_start: number of its first row in the shard.
+            rows: its rows in the shard: frames times cameras.
+            length: frames.
+            skew_p50_ms, skew_p95_ms, skew_max_ms: skew of the stream that was moved furthest.
+            skew: stream -> [p50, p95, max] in ms, as JSON.
+            trimmed: frames cut at the ends, where some streams had no data.
+            flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
+    <<<<<<< HEAD
+            group: shared by episodes of one recording, which belong into one split; empty for one of its own.
+            source: where it is another than the set's.
+            content: hash over what was read of it (`hma_data.conversion.episode_hash`); empty where it was not
+                noted.
+    =======
+            group: shared by the episodes of one recording, which belong in one split; empty for an episode
+                that has a recording of its own.
+            source: source of the episode if it differs from the set's.
+            content: hash over what was read of it, see `hma_data.content`; empty if it was not recorded.
+    >>>>>>> doc-parts
     """
 
     episode_index: int
@@ -83,7 +90,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Footer:
-    """What a shard says about itself; the manifest is made of these alone.
+    """The facts that a shard states about itself; the manifest is derived from the footers alone.
 
     Attributes:
         plan: what the shard was made from, see `hma_data.conversion.job.Plan.facts`.
@@ -91,7 +98,7 @@ class Footer:
         split: train or val.
         episodes: its episodes, in row order.
         quarantine: episodes planned for it that were refused.
-        stats: "action" and, where recorded, "state" -> Stats, per raw dim.
+        stats: "action" and, if recorded, "state" -> Stats, per raw dim.
     """
 
     plan: dict[str, Any]
@@ -102,7 +109,7 @@ class Footer:
     stats: dict[str, Stats]
 
     def to_metadata(self) -> dict[bytes, bytes]:
-        """Key-value metadata of the parquet footer."""
+        """Return the key-value metadata of the parquet footer."""
         values = {
             "schema_version": SCHEMA_VERSION,
             "plan": self.plan,
@@ -123,10 +130,11 @@ class Footer:
 
     @classmethod
     def from_metadata(cls, metadata: dict[bytes, bytes] | None, where: str) -> "Footer":
-        """The footer of a shard.
+        """Read the footer of a shard from the metadata of its file.
 
         Raises:
-            ShardError: the file is parquet but not a shard of ours, or of a version we do not know.
+            ShardError: the file is parquet but not a shard, has a version that this release does not read, or
+                has a damaged footer.
         """
         if not metadata or _FOOTER not in metadata:
             raise ShardError(where, "is parquet but not a shard: its footer has no 'hma' entry")
@@ -158,19 +166,19 @@ class Footer:
 
 
 def flags_text(trimmed: int, counts: Mapping[str, int]) -> str:
-    """The flags of an episode: trimmed, then each count as name=count."""
+    """Return the flags of an episode: trimmed, then each count as name=count."""
     words = ["trimmed"] if trimmed else []
     return ",".join([*words, *(f"{name}={count}" for name, count in sorted(counts.items()))])
 
 
 def flag_counts(flags: str) -> dict[str, int]:
-    """The counts that `flags_text` wrote; words without one are left out."""
+    """Return the counts that `flags_text` wrote; leave out words without a count."""
     pairs = (word.partition("=") for word in flags.split(","))
     return {name.strip(): int(count) for name, _, count in pairs if count.strip().isdecimal()}
 
 
 def token_column(spec: TokenizerSpec) -> tuple[str, int]:
-    """Name of the column that holds a frame, and its values a row."""
+    """Return the name of the column that holds a frame, and its number of values a row."""
     if spec.kind == "discrete":
         return "tokens", spec.grid[0] * spec.grid[1]
     return "latents", (spec.channels or 1) * spec.grid[0] * spec.grid[1]
@@ -184,9 +192,9 @@ _STORED = {"uint8": pa.uint8(), "uint16": pa.uint16(), "uint32": pa.uint32(), "f
 
 
 def mask_columns(embodiment: Embodiment) -> tuple[str, ...]:
-    """Columns that say which numbers are known: of embodiments some of whose numbers may not be.
+    """Return the columns that state which numbers are known, for embodiments with unknown numbers.
 
-    Those are the ones with `sync.beyond: mask`, and hand videos with `missing: mask`.
+    Those embodiments have `sync.beyond: mask`, or are hand videos with `missing: mask`.
     """
     layout = embodiment.source.layout or {}
     hands = embodiment.source.format == "hands" and layout.get("missing") == "mask"
@@ -198,7 +206,7 @@ def mask_columns(embodiment: Embodiment) -> tuple[str, ...]:
 def arrow_schema(
     spec: TokenizerSpec, action_width: int, state_width: int, cameras: int, masks: Sequence[str] = ()
 ) -> pa.Schema:
-    """Columns of a shard; no value is ever null. `masks`: see `mask_columns`."""
+    """Return the columns of a shard; no value is ever null. `masks`: see `mask_columns`."""
     name, width = token_column(spec)
     columns: list[tuple[str, pa.DataType]] = [
         ("episode_index", pa.int32()),
@@ -216,7 +224,7 @@ def arrow_schema(
 
 
 def encodings(schema: pa.Schema) -> dict[str, str]:
-    """Byte-stream split for what looks random, deltas for what counts up."""
+    """Choose encodings: byte-stream split for values that look random, deltas for values that count up."""
     chosen: dict[str, str] = {}
     for column in schema:
         if pa.types.is_fixed_size_list(column.type):
@@ -230,7 +238,7 @@ def encodings(schema: pa.Schema) -> dict[str, str]:
 
 
 def to_arrow(column: pa.Field, values: NDArray[Any]) -> pa.Array:
-    """(N, …) numpy -> the array of that column."""
+    """Convert a numpy array (N, …) to the arrow array of that column."""
     if pa.types.is_fixed_size_list(column.type):
         flat = pa.array(np.ascontiguousarray(values).reshape(-1), type=column.type.value_type)
         return pa.FixedSizeListArray.from_arrays(flat, type=column.type)
@@ -238,7 +246,7 @@ def to_arrow(column: pa.Field, values: NDArray[Any]) -> pa.Array:
 
 
 def to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
-    """A column -> (N,) or (N, width) numpy, without a copy where arrow allows it."""
+    """Convert a column to numpy (N,) or (N, width), without a copy if arrow allows it."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if pa.types.is_fixed_size_list(array.type):
         return _flat(array.flatten()).reshape(-1, array.type.list_size)
@@ -249,7 +257,10 @@ _NUMPY = {"halffloat": "float16", "float": "float32", "double": "float64"}  # wh
 
 
 def _flat(array: pa.Array) -> NDArray[Any]:
-    """As array.to_numpy, which imports pandas where it is installed: a second, and 50 MB of each worker."""
+    """Convert as array.to_numpy does, but avoid its import of pandas for plain numbers and bools.
+
+    If pandas is installed, that import takes a second, and 50 MB in each worker.
+    """
     name = str(array.type)
     plain = pa.types.is_integer(array.type) or pa.types.is_floating(array.type)
     if array.null_count or not len(array) or not (plain or name == "bool"):
@@ -263,10 +274,10 @@ def _flat(array: pa.Array) -> NDArray[Any]:
 
 
 def read_footer(path: Any, where: str) -> tuple[Footer, list[int]]:
-    """Footer and rows of each row group of a shard.
+    """Return the footer and the number of rows of each row group of a shard.
 
     Raises:
-        ShardError: not a whole parquet file, or not a shard.
+        ShardError: it is not a whole parquet file, or not a shard.
     """
     try:
         metadata = pq.read_metadata(parquet_input(path))

@@ -1,8 +1,8 @@
 """Check a shard set: every hash, row count and invariant. Nothing is changed.
 
-Each shard is checked against its manifest, its footer and itself; then the files that follow from the
-shards. Shards are checked a few at a time by threads (hashing and parquet leave the interpreter alone), a
-row group in memory for each, so memory does not grow with the set.
+Each shard is checked against its manifest, its footer and itself. Then the files that are derived from the
+shards are checked. Threads check a few shards at a time (hashing and parquet release the interpreter lock).
+Each thread holds one row group of tokens in memory, so memory does not grow with the set.
 
 N rows of a shard, A values of an action.
 """
@@ -51,17 +51,17 @@ from hma_data.storage.remote import parquet_file, parquet_input, place
 from hma_data.threads import usable_cores
 
 REMAKE = "delete it and run the same hma convert again"
-KNOWN = {"action": "action_known", "state": "state_known"}  # bool columns, where values can be missing
+KNOWN = {"action": "action_known", "state": "state_known"}  # bool columns of sets whose values can be missing
 
 
 @dataclass
 class Checked:
-    """What came of one shard.
+    """The result of checking one shard.
 
     Attributes:
-        problems: a line each.
-        footer: None when it cannot be read.
-        stats: of its rows, "action" and "state"; empty for a quick check.
+        problems: one line for each problem.
+        footer: None if it cannot be read.
+        stats: statistics of its rows, "action" and "state"; empty for a quick check.
     """
 
     problems: list[str] = field(default_factory=list)
@@ -70,7 +70,7 @@ class Checked:
 
 
 def check_shard(folder: Path, shard: ShardFile, manifest: Manifest, quick: bool) -> Checked:
-    """Everything wrong with one shard; `quick` looks at size and footer only."""
+    """Return everything wrong with one shard; `quick` checks size and footer only."""
     path = folder / shard.path
     try:
         if not path.is_file():
@@ -95,7 +95,7 @@ def check_shard(folder: Path, shard: ShardFile, manifest: Manifest, quick: bool)
 
 
 def _whose(path: Path, manifest: Manifest) -> str:
-    """Tells a shard of another run from a damaged one."""
+    """Return a phrase that marks a shard of another run; empty if it is of this run or cannot be read."""
     try:
         plan = read_footer(path, str(path))[0].plan
     except HMAError:
@@ -104,7 +104,7 @@ def _whose(path: Path, manifest: Manifest) -> str:
 
 
 def _belongs(plan: dict[str, Any], manifest: Manifest) -> bool:
-    """Whether a shard's plan is the set's, or one that the set extends."""
+    """Check whether a shard's plan is the set's, or one that the set extends."""
     own = manifest.plan
     if plan.get("hash") not in own.get("extends", ()):
         return plan == own
@@ -160,7 +160,7 @@ def _column_problems(path: Path, manifest: Manifest) -> list[str]:
 
 
 def _check_rows(path: Path, footer: Footer, manifest: Manifest, checked: Checked) -> None:
-    """Rows against the footer: whole episodes, frames counting up, tokens in range, finite numbers."""
+    """Check rows against the footer: whole episodes, frames counting up, tokens in range, finite numbers."""
     found, kept = checked.problems, _read_rows(path, manifest, checked.problems)
     cameras = len(manifest.cameras)
     length = np.array([row.length for row in footer.episodes], np.int64)
@@ -191,7 +191,7 @@ def _check_rows(path: Path, footer: Footer, manifest: Manifest, checked: Checked
 
 
 def _read_rows(path: Path, manifest: Manifest, found: list[str]) -> dict[str, NDArray[Any]]:
-    """All columns but the tokens, whole; tokens and numbers are checked a row group at a time."""
+    """Return all columns except the tokens; check tokens and numbers one row group at a time."""
     name = token_column(manifest.tokenizer)[0]
     size = manifest.tokenizer.vocab_size
     parts: dict[str, list[NDArray[Any]]] = {}
@@ -223,7 +223,7 @@ def _read_rows(path: Path, manifest: Manifest, found: list[str]) -> dict[str, ND
 
 
 def _row_stats(kept: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> dict[str, Stats]:
-    """Statistics of the rows that the first camera saw, made as a conversion makes them."""
+    """Return statistics of the rows of the first camera, computed as a conversion computes them."""
     widths = {"action": manifest.embodiment.action_dim}
     if manifest.embodiment.state:
         widths["state"] = manifest.embodiment.state.dims
@@ -242,10 +242,10 @@ def _row_stats(kept: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest
 def _stats_problems(
     footer: Footer, rows: dict[str, Stats], masked: dict[str, int], manifest: Manifest
 ) -> list[str]:
-    """The footer's statistics are those of its rows.
+    """Return where the footer's statistics are not those of its rows.
 
-    Strided rows lack a few steps at an episode's end, states between the rows, and the known steps of a
-    chunk that is not wholly known.
+    The footer's statistics of a strided set count steps that its rows lack: a few steps at an episode's end,
+    states between the rows, and the known steps of a chunk that is not wholly known.
     """
     found = []
     strided = manifest.plan.get("frames") == "strided"
@@ -268,7 +268,7 @@ def _stats_problems(
 
 
 def same_stats(a: dict[str, Any], b: dict[str, Any], quantiles: bool = True) -> bool:
-    """Whether two summaries say the same up to the rounding of sums; quantiles are of equal sketches."""
+    """Check whether two summaries are equal up to the rounding of sums; quantiles must be equal exactly."""
     if a.get("count") != b.get("count") or a.get("min") != b.get("min") or a.get("max") != b.get("max"):
         return False
     scale = np.maximum(np.abs(a["min"]), np.abs(a["max"]))
@@ -281,7 +281,7 @@ def same_stats(a: dict[str, Any], b: dict[str, Any], quantiles: bool = True) -> 
 
 
 def plan_problem(manifest: Manifest) -> str:
-    """What is wrong with the manifest's plan in itself; empty when nothing is."""
+    """Return what is wrong with the manifest's plan in itself; empty if nothing is wrong."""
     plan, embodiment, spec = manifest.plan, manifest.embodiment, manifest.tokenizer
     if plan.get("hash") != plan_hash(plan):
         return "its plan's hash is not that of the plan"
@@ -292,7 +292,7 @@ def plan_problem(manifest: Manifest) -> str:
     return ""
 
 
-BESIDE = {"README.md", ".gitattributes"}  # what a hub adds
+BESIDE = {"README.md", ".gitattributes"}  # files that a hub adds
 OnProgress = Callable[[int, int], None]
 
 
@@ -303,12 +303,13 @@ def verify(
     quick: bool = False,
     on_progress: OnProgress = lambda done, total: None,
 ) -> list[str]:
-    """Everything wrong with a shard set, a line each; empty when it is sound.
+    """Return everything wrong with a shard set, one line for each problem; empty if the set is sound.
 
     Args:
         folder: str or path of the set, or its URI.
-        workers: threads; None takes the cores.
-        quick: sizes and footers only: seconds for any set, but a flipped bit in a shard stays unseen.
+        workers: number of threads; None takes the number of cores.
+        quick: check sizes and footers only. This takes seconds for any set, but does not detect a flipped
+            bit in a shard.
         on_progress: called with (bytes checked, bytes in all) after each shard.
     """
     folder = place(folder)
@@ -341,7 +342,7 @@ def verify(
 def check_rows(
     folder: Path, manifest: Manifest, workers: int | None, on_progress: OnProgress
 ) -> tuple[list[str], dict[str, Stats]]:
-    """What is wrong with the shards, and the statistics of the train shards' rows."""
+    """Return what is wrong with the shards, and the statistics of the train shards' rows."""
     found: list[str] = []
     rows: dict[str, Stats] = {}
     for checked in _checked(folder, manifest, workers or usable_cores(), False, on_progress):
@@ -359,7 +360,7 @@ def _merge_train(rows: dict[str, Stats], checked: Checked) -> None:
 def _checked(
     folder: Path, manifest: Manifest, workers: int, quick: bool, on_progress: OnProgress
 ) -> Iterator[Checked]:
-    """Each shard checked, in the manifest's order."""
+    """Check each shard and yield the results in the manifest's order."""
     total = sum(shard.bytes for shard in manifest.shards)
     done, batch = 0, 4 * workers
     with ThreadPoolExecutor(workers) as pool:
@@ -373,7 +374,7 @@ def _checked(
 
 
 def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
-    """Files that are not of the set."""
+    """Yield a problem for each file that does not belong to the set."""
     known = {shard.path for shard in manifest.shards} | {MANIFEST, EPISODES, QUARANTINE, EMBODIMENT} | BESIDE
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -386,7 +387,7 @@ def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
 
 
 def _other_files(folder: Path, manifest: Manifest) -> Iterator[str]:
-    """What the manifest says about the files that are no shards."""
+    """Yield a problem for each file, other than shards, that differs from what the manifest states."""
     remedy = f"hma shards restat {folder} writes it anew from the shards"
     for name in (EPISODES, QUARANTINE, EMBODIMENT):
         path = folder / name
@@ -408,10 +409,10 @@ def _other_files(folder: Path, manifest: Manifest) -> Iterator[str]:
 def _set_problems(
     folder: Path, manifest: Manifest, gathered: Gathered, rows: dict[str, Stats], restat: str
 ) -> Iterator[str]:
-    """The files derived from the footers still say what the footers say, and episodes stand in one split."""
+    """Yield problems: derived files that differ from the footers, episodes twice or in both splits."""
     expected = gathered.episodes()
     yield from _episode_problems(folder, expected)
-    with suppress(OSError, pa.ArrowException):  # unreadable is unlike its sha256, which was said already
+    with suppress(OSError, pa.ArrowException):  # its sha256 differs and is reported already
         if not pq.read_table(parquet_input(folder / EPISODES)).equals(expected):
             yield f"{folder / EPISODES}: differs from the shards' footers — {restat}"
     with suppress(OSError):
@@ -433,7 +434,7 @@ def _set_problems(
 
 
 def _episode_problems(folder: Path, episodes: pa.Table) -> Iterator[str]:
-    """No episode twice, none in both splits, nor recordings that belong together."""
+    """Yield problems: episodes that occur twice, and recordings whose episodes are in both splits."""
     for column, said in (("id", "stands in it twice"), ("episode_index", "is the number of two episodes")):
         counts = pc.value_counts(episodes[column].combine_chunks())
         for item in counts.filter(pc.greater(counts.field("counts"), 1)).to_pylist()[:3]:

@@ -1,6 +1,6 @@
-"""Whether the values of a manifest or footer have the form that docs/format.md gives them; whoever wrote it.
+"""Check that the values of a manifest or footer have the form of docs/format.md, whoever wrote them.
 
-Each check raises ValueError with what is wrong; whoever reads makes one clear error of it.
+Each check raises ValueError with what is wrong; the caller turns it into one clear error.
 """
 
 import math
@@ -13,16 +13,16 @@ from hma_data.tokenizers.base import TokenizerSpec
 
 DTYPES = {"discrete": ("uint16", "uint32"), "continuous": ("float16", "uint8")}
 FRAMES = ("all", "strided")
-LARGEST = 2**20  # cells, pixels and channels of a tokenizer; beyond is no tokenizer
+LARGEST = 2**20  # upper limit of the cells, pixels and channels of a tokenizer
 
 
 def is_count(value: Any, least: int = 0) -> bool:
-    """A whole number that int64 holds."""
+    """Check whether a value is a whole number of at least `least` that int64 holds."""
     return type(value) is int and least <= value < 2**63
 
 
 def is_number(value: Any) -> bool:
-    """Finite, and within float64."""
+    """Check whether a value is a finite number; a whole number must fit int64."""
     return (type(value) is float and math.isfinite(value)) or (type(value) is int and abs(value) < 2**63)
 
 
@@ -35,7 +35,7 @@ _KINDS: dict[Any, Callable[[Any], bool]] = {
 
 
 def check_fields(item: Any) -> None:
-    """A dataclass whose values are of the types it declares; whole numbers are not negative."""
+    """Check that a dataclass's values have the types it declares; whole numbers are not negative."""
     for field in fields(item):
         value = getattr(item, field.name)
         if not _KINDS[field.type](value):
@@ -43,7 +43,7 @@ def check_fields(item: Any) -> None:
 
 
 def check_numbers(stats: dict[str, Any]) -> None:
-    """The statistics of one vector in a footer."""
+    """Check the statistics of one vector in a footer."""
     width = len(stats["mean"])
     for name in ("mean", "m2", "min", "max"):
         if len(stats[name]) != width or not all(map(is_number, stats[name])):
@@ -60,7 +60,7 @@ def check_numbers(stats: dict[str, Any]) -> None:
 
 
 def check_spec(spec: TokenizerSpec) -> None:
-    """A tokenizer's spec."""
+    """Check a tokenizer's spec."""
     sizes = [*spec.grid, spec.image_size, *(() if spec.channels is None else (spec.channels,))]
     if len(spec.grid) != 2 or not all(is_count(size, 1) and size <= LARGEST for size in sizes):
         raise ValueError(f"the tokenizer's sizes are {sizes}")
@@ -73,7 +73,7 @@ def check_spec(spec: TokenizerSpec) -> None:
 
 
 def check_plan(plan: dict[str, Any]) -> None:
-    """The facts of a plan that a reader goes by."""
+    """Check the facts of a plan that a reader uses."""
     if type(plan["hash"]) is not str or not is_count(plan["frame_stride"], 1):
         raise ValueError("its plan has no hash, or a frame_stride that is no whole number above 0")
     cameras = plan["cameras"]
@@ -89,7 +89,7 @@ def check_plan(plan: dict[str, Any]) -> None:
 
 
 def check_splits(splits: dict[str, Any]) -> None:
-    """Counts of both splits."""
+    """Check the counts of both splits."""
     for split in ("train", "val"):
         counts = [splits[split][name] for name in ("episodes", "frames", "rows", "shards")]
         if not all(is_count(count) for count in counts):
@@ -97,7 +97,7 @@ def check_splits(splits: dict[str, Any]) -> None:
 
 
 def check_stats(stats: dict[str, Any], robot: Embodiment) -> None:
-    """The summaries have a number for each value of the embodiment's vectors."""
+    """Check that the summaries have a number for each value of the embodiment's vectors."""
     widths = {"action": robot.action_dim} | ({"state": robot.state.dims} if robot.state else {})
     for name, width in widths.items():
         said = stats[name]

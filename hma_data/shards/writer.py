@@ -1,4 +1,4 @@
-"""Write one shard: rows of whole episodes in, one file that is complete or absent out."""
+"""Write one shard from the rows of whole episodes; the file is complete or absent."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +17,15 @@ from hma_data.tokenizers.base import TokenizerSpec
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """The rows of one episode as one camera saw it.
+    """The rows of one episode as one camera recorded it.
 
     Attributes:
-        episode_index: as in the plan.
+        episode_index: number of the episode in the plan.
         timestamps: (T,) seconds from the first frame.
         tokens: (T, h, w) ids or (T, c, h, w) latents.
         actions: (T, A) float32; states: (T, A') or None.
-        camera: its name; written only where the shard set has more than one.
-        action_known, state_known: (T,) or None where all are; written only where the shard set has them.
+        camera: name of the camera; written only if the shard set has more than one.
+        action_known, state_known: (T,), or None if all are known; written only if the shard set has masks.
     """
 
     episode_index: int
@@ -39,11 +39,13 @@ class EpisodeRows:
 
 
 class ShardWriter:
-    """Context manager: `add` episodes, then `close` with the footer; without `close` nothing is left.
+    """A context manager that writes a shard: `add` episodes, then `close` with the footer.
+
+    Without `close`, no file is left.
 
     Attributes:
-        rows: added so far.
-        bytes, sha256: of the file, once it is closed.
+        rows: number of rows added so far.
+        bytes, sha256: size and SHA-256 of the file, set by `close`.
     """
 
     def __init__(self, path: Path, schema: pa.Schema, spec: TokenizerSpec) -> None:
@@ -66,13 +68,13 @@ class ShardWriter:
             use_dictionary=["camera"] if "camera" in self._schema.names else False,
             column_encoding=encodings(self._schema),
             write_statistics=["episode_index", "frame_index"],
-            write_page_checksum=True,  # a damaged page is known even where the manifest is lost
+            write_page_checksum=True,  # a damaged page is detected even if the manifest is lost
             store_schema=True,
         )
         return self
 
     def add(self, episode: EpisodeRows) -> None:
-        """Append an episode; row groups are made of whole episodes where they fit."""
+        """Append an episode; a row group holds whole episodes if they fit."""
         length = len(episode.timestamps)
         values: dict[str, NDArray[Any]] = {
             "episode_index": np.full(length, episode.episode_index, np.int32),
@@ -100,13 +102,13 @@ class ShardWriter:
         self._pending = []
 
     def close(self, footer: Footer) -> None:
-        """Write what is pending and the footer; the shard appears under its name when the block ends."""
+        """Write the pending rows and the footer; the shard gets its name when the `with` block ends."""
         if self._pending:
             self._flush()
         self._writer.add_key_value_metadata(footer.to_metadata())
         self._writer.close()
         self._closed = True
-        self.bytes, self.sha256 = self._part.stat().st_size, file_sha256(self._part)  # it is in memory still
+        self.bytes, self.sha256 = self._part.stat().st_size, file_sha256(self._part)  # it is still in memory
 
     def __exit__(
         self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None

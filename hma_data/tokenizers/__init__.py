@@ -1,4 +1,4 @@
-"""Tokenizers by name; the module of each is imported on use."""
+"""Offer tokenizers by name. The module of a tokenizer is imported when it is first used."""
 
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 

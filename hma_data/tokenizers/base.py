@@ -1,4 +1,4 @@
-"""What a tokenizer is: pictures in, discrete ids or continuous latents out, and back.
+"""Define the tokenizer interface: encode pictures to discrete ids or continuous latents, and decode them.
 
 N pictures, h·w grid, c channels. Pictures are uint8 RGB (N, S, S, 3) with S = `spec.image_size`.
 A module of this package makes one tokenizer or a family; `get_tokenizer` imports it on use.
@@ -25,21 +25,22 @@ TOKENIZERS: dict[str, tuple[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class TokenizerSpec:
-    """All that decides what the tokens mean. Two specs that are equal give the same tokens.
+    """Everything that decides the meaning of the tokens. Two equal specs give the same tokens.
 
     Attributes:
-        name: as `get_tokenizer` takes it.
-        version: of the code, raised when equal weights would give other tokens.
+        name: name that `get_tokenizer` takes.
+        version: version of the code, raised when the same weights would give other tokens.
         kind: discrete ids or continuous latents.
         image_size: side of the square picture in pixels.
         grid: (h, w) of the tokens or latents.
         vocab_size: number of ids; None when continuous.
         factored: sizes whose product is the vocabulary, low digit first: id = d0 + factored[0]*d1.
-        channels: c of the latents; None when discrete.
-        latent_scale: a model multiplies stored latents by it.
-        dtype: of what is stored: uint16, uint32 or float16; uint8 for pixels.
-        resize_filter: how pictures are brought to `image_size`; it changes the tokens, so it belongs here.
-        weights_sha256: of the weights' file; empty when there are none.
+        channels: number c of latent channels; None when discrete.
+        latent_scale: factor by which a model multiplies stored latents.
+        dtype: dtype of the stored values: uint16, uint32 or float16; uint8 for pixels.
+        resize_filter: filter that resizes pictures to `image_size`; it is part of the spec because it
+            changes the tokens.
+        weights_sha256: SHA-256 of the weights' file; empty when there are no weights.
     """
 
     name: str
@@ -56,48 +57,51 @@ class TokenizerSpec:
     weights_sha256: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, as the manifest and the checkpoint hold them."""
+        """Return plain values, as the manifest and the checkpoint hold them."""
         return json.loads(json.dumps(asdict(self)))
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "TokenizerSpec":
-        """The spec that `to_json` wrote."""
+        """Return the spec that `to_json` wrote."""
         return cls(
             **{**values, "grid": tuple(values["grid"]), "factored": tuple(values.get("factored") or ())}
         )
 
     @property
     def digest(self) -> str:
-        """Sixteen hex digits over everything above."""
+        """Return sixteen hex digits of the SHA-256 over all attributes."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
 
 
 @runtime_checkable
 class Tokenizer(Protocol):
-    """`encode` and `decode`; a network-backed one shows its module as `.network` (`encoder`, `decoder`)."""
+    """An object with `spec`, `encode` and `decode`.
+
+    A tokenizer with a network exposes it as `.network`, with `.network.encoder` and `.network.decoder`.
+    """
 
     spec: TokenizerSpec
 
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
-        """(N, S, S, 3) uint8 RGB -> (N, h, w) uint32 ids, or (N, c, h, w) float16 latents."""
+        """Encode (N, S, S, 3) uint8 RGB to (N, h, w) uint32 ids, or to (N, c, h, w) float16 latents."""
         ...
 
     def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
-        """What `encode` gives -> (N, S, S, 3) uint8 RGB."""
+        """Decode what `encode` returns to (N, S, S, 3) uint8 RGB."""
         ...
 
 
 def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, device: str = "cpu") -> Tokenizer:
-    """The tokenizer of that name, ready to use.
+    """Return the tokenizer of that name, ready to use.
 
     Args:
         name_or_path: a name of `TOKENIZERS`.
         weights: str or path of a file (or folder) to take the weights from instead of the usual place, or
             `hf://[datasets/]ORGANISATION/NAME[@REVISION]/FILE`.
-        device: where a network runs: cpu, cuda, mps.
+        device: device that runs the network: cpu, cuda, mps.
 
     Raises:
-        TokenizerError: no such tokenizer, or its weights cannot be used.
+        TokenizerError: there is no such tokenizer, or its weights cannot be used.
     """
     name, given = as_text(name_or_path), None if weights is None else as_text(weights)
     if name not in TOKENIZERS:

@@ -1,7 +1,7 @@
-"""Which tokenizers there are: what each is, where its weights come from, and what it needs here.
+"""List the tokenizers: what each is, where its weights come from, and what it needs on this machine.
 
-A new tokenizer is a row of `CATALOG` and a module with `load(name, *, weights, device, **arguments)`.
-Nothing here imports torch or a tokenizer's module.
+To add a tokenizer, add a row to `CATALOG` and a module with `load(name, *, weights, device, **arguments)`.
+This module imports neither torch nor a tokenizer's module.
 """
 
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ EMBEDDED = Path(__file__).parent / "weights"
 
 @dataclass(frozen=True)
 class Entry:
-    """One tokenizer, as `hma tokenizer list` shows it.
+    """A tokenizer, as `hma tokenizer list` shows it.
 
     Attributes:
-        name: as `--tokenizer` takes it.
+        name: name that `--tokenizer` takes.
         kind: discrete ids or continuous latents.
         image_size: side of the square picture in pixels.
         grid: (h, w) of the tokens or latents.
@@ -27,13 +27,13 @@ class Entry:
             user names.
         module: imported on use; its `load` makes the tokenizer.
         arguments: further keyword arguments of `load`.
-        licence: SPDX id or name of the weights' licence, or of the code where there are no weights.
+        licence: SPDX id or name of the weights' licence, or of the code's if there are no weights.
         file: the weights' file, inside the package or inside `repo`.
-        bytes: of a download; an embedded file is measured.
-        repo, revision, repo_type: of the hub, when weights are downloaded.
-        sha256: of the download, where it is known; another file is refused.
+        bytes: size of a download; the size of an embedded file is read from the file.
+        repo, revision, repo_type: repository on the hub, if weights are downloaded.
+        sha256: SHA-256 of the download, if it is known; another file is refused.
         imports: modules that must be importable.
-        extra: the command that installs them; empty where the plain dependencies do.
+        extra: the command that installs them; empty if the plain dependencies do.
     """
 
     name: str
@@ -55,17 +55,17 @@ class Entry:
     extra: str = ""
 
     def missing(self) -> list[str]:
-        """Modules it needs that are not installed."""
+        """Return the modules it needs that are not installed."""
         return [name for name in self.imports if find_spec(name) is None]
 
     def size(self) -> int:
-        """Bytes of the weights; 0 where there are none or the user names them."""
+        """Return the size of the weights in bytes; 0 if there are none or the user names them."""
         if self.weights == "embedded":
             return (EMBEDDED / self.file).stat().st_size
         return self.bytes or 0
 
     def downloaded(self) -> bool:
-        """Whether the hub's cache on this machine holds the weights."""
+        """Check whether the hub's cache on this machine holds the weights."""
         if self.weights != "download":
             return False
         from huggingface_hub import try_to_load_from_cache
@@ -76,7 +76,7 @@ class Entry:
         return isinstance(found, str)
 
     def state(self) -> str:
-        """What stands between here and using it: ready, a download, an install, or a path to name."""
+        """Return "ready" or what it still needs: an install, a path, or a download on first use."""
         if missing := self.missing():
             return f"needs {', '.join(missing)}: {self.extra}"
         if self.weights == "path":
@@ -86,7 +86,7 @@ class Entry:
         return "ready"
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, with the state and the measured size."""
+        """Return plain values, with the state and the measured size."""
         values = asdict(self)
         del values["module"], values["arguments"]
         return values | {

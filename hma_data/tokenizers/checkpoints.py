@@ -1,9 +1,9 @@
-"""Weights of the tokenizers that are not in the package: found, checked, read.
+"""Find, check and read the weights of the tokenizers that are not in the package.
 
-Where they are looked for: the path that was named; a file or folder of the tokenizer's name in
-$HMA_WEIGHTS; the Hugging Face Hub, at the revision that `catalog` pins. Nothing that is read can run
-code: safetensors holds no code, and of a torch checkpoint only tensors and plain values are unpickled
-(`weights_only`). A network takes all its weights or none.
+Weights are looked for in three places, in this order: the path that was named; a file or folder of the
+tokenizer's name in $HMA_WEIGHTS; the Hugging Face Hub, at the revision that `catalog` pins. Reading runs
+no code from the files: safetensors holds no code, and of a torch checkpoint only tensors and plain values
+are unpickled (`weights_only`). A network takes all its weights or none.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ from hma_data.errors import TokenizerError
 from hma_data.storage.files import file_sha256
 from hma_data.tokenizers.catalog import CATALOG, Entry
 
-FOLDER = "HMA_WEIGHTS"  # environment variable: a folder of weights, named as the tokenizers are
+FOLDER = "HMA_WEIGHTS"  # environment variable: a folder of weights, named after the tokenizers
 SUFFIXES = (".safetensors", ".ckpt", ".pt", ".pth")
 NESTED = ("state_dict", "model_state_dict", "model")  # where trainers keep the weights in a checkpoint
 HALVES = ("encoder", "decoder")  # in the names of files that come in pairs
@@ -36,10 +36,10 @@ Tensors = dict[str, Tensor]
 
 
 def find_weights(name: str, weights: str | None) -> Path:
-    """The file or folder that holds a tokenizer's weights.
+    """Return the file or folder that holds a tokenizer's weights.
 
     Args:
-        name: of the tokenizer, a key of `CATALOG`.
+        name: name of the tokenizer, a key of `CATALOG`.
         weights: a path, or `hf://[datasets/]ORGANISATION/NAME[@REVISION]/FILE`; None takes the usual place.
 
     Raises:
@@ -74,7 +74,7 @@ def _parse_uri(uri: str) -> Entry:
         raise TokenizerError(uri, "is no file on the hub", "write hf://ORGANISATION/NAME@REVISION/FILE")
     dataset, repo, revision, file = found.groups()
     kind = "dataset" if dataset else "model"
-    # Only what names the file matters here.
+    # Only the fields that name the file matter here.
     return Entry(
         uri,
         "discrete",
@@ -91,7 +91,7 @@ def _parse_uri(uri: str) -> Entry:
 
 
 def _from_hub(name: str, entry: Entry) -> Path:
-    """Take a pinned file from the hub's cache, or download it."""
+    """Return the path of a pinned file in the hub's cache; download it if it is not there."""
     import httpx
     from huggingface_hub import errors
 
@@ -123,7 +123,7 @@ def _unreachable(name: str, wanted: str, fault: Exception, remedy: str) -> Token
 
 
 def _cached(entry: Entry) -> str | None:
-    """The file in the hub's cache, where the revision is a commit and so cannot have moved."""
+    """Return the file in the hub's cache if the revision is a commit; a branch or tag can move."""
     from huggingface_hub import try_to_load_from_cache
 
     if not re.fullmatch(r"[0-9a-f]{40}", entry.revision):
@@ -136,13 +136,13 @@ def _download(entry: Entry) -> str:
     from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
 
     kind, revision = entry.repo_type, entry.revision
-    # Asked once: the download itself would try for half a minute, and tell of each time.
+    # Ask once first: without a connection, the download would retry for half a minute and log each try.
     get_hf_file_metadata(hf_hub_url(entry.repo, entry.file, repo_type=kind, revision=revision))
     return hf_hub_download(entry.repo, entry.file, revision=revision, repo_type=kind)
 
 
 def one_file(path: Path, names: Iterable[str], what: str) -> Path:
-    """The path if it is a file, else the first of `names` in the folder.
+    """Return the path if it is a file, else the first of `names` in the folder.
 
     Raises:
         TokenizerError: none of them is there.
@@ -157,10 +157,10 @@ def one_file(path: Path, names: Iterable[str], what: str) -> Path:
 
 
 def pair_of(path: Path) -> list[Path]:
-    """Encoder's and decoder's file, where the path is named after one of them; else nothing.
+    """Return the encoder's and the decoder's file if the path is named after one of them; else an empty list.
 
     Raises:
-        TokenizerError: the other one is not there.
+        TokenizerError: the other file is not there.
     """
     named = re.search(r"(?<![A-Za-z])(encoder|decoder)", path.name)
     if not named:
@@ -174,7 +174,7 @@ def pair_of(path: Path) -> list[Path]:
 
 
 def digest_of(paths: Iterable[Path]) -> str:
-    """SHA-256 of one file; of several, that of their digests in a row."""
+    """Return the SHA-256 of one file; for several, the SHA-256 of their concatenated digests."""
     digests = [file_sha256(path) for path in paths]
     return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
@@ -183,10 +183,10 @@ def digest_of(paths: Iterable[Path]) -> str:
 
 
 def read_tensors(path: Path) -> Tensors:
-    """All tensors of a safetensors file or of a torch checkpoint, by name, as they are stored.
+    """Read all tensors of a safetensors file or of a torch checkpoint, by name, in their stored dtypes.
 
     Raises:
-        TokenizerError: not such a file, truncated, or holding what only code could make.
+        TokenizerError: it is not such a file, is truncated, or holds values that only code could make.
     """
     try:
         with path.open("rb") as file:
@@ -218,7 +218,7 @@ def _read_torch(path: Path) -> Tensors:
     try:
         try:
             values = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-        except RuntimeError:  # written before torch 1.6, which cannot be mapped
+        except RuntimeError:  # a file written before torch 1.6 cannot be mapped
             values = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as fault:
         raise TokenizerError(
@@ -226,7 +226,7 @@ def _read_torch(path: Path) -> Tensors:
             f"holds more than tensors and plain values, and was not unpickled: {_refused(fault)}",
             "save its state_dict as safetensors where it can be trusted",
         ) from fault
-    except Exception as fault:  # whatever a damaged file does to the reader
+    except Exception as fault:  # a damaged file can raise anything
         text = f"{type(fault).__name__}: {_one_line(fault)}"
         raise TokenizerError(path, f"is no whole torch checkpoint ({text})", "fetch it again") from fault
     for key in NESTED:
@@ -241,17 +241,17 @@ def _read_torch(path: Path) -> Tensors:
 
 
 def _refused(fault: Exception) -> str:
-    """What the unpickler met, out of its long advice."""
+    """Return the name that the unpickler refused, taken from its long message."""
     text = _one_line(fault, 4000)
     found = re.search(r"GLOBAL ([\w.]+)", text) or re.search(r"WeightsUnpickler error: ([^.]{1,120})", text)
     return found.group(1) if found else text[:120]
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """The `config.json` of a folder; empty where there is none.
+    """Return the `config.json` of a folder; empty if there is none.
 
     Raises:
-        TokenizerError: it is no JSON object.
+        TokenizerError: it is not a JSON object.
     """
     path = folder / "config.json"
     if not path.is_file():
@@ -268,7 +268,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def fill(network: nn.Module, tensors: Mapping[str, Tensor], where: object) -> None:
-    """Give a network (which may be on the meta device) its weights as float32: all of them, or an error.
+    """Give a network (which may be on the meta device) all its weights as float32.
 
     Raises:
         TokenizerError: a weight is missing, unexpected, of another shape, or not finite.
@@ -292,7 +292,7 @@ def fill(network: nn.Module, tensors: Mapping[str, Tensor], where: object) -> No
 
 @contextmanager
 def shapes_of(where: object, what: str) -> Iterator[None]:
-    """Turn a missing or odd tensor met while sizes are derived into one error."""
+    """Turn a missing or unsuitable tensor, met while sizes are derived, into one TokenizerError."""
     try:
         yield
     except KeyError as fault:
@@ -306,7 +306,7 @@ def shapes_of(where: object, what: str) -> Iterator[None]:
 
 
 def numbers(names: Iterable[str], prefix: str) -> list[int]:
-    """The numbers n of `<prefix>n.…` among names, ascending."""
+    """Return the numbers n of `<prefix>n.…` among names, ascending."""
     found = {name[len(prefix) :].split(".", 1)[0] for name in names if name.startswith(prefix)}
     return sorted(int(number) for number in found if number.isdecimal())
 

@@ -1,9 +1,9 @@
-"""`cosmos-di16` and `cosmos-ci16`: NVIDIA's image tokenizers, as TorchScript files.
+"""`cosmos-di16` and `cosmos-ci16`: run NVIDIA's image tokenizers from TorchScript files.
 
-A `.jit` file is a program, not a table of numbers: running it does what its author wrote, with
-everything TorchScript's operators can do, reading and writing files among it. So there is no default
-download: the user names files that the user trusts (`encoder.jit` and `decoder.jit`, or the folder
-that holds both), and their SHA-256 is recorded in the spec and in every shard.
+A `.jit` file is a program, not a table of numbers. It can do everything that TorchScript's operators
+can do, which includes reading and writing files. For that reason there is no default download: the
+user names files that the user trusts (`encoder.jit` and `decoder.jit`, or the folder that holds
+both). Their SHA-256 is recorded in the spec and in every shard.
 
 Both take 256×256 pictures to a 16×16 grid. `di16`: 64,000 ids, finite scalar quantisation with levels
 (8, 8, 8, 5, 5, 5), the first lowest, so two digits of 512 and 125. `ci16`: latents of 16 channels.
@@ -32,7 +32,7 @@ REMEDY = "name the folder with the encoder.jit and decoder.jit of NVIDIA's relea
 
 
 class CosmosNetwork(nn.Module):
-    """`encoder` and `decoder`, each a TorchScript program."""
+    """A network of `encoder` and `decoder`, each a TorchScript program."""
 
     def __init__(self, encoder: nn.Module, decoder: nn.Module) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class CosmosNetwork(nn.Module):
 
 
 def find_files(path: Path) -> list[Path]:
-    """Encoder's and decoder's file, from the folder or from one of them.
+    """Return the encoder's and the decoder's file, given the folder or one of the two files.
 
     Raises:
         TokenizerError: one of them is not there.
@@ -52,10 +52,10 @@ def find_files(path: Path) -> list[Path]:
 
 
 def read_program(path: Path) -> torch.jit.ScriptModule:
-    """Load a TorchScript file. This trusts the file: see above.
+    """Load a TorchScript file. Loading trusts the file: see the module's docstring.
 
     Raises:
-        TokenizerError: it is no TorchScript archive, or truncated.
+        TokenizerError: the file is not a TorchScript archive, or is truncated.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -73,7 +73,7 @@ def read_program(path: Path) -> torch.jit.ScriptModule:
 
 
 def _first(made: object) -> Tensor:
-    """What an encoder gives first: ids or latents; the rest are codes and losses."""
+    """Return the first output of a program: the ids, latents or pixels; the rest are codes and losses."""
     value = made[0] if isinstance(made, tuple | list) and made else made
     if not isinstance(value, Tensor):
         raise TypeError(f"it gives a {type(value).__name__}")
@@ -81,7 +81,7 @@ def _first(made: object) -> Tensor:
 
 
 def _try(tokenizer: NetworkTokenizer, files: list[Path]) -> None:
-    """One grey picture there and back, so that programs of other tokenizers are refused at once."""
+    """Encode and decode one grey picture, so that programs of other tokenizers are refused at once."""
     grey: NDArray[Any] = np.full((1, IMAGE_SIZE, IMAGE_SIZE, 3), 127, np.uint8)
     for file, half in zip(files, (tokenizer.encode, tokenizer.decode), strict=True):
         try:
@@ -94,10 +94,11 @@ def _try(tokenizer: NetworkTokenizer, files: list[Path]) -> None:
 
 
 def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
-    """The tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
 
     Args:
-        weights: the folder of `encoder.jit` and `decoder.jit`, or one of them; trusted, see above.
+        weights: the folder of `encoder.jit` and `decoder.jit`, or one of them. They are trusted: see the
+            module's docstring.
 
     Raises:
         TokenizerError: the files cannot be used, or there is no such device.

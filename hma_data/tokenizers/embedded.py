@@ -1,7 +1,7 @@
-"""The weights' file of the tokenizers that are in the package.
+"""Write and read the weights' files of the tokenizers that are in the package.
 
-It is safetensors: float16 parameters, and in the metadata its format, the network's shape and how it
-was trained.
+A file is safetensors. It holds float16 parameters; its metadata holds the format, the network's shape
+and the facts of the training.
 """
 
 import hashlib
@@ -24,12 +24,12 @@ class Config(Protocol):
     """A network's shape as a weights' file holds it."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         ...
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Self:
-        """What `to_json` wrote; raises TypeError, ValueError or KeyError on anything else."""
+        """Return the config that `to_json` wrote; raise TypeError, ValueError or KeyError on other values."""
         ...
 
 
@@ -43,7 +43,7 @@ def save_weights(
 
 
 def _sorted_header(content: bytes) -> bytes:
-    """The same safetensors file with its header in one order: the library's varies from run to run."""
+    """Sort the header of a safetensors file; the order in which the library writes it varies."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)
@@ -51,10 +51,10 @@ def _sorted_header(content: bytes) -> bytes:
 
 
 def read_weights[C: Config](path: Path, form: str, config: type[C]) -> tuple[C, dict[str, Tensor], str]:
-    """A weights' file: the network's shape, its parameters (float32), the file's SHA-256.
+    """Read a weights' file; return the network's shape, its parameters (float32) and the file's SHA-256.
 
     Raises:
-        TokenizerError: no such file, not safetensors, truncated, or of another network.
+        TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
     """
     try:
         if path.stat().st_size > MAX_BYTES:

@@ -1,7 +1,8 @@
-"""`fsq-16` and `fsq-8`: the embedded tokenizer, its weights inside the package.
+"""`fsq-16` and `fsq-8`: encode pictures to discrete ids, with weights that are inside the package.
 
-One network and one file of weights serve both: 16 pixels a token, 18 bits a token, at 256×256
-(16×16 tokens) and at 128×128 (8×8 tokens). How it was trained: recipes/tokenizer/fsq.yaml.
+One network and one file of weights serve both. A token covers 16×16 pixels and has 18 bits.
+`fsq-16` takes 256×256 pictures (16×16 tokens), `fsq-8` takes 128×128 pictures (8×8 tokens).
+The training recipe is recipes/tokenizer/fsq.yaml.
 """
 
 import math
@@ -22,7 +23,7 @@ VERSION = 1
 
 
 def load(name: str, *, weights: str | None, device: str, image_size: int) -> NetworkTokenizer:
-    """The tokenizer of that name; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer of that name; `hma_data.tokenizers.base.get_tokenizer` calls this.
 
     Its `.network` has `encoder`, `quantizer` and `decoder`.
 
@@ -34,7 +35,7 @@ def load(name: str, *, weights: str | None, device: str, image_size: int) -> Net
     config, tensors, sha256 = read_weights(path, FORMAT, FsqConfig)
     with torch.device("meta"):
         network = FsqAutoencoder(config)
-    quantizer = network.quantizer = Quantizer(config)  # what it holds is not in the file
+    quantizer = network.quantizer = Quantizer(config)  # its buffers are not in the weights' file
     fill(network, tensors, path)
     spec = TokenizerSpec(
         name=name,

@@ -1,9 +1,9 @@
-"""The network of the embedded tokenizer: a convolutional autoencoder with finite scalar quantisation.
+"""Define the network of `fsq-16` and `fsq-8`: a convolutional autoencoder with finite scalar quantisation.
 
-The picture is cut into 8×8 patches at once, and everything after that works at 1/8 and 1/16 of its
-size; that is what makes it fast on a CPU. The bottleneck holds a few channels, each rounded to a
-fixed number of levels (finite scalar quantisation, Mentzer et al. 2023): there is no codebook to
-learn and none to collapse. All layers are convolutions, so any size divisible by 16 fits.
+The picture is first cut into 8×8 patches, and all later layers work at 1/8 and 1/16 of its size; this
+makes the network fast on a CPU. The bottleneck has a few channels, each rounded to a fixed number of
+levels (finite scalar quantisation, Mentzer et al. 2023), so there is no learned codebook that could
+collapse. All layers are convolutions, so the network takes any size divisible by 16.
 
 B pictures, S side, h = S/16, C latent channels, K digits. Pixels inside the network are in [-1, 1].
 """
@@ -23,7 +23,7 @@ FORMAT = "hma-fsq-1"
 
 @dataclass(frozen=True)
 class FsqConfig:
-    """The network's shape, kept in the weights' file.
+    """The network's shape, stored in the weights' file.
 
     Attributes:
         levels: number of levels of each digit's channels; `[[8, 8, 8], [8, 8, 8]]` is two digits of 512.
@@ -56,21 +56,21 @@ class FsqConfig:
 
     @property
     def factored(self) -> tuple[int, ...]:
-        """Values of each digit, low digit first."""
+        """Return the number of values of each digit, low digit first."""
         return tuple(math.prod(digit) for digit in self.levels)
 
     @property
     def channels(self) -> int:
-        """C, the latent channels."""
+        """Return C, the number of latent channels."""
         return sum(len(digit) for digit in self.levels)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "FsqConfig":
-        """The config that `to_json` wrote.
+        """Return the config that `to_json` wrote.
 
         Raises:
             TypeError, ValueError, KeyError: the values are not such a config.
@@ -92,10 +92,10 @@ class FsqConfig:
 
 
 class Quantizer(nn.Module):
-    """Latents (B, C, h, w) to levels, to ids and back. It has no parameters.
+    """A quantizer without parameters: latents (B, C, h, w) to levels, levels to ids, and back.
 
-    A latent z is squashed to u = erf(z/√2) in (-1, 1), which makes a standard normal z uniform, so
-    that all levels get used; level k of L stands for u = (2k + 1)/L - 1.
+    A latent z is squashed to u = erf(z/√2) in (-1, 1). For a standard normal z, u is uniform, so that all
+    levels are used. Level k of L stands for u = (2k + 1)/L - 1.
     """
 
     count: Tensor
@@ -108,21 +108,27 @@ class Quantizer(nn.Module):
         self.register_buffer("count", flat.view(1, -1, 1, 1), persistent=False)
 
     def to_levels(self, latents: Tensor) -> Tensor:
-        """(B, C, h, w) latents -> whole numbers 0..L-1 of the same dtype."""
+        """Return the levels of latents (B, C, h, w): whole numbers 0..L-1 of the same dtype."""
         unit = torch.erf(latents * math.sqrt(0.5)) * 0.5 + 0.5
         return torch.minimum(torch.floor(unit * self.count), self.count - 1)
 
     def from_levels(self, levels: Tensor) -> Tensor:
-        """Whole numbers -> what the decoder takes, in (-1, 1)."""
+        """Return the decoder's input for whole levels, in (-1, 1)."""
         return (2 * levels + 1) / self.count - 1
 
     def forward(self, latents: Tensor) -> Tensor:
-        """What the decoder takes, with the gradient of the squashing (straight through the rounding)."""
+        """Return the decoder's input.
+
+        Its gradient is that of the squashing (straight through the rounding).
+        """
         soft = torch.erf(latents * math.sqrt(0.5))
         return soft + (self.from_levels(self.to_levels(latents)) - soft).detach()
 
     def to_ids(self, levels: Tensor) -> Tensor:
-        """(B, C, h, w) levels -> (B, h, w) int64 ids; the first channel of the first digit is lowest."""
+        """Return the ids of levels: (B, C, h, w) -> (B, h, w) int64.
+
+        The first channel of the first digit is the lowest.
+        """
         whole = levels.to(torch.int64)
         ids = torch.zeros_like(whole[:, 0])
         scale = 1
@@ -132,7 +138,7 @@ class Quantizer(nn.Module):
         return ids
 
     def to_digits(self, ids: Tensor) -> Tensor:
-        """(B, h, w) int64 ids -> (B, C, h, w) float32 levels."""
+        """Return the levels of ids: (B, h, w) int64 -> (B, C, h, w) float32."""
         channels = []
         for size in (n for digit in self.levels for n in digit):
             channels.append(ids % size)
@@ -141,7 +147,10 @@ class Quantizer(nn.Module):
 
 
 class Block(nn.Module):
-    """x + conv1(silu(conv3(x))), 3×3 to `hidden` channels and 1×1 back; it starts as the identity."""
+    """A residual block: x + conv1(silu(conv3(x))), 3×3 to `hidden` channels and 1×1 back.
+
+    Its initial weights make it the identity.
+    """
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
@@ -155,12 +164,12 @@ class Block(nn.Module):
 
 
 def stack(width: int, hidden: int, count: int) -> nn.Sequential:
-    """`count` residual blocks in a row."""
+    """Return `count` residual blocks in sequence."""
     return nn.Sequential(*(Block(width, hidden) for _ in range(count)))
 
 
 class Encoder(nn.Module):
-    """(B, 3, S, S) pixels in [-1, 1] -> (B, C, S/16, S/16) latents, about standard normal."""
+    """The encoder: (B, 3, S, S) pixels in [-1, 1] -> (B, C, S/16, S/16) latents, about standard normal."""
 
     def __init__(self, config: FsqConfig) -> None:
         super().__init__()
@@ -180,7 +189,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """(B, C, h, w) in (-1, 1) -> (B, 3, 16h, 16w) pixels, about [-1, 1]."""
+    """The decoder: (B, C, h, w) in (-1, 1) -> (B, 3, 16h, 16w) pixels, about [-1, 1]."""
 
     def __init__(self, config: FsqConfig) -> None:
         super().__init__()
@@ -205,7 +214,7 @@ class Decoder(nn.Module):
 
 
 class FsqAutoencoder(nn.Module):
-    """`encoder`, `quantizer`, `decoder`; `forward` is the training pass."""
+    """An autoencoder of `encoder`, `quantizer` and `decoder`; `forward` is the training pass."""
 
     stride = STRIDE
     linear_gain = 1.7  # least-squares estimate of z as 1.7 u, from u = erf(z/√2), z standard normal
@@ -218,9 +227,9 @@ class FsqAutoencoder(nn.Module):
         self.decoder = Decoder(config)
 
     def forward(self, pixels: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """(B, 3, S, S) in [-1, 1] -> (reconstruction of the same shape, latents (B, C, h, w)).
+        """Return the reconstruction of (B, 3, S, S) pixels in [-1, 1], and their latents (B, C, h, w).
 
-        Nothing here is random: `generator` is for networks that add noise.
+        This network draws no random numbers; `generator` is for networks that add noise.
         """
         latents = self.encoder(pixels)
         return self.decoder(self.quantizer(latents)), latents

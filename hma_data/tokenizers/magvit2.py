@@ -1,10 +1,11 @@
-"""`magvit2`, `magvit2-plain`: Open-MAGVIT2, the discrete tokenizer of the paper's release.
+"""`magvit2` and `magvit2-plain`: encode with Open-MAGVIT2, the discrete tokenizer of the paper's release.
 
-256×256 pictures, 16×16 ids of 18 bits, two digits of 512. Loads 1X's `magvit2.ckpt` (the default),
-TencentARC's checkpoints, and plain safetensors of `encoder.*` and `decoder.*`; widths, levels and
-blocks are read off the weights. Some checkpoints, 1X's among them, hold averaged weights
-(`model_ema.*`) beside the plain ones: `magvit2` uses the average. The paper's own loader never sees
-it, as it copies the plain weights over the average: `magvit2-plain` gives that loader's ids.
+Both take 256×256 pictures and give 16×16 ids of 18 bits, two digits of 512. They load 1X's
+`magvit2.ckpt` (the default), TencentARC's checkpoints, and plain safetensors of `encoder.*` and
+`decoder.*`. Widths, levels and blocks are derived from the weights. Some checkpoints, 1X's among them,
+hold averaged weights (`model_ema.*`) beside the plain ones: `magvit2` uses the averaged weights. The
+paper's own loader overwrites the averaged weights with the plain ones: `magvit2-plain` gives that
+loader's ids.
 """
 
 from collections.abc import Mapping
@@ -35,20 +36,20 @@ WHAT = "an Open-MAGVIT2 tokenizer"
 FILES = ("model.safetensors", "magvit2.safetensors", "magvit2.ckpt")
 FIRST = "encoder.conv_in.weight"
 AVERAGED = "model_ema."
-# Projections around a learned codebook: such a network is a VQGAN or IBQ, not this one.
+# Projections around a learned codebook; a network that has them is a VQGAN or IBQ, not Open-MAGVIT2.
 FOREIGN = ("quant_conv.", "post_quant_conv.", "quantize.embedding")
 
 
 def choose_weights(tensors: Mapping[str, torch.Tensor], where: object, *, averaged: bool = True) -> Tensors:
-    """The parameters of encoder and decoder in a checkpoint, under their plain names.
+    """Return the parameters of encoder and decoder in a checkpoint, under their plain names.
 
-    A trainer's prefix is taken off, and what belongs to the loss (the discriminator) is left out.
+    The trainer's prefix is removed, and parameters of the loss (the discriminator) are left out.
 
     Args:
-        averaged: whether the averaged weights are taken where there are any.
+        averaged: whether to take the averaged weights if there are any.
 
     Raises:
-        TokenizerError: there is no such network in it, or only part of it is averaged.
+        TokenizerError: the checkpoint holds no such network, or averages only a part of it.
     """
     prefixes = [name.removesuffix(FIRST) for name in tensors if name.endswith(FIRST)]
     if not prefixes:
@@ -71,10 +72,10 @@ def choose_weights(tensors: Mapping[str, torch.Tensor], where: object, *, averag
 
 
 def derive_config(tensors: Mapping[str, torch.Tensor], where: object) -> Magvit2Config:
-    """The network's shape, from the shapes of its weights.
+    """Derive the network's shape from the shapes of its weights.
 
     Raises:
-        TokenizerError: they are no such network's.
+        TokenizerError: the weights are not those of such a network.
     """
     with shapes_of(where, WHAT):
         base, colours = tensors[FIRST].shape[:2]
@@ -94,7 +95,7 @@ def derive_config(tensors: Mapping[str, torch.Tensor], where: object) -> Magvit2
 
 
 def check_config(config: Magvit2Config, stated: Mapping[str, Any], where: object) -> None:
-    """Raise TokenizerError where a `config.json` beside the weights contradicts them."""
+    """Raise TokenizerError if a `config.json` beside the weights contradicts them."""
     derived = {
         "base_channels": config.base,
         "z_channels": config.z,
@@ -109,10 +110,10 @@ def check_config(config: Magvit2Config, stated: Mapping[str, Any], where: object
 
 
 def read_network(path: Path, *, averaged: bool = True) -> Magvit2:
-    """The network of a weights' file, with its averaged weights or the plain ones.
+    """Read the network from a weights' file, with its averaged weights or the plain ones.
 
     Raises:
-        TokenizerError: it cannot be read, or holds another network.
+        TokenizerError: the file cannot be read, or holds another network.
     """
     tensors = choose_weights(read_tensors(path), path, averaged=averaged)
     config = derive_config(tensors, path)
@@ -124,14 +125,14 @@ def read_network(path: Path, *, averaged: bool = True) -> Magvit2:
 
 
 def load(name: str, *, weights: str | None, device: str, averaged: bool) -> NetworkTokenizer:
-    """The tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
 
     Args:
         weights: a file, a folder with one of `FILES`, or `hf://…`; None takes 1X's from the hub.
-        averaged: whether the averaged weights are taken where there are any.
+        averaged: whether to take the averaged weights if there are any.
 
     Raises:
-        TokenizerError: the weights cannot be had or used, or there is no such device.
+        TokenizerError: the weights cannot be obtained or used, or there is no such device.
     """
     place = open_device(name, device)
     path = one_file(find_weights(name, weights), FILES, name)

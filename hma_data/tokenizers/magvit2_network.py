@@ -1,8 +1,8 @@
-"""The network of Open-MAGVIT2: a convolutional autoencoder whose latents are reduced to their signs.
+"""Define the network of Open-MAGVIT2: a convolutional autoencoder whose latents are reduced to their signs.
 
-Parameter names are those of the released checkpoints, so that they load as they are. The first
-checkpoints (1X's among them) have a plain decoder; the later ones normalise the decoder's stages anew
-by the mean and spread of the code (`adaptive`). Lookup-free quantisation: Yu et al. 2024.
+Parameter names are those of the released checkpoints, so that the checkpoints load unchanged. The first
+checkpoints (1X's among them) have a plain decoder. In later ones (`adaptive`), each stage of the decoder
+has a group norm whose scale and shift come from the code. Lookup-free quantisation: Yu et al. 2024.
 
 B pictures, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
 """
@@ -22,11 +22,11 @@ class Magvit2Config:
     """The network's shape.
 
     Attributes:
-        base: channels at the picture's own size.
-        z: channels of the code, bits of a token.
-        mult: channels of each level as multiples of `base`; each level but the last halves the side.
-        res_blocks: residual blocks a level.
-        adaptive: the decoder has adaptive group norms.
+            base: channels at the picture's own size.
+            z: channels of the code, which is the number of bits of a token.
+            mult: channels of each level as multiples of `base`; each level except the last halves the side.
+            res_blocks: residual blocks a level.
+            adaptive: whether the decoder has adaptive group norms.
     """
 
     base: int = 128
@@ -45,12 +45,12 @@ class Magvit2Config:
 
     @property
     def stride(self) -> int:
-        """Pixels a token, along each side."""
+        """Return the number of pixels a token covers along each side."""
         return 2 ** (len(self.mult) - 1)
 
     @property
     def factored(self) -> tuple[int, ...]:
-        """Two digits, low first, as equal as z allows; one where z is 1."""
+        """Return the sizes of two digits, low digit first, as equal as z allows; one digit if z is 1."""
         return (2 ** (self.z - self.z // 2), 2 ** (self.z // 2)) if self.z > 1 else (2,)
 
 
@@ -59,9 +59,9 @@ def _norm(width: int) -> nn.GroupNorm:
 
 
 class ResBlock(nn.Module):
-    """x + conv2(silu(norm2(conv1(silu(norm1(x)))))), 3×3 and without bias.
+    """A residual block: x + conv2(silu(norm2(conv1(silu(norm1(x)))))), 3×3 and without bias.
 
-    Where the widths differ, x goes past through a 1×1 convolution.
+    If the widths differ, a 1×1 convolution of x replaces x in the sum.
     """
 
     def __init__(self, before: int, after: int) -> None:
@@ -88,7 +88,7 @@ def _run(blocks: Iterable[nn.Module], x: Tensor) -> Tensor:
 
 
 class DownLevel(nn.Module):
-    """Residual blocks, then half the side by a strided convolution, but on the last level."""
+    """Residual blocks, then a strided convolution that halves the side, except on the last level."""
 
     def __init__(self, before: int, after: int, count: int, last: bool) -> None:
         super().__init__()
@@ -101,7 +101,10 @@ class DownLevel(nn.Module):
 
 
 class Upsample(nn.Module):
-    """Four times the channels by a 3×3 convolution, laid out as 2×2 pixels, the channel varying fastest."""
+    """An upsampling by 2: a 3×3 convolution makes four times the channels, which become 2×2 pixels.
+
+    Of the output channels of the convolution, the picture channel varies fastest.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -114,7 +117,7 @@ class Upsample(nn.Module):
 
 
 class UpLevel(nn.Module):
-    """Residual blocks, then twice the side, but on the finest level."""
+    """Residual blocks, then an upsampling that doubles the side, except on the finest level."""
 
     def __init__(self, before: int, after: int, count: int, finest: bool) -> None:
         super().__init__()
@@ -127,7 +130,7 @@ class UpLevel(nn.Module):
 
 
 class AdaptiveNorm(nn.Module):
-    """Group norm whose scale comes from the code's spread over the picture, and its shift from the mean."""
+    """A group norm whose scale comes from the code's spread over the picture, and its shift from the mean."""
 
     def __init__(self, z: int, width: int) -> None:
         super().__init__()
@@ -141,7 +144,7 @@ class AdaptiveNorm(nn.Module):
 
 
 class Encoder(nn.Module):
-    """(B, 3, S, S) pixels -> (B, z, h, h), whose signs are the code."""
+    """The encoder: (B, 3, S, S) pixels -> (B, z, h, h), whose signs are the code."""
 
     def __init__(self, config: Magvit2Config) -> None:
         super().__init__()
@@ -161,12 +164,12 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """(B, z, h, h) codes of -1 and 1 -> (B, 3, S, S) pixels, about [-1, 1]."""
+    """The decoder: (B, z, h, h) codes of -1 and 1 -> (B, 3, S, S) pixels, about [-1, 1]."""
 
     def __init__(self, config: Magvit2Config) -> None:
         super().__init__()
         after = [config.base * m for m in config.mult]
-        before = [*after[1:], after[-1]]  # of a level, which is reached from the coarser one
+        before = [*after[1:], after[-1]]  # input widths; a level takes the output of the coarser one
         levels = range(len(after))
         self.conv_in = nn.Conv2d(config.z, after[-1], 3, padding=1)
         self.mid_block = _blocks(after[-1], after[-1], config.res_blocks)
@@ -186,10 +189,10 @@ class Decoder(nn.Module):
 
 
 class Magvit2(nn.Module):
-    """`encoder`, `decoder`, and the quantiser between them, which has no parameters.
+    """An autoencoder of `encoder` and `decoder`, with a quantiser between them that has no parameters.
 
-    A channel above zero is a 1. Bit c of an id is channel c, the lowest first: the order in which the
-    paper's release stores ids (its `flip`), the reverse of upstream's.
+    A channel above zero is a 1. Bit c of an id is channel c, the lowest first. The paper's release
+    stores ids in this order (its `flip`); upstream's order is the reverse.
     """
 
     def __init__(self, config: Magvit2Config) -> None:
@@ -199,12 +202,12 @@ class Magvit2(nn.Module):
         self.decoder = Decoder(config)
 
     def to_ids(self, latents: Tensor) -> Tensor:
-        """(B, z, h, w) -> (B, h, w) int64 ids."""
+        """Return the ids of latents: (B, z, h, w) -> (B, h, w) int64."""
         bits = (latents > 0).to(torch.int64)
         weights = 2 ** torch.arange(self.config.z, device=latents.device)
         return (bits * weights.view(1, -1, 1, 1)).sum(1)
 
     def from_ids(self, ids: Tensor) -> Tensor:
-        """(B, h, w) int64 ids -> (B, z, h, w) float32 codes of -1 and 1."""
+        """Return the codes of ids: (B, h, w) int64 -> (B, z, h, w) float32 of -1 and 1."""
         shifts = torch.arange(self.config.z, device=ids.device).view(1, -1, 1, 1)
         return ((ids.unsqueeze(1) >> shifts) & 1).float() * 2 - 1

@@ -1,10 +1,11 @@
-"""A tokenizer around any network: batches of a fixed size, device, number formats.
+"""Make a tokenizer of any network: run it in batches of a fixed size, on a device, in a number format.
 
-A kernel may sum in another order when the batch has another size or more threads share the work, and
-the last bits of a latent decide its sign or its rounding. So frames go through in batches of one size,
-the last one padded, and on a CPU each frame is encoded by one thread, several frames at a time: the
-same frame then gives the same tokens whatever the batch, the worker or the number of cores.
-float32 on a CPU; bfloat16 and channels-last on CUDA, where a network does not ask for float32.
+A kernel may sum in another order when the batch has another size or more threads share the work. Then
+the last bits of a latent change, and these can change its sign or its rounding. For that reason all
+batches have one size, the last one padded. On a CPU, one thread encodes each frame, and several frames
+are encoded at a time. The same frame then gives the same tokens whatever the batch, the worker or the
+number of cores. Networks run in float32 on a CPU, and in bfloat16 and channels-last on CUDA, except a
+network that asks for float32.
 
 B pictures of a batch, S side, c channels, h·w grid. Pixels inside are (B, 3, S, S) in [-1, 1].
 """
@@ -26,13 +27,13 @@ Step = Callable[[Tensor], Tensor]
 
 
 class NetworkTokenizer:
-    """See `hma_data.tokenizers.base.Tokenizer`.
+    """A tokenizer with a network; see `hma_data.tokenizers.base.Tokenizer`.
 
     Attributes:
         spec: what decides the tokens.
         network: torch module with `encoder` and `decoder`, in evaluation mode.
         batch: frames a pass through the network.
-        light: decodes each frame on one thread too, which is fast enough for a small network.
+        light: whether to decode each frame on one thread too, which is fast enough for a small network.
     """
 
     def __init__(
@@ -45,12 +46,14 @@ class NetworkTokenizer:
         *,
         light: bool = False,
     ) -> None:
-        """
+        """Move the network to the device and set it to evaluation mode.
+
         Args:
-            network: placed on `device` here.
+            network: moved to `device`.
             encode: pixels (B, 3, S, S) -> int64 ids (B, h, w), or latents (B, c, h, w).
-            decode: the same back to pixels.
-            light: a network of plain convolutions, small enough for float32 and channels-last anywhere.
+            decode: ids or latents, as `encode` returns them, -> pixels (B, 3, S, S).
+            light: whether it is a network of plain convolutions, small enough for float32 and channels-last
+                on any device.
         """
         cuda = device.type == "cuda"
         self.spec, self.device, self.light = spec, device, light
@@ -64,10 +67,10 @@ class NetworkTokenizer:
         self._encode, self._decode = encode, decode
 
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
-        """(N, S, S, 3) uint8 RGB -> (N, h, w) ids, or (N, c, h, w) float16 latents.
+        """Encode (N, S, S, 3) uint8 RGB to (N, h, w) ids, or to (N, c, h, w) float16 latents.
 
         Raises:
-            TokenizerError: frames of another shape or dtype, or what the network makes cannot be stored.
+            TokenizerError: frames have another shape or dtype, or the network's output cannot be stored.
         """
         check_frames(frames, self.spec)
         cells = self.spec.grid if self.spec.kind == "discrete" else (self.spec.channels or 0, *self.spec.grid)
@@ -76,10 +79,11 @@ class NetworkTokenizer:
         return tokens
 
     def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
-        """What `encode` gives -> (N, S, S, 3) uint8 RGB.
+        """Decode what `encode` returns to (N, S, S, 3) uint8 RGB.
 
         Raises:
-            TokenizerError: another grid or dtype, ids outside the vocabulary, latents that are not finite.
+            TokenizerError: the tokens have another grid or dtype, ids are outside the vocabulary, or latents
+                are not finite.
         """
         check_tokens(tokens, self.spec)
         discrete = self.spec.kind == "discrete"
@@ -99,8 +103,10 @@ class NetworkTokenizer:
         items: NDArray[Any],
         alone: bool,
     ) -> None:
-        """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time; on a CPU several batches
-        side by side, each on one thread, where they are to be computed alone."""
+        """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time.
+
+        With `alone`, on a CPU, several batches are computed at the same time, each on one thread.
+        """
         parts = [items[start : start + self.batch] for start in range(0, len(items), self.batch)]
         if alone and parts and self.device.type == "cpu":
             with single_threads(len(parts)) as pool:
@@ -114,14 +120,14 @@ class NetworkTokenizer:
 
     @torch.inference_mode()
     def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
-        """Up to a batch of frames, encoded and checked."""
+        """Encode at most one batch of frames and check the result."""
         pixels = self._padded(frames).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
         pixels = pixels.to(self.dtype).contiguous(memory_format=self._format)
         return self._storable(self._encode(pixels)[: len(frames)])
 
     @torch.inference_mode()
     def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
-        """Up to a batch of ids or latents, decoded."""
+        """Decode at most one batch of ids or latents."""
         discrete = self.spec.kind == "discrete"
         values = self._padded(tokens.astype(np.int64 if discrete else np.float32))
         pixels = self._decode(values if discrete else values.to(self.dtype)).float()
@@ -130,7 +136,7 @@ class NetworkTokenizer:
         return made[: len(tokens)]
 
     def _storable(self, made: Tensor) -> NDArray[Any]:
-        """Ids or latents as an array, checked to fit what the spec stores."""
+        """Return ids or latents as an array; check that the spec's dtype can store them."""
         if self.spec.kind == "discrete":
             ids = made.cpu().numpy()
             if ids.size and (ids.min() < 0 or ids.max() >= (self.spec.vocab_size or 0)):
@@ -145,7 +151,7 @@ class NetworkTokenizer:
         return latents
 
     def _padded(self, part: NDArray[Any]) -> Tensor:
-        """The part on the device, repeated up to a whole batch."""
+        """Return the part on the device, repeated up to a whole batch."""
         if len(part) < self.batch:
             part = np.resize(part, (self.batch, *part.shape[1:]))
         return torch.from_numpy(part.copy()).to(self.device)  # torch takes no negative strides
@@ -164,10 +170,10 @@ def single_threads(tasks: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def open_device(name: str, device: str) -> torch.device:
-    """The torch device of that name, tried.
+    """Return the torch device of that name, after a trial allocation on it.
 
     Raises:
-        TokenizerError: there is none here.
+        TokenizerError: this machine has no such device.
     """
     try:
         place = torch.device(device)
@@ -179,10 +185,10 @@ def open_device(name: str, device: str) -> torch.device:
 
 
 def grid_of(size: int, stride: int, where: object) -> tuple[int, int]:
-    """(h, w) of a square picture cut into cells of `stride` pixels.
+    """Return (h, w) of a square picture cut into cells of `stride` pixels.
 
     Raises:
-        TokenizerError: they do not fit.
+        TokenizerError: the cells do not tile the picture.
     """
     if stride < 1 or size % stride:
         raise TokenizerError(where, f"makes cells of {stride} pixels, which do not tile {size}")

@@ -1,7 +1,7 @@
-"""`raw`: pixels as they are, for baselines and for models that bring their own tokenizer.
+"""`raw`: store pixels unchanged, for baselines and for models that bring their own tokenizer.
 
-Stored channels first, (3, 256, 256) uint8, so that they look like the latents of a continuous
-tokenizer with one cell a pixel; a model maps them to [0, 1] with `spec.latent_scale`.
+Frames are stored channels first, (3, 256, 256) uint8, so that they have the layout of a continuous
+tokenizer's latents with one cell per pixel. A model maps them to [0, 1] with `spec.latent_scale`.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ SIZE = 256
 
 
 class RawTokenizer:
-    """Pixels in, the same pixels out; see `hma_data.tokenizers.base.Tokenizer`."""
+    """A tokenizer that returns its pixels unchanged; see `hma_data.tokenizers.base.Tokenizer`."""
 
     def __init__(self, name: str) -> None:
         self.spec = TokenizerSpec(
@@ -31,15 +31,15 @@ class RawTokenizer:
         )
 
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(N, 256, 256, 3) uint8 -> (N, 3, 256, 256) uint8."""
+        """Return (N, 256, 256, 3) uint8 frames as (N, 3, 256, 256) uint8."""
         check_frames(frames, self.spec)
         return np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
 
     def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
-        """(N, 3, 256, 256) uint8 -> (N, 256, 256, 3) uint8.
+        """Return (N, 3, 256, 256) uint8 tokens as (N, 256, 256, 3) uint8 frames.
 
         Raises:
-            TokenizerError: another shape, or another dtype than uint8.
+            TokenizerError: the tokens have another shape, or a dtype other than uint8.
         """
         check_tokens(tokens, self.spec)
         if tokens.dtype != np.uint8:
@@ -48,7 +48,7 @@ class RawTokenizer:
 
 
 def load(name: str, *, weights: str | None, device: str) -> RawTokenizer:
-    """The tokenizer of that name; it has no weights and no network, so `device` changes nothing.
+    """Return the tokenizer of that name. It has no weights and no network, so `device` has no effect.
 
     Raises:
         TokenizerError: weights were given.

@@ -1,8 +1,8 @@
-"""`svd-vae`: the autoencoder of Stable Video Diffusion, the paper's continuous tokenizer.
+"""`svd-vae`: encode with the autoencoder of Stable Video Diffusion, the paper's continuous tokenizer.
 
-256×256 pictures, 4×32×32 latents: the mean of the posterior, stored unscaled as float16; a model
-multiplies them by `latent_scale` (0.18215). Frames are coded one by one, so the decoder, which looks
-over time, is given films of one frame. The network is diffusers' `AutoencoderKLTemporalDecoder`.
+It takes 256×256 pictures and gives 4×32×32 latents: the mean of the posterior, stored unscaled as
+float16. A model multiplies them by `latent_scale` (0.18215). Frames are encoded one by one; the decoder,
+which works on videos, gets videos of one frame. The network is diffusers' `AutoencoderKLTemporalDecoder`.
 """
 
 from collections.abc import Mapping
@@ -40,10 +40,10 @@ FILES = (
 
 
 def derive_config(tensors: Mapping[str, Tensor], where: object) -> dict[str, Any]:
-    """Arguments of diffusers' class, from the shapes of the weights.
+    """Return the arguments of diffusers' class, derived from the shapes of the weights.
 
     Raises:
-        TokenizerError: they are no such network's.
+        TokenizerError: the weights are not those of such a network.
     """
     with shapes_of(where, WHAT):
         levels = numbers(tensors, "encoder.down_blocks.")
@@ -70,7 +70,7 @@ def _diffusers() -> Any:
 
 
 def read_network(path: Path) -> nn.Module:
-    """The network of a weights' file.
+    """Read the network from a weights' file.
 
     Raises:
         MissingDependencyError: diffusers is not installed.
@@ -93,14 +93,14 @@ def _scale(stated: Mapping[str, Any], where: object) -> float:
 
 
 def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
-    """The tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
 
     Args:
         weights: a file, a folder as diffusers writes it, or `hf://…`; None takes them from the hub.
 
     Raises:
         MissingDependencyError: diffusers is not installed.
-        TokenizerError: the weights cannot be had or used, or there is no such device.
+            TokenizerError: the weights cannot be obtained or used, or there is no such device.
     """
     place = open_device(name, device)
     _diffusers()  # before anything is downloaded

@@ -1,10 +1,10 @@
-"""`taesd` and `taef2`: tiny continuous tokenizers, fast on a CPU.
+"""`taesd` and `taef2`: encode with tiny continuous tokenizers that are fast on a CPU.
 
 `taesd` makes the latents of Stable Diffusion 1 and 2 (4×32×32), `taef2` those of FLUX.2 (32×32×32).
-Latents are stored as the encoder makes them; both are distilled to latents that need no scale
-(`latent_scale` 1). Weights come as diffusers writes an `AutoencoderTiny` (one file of
-`encoder.layers.N.*` and `decoder.layers.N.*`), or as the author does: a pair of files, one a half,
-of `N.*`. Neither diffusers nor the author's code is needed.
+Latents are stored as the encoder makes them; both encoders are distilled to latents that need no scale
+(`latent_scale` 1). Two layouts of weights are read. Diffusers writes an `AutoencoderTiny` as one file of
+`encoder.layers.N.*` and `decoder.layers.N.*`. The author writes two files, one for the encoder and one
+for the decoder, of `N.*`. Neither diffusers nor the author's code is needed.
 """
 
 from collections.abc import Iterable, Mapping
@@ -36,15 +36,15 @@ VERSION = 1
 IMAGE_SIZE = 256
 WHAT = "a TAESD tokenizer"
 WHOLE = ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.bin")
-# What an AutoencoderTiny's config.json must say, if it says anything: the network knows no other.
+# Values that an AutoencoderTiny's config.json must have if it states them; the network supports no others.
 KNOWN = {"act_fn": "relu", "upsample_fn": "nearest", "upsampling_scaling_factor": 2, "shift_factor": 0.0}
 
 
 def find_files(name: str, path: Path) -> list[Path]:
-    """The one file of both halves, or encoder's and decoder's.
+    """Return the one file of encoder and decoder, or their two files.
 
     Raises:
-        TokenizerError: the folder holds neither, or the other half of a pair is not there.
+        TokenizerError: the folder holds neither, or one file of the pair is missing.
     """
     if path.is_dir():
         for whole in (*WHOLE, f"{name}.safetensors"):
@@ -61,10 +61,10 @@ def find_files(name: str, path: Path) -> list[Path]:
 
 
 def read_halves(files: list[Path]) -> Tensors:
-    """All weights, named `<half>.<number>.…`.
+    """Read all weights, named `<half>.<number>.…`.
 
     Raises:
-        TokenizerError: a file cannot be read, or holds something besides the halves.
+        TokenizerError: a file cannot be read, or holds other tensors than those of encoder and decoder.
     """
     if len(files) == 2:
         return {
@@ -80,7 +80,7 @@ def read_halves(files: list[Path]) -> Tensors:
 
 
 def in_order(tensors: Mapping[str, Tensor]) -> Tensors:
-    """The same weights as `<half>.layers.<place>.…`, places counted without what has no weights."""
+    """Rename the weights to `<half>.layers.<place>.…`; layers without weights have no place."""
     places = {
         f"{half}.{number}": f"{half}.layers.{place}"
         for half in HALVES
@@ -94,10 +94,10 @@ def in_order(tensors: Mapping[str, Tensor]) -> Tensors:
 
 
 def derive_config(tensors: Mapping[str, Tensor], where: object) -> TinyConfig:
-    """The layers, from the names and shapes that `in_order` gave.
+    """Derive the layers from the names and shapes that `in_order` returned.
 
     Raises:
-        TokenizerError: they are no such network's.
+        TokenizerError: the weights are not those of such a network.
     """
     with shapes_of(where, WHAT):
         halves = [
@@ -117,7 +117,7 @@ def _layer(tensors: Mapping[str, Tensor], prefix: str) -> Layer:
 
 
 def _check_config(stated: Mapping[str, Any], where: object) -> float:
-    """The latents' scale that a config.json states; TokenizerError where it asks for another network."""
+    """Return the scale of the latents that a config.json states; raise TokenizerError for another network."""
     for key, value in KNOWN.items():
         if stated.get(key, value) != value:
             raise TokenizerError(where, f"its config.json asks for {key} {stated[key]!r}, known is {value!r}")
@@ -128,10 +128,10 @@ def _check_config(stated: Mapping[str, Any], where: object) -> float:
 
 
 def read_network(files: list[Path]) -> TinyAutoencoder:
-    """The network of one file or of a pair.
+    """Read the network from one file or from a pair.
 
     Raises:
-        TokenizerError: they cannot be read, or hold another network.
+        TokenizerError: the files cannot be read, or hold another network.
     """
     where = _names(files)
     tensors = in_order(read_halves(files))
@@ -147,14 +147,14 @@ def _names(files: Iterable[Path]) -> str:
 
 
 def load(name: str, *, weights: str | None, device: str, channels: int) -> NetworkTokenizer:
-    """The tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
 
     Args:
         weights: a file, one file of a pair, a folder, or `hf://…`; None takes them from the hub.
-        channels: of the latents that the name promises.
+        channels: number of latent channels that a tokenizer of this name has.
 
     Raises:
-        TokenizerError: the weights cannot be had or used, or there is no such device.
+        TokenizerError: the weights cannot be obtained or used, or there is no such device.
     """
     place = open_device(name, device)
     files = find_files(name, find_weights(name, weights))
@@ -162,7 +162,7 @@ def load(name: str, *, weights: str | None, device: str, channels: int) -> Netwo
     if network.config.channels != channels:
         fault = f"has latents of {network.config.channels} channels, {name} has {channels}"
         raise TokenizerError(_names(files), fault, "name the weights of this tokenizer")
-    # A config.json beside a pair of files is somebody else's.
+    # A config.json beside a pair of files belongs to other weights.
     stated = read_config(files[0].parent) if files[0].name in WHOLE else {}
     spec = TokenizerSpec(
         name=name,

@@ -1,8 +1,9 @@
-"""The tiny autoencoders of the TAESD family: 3×3 convolutions, ReLUs, residual blocks.
+"""Define the tiny autoencoders of the TAESD family: 3×3 convolutions, ReLUs, residual blocks.
 
-Each distils another autoencoder's latent space. The halves are plain sequences, so their layers are
-read off the weights: a convolution without a bias halves (encoder) or doubles (decoder) the side.
-Sizes and order: Ollin Boer Bohan's TAESD. Pixels are in [-1, 1] outside; the weights want [0, 1].
+Each is distilled from another autoencoder and shares its latent space. Encoder and decoder are plain
+sequences, so their layers are derived from the weights: a convolution without a bias halves (encoder)
+or doubles (decoder) the side. Sizes and order follow Ollin Boer Bohan's TAESD. Pixels are in [-1, 1]
+at the interface; the weights expect [0, 1].
 """
 
 from collections.abc import Sequence
@@ -13,18 +14,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-LIMIT = 3.0  # latents are squeezed into (-LIMIT, LIMIT) before decoding
+LIMIT = 3.0  # the decoder squeezes latents into (-LIMIT, LIMIT)
 POOL_GROUPS = 4
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One layer of a half.
+    """One layer of the encoder or the decoder.
 
     Attributes:
         kind: `conv` keeps the size, `scale` halves or doubles it, `block` is residual.
-        before, after: channels.
-        pooled: channels inside the block's second branch; 0 where it has none.
+        before, after: numbers of input and output channels.
+        pooled: channels inside the block's second branch; 0 if the block has none.
     """
 
     kind: str
@@ -35,7 +36,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class TinyConfig:
-    """The layers of both halves, in order."""
+    """The layers of the encoder and the decoder, in order."""
 
     encoder: tuple[Layer, ...] = field(default=())
     decoder: tuple[Layer, ...] = field(default=())
@@ -57,12 +58,12 @@ class TinyConfig:
 
     @property
     def channels(self) -> int:
-        """Of the latents."""
+        """Return the number of latent channels."""
         return self.encoder[-1].after
 
     @property
     def stride(self) -> int:
-        """Pixels a latent, along each side."""
+        """Return the number of pixels a latent covers along each side."""
         return _stride(self.encoder)
 
 
@@ -71,7 +72,10 @@ def _stride(layers: Sequence[Layer]) -> int:
 
 
 class Block(nn.Module):
-    """relu(x + three convolutions of x); with `pool`, x has a normalised 1×1 branch added first."""
+    """A residual block: relu(x + three convolutions of x).
+
+    With `pool`, a normalised 1×1 branch is first added to x.
+    """
 
     def __init__(self, layer: Layer) -> None:
         super().__init__()
@@ -112,7 +116,7 @@ def _modules(layers: Sequence[Layer], stride: int) -> nn.ModuleList:
 
 
 class Encoder(nn.Module):
-    """(B, 3, S, S) pixels -> (B, c, h, h) latents."""
+    """The encoder: (B, 3, S, S) pixels -> (B, c, h, h) latents."""
 
     def __init__(self, layers: Sequence[Layer]) -> None:
         super().__init__()
@@ -126,7 +130,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """(B, c, h, h) latents -> (B, 3, S, S) pixels, about [-1, 1]."""
+    """The decoder: (B, c, h, h) latents -> (B, 3, S, S) pixels, about [-1, 1]."""
 
     def __init__(self, layers: Sequence[Layer]) -> None:
         super().__init__()
@@ -142,7 +146,7 @@ class Decoder(nn.Module):
 
 
 class TinyAutoencoder(nn.Module):
-    """`encoder` and `decoder`."""
+    """An autoencoder of `encoder` and `decoder`."""
 
     def __init__(self, config: TinyConfig) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
-"""`vae-8`: continuous latents without a download, 4×32×32 for a picture of 256², weights in the package.
+"""`vae-8`: encode pictures to continuous latents, with weights that are inside the package.
 
-The encoder is deterministic: what is stored is the latent's mean. How it was trained:
-recipes/tokenizer/vae.yaml.
+A picture of 256×256 pixels gives latents of 4×32×32. The encoder is deterministic: the stored value is
+the mean of the latent. The training recipe is recipes/tokenizer/vae.yaml.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ VERSION = 1
 
 
 def load(name: str, *, weights: str | None, device: str, image_size: int) -> NetworkTokenizer:
-    """The tokenizer of that name; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer of that name; `hma_data.tokenizers.base.get_tokenizer` calls this.
 
     Raises:
         TokenizerError: the weights cannot be used, or there is no such device.

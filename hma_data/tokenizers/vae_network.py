@@ -1,8 +1,9 @@
-"""The network of the embedded continuous tokenizer: a small convolutional autoencoder, 8 pixels a cell.
+"""Define the network of `vae-8`: a small convolutional autoencoder with 8 pixels a cell.
 
-Built like `hma_data.tokenizers.fsq_network`: the picture is cut into 8×8 patches at once, and a linear
-code of those patches runs beside the convolutions. Latents are about standard normal in each channel;
-in training a little noise is added to them, so that near latents decode to near pictures.
+It is built like `hma_data.tokenizers.fsq_network`: the picture is first cut into 8×8 patches, and a
+linear code of those patches is added to the output of the convolutions. The latents are about standard
+normal in each channel. Training adds a little noise to them, so that similar latents decode to similar
+pictures.
 
 B pictures, S side, C latent channels, S/8 the side of the grid. Pixels are in [-1, 1].
 """
@@ -21,17 +22,17 @@ FORMAT = "hma-vae-1"
 
 @dataclass(frozen=True)
 class VaeConfig:
-    """The network's shape, kept in the weights' file.
+    """The network's shape, stored in the weights' file.
 
     Attributes:
-        channels: C, of the latents.
+        channels: number C of latent channels.
         width: channels at 1/8 of the picture's side.
         hidden: channels inside the residual blocks at 1/8.
         encoder_blocks: residual blocks of the encoder.
         decoder_blocks: residual blocks of the decoder at 1/8 and at 1/4.
         fine_width: channels of the decoder at 1/4.
-        noise: standard deviation of what is added to the latents in training.
-        latent_scale: brings latents to unit variance; measured when training ends.
+        noise: standard deviation of the noise that training adds to the latents.
+        latent_scale: factor that brings the latents to unit variance; measured when training ends.
     """
 
     channels: int = 4
@@ -56,12 +57,12 @@ class VaeConfig:
             )
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "VaeConfig":
-        """The config that `to_json` wrote.
+        """Return the config that `to_json` wrote.
 
         Raises:
             TypeError, ValueError, KeyError: the values are not such a config.
@@ -80,7 +81,7 @@ class VaeConfig:
 
 
 class Encoder(nn.Module):
-    """(B, 3, S, S) pixels in [-1, 1] -> (B, C, S/8, S/8) latents, about standard normal."""
+    """The encoder: (B, 3, S, S) pixels in [-1, 1] -> (B, C, S/8, S/8) latents, about standard normal."""
 
     def __init__(self, config: VaeConfig) -> None:
         super().__init__()
@@ -95,7 +96,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """(B, C, h, w) latents -> (B, 3, 8h, 8w) pixels, about [-1, 1]."""
+    """The decoder: (B, C, h, w) latents -> (B, 3, 8h, 8w) pixels, about [-1, 1]."""
 
     def __init__(self, config: VaeConfig) -> None:
         super().__init__()
@@ -116,10 +117,10 @@ class Decoder(nn.Module):
 
 
 class VaeAutoencoder(nn.Module):
-    """`encoder`, `decoder`; `forward` is the training pass."""
+    """An autoencoder of `encoder` and `decoder`; `forward` is the training pass."""
 
     stride = PATCH
-    linear_gain = 1.0  # the decoder is given the latents themselves
+    linear_gain = 1.0  # the decoder takes the latents unchanged
 
     def __init__(self, config: VaeConfig) -> None:
         super().__init__()
@@ -128,7 +129,7 @@ class VaeAutoencoder(nn.Module):
         self.decoder = Decoder(config)
 
     def forward(self, pixels: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """(B, 3, S, S) in [-1, 1] -> (reconstruction of the same shape, latents (B, C, h, w))."""
+        """Return the reconstruction of (B, 3, S, S) pixels in [-1, 1], and their latents (B, C, h, w)."""
         latents = self.encoder(pixels)
         noise = torch.randn(latents.shape, generator=generator).to(latents.device)
         return self.decoder(latents + self.config.noise * noise), latents

@@ -1,4 +1,4 @@
-"""One picture of what the tokenizers make of a folder's frames: the originals, then a row a tokenizer.
+"""Draw one picture of a folder's frames: the originals, then one row of decoded frames for each tokenizer.
 
 python recipes/tokenizer/contact_sheet.py FOLDER docs/tokenizers.jpg [--columns 6] [--tokenizer fsq-16 …]
 """
@@ -19,7 +19,7 @@ SIDE = 256
 
 
 def main() -> None:
-    """Read, code, decode, draw."""
+    """Read, encode, decode and draw the frames."""
     parser = argparse.ArgumentParser(description="Draw what tokenizers make of some frames")
     parser.add_argument("folder", type=Path)
     parser.add_argument("out", type=Path)

@@ -1,8 +1,8 @@
-"""Make the pictures that the tokenizers' corpus takes from no package: gym-pusht, and drawn scenes.
+"""Make the pictures of the tokenizers' corpus that come from no package: gym-pusht, and drawn scenes.
 
     python recipes/tokenizer/draw.py OUT [--pusht 200] [--drawn 300] [--seed 20]
 
-They are written to OUT/pusht/00000.png … and OUT/drawn/00000.png …, where recipes look for them.
+They are written to OUT/pusht/00000.png … and OUT/drawn/00000.png …, where the recipes expect them.
 """
 
 import argparse
@@ -17,7 +17,7 @@ Picture = NDArray[np.uint8]
 
 
 def push_pictures(count: int, seed: int) -> Iterator[Picture]:
-    """Frames of gym-pusht, 256×256, the agent wandering towards random points."""
+    """Yield frames of gym-pusht, 256×256; the agent moves towards random points."""
     import gym_pusht  # noqa: F401  registers the environment
     import gymnasium
 
@@ -39,14 +39,14 @@ def push_pictures(count: int, seed: int) -> Iterator[Picture]:
                 goal = rng.uniform(50, 460, 2)
             env.step(goal.astype(np.float32))
             if step % 6 == 5 and made < count:
-                whole = bool(rng.random() < 0.5)  # at 680 pixels with the target of the action, or at 256
+                whole = bool(rng.random() < 0.5)  # 680 pixels with the action's target drawn, or 256
                 yield np.asarray(env.unwrapped._render(visualize=whole), np.uint8)
                 made += 1
     env.close()
 
 
 def draw_scene(rng: np.random.Generator, size: int = 384) -> Picture:
-    """A scene of smooth and sharp parts: gradients, noise of several scales, shapes, bars."""
+    """Draw a scene of smooth and sharp parts: gradients, noise of several scales, shapes, bars."""
     import cv2
 
     def colour() -> tuple[float, float, float]:
@@ -92,7 +92,7 @@ def _draw_shape(canvas: Picture, rng: np.random.Generator, colour: tuple[float, 
 
 
 def write_pictures(folder: Path, pictures: Iterator[Picture]) -> None:
-    """Write folder/00000.png …"""
+    """Write folder/00000.png and the pictures that follow."""
     import cv2
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,10 +2,10 @@
 
     MUJOCO_GL=osmesa python recipes/tokenizer/render.py OUT [--pictures 120] [--seed 20]
 
-Needs, in an environment of its own (their versions of MuJoCo exclude others): gym-aloha,
-gymnasium-robotics, metaworld, mujoco; and Debian's libosmesa6. Scenes come from the simulators'
-own tasks after random actions; each picture has its own camera, lights and colours. With
-`--package robosuite` come pictures to look at afterwards: no robosuite scene is trained on.
+It needs an environment of its own, because the simulators' versions of MuJoCo exclude others: gym-aloha,
+gymnasium-robotics, metaworld, mujoco; and Debian's libosmesa6. Scenes come from the simulators' own tasks
+after random actions; each picture has its own camera, lights and colours. `--package robosuite` renders
+pictures that are held out: no robosuite scene is used in training.
 """
 
 import argparse
@@ -61,7 +61,7 @@ def _make_robosuite(task: str, seed: int) -> Any:
 
 
 def _make(package: str, task: str, seed: int) -> tuple[Any, Callable[[], tuple[Any, Any]]]:
-    """An environment, and what gives its MuJoCo model and data."""
+    """Return an environment, and a function that returns its MuJoCo model and data."""
     import gymnasium
 
     if package == "robosuite":
@@ -90,7 +90,7 @@ def _make(package: str, task: str, seed: int) -> tuple[Any, Callable[[], tuple[A
 
 
 def _randomize(model: Any, rng: np.random.Generator) -> None:
-    """Other colours and lights, in place; textures stay."""
+    """Change colours and lights of the model in place; keep the textures."""
     visible = model.geom_rgba[:, 3] > 0
     tint = rng.uniform(0.3, 1.0, (len(model.geom_rgba), 3))
     chosen = visible & (rng.random(len(visible)) < 0.4)
@@ -105,7 +105,7 @@ def _randomize(model: Any, rng: np.random.Generator) -> None:
 
 
 def _camera(model: Any, data: Any, rng: np.random.Generator) -> Any:
-    """One of the scene's own cameras, or one looking at a random body from nearby."""
+    """Return one of the scene's own cameras, or one that looks at a random body from nearby."""
     mujoco = import_module("mujoco")
     if model.ncam and rng.random() < 0.3:
         return int(rng.integers(model.ncam))
@@ -118,12 +118,12 @@ def _camera(model: Any, data: Any, rng: np.random.Generator) -> Any:
 
 
 def render(package: str, count: int, seed: int) -> Iterator[NDArray[np.uint8]]:
-    """`count` pictures (256, 256, 3) uint8 RGB of a package's scenes."""
+    """Yield `count` pictures (256, 256, 3) uint8 RGB of a package's scenes."""
     mujoco = import_module("mujoco")
     rng = np.random.default_rng([seed, len(package)])
     tasks = (SCENES | HELD_OUT)[package]
     option = mujoco.MjvOption()
-    option.geomgroup[0] = package != "robosuite"  # where robosuite keeps what only collides
+    option.geomgroup[0] = package != "robosuite"  # robosuite's group of collision geometry
     for index, task in enumerate(tasks):
         env, handles = _make(package, task, seed)
         env.reset(seed=seed)
@@ -142,7 +142,7 @@ def render(package: str, count: int, seed: int) -> Iterator[NDArray[np.uint8]]:
 
 
 def main() -> None:
-    """Write OUT/<package>/00000.png …"""
+    """Write OUT/<package>/00000.png and the pictures that follow, for each package."""
     import cv2
 
     parser = argparse.ArgumentParser(description="Render robots in MuJoCo for the tokenizer's training")

@@ -1,8 +1,8 @@
-"""What an engine is: it does units of work in processes that may die, and says what became of each.
+"""Define engines: they run units of work in processes that may die, and report the outcome of each unit.
 
-A unit is any picklable value. `make_work(workers)` is called once in each process and returns the
-function that does a unit; the function reports its steps, so that a process that dies or hangs tells
-which step it was at. The rules for trying again are the Ledger's, the same for every engine.
+A unit is any picklable value. `make_work(workers)` is called once in each process and returns the function
+that runs a unit. This function reports its steps, so that the last step of a process that dies or hangs is
+known. The Ledger decides when a unit is tried again; its rules are the same for every engine.
 """
 
 from collections import deque
@@ -18,25 +18,26 @@ Cause = Literal["crashed", "hung", "killed"]
 
 @dataclass(frozen=True)
 class Step:
-    """A sign of life: what a unit is at. Reported by the work, kept by the engine."""
+    """A sign of life: the step that a unit is at. The work reports it, the engine keeps it."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class Retry:
-    """An event of the engine: a unit is done again from its beginning."""
+    """An event of the engine: a unit starts again from its beginning."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """Which try of a unit this is.
+    """The attempt at a unit.
 
     Attributes:
-        number: 0 for the first. Later ones should do one step at a time, so that the blame is exact.
-        refused: step -> reason, for steps that ended or stopped the process before: not to be tried again.
+        number: 0 for the first. Later attempts should take one step at a time, so that the failing step
+            is known exactly.
+        refused: step -> reason, for steps that crashed or stopped the process before; they are skipped.
     """
 
     number: int = 0
@@ -50,11 +51,11 @@ OnEvent = Callable[[int, Any], None]
 
 @dataclass(frozen=True)
 class Limits:
-    """When an engine gives up.
+    """The limits after which an engine gives up.
 
     Attributes:
-        quiet_s: seconds without a sign of life after which a unit hangs; None waits forever.
-        kills: how often a unit may lose its process to a kill from outside (a lack of memory, mostly).
+        quiet_s: seconds without a sign of life after which a unit counts as hung; None waits forever.
+        kills: how often a unit may lose its process to a kill from outside (mostly for lack of memory).
     """
 
     quiet_s: float | None = 300.0
@@ -65,7 +66,7 @@ LIMITS = Limits()
 
 
 class Engine(Protocol):
-    """Runs units somewhere."""
+    """A function that runs units, on this machine or elsewhere."""
 
     def __call__(
         self,
@@ -75,16 +76,16 @@ class Engine(Protocol):
         on_event: OnEvent,
         limits: Limits,
     ) -> Iterator[Any]:
-        """Yield each unit's result as it is ready; on_event(index of the unit, what it reported)."""
+        """Yield each unit's result when it is ready; call on_event(index of the unit, what it reported)."""
         ...
 
 
 class Ledger:
-    """What is waiting, what was tried, what is given up.
+    """The units that wait, run, or have failed, and the rules for trying again.
 
     A step that crashes its process (a fault in a decoder) or hangs is tried twice and then refused; the
-    unit is done without it. A process killed from outside costs nothing but time, up to `limits.kills`;
-    after the second kill the unit waits until it has the machine to itself.
+    unit is done without it. A unit whose process was killed from outside is tried again, up to
+    `limits.kills` kills; after the second kill it waits until no other unit is running.
     """
 
     def __init__(self, units: Iterable[Any], limits: Limits) -> None:
@@ -100,11 +101,11 @@ class Ledger:
 
     @property
     def open(self) -> bool:
-        """Whether anything is left to do or being done."""
+        """Check whether any unit is waiting or running."""
         return bool(self._waiting or self._alone or self.running)
 
     def take(self) -> tuple[int, Any, Attempt] | None:
-        """The next unit to start; None when nothing may start now."""
+        """Return the next unit to start; None if none may start now."""
         if self._waiting:
             number = self._waiting.popleft()
         elif self._alone and not self.running:
@@ -119,15 +120,15 @@ class Ledger:
         )
 
     def finished(self, number: int) -> None:
-        """The unit is done."""
+        """Record that the unit is done."""
         self.running.discard(number)
 
     def lost(self, number: int, cause: Cause, step: str, how: str) -> Retry | None:
-        """A unit's process is gone: what follows; None when the unit is given up.
+        """Record that a unit lost its process, and schedule it again; return None if the unit is given up.
 
         Args:
-            step: the last it reported; empty when none.
-            how: in words, e.g. "ended by SIGSEGV".
+            step: the last step it reported; empty if it reported none.
+            how: how the process ended, in words, e.g. "ended by SIGSEGV".
         """
         self.running.discard(number)
         self._attempts[number] += 1
@@ -155,6 +156,6 @@ class Ledger:
         )
 
     def raise_failures(self) -> None:
-        """The first unit that was given up, as an error; the rest is done by now."""
+        """Raise the error of the first unit that was given up, when all other units are done."""
         if self.failures:
             raise self.failures[0]

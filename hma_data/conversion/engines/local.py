@@ -1,7 +1,7 @@
-"""Run work units on this machine: in this process, or in several that may die without taking the job along.
+"""Run work units on this machine: in this process, or in workers that may die without ending the job.
 
 Workers are spawned, not forked, so that torch, HDF5 and FFmpeg start clean in each. A worker ends
-when its parent does, however that ends.
+when its parent ends, for whatever reason.
 """
 
 import multiprocessing
@@ -19,9 +19,10 @@ from hma_data.conversion.engines.base import FIRST, LIMITS, Cause, Ledger, Limit
 from hma_data.errors import HMAError
 from hma_data.priority import take_ordinary_priority
 
-CRASHES = {"SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGSYS"}  # of a process's own making
+CRASHES = {"SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGSYS"}  # signals of a process's own faults
 TICK_S = 0.5
-START_FAILURES, KILLS_A_FAILURE = 30, 10  # in a row; a kill from outside weighs less
+# Limit of failed starts in a row. A kill from outside counts 1, any other failure counts 10.
+START_FAILURES, KILLS_A_FAILURE = 30, 10
 
 
 def run(
@@ -31,10 +32,10 @@ def run(
     on_event: OnEvent,
     limits: Limits = LIMITS,
 ) -> Iterator[Any]:
-    """Do every unit and yield each result as it is ready; see engines.base.Engine.
+    """Run every unit and yield each result when it is ready; see engines.base.Engine.
 
     Args:
-        workers: processes; 0 works in this one, where a crash or a hang cannot be survived.
+        workers: number of processes; 0 works in this one, which does not survive a crash or a hang.
 
     Raises:
         HMAError: a unit failed for a reason that is not its data, or its worker died too often.
@@ -64,7 +65,7 @@ def _reporter(on_event: OnEvent, number: int) -> Callable[[Any], None]:
 
 @dataclass
 class _Worker:
-    """A process, and what it is at."""
+    """A process, and the unit and step it is at."""
 
     process: Any
     pipe: Connection
@@ -87,7 +88,7 @@ class _Pool:
         self._workers: list[_Worker] = []
 
     def turn(self) -> Iterator[Any]:
-        """Hand out units, then take in whatever the workers say; yields results."""
+        """Hand out units, then process the messages of the workers; yield results."""
         while len(self._workers) < self._count:
             self._workers.append(self._start())
         for worker in self._workers:
@@ -99,7 +100,7 @@ class _Pool:
             if isinstance(pipe, Connection):
                 yield from self._listen(pipes[pipe])
         for worker in [ends[end] for end in heard if end in ends]:
-            yield from self._listen(worker)  # what it said before it died
+            yield from self._listen(worker)  # its messages from before it died
             self._bury(worker)
         self._stop_the_hung()
 
@@ -120,7 +121,7 @@ class _Pool:
             return
         number, unit, attempt = taken
         worker.unit, worker.step, worker.heard = number, "", time.monotonic()
-        with suppress(OSError):  # it died just now: `turn` buries it, and the unit is done again
+        with suppress(OSError):  # it died just now; `turn` removes it and the unit is retried
             worker.pipe.send((unit, attempt))
 
     def _listen(self, worker: _Worker) -> Iterator[Any]:
@@ -144,7 +145,7 @@ class _Pool:
                 elif worker.unit is not None:
                     self._on_event(worker.unit, value)
         except (EOFError, OSError):
-            return  # `turn` sees its end
+            return  # `turn` notices its end
 
     def _bury(self, worker: _Worker) -> None:
         worker.process.join()
@@ -194,7 +195,7 @@ class _Pool:
 
 
 def signal_name(number: int) -> str:
-    """SIGKILL for 9."""
+    """Return the name of a signal: SIGKILL for 9."""
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -205,16 +206,16 @@ def signal_name(number: int) -> str:
 
 
 def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> None:
-    """What a worker's process runs: does the units that come by the pipe, and tells of them, until it closes.
+    """Run units that come by the pipe and report on them until it closes; a worker's process calls this.
 
     Args:
-        pipe: brings (unit, attempt); takes (kind, value), of the kinds ready, event, done, failed and
+        pipe: receives (unit, attempt); sends (kind, value), where kind is ready, event, done, failed or
             short of memory.
         make_work: called once.
-        workers: of the whole run.
+        workers: number of workers of the whole run.
     """
     take_ordinary_priority()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_end_with_parent, daemon=True).start()
     sending = threading.Lock()  # a unit reports from more than one thread
 
@@ -223,7 +224,7 @@ def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> N
             try:
                 pipe.send((kind, value))
             except (BrokenPipeError, ConnectionResetError):
-                os._exit(1)  # the job is over, and none of its units at fault
+                os._exit(1)  # the job is over; no unit is at fault
 
     try:
         work = make_work(workers)
@@ -251,8 +252,16 @@ def _as_ours(fault: Exception) -> HMAError:
 
 
 def _end_with_parent() -> None:
-    """A worker that outlives its job would write beside the next one."""
+    """End this process when its parent ends; otherwise it would write beside the next job's workers."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
         os._exit(1)
+<<<<<<< HEAD:hma_data/conversion/engines/local.py
+=======
+
+
+def usable_cores() -> int:
+    """Return the number of cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+>>>>>>> doc-parts:hma_data/engines/local.py

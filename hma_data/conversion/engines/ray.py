@@ -1,9 +1,9 @@
-"""Run work units on a Ray cluster: an actor a worker, with the tokenizer on the GPU where the actor has one.
+"""Run work units on a Ray cluster, one actor a worker, with the tokenizer on the actor's GPU if it has one.
 
-The same units, the same bytes as the local engine; only where they are made differs. What an actor does is
-in ray_actor.py. The output folder must be one that every node sees. A node that is lost takes its actors
-along: their units are done again elsewhere. `RAY_ADDRESS` names the cluster; without one, Ray starts on
-this machine.
+Units and output bytes are the same as with the local engine; only the machine differs. ray_actor.py defines
+the actor. The output folder must be one that every node sees. When a node is lost, its actors are lost too,
+and their units are done again elsewhere. `RAY_ADDRESS` names the cluster; without it, Ray starts on this
+machine.
 """
 
 import os
@@ -17,11 +17,11 @@ from hma_data.conversion.engines.ray_actor import Answer, End, Failed, Lost, Ope
 from hma_data.errors import HMAError, MissingDependencyError
 
 TICK_S = 0.5
-ANSWER_S = 1.0  # how long an actor gathers before it answers
-ANSWERS_A_S = 100.0  # that the driver takes in at most
-SILENT_S = 60.0  # beyond the time a unit may be quiet: an actor answers whatever its unit does
-NO_ROOM_S = 900.0  # without any actor that could be placed
-LOST_STARTS = 5, 3  # and so many for each worker: actors in a row that end before they are ready
+ANSWER_S = 1.0  # seconds for which an actor collects events before it answers
+ANSWERS_A_S = 100.0  # largest number of answers a second that the driver processes
+SILENT_S = 60.0  # beyond a unit's quiet time; an actor always answers, whatever its unit does
+NO_ROOM_S = 900.0  # seconds without any actor that could be placed
+LOST_STARTS = 5, 3  # limit of actors in a row that end before they are ready: 5, and 3 for each worker
 INSTALLED = "hma-toolkit and what it needs must be installed on every node; see Ray's logs"
 
 
@@ -33,15 +33,15 @@ def run(
     limits: Limits = LIMITS,
     gpus: float = 0.0,
 ) -> Iterator[Any]:
-    """Do every unit and yield each result as it is ready; see engines.base.Engine.
+    """Run every unit and yield each result when it is ready; see engines.base.Engine.
 
     Args:
-        workers: actors.
-        gpus: of each.
+        workers: number of actors.
+        gpus: GPUs of each actor.
 
     Raises:
         HMAError: a unit failed for a reason that is not its data, its worker was lost too often, or the
-            cluster has no room for any or cannot start them.
+            cluster has no room for any worker or cannot start one.
         MissingDependencyError: Ray is not installed.
     """
     ray = _ray()
@@ -73,7 +73,7 @@ def _ray() -> Any:
 def _join(ray: Any) -> None:
     try:
         ray.init(log_to_driver=False, logging_level="warning", include_dashboard=False)
-    except Exception as fault:  # which is the class of some that Ray raises here
+    except Exception as fault:  # Ray raises some errors of this class here
         ray.shutdown()
         address = os.environ.get("RAY_ADDRESS")
         raise HMAError(
@@ -85,7 +85,7 @@ def _join(ray: Any) -> None:
 
 @dataclass
 class _Slot:
-    """An actor, and what it is at; `answer` is one that has not come yet."""
+    """An actor and the unit it is at; `answer` is a reference to an answer that has not come yet."""
 
     actor: Any
     answer: Any
@@ -95,7 +95,7 @@ class _Slot:
 
 
 class _Actors:
-    """The actors of one run. At most one unit is with each, so a slow one holds up nothing."""
+    """The actors of one run. Each has at most one unit, so that a slow one delays no other unit."""
 
     def __init__(
         self,
@@ -113,7 +113,7 @@ class _Actors:
             ledger.limits.quiet_s,
             max(ANSWER_S, count / ANSWERS_A_S),
         )
-        # without task events: Ray keeps a record of each call, for its dashboard, in three processes
+        # no task events: for its dashboard, Ray keeps a record of each call in three processes
         self._class = ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, enable_task_events=False)(Worker)
         self._gone = (
             ray.exceptions.RayActorError,
@@ -127,7 +127,7 @@ class _Actors:
         self._placed = time.monotonic()
 
     def turn(self) -> Iterator[Any]:
-        """Hand out units, then take in whatever the actors say; yields results."""
+        """Hand out units, then process the answers of the actors; yield results."""
         while len(self._slots) < self._count:
             actor = self._class.remote(*self._arguments)
             self._slots.append(_Slot(actor, actor.open.remote()))
@@ -185,7 +185,7 @@ class _Actors:
 
     def _bury(self, slot: _Slot, how: str) -> None:
         self._slots.remove(slot)
-        self._ray.kill(slot.actor)  # one that could only not be reached would go on
+        self._ray.kill(slot.actor)  # an actor that is only out of reach would go on
         if slot.unit is not None:
             self._lost(slot.unit, "", "killed", how)
         elif not slot.ready:
@@ -200,7 +200,7 @@ class _Actors:
             self._on_event(number, retry)
 
     def _end_the_silent(self) -> None:
-        """Of actors; a unit that is quiet is ended by its actor."""
+        """End actors that do not answer; an actor itself ends a unit that is quiet."""
         quiet = self._ledger.limits.quiet_s
         for slot in list(self._slots):
             if quiet and slot.unit is not None and time.monotonic() - slot.heard > quiet + SILENT_S:

@@ -1,8 +1,8 @@
-"""What a worker on a cluster is: it keeps a process that works, and says what it hears of it.
+"""Run units in an actor of a cluster: keep one worker process, hand it units, and pass on its messages.
 
-The process is one of the local engine's. So the threads and buffers of whatever runs the cluster lie in
-another process than the tokenizer, how a process ended is known, and events are gathered before they are
-sent: the driver hears of a unit about once a second, not at every step.
+The process is a worker process of the local engine. This has three effects. The threads and buffers of the
+cluster's software are in another process than the tokenizer. The exit code of the process is known. Events
+are collected before they are sent, so that the driver gets an answer about once a second, not at every step.
 """
 
 import multiprocessing
@@ -29,14 +29,14 @@ class Opened:
 
 @dataclass(frozen=True)
 class Done:
-    """The unit's result."""
+    """A unit is done, with this result."""
 
     result: Any
 
 
 @dataclass(frozen=True)
 class Lost:
-    """The unit's process is gone, or ran out of memory; see engines.base.Ledger.lost."""
+    """The unit's process is gone or ran out of memory; see engines.base.Ledger.lost."""
 
     cause: Cause
     step: str
@@ -55,22 +55,22 @@ End = Opened | Done | Lost | Failed
 
 @dataclass(frozen=True)
 class Answer:
-    """What a unit reported since the last answer, its steps aside; and what became of it, when it is over."""
+    """The events of a unit since the last answer, without its steps; and its end, if it is over."""
 
     events: tuple[Any, ...]
     end: End | None = None
 
 
 class Worker:
-    """What an actor is: it keeps a process that works, hands it units and says what it hears of them.
+    """An actor that keeps a worker process, hands it units and passes on its messages.
 
     The driver calls `open` or `do`, then `go_on` until an answer carries an end.
 
     Args:
         make_work: called in the process.
-        workers: of the whole run.
+        workers: number of workers of the whole run.
         quiet_s: see engines.base.Limits.
-        answer_s: seconds to gather events for, unless the unit is over before.
+        answer_s: seconds for which events are collected, unless the unit ends before.
     """
 
     def __init__(
@@ -84,12 +84,12 @@ class Worker:
         self._start_failures = 0
 
     def open(self) -> Answer:
-        """Start the process; its answers end with Opened."""
+        """Start the process; its last answer carries Opened."""
         self._start()
         return self.go_on()
 
     def do(self, unit: Any, attempt: Attempt) -> Answer:
-        """Begin a unit."""
+        """Start a unit."""
         self._unit = unit, attempt
         if self._process is not None and not self._process.is_alive():
             self._end()
@@ -100,7 +100,7 @@ class Worker:
         return self.go_on()
 
     def go_on(self) -> Answer:
-        """Listen for a while, or until the end."""
+        """Listen for `answer_s` seconds, or until the end."""
         events: list[Any] = []
         until = time.monotonic() + self._answer_s
         while (left := until - time.monotonic()) > 0:
@@ -122,7 +122,7 @@ class Worker:
 
     def _hand_over(self) -> None:
         self._step, self._heard = "", time.monotonic()
-        with suppress(OSError):  # it died just now: `_listen` sees its end
+        with suppress(OSError):  # it died just now; `_listen` notices its end
             self._pipe.send(self._unit)
 
     def _listen(self, seconds: float, events: list[Any]) -> End | None:
@@ -164,7 +164,7 @@ class Worker:
         return None
 
     def _ended(self) -> End | None:
-        """The process is gone: what that means for the unit; one that was not ready yet is started again."""
+        """Return what the end of the process means for the unit; restart a process that was not ready yet."""
         code = self._end()
         name = _name_of_end(code)
         if self._ready:
@@ -180,10 +180,10 @@ class Worker:
         return None
 
     def _end(self) -> int | None:
-        """Its exit code; None where the cluster is set up to keep it from us."""
+        """End the process and return its exit code; None if the cluster's settings hide it."""
         self._pipe.close()
         process, self._process = self._process, None
-        process.kill()  # of no effect on one that is gone
+        process.kill()  # has no effect if it is already gone
         process.join()
         code: int | None = process.exitcode
         return code
@@ -201,7 +201,7 @@ def _name_of_end(code: int | None) -> str:
 
 @contextmanager
 def _no_script() -> Iterator[None]:
-    """A spawned process runs its parent's main script again, which is Ray's own here: without it."""
+    """Replace the main module for a moment; a spawned process would run it, and here it is Ray's own."""
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:

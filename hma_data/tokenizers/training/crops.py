@@ -1,7 +1,7 @@
-"""Training crops for a tokenizer, out of the pictures and videos that a recipe lists.
+"""Draw training crops for a tokenizer from the pictures and videos that a recipe lists.
 
-Pictures are held as uint8 RGB at a few sizes; a training crop is one of them, scaled, turned,
-mirrored and recoloured. A crop is decided by (seed, step, index in the batch) alone.
+Pictures are held as uint8 RGB at a few sizes. A training crop is a part of one picture: scaled,
+rotated, mirrored and recoloured. A crop depends only on (seed, step, index in the batch).
 
 N crops, S side of a crop.
 """
@@ -20,7 +20,7 @@ from hma_data.tokenizers.training.frames import read_pictures
 from hma_data.tokenizers.training.recipe import DrawnSource, FileSource
 
 Picture = NDArray[np.uint8]
-LARGEST, SMALLEST = 768, 48  # short side of what is kept, pixels
+LARGEST, SMALLEST = 768, 48  # short side of the pictures that are kept, pixels
 SHARES, SHARE_ODDS = ((0.42, 0.6), (0.3, 1.0), (1.0, 1.0)), (0.45, 0.35, 0.2)  # of a picture's short side
 
 
@@ -34,7 +34,7 @@ class Pool:
 
 
 def shrink(picture: Picture, short_side: int) -> Picture:
-    """The picture with at most that short side, by area averaging."""
+    """Return the picture shrunk by area averaging to at most that short side."""
     import cv2
 
     height, width = picture.shape[:2]
@@ -70,7 +70,7 @@ def _source_files(source: FileSource | DrawnSource, corpus: Path) -> list[Path]:
 
 
 def load_pools(sources: Sequence[FileSource | DrawnSource], corpus: Path) -> tuple[list[Pool], str]:
-    """Everything the sources hold, in memory, and a digest of the pixels.
+    """Read all pictures of the sources into memory; return them and a SHA-256 of their pixels.
 
     Raises:
         RecipeError: a source has no picture.
@@ -91,7 +91,10 @@ def load_pools(sources: Sequence[FileSource | DrawnSource], corpus: Path) -> tup
 
 
 def draw_batch(pools: list[Pool], side: int, count: int, seed: int, step: int) -> NDArray[np.float32]:
-    """(N, S, S, 3) float32 in [-1, 1]: the crops of a training step, the same whenever asked for."""
+    """Return the crops of a training step, (N, S, S, 3) float32 in [-1, 1].
+
+    The same arguments always give the same crops.
+    """
     weights = np.array([pool.weight for pool in pools])
     crops = np.empty((count, side, side, 3), np.float32)
     for index in range(count):
@@ -103,11 +106,11 @@ def draw_batch(pools: list[Pool], side: int, count: int, seed: int, step: int) -
 
 
 def _crop(levels: list[Picture], side: int, rng: np.random.Generator) -> Picture:
-    """A square of the picture, turned and mirrored, brought to `side`."""
+    """Cut a square out of the picture, rotate and mirror it, and scale it to `side`."""
     import cv2
 
     short = min(levels[0].shape[:2])
-    # A crop of 128 holds half a side of a frame at 256², and the whole side of one at 128².
+    # A crop of 128 covers half the side of a frame at 256², and the whole side of a frame at 128².
     low, high = SHARES[int(rng.choice(len(SHARES), p=SHARE_ODDS))]
     share = math.exp(rng.uniform(math.log(low), math.log(high)))
     wanted = max(short * share, side / 3)
@@ -132,7 +135,11 @@ def _crop(levels: list[Picture], side: int, rng: np.random.Generator) -> Picture
 
 
 def _recolour(crop: Picture, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Brightness, contrast, gamma, saturation, colour cast, blur and noise; float32 in about [-1, 1]."""
+    """Change brightness, contrast, gamma, saturation and colour cast, and add blur and noise.
+
+    Returns:
+        float32 in [-1, 1].
+    """
     import cv2
 
     x = crop.astype(np.float32) / 255.0

@@ -1,4 +1,4 @@
-"""How good a tokenizer is: what a round trip loses, what its ids use, what it costs.
+"""Measure a tokenizer: the error of a round trip, the use of its ids, its size and its speed.
 
     evaluate(get_tokenizer("fsq-16"), hma_data.tokenizers.training.frames.read_frames(Path("video.mp4"), 256))
 
@@ -28,7 +28,7 @@ GREY = (0.299, 0.587, 0.114)
 
 
 def _window(size: int, like: Tensor) -> Tensor:
-    """(S-10, S) matrix that smooths along a side."""
+    """Return the (S-10, S) matrix that smooths along a side."""
     offset = torch.arange(size, dtype=like.dtype, device=like.device)
     offset = offset[None, :] - torch.arange(5, size - 5, dtype=like.dtype, device=like.device)[:, None]
     taps = torch.exp(-(offset**2) / (2 * 1.5**2)) * (offset.abs() <= 5)
@@ -40,7 +40,7 @@ def _smooth(x: Tensor) -> Tensor:
 
 
 def ssim_map(first: Tensor, second: Tensor) -> Tensor:
-    """Structural similarity of (N, C, S, S) pictures in [0, 1] at every place (N, C, S-10, S-10)."""
+    """Return the structural similarity of (N, C, S, S) pictures in [0, 1] per pixel, (N, C, S-10, S-10)."""
     c1, c2 = 0.01**2, 0.03**2
     count = first.shape[1]
     both = torch.cat([first, second, first * first, second * second, first * second], dim=1)
@@ -53,21 +53,24 @@ def ssim_map(first: Tensor, second: Tensor) -> Tensor:
 
 
 def psnr_db(true: Frames, made: Frames) -> NDArray[np.float64]:
-    """Peak signal-to-noise ratio of each frame, (N, S, S, 3) uint8 -> (N,); equal frames give inf."""
+    """Return the peak signal-to-noise ratio of each frame in dB; equal frames give inf.
+
+    (N, S, S, 3) uint8 -> (N,).
+    """
     error = np.square(true.astype(np.float64) - made).mean(axis=(1, 2, 3))
     with np.errstate(divide="ignore"):
         return 10 * np.log10(255.0**2 / error)
 
 
 def ssim(true: Frames, made: Frames) -> NDArray[np.float64]:
-    """Structural similarity of the grey of each frame, (N, S, S, 3) uint8 -> (N,)."""
+    """Return the structural similarity of each frame in grey, (N, S, S, 3) uint8 -> (N,)."""
     weights = torch.tensor(GREY, dtype=torch.float64) / 255
     grey = [torch.from_numpy(frames).to(torch.float64) @ weights for frames in (true, made)]
     return ssim_map(grey[0][:, None], grey[1][:, None]).mean(dim=(1, 2, 3)).numpy()
 
 
 class CodebookUse:
-    """Counts of the ids met."""
+    """Counts of the ids that occur."""
 
     def __init__(self, spec: TokenizerSpec) -> None:
         self.sizes = spec.factored or (spec.vocab_size or 1,)
@@ -78,7 +81,10 @@ class CodebookUse:
         self.joint += np.bincount(ids.ravel().astype(np.int64), minlength=len(self.joint))
 
     def result(self) -> dict[str, Any]:
-        """Share used and perplexity of each digit and of the whole id, entropy in bits a token."""
+        """Return the share used and the perplexity of each digit, and figures of the whole id.
+
+        For the whole id: the number of ids used, the perplexity, and the entropy in bits a token.
+        """
         # Low digit first: in C order of the reversed sizes it is the last axis.
         table = self.joint.reshape(self.sizes[::-1])
         digits = [
@@ -101,7 +107,7 @@ def _entropy_bits(counts: NDArray[np.int64]) -> float:
 
 
 def bits_per_frame(spec: TokenizerSpec) -> float:
-    """What a frame's tokens or latents take before any entropy coding."""
+    """Return the number of bits of a frame's tokens or latents before any entropy coding."""
     cells = spec.grid[0] * spec.grid[1]
     if spec.kind == "discrete":
         return cells * math.log2(spec.vocab_size or 1)
@@ -109,7 +115,7 @@ def bits_per_frame(spec: TokenizerSpec) -> float:
 
 
 class LatentMoments:
-    """Mean and spread of continuous latents, as a model sees them (times `latent_scale`)."""
+    """The mean and spread of continuous latents, as a model sees them (times `latent_scale`)."""
 
     def __init__(self, spec: TokenizerSpec) -> None:
         self.scale, self.count, self.total, self.squares = spec.latent_scale, 0, 0.0, 0.0
@@ -122,7 +128,7 @@ class LatentMoments:
         self.squares += float(np.square(scaled).sum())
 
     def result(self) -> dict[str, Any]:
-        """Mean and standard deviation over everything."""
+        """Return the mean and standard deviation of all latents."""
         mean = self.total / self.count
         deviation = math.sqrt(max(0.0, self.squares / self.count - mean**2))
         return {"latent_mean_scaled": round(mean, 4), "latent_std_scaled": round(deviation, 4)}
@@ -146,28 +152,28 @@ def evaluate(
     worst: int = 0,
     perceptual: Perceptual | None = None,
 ) -> dict[str, Any]:
-    """Send frames through a tokenizer and measure.
+    """Encode and decode frames with a tokenizer, and measure the result.
 
     Args:
-        tokenizer: what to measure.
+        tokenizer: the tokenizer to measure.
         frames_iter: frames (S, S, 3), or batches of them (n, S, S, 3), uint8.
         worst: how many of the frames with the lowest PSNR to return as `worst_frames`.
         perceptual: measures LPIPS, see `hma_data.tokenizers.training.perceptual`.
 
     Returns:
         frames, psnr_db (mean over frames, lossless frames counted as 99), psnr_db_min, ssim, bits_per_frame,
-        encode_frames_per_second, decode_frames_per_second (resizing not counted); `lpips` where it is
-        measured; the fields of `CodebookUse.result` or `LatentMoments.result`; `worst_frames`, a list of
-        (psnr, index, frame, made), when asked for.
+        encode_frames_per_second, decode_frames_per_second (resizing not counted); `lpips` if it is
+        measured; the fields of `CodebookUse.result` or `LatentMoments.result`; if `worst` is above 0,
+        `worst_frames`, a list of (psnr, index, frame, made).
 
     Raises:
-        TokenizerError: no frame, or frames that do not fit.
+        TokenizerError: there is no frame, or the frames do not fit.
     """
     discrete = tokenizer.spec.kind == "discrete"
     totals = _Totals(CodebookUse(tokenizer.spec) if discrete else LatentMoments(tokenizer.spec))
     for batch in _batches(frames_iter):
         if not totals.psnr:
-            tokenizer.decode(tokenizer.encode(batch[:1]))  # the first pass sets kernels up
+            tokenizer.decode(tokenizer.encode(batch[:1]))  # the first pass prepares kernels
         _measure(tokenizer, batch, totals, worst, perceptual)
     if not totals.psnr:
         raise TokenizerError(tokenizer.spec.name, "was given no frame to measure")

@@ -1,4 +1,4 @@
-"""Frames to measure a tokenizer on: out of pictures, videos, recordings and shard sets' sources.
+"""Read the frames to measure a tokenizer on, from pictures, videos, recordings or a shard set's source.
 
 S side of the square that the tokenizer takes. All frames are uint8 RGB (S, S, 3).
 """
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 Frame = NDArray[np.uint8]
 VIDEOS = {".mp4", ".avi", ".mkv", ".webm", ".gif"}
 PICTURES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
-EPISODES = 16  # of a recording, evenly
+EPISODES = 16  # number of episodes taken from a recording, evenly spaced
 
 
 def _ignore(text: str) -> None:
-    """For callers who do not ask what was left out."""
+    """Do nothing; the default for callers that do not ask what was skipped."""
 
 
 def read_frames(
@@ -37,15 +37,15 @@ def read_frames(
     resize_filter: Filter = "area",
     on_skip: Callable[[str], None] = _ignore,
 ) -> Iterator[Frame]:
-    """Frames of a picture, a video, or every picture and video below a folder.
+    """Yield frames of a picture, a video, or every picture and video below a folder.
 
     Args:
-        path: str or path of it.
-        frames: taken from each video, evenly.
-        on_skip: told of a file in a folder that cannot be decoded.
+        path: str or path of the file or folder.
+        frames: number of frames taken from each video, evenly spaced.
+        on_skip: called with the reason for each file in a folder that cannot be decoded.
 
     Raises:
-        TokenizerError: there is nothing, no picture and no video, or none that can be decoded.
+        TokenizerError: the path does not exist, holds no picture and no video, or none can be decoded.
     """
     path = as_path(path)
     if not path.exists():
@@ -73,7 +73,10 @@ def read_frames(
 
 
 def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
-    """The picture in a file, or `frames` evenly taken from a video; nothing where neither is."""
+    """Yield the picture in a file, or `frames` evenly spaced frames of a video.
+
+    Yield nothing if the file is neither.
+    """
     import cv2
 
     if path.suffix.lower() in VIDEOS:
@@ -104,7 +107,7 @@ def _pictures(file: Path, frames: int) -> Iterator[Frame]:
         for picture in read_pictures(file, frames):
             count += 1
             yield picture
-    except (FFmpegError, IndexError) as fault:  # a container without pictures has no stream 0
+    except (FFmpegError, IndexError) as fault:  # a container without video has no stream 0
         reason = getattr(fault, "strerror", None) or "it holds no video stream"
         raise TokenizerError(file, f"is no video that can be decoded: {reason}") from fault
     if not count:
@@ -119,15 +122,15 @@ def recording_frames(
     frames: int = 64,
     on_skip: Callable[[str], None] = _ignore,
 ) -> Iterator[Frame]:
-    """Frames of a recording as a conversion would tokenize them: every camera, by the robot's YAML.
+    """Yield frames of a recording as a conversion would tokenize them: every camera, by the robot's YAML.
 
     Args:
         uri: str or path of the recording, or its URI.
-        frames: taken from each of up to 16 episodes, evenly.
-        on_skip: told of an episode that cannot be read; another takes its place.
+        frames: number of frames taken from each of up to 16 episodes, evenly spaced.
+        on_skip: called with the reason for each episode that cannot be read; another episode replaces it.
 
     Raises:
-        SourceError: the recording cannot be read, or not one of its episodes can.
+        SourceError: the recording cannot be read, or none of its episodes can be read.
     """
     from hma_data.sources.base import open_source
 
@@ -167,11 +170,13 @@ def frames_of(
     frames: int = 64,
     on_skip: Callable[[str], None] = _ignore,
 ) -> Iterator[Frame]:
-    """Frames of whatever lies there: with an embodiment a recording (a path or URI), else a shard set's
-    source, pictures or videos.
+    """Return an iterator over the frames of a recording, a shard set's source, pictures or videos.
+
+    With an embodiment, the data is a recording (a path or URI). Without one, it is a shard set, whose
+    source is read, or a picture, a video or a folder of them.
 
     Args:
-        data: str or path of it, or the URI of a recording.
+        data: str or path of the data, or the URI of a recording.
 
     Raises:
         TokenizerError: nothing there can be measured.

@@ -1,7 +1,7 @@
-"""Muon: momentum whose matrices are made orthogonal before each step (Jordan et al. 2024).
+"""Optimize matrices with Muon: momentum made orthogonal before each step (Jordan et al. 2024).
 
-A convolution's weight (out, in, k, k) counts as a matrix (out, in·k·k). The orthogonal factor is
-approached by a quintic Newton–Schulz iteration; about five rounds bring singular values near 1.
+A convolution's weight (out, in, k, k) is treated as a matrix (out, in·k·k). A quintic Newton–Schulz
+iteration approximates the orthogonal factor; about five rounds bring the singular values near 1.
 """
 
 from collections.abc import Callable, Iterable
@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 ROUNDS = 5
-_A, _B, _C = 3.4445, -4.7750, 2.0315  # steepest at zero while values in (0, 1] stay near 1
+_A, _B, _C = 3.4445, -4.7750, 2.0315  # largest slope at zero that keeps values in (0, 1] near 1
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
-    """(R, C) -> about the nearest matrix whose singular values are 1, of the same shape."""
+    """Return approximately the nearest matrix whose singular values are 1; (R, C) -> (R, C)."""
     x = matrix / (matrix.norm() + 1e-7)
     tall = x.shape[0] > x.shape[1]
     x = x.T if tall else x
@@ -26,10 +26,11 @@ def orthogonal(matrix: Tensor) -> Tensor:
 
 
 class Muon(torch.optim.Optimizer):
-    """For weights of two dimensions or more; `lr` is the spectral norm of a step (× √(rows/columns)).
+    """The Muon optimizer, for weights of two dimensions or more.
 
-    Without `decay` nothing holds the weights' norm in a network without normalisation: it is bounded
-    by 1/decay, as each step shrinks the weights by lr·decay.
+    `lr` is the spectral norm of a step, multiplied by √(rows/columns) for tall matrices. Each step shrinks
+    the weights by lr·decay, which bounds their norm by 1/decay. Without `decay`, nothing bounds the norm of
+    the weights in a network that has no normalisation.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
-        """One step; `closure` is not called."""
+        """Take one step; `closure` is not called."""
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:

@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018), where its package and its backbone's weights are.
+"""Measure LPIPS (Zhang et al. 2018), if its package and the weights of its backbone are installed.
 
 N pictures of S×S, uint8 RGB.
 """
@@ -22,10 +22,10 @@ BACKBONE = "alexnet-owt-7be5be79.pth"  # torchvision's file of AlexNet, 233 MB
 
 
 def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
-    """What measures LPIPS: (N, S, S, 3) true and made -> (N,), lower is nearer.
+    """Return a function that measures LPIPS: (N, S, S, 3) true and made -> (N,); lower is nearer.
 
     Args:
-        download: whether the backbone may be fetched.
+        download: whether the backbone may be downloaded.
 
     Raises:
         MissingDependencyError: the package or the backbone is missing; the remedy says how to get it.
@@ -41,7 +41,7 @@ def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
         )
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # its use of torchvision's old arguments
+            warnings.simplefilter("ignore")  # it uses torchvision's old arguments
             network = lpips.LPIPS(net="alex", verbose=False).to(device).eval()
     except OSError as fault:
         raise MissingDependencyError(

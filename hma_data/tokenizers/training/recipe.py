@@ -1,6 +1,6 @@
-"""What a training of the embedded tokenizer is decided by, as YAML.
+"""Read and check the YAML recipe that trains an embedded tokenizer.
 
-Every value is checked before anything is read or trained; unknown keys are refused.
+Every value is checked before any data is read or any step is trained; unknown keys are refused.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ class _Strict(BaseModel):
 
 
 class FsqRecipe(_Strict):
-    """`FsqConfig` as a recipe says it."""
+    """The values of `FsqConfig` that a recipe states."""
 
     levels: list[list[int]]
     width: tuple[int, int]
@@ -37,12 +37,12 @@ class FsqRecipe(_Strict):
         return self
 
     def config(self) -> FsqConfig:
-        """The network's shape."""
+        """Return the network's shape."""
         return FsqConfig.from_json(self.model_dump())
 
 
 class VaeRecipe(_Strict):
-    """`VaeConfig` as a recipe says it; the scale of the latents is measured, not said."""
+    """The values of `VaeConfig` that a recipe states; the scale of the latents is measured instead."""
 
     channels: int
     width: int
@@ -58,25 +58,26 @@ class VaeRecipe(_Strict):
         return self
 
     def config(self) -> VaeConfig:
-        """The network's shape."""
+        """Return the network's shape."""
         return VaeConfig.from_json(self.model_dump())
 
 
 class TrainingRecipe(_Strict):
-    """How long and how fast.
+    """The length, batch size and learning rates of a training.
 
     Attributes:
-        steps: of the optimizer.
-        batch, crop: crops a step, and their side in pixels, a multiple of 16.
-        learning_rate: the highest, of Muon (matrices) in units of the spectral norm.
-        adam_learning_rate: the highest, of Adam (biases, first and last layers).
-        weight_decay: of Muon's matrices; their spectral norms stay below its inverse.
-        warmup_steps: of linear rise at the start.
-        fall: (step, share of the highest rate), in order: the rate is constant up to the first, linear
-            between them, and the last is (steps, 0). A run under way can be given another future,
-            shorter or longer, and goes on as if it had been meant so.
-        ema: decay of the averaged weights, which are the ones kept.
-        threads: of torch; the result depends on it in the last bits only.
+        steps: number of optimizer steps.
+        batch, crop: number of crops a step, and their side in pixels, a multiple of 16.
+        learning_rate: highest rate of Muon (matrices), in units of the spectral norm.
+        adam_learning_rate: highest rate of Adam (biases, first and last layers).
+        weight_decay: decay of Muon's matrices; it keeps their spectral norms below its inverse.
+        warmup_steps: number of steps over which the rate rises linearly at the start.
+        fall: points (step, share of the highest rate), in ascending order. The rate is constant up to the
+            first point and linear between points; the last point is (steps, 0). A run that has started
+            can be resumed with another `fall` and another `steps`, as long as the rates of the past
+            steps stay the same.
+        ema: decay of the averaged weights; the averaged weights are the ones that are kept.
+        threads: number of torch threads; it changes only the last bits of the result.
     """
 
     steps: int = Field(gt=0)
@@ -102,7 +103,7 @@ class TrainingRecipe(_Strict):
         return self
 
     def rate(self, step: int) -> float:
-        """Share of the highest learning rate at a step, counted from 0."""
+        """Return the share of the highest learning rate at a step; steps count from 0."""
         rise = min(1.0, (step + 1) / max(1, self.warmup_steps))
         if not self.fall:
             return rise
@@ -111,7 +112,7 @@ class TrainingRecipe(_Strict):
 
 
 class LossRecipe(_Strict):
-    """Weights of the parts of the loss; pixels in [0, 1]."""
+    """The weights of the parts of the loss; pixels are in [0, 1]."""
 
     l2: float = Field(ge=0)
     l1: float = Field(ge=0)
@@ -124,10 +125,10 @@ class FileSource(_Strict):
 
     Attributes:
         path: folder below the recipe's `corpus`.
-        glob: which files.
-        origin: the package and version they come from.
+        glob: patterns of the files to take.
+        origin: the package and version that the files come from.
         weight: how often a crop is from this source, relative to the others.
-        frames: taken from each video, evenly.
+        frames: number of frames taken from each video, evenly spaced.
     """
 
     kind: Literal["files"]
@@ -139,7 +140,7 @@ class FileSource(_Strict):
 
 
 class DrawnSource(_Strict):
-    """Pictures made by `recipes/tokenizer/draw.py`, in a folder of the corpus named by their kind."""
+    """Pictures made by `recipes/tokenizer/draw.py`, in a folder of the corpus named after their kind."""
 
     kind: Literal["pusht", "drawn"]
     pictures: int = Field(gt=0, default=200)
@@ -147,22 +148,22 @@ class DrawnSource(_Strict):
 
     @property
     def path(self) -> str:
-        """Folder below the recipe's `corpus`."""
+        """Return the folder below the recipe's `corpus`."""
         return self.kind
 
     @property
     def glob(self) -> list[str]:
-        """Which files."""
+        """Return the patterns of the files to take."""
         return ["*.png"]
 
     @property
     def frames(self) -> int:
-        """Taken from each file."""
+        """Return the number of frames taken from each file."""
         return 1
 
 
 class TokenizerRecipe(_Strict):
-    """A whole training, so that it can be done again."""
+    """A whole training, described well enough to repeat it."""
 
     job: Literal["tokenizer"]
     name: str
@@ -174,11 +175,15 @@ class TokenizerRecipe(_Strict):
     sources: list[FileSource | DrawnSource] = Field(min_length=1)
 
     def digest(self) -> str:
-        """SHA-256 over all but where the corpus lies."""
+        """Return the SHA-256 of all values except the corpus's location."""
         return _digest(self.model_dump(mode="json", exclude={"corpus"}))
 
     def course(self) -> str:
-        """SHA-256 over all but the rates: with the same past of those too, a run can go on."""
+        """Return the SHA-256 of the values that must not change when a run is resumed.
+
+        It covers all values except the corpus's location, `steps`, `fall` and `threads`. A run can be
+        resumed if this digest and the rates of its past steps are the same.
+        """
         values = self.model_dump(mode="json", exclude={"corpus"})
         for key in ("steps", "fall", "threads"):
             values["training"].pop(key)
@@ -190,10 +195,11 @@ def _digest(values: dict[str, Any]) -> str:
 
 
 def load_recipe(path: StrPath, overrides: dict[str, Any] | None = None) -> TokenizerRecipe:
-    """The recipe of a YAML file; `overrides` replace values by dotted key (`training.steps`).
+    """Read a recipe from a YAML file.
 
     Args:
         path: str or path of the YAML.
+        overrides: values that replace those of the file, by dotted key (`training.steps`).
 
     Raises:
         RecipeError: the file or an override is not valid.

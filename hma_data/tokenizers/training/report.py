@@ -1,4 +1,4 @@
-"""What `hma tokenizer eval` writes: a table, JSON, and a picture of the worst frames."""
+"""Write the report of `hma tokenizer eval`: a table, JSON, and a picture of the worst frames."""
 
 import json
 from collections.abc import Callable
@@ -18,7 +18,7 @@ def _percent(shares: list[float]) -> str:
     return ", ".join(f"{100 * share:.0f} %" for share in shares)
 
 
-# column -> key of a result, and how it is shown
+# column -> (key in a result, function that formats its value)
 COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "frames": ("frames", str),
     "PSNR dB": ("psnr_db", "{:.2f}".format),
@@ -35,7 +35,11 @@ COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
 
 
 def to_markdown(results: Results) -> str:
-    """A table, one row a set of frames: name -> what `evaluate` returned; columns nobody has are left out."""
+    """Return a table with one row per set of frames; leave out columns that no result has.
+
+    Args:
+        results: name -> what `evaluate` returned.
+    """
     columns = {
         name: column for name, column in COLUMNS.items() if any(column[0] in r for r in results.values())
     }
@@ -50,9 +54,9 @@ def write_report(folder: StrPath, title: str, results: Results, notes: list[str]
     """Write `eval.md`, `eval.json` and, where results hold worst frames, `worst.png` to a folder.
 
     Args:
-        folder: str or path of the folder.
-        results: as for `to_markdown`; their `worst_frames` go into the picture.
-        notes: lines below the table.
+            folder: str or path of the folder.
+            results: as for `to_markdown`; their `worst_frames` go into the picture.
+            notes: lines to print below the table.
     """
     folder = as_path(folder)
     plain = {name: without_frames(result) for name, result in results.items()}
@@ -75,5 +79,5 @@ def write_report(folder: StrPath, title: str, results: Results, notes: list[str]
 
 
 def without_frames(result: dict[str, Any]) -> dict[str, Any]:
-    """A result as plain values."""
+    """Return the result without its `worst_frames`, so that it holds plain values only."""
     return {key: value for key, value in result.items() if key != "worst_frames"}

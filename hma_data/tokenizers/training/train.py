@@ -2,10 +2,10 @@
 
     train(Path("recipes/tokenizer/fsq.yaml"), Path("fsq.safetensors"), {"corpus": "/data/corpus"})
 
-The loss is what can be had without a pretrained network: squared and absolute error, gradients at
-several scales, and SSIM. Before the first step the network is the best linear code of patches
-(their principal components); the rest starts at zero and learns what is left. A weights' file is
-written now and then, and the state of the run beside it: running it again goes on, on any device.
+The loss needs no pretrained network: squared and absolute error, gradients at several scales, and SSIM.
+Before the first step the network is the best linear code of patches (their principal components); the
+other layers start near zero and learn the remaining error. At every report the run writes a weights'
+file, and its state beside it. The same call resumes a run that was stopped, on any device.
 
 B crops, S side of a crop, C latent channels.
 """
@@ -41,12 +41,12 @@ from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, Tra
 from hma_data.tokenizers.vae_network import FORMAT as VAE_FORMAT
 from hma_data.tokenizers.vae_network import VaeAutoencoder, VaeConfig
 
-START, END = 2**32 - 1, 2**32 - 2  # numbers of the batches that start and measure a network
+START, END = 2**32 - 1, 2**32 - 2  # step numbers of the batches that initialise and measure a network
 Autoencoder = FsqAutoencoder | VaeAutoencoder
 
 
 def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
-    """The loss of (B, 3, S, S) pictures in [-1, 1], and the mean squared error in [0, 1] units."""
+    """Return the loss of (B, 3, S, S) pictures in [-1, 1], and the mean squared error in [0, 1] units."""
     made, true = (made + 1) / 2, (true + 1) / 2
     squared = functional.mse_loss(made, true)
     loss = weights.l2 * squared
@@ -65,7 +65,7 @@ def _grey(pictures: Tensor) -> Tensor:
 
 
 def _gradient_loss(made: Tensor, true: Tensor) -> Tensor:
-    """Mean absolute error of the differences of neighbours, at three scales."""
+    """Return the mean absolute error of the differences of neighbours, at three scales."""
     error = made - true
     total = error.new_zeros(())
     for _ in range(3):
@@ -75,7 +75,7 @@ def _gradient_loss(made: Tensor, true: Tensor) -> Tensor:
 
 
 def start_linear(network: Autoencoder, crops: Tensor) -> None:
-    """Set the linear paths to the principal components of the crops' patches, whitened and turned.
+    """Set the linear paths to the principal components of the crops' patches, whitened and rotated.
 
     Args:
         crops: (B, 3, S, S) in [-1, 1].
@@ -87,7 +87,7 @@ def start_linear(network: Autoencoder, crops: Tensor) -> None:
     _, values, basis = torch.linalg.svd(patches - mean, full_matrices=False)
     scale = values[:channels, None] / math.sqrt(len(patches))
     whiten = basis[:channels] / scale
-    # Turned at random, so that every channel carries a share of the strong components.
+    # Rotated at random, so that every channel carries a share of the strong components.
     turn = torch.linalg.qr(torch.randn(channels, channels, dtype=torch.float64))[0]
     back = network.linear_gain * (turn @ (basis[:channels] * scale)).T
     whiten = turn @ whiten
@@ -106,7 +106,7 @@ def _autoencoder(recipe: TokenizerRecipe) -> Autoencoder:
 
 
 class Run:
-    """A training under way: network, averaged weights, optimizers, and the step it has reached."""
+    """A training in progress: network, averaged weights, optimizers, and the step it has reached."""
 
     def __init__(self, recipe: TokenizerRecipe, pools: list[Pool], device: torch.device) -> None:
         self.recipe, self.pools, self.step, self.seconds = recipe, pools, 0, 0.0
@@ -119,12 +119,12 @@ class Run:
         self.optimizers = _optimizers(self.network, recipe.training)
 
     def batch(self, step: int, count: int) -> Tensor:
-        """(B, 3, S, S) crops of a step, in the CPU's memory."""
+        """Return the (B, 3, S, S) crops of a step, in the CPU's memory."""
         crops = draw_batch(self.pools, self.recipe.training.crop, count, self.recipe.seed, step)
         return torch.from_numpy(crops).permute(0, 3, 1, 2)
 
     def advance(self, crops: Tensor) -> float:
-        """One step on its crops; their mean squared error, pixels in [0, 1]."""
+        """Take one step on its crops; return their mean squared error, pixels in [0, 1]."""
         training = self.recipe.training
         for optimizer, highest in zip(self.optimizers, (training.learning_rate, training.adam_learning_rate)):
             optimizer.param_groups[0]["lr"] = highest * training.rate(self.step)
@@ -145,7 +145,7 @@ class Run:
         return float(squared)
 
     def write_weights(self, path: Path, facts: dict[str, Any]) -> None:
-        """Write the averaged weights as a tokenizer's file, with how they came about."""
+        """Write the averaged weights as a tokenizer's file, with the facts of the training."""
         config = self.recipe.network.config()
         if isinstance(config, FsqConfig):
             save_weights(path, FORMAT, config, self.average, facts)
@@ -155,7 +155,7 @@ class Run:
 
     @torch.no_grad()
     def _latent_scale(self, config: VaeConfig) -> float:
-        """One by the standard deviation of the averaged encoder's latents over a batch."""
+        """Return the inverse standard deviation of the averaged encoder's latents over a batch."""
         network = VaeAutoencoder(config)
         network.load_state_dict(self.average)
         return round(1 / float(network.encoder(self.batch(END, 128)).std()), 4)
@@ -169,7 +169,7 @@ class Run:
         write_atomic(path, save(tensors, metadata))
 
     def _state(self) -> dict[str, Tensor]:
-        """Copies of parameters, averages and the optimizers' moments, by name."""
+        """Return copies of the parameters, the averages and the optimizers' moments, by name."""
         state = {f"network.{name}": p.detach().clone() for name, p in self.network.named_parameters()}
         state |= {f"average.{name}": tensor.clone() for name, tensor in self.average.items()}
         for number, optimizer in enumerate(self.optimizers):
@@ -178,10 +178,10 @@ class Run:
         return state
 
     def resume(self, path: Path) -> None:
-        """Go on from a state that `save` wrote.
+        """Resume from a state that `save` wrote.
 
         Raises:
-            RecipeError: it is no such state, or of a training with other settings.
+            RecipeError: the file is not such a state, or is of a training with other settings.
         """
         remedy = f"remove {path.name} to start anew"
         try:
@@ -212,7 +212,7 @@ class Run:
             optimizer.load_state_dict({"state": moments, "param_groups": groups})
 
     def _past_rates(self, step: int) -> str:
-        """Digest of the rates of all steps before this one."""
+        """Return a digest of the rates of all steps before this one."""
         rates = [round(self.recipe.training.rate(past), 9) for past in range(step)]
         return hashlib.sha256(repr(rates).encode()).hexdigest()
 
@@ -230,7 +230,10 @@ def _optimizers(network: Autoencoder, recipe: TrainingRecipe) -> list[torch.opti
 
 
 def _latent_penalty(latents: Tensor) -> Tensor:
-    """Keeps latents where the squashing still has a slope: zero mean, unit variance, no far tails."""
+    """Return a penalty that keeps latents at zero mean, unit variance and short tails.
+
+    In that range the squashing still has a gradient.
+    """
     per_channel = latents.transpose(0, 1).flatten(1)
     spread = (per_channel.var(1) - 1).square().mean() + per_channel.mean(1).square().mean()
     return spread + functional.relu(latents.abs() - 2.5).square().mean()
@@ -246,20 +249,20 @@ def train(
     report: Callable[[str], None] = print,
     report_every: int = 100,
 ) -> dict[str, Any]:
-    """Train as the recipe says and write the weights; a run that was stopped goes on.
+    """Train as the recipe states and write the weights; resume a run that was stopped.
 
     Args:
         recipe_path: str or path of a YAML, see `hma_data.tokenizers.training.recipe.TokenizerRecipe`.
         out: str or path of the weights' file, rewritten at every report; `<out>.state` holds the run until
             it ends.
         overrides: values to replace in the recipe, by dotted key.
-        device: where the network is trained: cpu, cuda, mps.
-        workers: threads that draw crops ahead; 0 draws them in turn. The crops are the same.
-        report: takes a line of progress.
+        device: device that trains the network: cpu, cuda, mps.
+        workers: threads that draw crops ahead; 0 draws each batch when it is needed. The crops are the same.
+        report: called with each line of progress.
         report_every: steps between reports.
 
     Returns:
-        what the file's metadata says: recipe and corpus digests, seed, steps, training PSNR, seconds
+        The facts in the file's metadata: recipe and corpus digests, seed, steps, training PSNR, seconds
         and machine.
 
     Raises:
@@ -283,7 +286,7 @@ def train(
         "seed": recipe.seed,
         "machine": _machine(place, recipe.training.threads),
     }
-    # Far below zero the slope of silu is a denormal number; with those a step takes seven times as long.
+    # Far below zero the slope of silu is a denormal number; denormal numbers make a step seven times slower.
     torch.set_flush_denormal(True)
     try:
         _advance(run, out, facts, workers, report, report_every)
@@ -299,7 +302,7 @@ def _machine(device: torch.device, threads: int) -> str:
 
 
 def _crops(run: Run, workers: int) -> Iterator[Tensor]:
-    """The crops of every step that is left, in order, drawn ahead by threads."""
+    """Yield the crops of every remaining step, in order; threads draw them ahead."""
     count, steps = run.recipe.training.batch, iter(range(run.step, run.recipe.training.steps))
     if not workers:
         yield from (run.batch(step, count) for step in steps)
@@ -319,7 +322,7 @@ def _advance(
     report: Callable[[str], None],
     report_every: int,
 ) -> None:
-    """Take all the steps; now and then write weights and state, and report."""
+    """Take all remaining steps; at every report write weights and state."""
     errors: list[float] = []
     last = time.monotonic()
     for crops in _crops(run, workers):
