@@ -34,11 +34,7 @@ log = logging.getLogger(__name__)
 
 
 class Repository:
-<<<<<<< HEAD
-    """See `hma_model.hub.publish.Store`.
-=======
-    """A repository of the hub; see `hma_model.hub.Store`.
->>>>>>> doc-parts
+    """A repository of the hub; see `hma_model.hub.publish.Store`.
 
     Args:
         repo: organisation/name.

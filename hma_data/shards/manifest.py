@@ -35,12 +35,8 @@ MANIFEST, EPISODES, QUARANTINE, EMBODIMENT = (
     "embodiment.yaml",
 )
 SPLITS = ("train", "val")
-<<<<<<< HEAD
 WORKING = (".lock", ".journal", ".plan")  # names of what a conversion keeps in the folder begin with these
-HASHERS = 4  # threads; hashing leaves the interpreter alone
-=======
 HASHERS = 4  # threads; hashing releases the interpreter lock
->>>>>>> doc-parts
 SHARD_NAME = re.compile(r"(train|val)/shard-([0-9]{5,9})\.parquet")
 _SEAL = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')
 _UNSEALED = "0" * 64

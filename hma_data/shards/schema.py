@@ -33,29 +33,23 @@ _FOOTER = b"hma"
 class EpisodeRow:
     """One row of episodes.parquet.
 
-        Attributes:
-            episode_index: place in the plan; the same number is in the shard's rows.
-            id: id of the episode in its source.
-            split: train or val.
-            shard: path of its shard below the shard set.
-            row_start: number of its first row in the shard.
-            rows: its rows in the shard: frames times cameras.
-            length: frames.
-            skew_p50_ms, skew_p95_ms, skew_max_ms: skew of the stream that was moved furthest.
-            skew: stream -> [p50, p95, max] in ms, as JSON.
-            trimmed: frames cut at the ends, where some streams had no data.
-            flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
-    <<<<<<< HEAD
-            group: shared by episodes of one recording, which belong into one split; empty for one of its own.
-            source: where it is another than the set's.
-            content: hash over what was read of it (`hma_data.conversion.episode_hash`); empty where it was not
-                noted.
-    =======
-            group: shared by the episodes of one recording, which belong in one split; empty for an episode
-                that has a recording of its own.
-            source: source of the episode if it differs from the set's.
-            content: hash over what was read of it, see `hma_data.content`; empty if it was not recorded.
-    >>>>>>> doc-parts
+    Attributes:
+        episode_index: place in the plan; the same number is in the shard's rows.
+        id: id of the episode in its source.
+        split: train or val.
+        shard: path of its shard below the shard set.
+        row_start: number of its first row in the shard.
+        rows: its rows in the shard: frames times cameras.
+        length: frames.
+        skew_p50_ms, skew_p95_ms, skew_max_ms: skew of the stream that was moved furthest.
+        skew: stream -> [p50, p95, max] in ms, as JSON.
+        trimmed: frames cut at the ends, where some streams had no data.
+        flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
+    group: shared by the episodes of one recording, which belong in one split; empty for an episode
+        that has a recording of its own.
+    source: source of the episode if it differs from the set's.
+    content: hash over what was read of it, see `hma_data.conversion.episode_hash`; empty if it was not
+        recorded.
     """
 
     episode_index: int

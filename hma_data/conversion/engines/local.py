@@ -257,11 +257,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         wait([parent.sentinel])
         os._exit(1)
-<<<<<<< HEAD:hma_data/conversion/engines/local.py
-=======
-
-
-def usable_cores() -> int:
-    """Return the number of cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
->>>>>>> doc-parts:hma_data/engines/local.py

@@ -1,1 +1,0 @@
-"""Run work units: in this process, in several, or on a cluster. Units and outputs are the same in each."""
