@@ -1,4 +1,4 @@
-"""What the model predicts, as a picture a robot: truth, prediction, and prediction with other actions."""
+"""Draw a picture of each robot: truth, prediction, and prediction with other actions."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -25,14 +25,14 @@ def sample_pictures(
     """Write `pictures/step-N-ID.png` for each robot.
 
     Args:
-        model: as it is evaluated.
+        model: the evaluated model.
         sets: shard sets with validation windows.
         out: the run's folder.
-        step: steps done.
-        recipe: says how many windows.
+        step: number of finished steps.
+        recipe: states the number of windows.
 
     Returns:
-        Why there are none, where the tokenizer cannot be had here; nothing otherwise.
+        The reason for no pictures if the tokenizer is not available here; else an empty string.
     """
     from hma_data.shards.preview import tokenizer_of
 
@@ -53,7 +53,7 @@ def sample_pictures(
 
 
 def newest_pictures(out: Path, names: Iterable[str]) -> dict[str, bytes]:
-    """The last picture of each robot that has one, PNG."""
+    """Return the last picture (PNG) of each robot that has one."""
     found = {}
     for name in names:
         paths = sorted((out / FOLDER).glob(f"step-????????-{name}.png"))
