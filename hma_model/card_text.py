@@ -79,7 +79,7 @@ def line(value: Any) -> str:
         return text
     text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     text = re.sub(r"([|`\[\]\\*_~!#(){}$])", r"\\\1", text)
-    return re.sub(r"(?i)(\w)(://|@)", r"\1&#8203;\2", text)  # no address becomes a link by itself
+    return re.sub(r"(?i)(\w)(://|@)", r"\1&#8203;\2", text)  # prevents automatic links
 
 
 def number(value: Any) -> str:

@@ -1,7 +1,7 @@
 """Open and check a checkpoint's folder without reading weights (DESIGN section 9).
 
     config.json                  format version, architecture, tokenizer spec
-    trunk.safetensors            what all embodiments share
+    trunk.safetensors            tensors that all embodiments share
     embodiments/<id>/            stem.safetensors, head.safetensors, embodiment.yaml, stats.json, card.json
     README.md                    the model card, made from the card.json files
     training/                    optimizer, sampler and rng state; never published
@@ -58,7 +58,7 @@ class Checkpoint:
     """A checkpoint's folder, checked as far as possible without reading weights.
 
     Attributes:
-        folder: where it is.
+        folder: the path of the folder.
         config: of the network; the tokenizer's spec is in it.
         embodiments: ids present, sorted.
         trunk_sha256: of the trunk, as config.json states it.

@@ -95,7 +95,7 @@ def push_data(
     target: Annotated[str, typer.Argument(help="org/name of a dataset on the hub, or a folder.")],
     private: Private = False,
 ) -> None:
-    """Publish a shard set as a dataset; run it again to go on after an interruption.
+    """Publish a shard set as a dataset; run it again to continue after an interruption.
 
     Example: hma hub push-data shards/my_arm team/my_arm
     """
@@ -110,7 +110,7 @@ def pull_data(
     out: Annotated[Path, typer.Option("--out", help="Folder of the shard set.")],
     revision: Revision = None,
 ) -> None:
-    """Fetch a published shard set; run it again to go on after an interruption.
+    """Fetch a published shard set; run it again to continue after an interruption.
 
     Example: hma hub pull-data team/my_arm --out shards/my_arm
     """

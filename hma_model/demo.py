@@ -59,7 +59,7 @@ class Demo:
         figures: robot -> the result of `evaluate` on its held-out windows.
         films: robot -> a held-out rollout.
         seconds: stage -> wall time.
-        sizes: what -> bytes.
+        sizes: name of a file or folder -> bytes.
     """
 
     out: Path

@@ -304,7 +304,7 @@ class FolderStore:
         def move() -> None:
             try:
                 self._fs.mv(new, final)
-            except FileNotFoundError:  # an earlier try whose answer was lost may have done it
+            except FileNotFoundError:  # an earlier try may have moved it, with a lost answer
                 if self._fs.exists(new) or not self._fs.exists(final):
                     raise
 
@@ -363,7 +363,7 @@ def _folder_lock(folder: Path) -> Iterator[None]:
                     raise HubError(folder, "somebody else keeps writing here", "push again later") from fault
                 time.sleep(0.02)
             except OSError:
-                break  # its file system knows no locks
+                break  # the file system has no locks
         yield
     finally:
         os.close(handle)

@@ -41,7 +41,7 @@ class Output:
         loss: scalar to minimise.
         video_loss: scalar, nats a token or squared error of the noise; None where video is not predicted.
         action_loss: scalar; None where actions are not predicted.
-        per_sample: (B,) detached, each sample's video loss, or its action loss where there is no other.
+        per_sample: (B,) detached, each sample's video loss, or its action loss if there is no video loss.
         masked: (B, T, h, w) bool, the tokens of the video loss.
         objective: the objective of the pass.
         video_logits: (B, T, h, w, F, V) float32 of the discrete model outside training, else None.

@@ -56,7 +56,7 @@ def open_trackers(recipe: "Recipe", out: Path, step: int) -> list[Tracker]:
 
 
 class Remote:
-    """A tracker for trackio or wandb, whose functions have the same names.
+    """A tracker for trackio or wandb, which have the same functions.
 
     Args:
         name: the name of the package.
