@@ -1,4 +1,4 @@
-"""The Heterogeneous Masked Autoregression world model: network, training, generation, publishing.
+"""Provide the Heterogeneous Masked Autoregression world model: network, training, generation, publishing.
 
 `from hma_model import HMA, HMAConfig` imports torch; the package itself does not.
 """

@@ -1,7 +1,7 @@
-"""What the network is: one frozen configuration, and the action space of each embodiment.
+"""Define the network's configuration and the action space of each embodiment.
 
-`HMAConfig` describes everything the embodiments share; `ActionSpace` is what the network must know of
-one embodiment. Both are validated when made and go to JSON and back without loss.
+`HMAConfig` describes everything that the embodiments share. `ActionSpace` describes one embodiment as far as
+the network depends on it. Both are validated when made. `HMAConfig` converts to JSON and back without loss.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ class HMAConfig:
     """The network's architecture, objectives and mask schedule (paper section 3).
 
     Raises:
-        RecipeError: a value is not allowed; it names the field, the value and what is allowed.
+        RecipeError: a value is not allowed; it names the field, the value and the allowed values.
     """
 
     kind: str = "discrete"  # discrete: VQ tokens, cross-entropy; continuous: latents, diffusion head
@@ -50,7 +50,7 @@ class HMAConfig:
     width: int = 256
     heads: int = 8
     mlp_ratio: float = 4.0
-    frames: int = 12  # T, the window; also how far back temporal attention sees in a longer rollout
+    frames: int = 12  # T, the window; in a longer rollout, temporal attention sees this many frames
     grid: tuple[int, int] = (
         16,
         16,
@@ -60,21 +60,22 @@ class HMAConfig:
     factored: tuple[int, ...] = (512, 512)  # discrete: values a digit, low digit first
     channels: int = 4  # continuous: the latents' channels,
     patch: int = 2  # the side of a patch that becomes one token,
-    latent_scale: float = 1.0  # and what stored latents are multiplied by
+    latent_scale: float = 1.0  # and the factor by which stored latents are multiplied
 
     conditioning: tuple[str, ...] = ("modulation",)  # any of CONDITIONINGS together
     shared_modulation: bool = False  # False: modulation weights per embodiment (paper); True: in the trunk
-    modulation_out: str = "trunk"  # whose the projection after the modulated norm is; released: embodiment
+    modulation_out: str = "trunk"  # owner of the projection after the modulated norm; released: embodiment
     action_tokens: int = 1  # copies of the action embedding put after a frame's tokens (concat)
     add_at: str = "input"  # where embeddings are added (add); "layers": in every block (released)
-    # Without any actions: a learned "embedding" stands for each; "skip": no conditioning (released);
-    # "tokens": only learned action tokens (released, actions predicted too). With "tokens" a chunk hidden
-    # among others is hidden in the action tokens alone, and modulation sees it, as in the released code.
+    # The conditioning of a pass without any actions. "embedding": a learned embedding replaces each action;
+    # "skip": no conditioning (released); "tokens": only learned action tokens (released, actions predicted
+    # too). With "tokens", a single hidden chunk is hidden only in the action tokens; modulation still sees
+    # it, as in the released code.
     absent_action: str = "embedding"
     action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
 
     time_position: str = "rotary"  # relative, so that a cache may roll; "learned": absolute (released)
-    rotary_base: float = 100.0  # longest wavelength over the shortest; windows are short
+    rotary_base: float = 100.0  # ratio of the longest wavelength to the shortest; windows are short
     norms: str = "before"  # before spatial attention and the MLP; "qk": none there (released with qk_norm)
     temporal_norm: bool = True  # norm before temporal attention; the released code has none
     final_norm: bool = True  # norm after the last block; the released code has none
@@ -82,24 +83,24 @@ class HMAConfig:
     proj_bias: bool = True
     mlp_bias: bool = True
     qk_norm: bool = False
-    mup: bool = False  # attention scale 8 / head_dim and a readout that shrinks with width
-    base_width: int = 256  # where muP's multipliers are one
+    mup: bool = False  # attention scale 8 / head_dim, and a readout scaled down as the width grows
+    base_width: int = 256  # the width at which muP's multipliers are one
 
     objectives: Mapping[str, float] = field(
         default_factory=lambda: {"forward": 1.0}
     )  # how often each is drawn
     action_loss: str = "mse"
-    action_target: str = "normalized"  # "raw": what the released action heads were trained on
-    action_loss_weight: float = 0.5  # beside the video loss
+    action_target: str = "normalized"  # "raw": the released action heads were trained on raw actions
+    action_loss_weight: float = 0.5  # relative to the video loss
     label_smoothing: float = 0.01
     corrupt_max: float = 0.2  # discrete: a sample's share of digits replaced at random is U(0, this)
     history_probability: float = (
-        0.2  # how often a longer history stays unmasked, with later frames corrupted more
+        0.2  # share of samples whose longer history stays unmasked, with later frames corrupted more
     )
     history_frames: int = 4  # the shortest such history
     mask_ratio_min: float = 0.0  # a masked frame's smallest mask probability
 
-    diffusion_target: str = "noise"  # what the head predicts (paper); "velocity": also right at full noise
+    diffusion_target: str = "noise"  # what the head predicts (paper); "velocity": well defined at full noise
     diffusion_depth: int = 3
     diffusion_width: int = 1024
     diffusion_train_steps: int = 1000
@@ -125,48 +126,48 @@ class HMAConfig:
 
     @property
     def token_grid(self) -> tuple[int, int]:
-        """(h, w) of the tokens the trunk sees in a frame."""
+        """Return (h, w), the grid of the tokens that the trunk sees in a frame."""
         side = self.patch if self.kind == "continuous" else 1
         return self.grid[0] // side, self.grid[1] // side
 
     @property
     def tokens_per_frame(self) -> int:
-        """S, without action tokens."""
+        """Return S, the number of tokens a frame, without action tokens."""
         return math.prod(self.token_grid)
 
     @property
     def appended_tokens(self) -> int:
-        """Action tokens after each frame's own, where there are actions."""
+        """Return the number of action tokens after the tokens of a frame, in a pass with actions."""
         return self.action_tokens if "concat" in self.conditioning else 0
 
     @property
     def absent_tokens(self) -> int:
-        """Action tokens after each frame's own in a pass without any actions."""
+        """Return the number of action tokens after the tokens of a frame, in a pass without any actions."""
         if self.absent_action == "embedding":
             return self.appended_tokens
         return self.action_tokens if self.absent_action == "tokens" else 0
 
     @property
     def vocab_size(self) -> int:
-        """Number of token ids; also the id that means masked."""
+        """Return the number of token ids; this number is also the id that means masked."""
         return math.prod(self.factored)
 
     @property
     def patch_dim(self) -> int:
-        """Values in one patch of latents."""
+        """Return the number of values in one patch of latents."""
         return self.channels * self.patch**2
 
     @property
     def head_dim(self) -> int:
-        """Width of one attention head."""
+        """Return the width of one attention head."""
         return self.width // self.heads
 
     def replace(self, **changes: Any) -> Self:
-        """The same configuration with some fields changed, validated again."""
+        """Return a copy with some fields changed, validated again."""
         return dataclasses.replace(self, **changes)
 
     def to_json(self) -> dict[str, Any]:
-        """A dictionary that `json.dumps` takes and `from_json` reads back."""
+        """Return a dictionary that `json.dumps` accepts and `from_json` reads back."""
         return {
             f.name: list(value) if isinstance(value := getattr(self, f.name), tuple) else value
             for f in dataclasses.fields(self)
@@ -174,7 +175,7 @@ class HMAConfig:
 
     @classmethod
     def from_json(cls, source: str | Mapping[str, Any], where: str = "model") -> Self:
-        """From `to_json`'s dictionary or its text; unknown fields are an error naming them."""
+        """Read the dictionary of `to_json`, or its text; a RecipeError names an unknown field."""
         values = json.loads(source) if isinstance(source, str) else dict(source)
         unknown = sorted(set(values) - {f.name for f in dataclasses.fields(cls)})
         if unknown:
@@ -255,16 +256,16 @@ class _Stats(Protocol):
 
 @dataclass(frozen=True)
 class ActionSpace:
-    """What the network must know of an embodiment.
+    """The action space of an embodiment, and the statistics of its actions.
 
     Attributes:
         id: the embodiment's id.
         action_dim: A, values of one raw action.
         stride: actions in a chunk.
         mean, std: (A,) of the raw actions.
-        normalize: (A,) False for dims that pass through as they are.
-        zero_variance: what dims that never vary become: "zero"; "divide": they are divided by std + 1e-10
-            like any other (released).
+        normalize: (A,) False for dims that pass through unchanged.
+        zero_variance: the treatment of dims that never vary. "zero": they become zero; "divide": they are
+            divided by std + 1e-10 like any other (released).
 
     Raises:
         RecipeError: lengths differ from action_dim, or statistics are not finite.
@@ -294,11 +295,11 @@ class ActionSpace:
 
     @property
     def chunk_dim(self) -> int:
-        """K = stride * action_dim."""
+        """Return K = stride * action_dim."""
         return self.stride * self.action_dim
 
     def agrees_with(self, other: "ActionSpace") -> bool:
-        """Equal up to the rounding of statistics to float32, as a stem keeps them."""
+        """Check whether two spaces are equal, up to the rounding of statistics to float32 in a stem."""
         sizes = ("id", "action_dim", "stride", "normalize", "zero_variance")
         return all(getattr(self, name) == getattr(other, name) for name in sizes) and all(
             np.allclose(getattr(self, name), getattr(other, name), rtol=1e-6, atol=1e-30)
@@ -307,7 +308,7 @@ class ActionSpace:
 
     @classmethod
     def of(cls, embodiment: _Embodiment, stats: _Stats | None = None) -> Self:
-        """From a registry embodiment and its statistics; without any, actions pass unchanged."""
+        """Make one from a registry embodiment and its statistics; without them actions pass unchanged."""
         dims = embodiment.action_dim
         mean = np.zeros(dims) if stats is None else np.asarray(stats.mean, dtype=np.float64)
         std = np.ones(dims) if stats is None else np.asarray(stats.std, dtype=np.float64)

@@ -45,11 +45,11 @@ class EpisodeRow:
         skew: stream -> [p50, p95, max] in ms, as JSON.
         trimmed: frames cut at the ends, where some streams had no data.
         flags: remarks, comma separated, counts as `masked_actions=12`; see `flags_text`.
-    group: shared by the episodes of one recording, which belong in one split; empty for an episode
-        that has a recording of its own.
-    source: source of the episode if it differs from the set's.
-    content: hash over what was read of it, see `hma_data.conversion.episode_hash`; empty if it was not
-        recorded.
+        group: shared by the episodes of one recording, which belong in one split; empty for an episode
+            that has a recording of its own.
+        source: source of the episode if it differs from the set's.
+        content: hash over what was read of it, see `hma_data.conversion.episode_hash`; empty if it was not
+            recorded.
     """
 
     episode_index: int

@@ -1,4 +1,4 @@
-"""Folders that are whole or not there; JSON and safetensors as we write and accept them."""
+"""Write folders atomically; read and write JSON and safetensors files."""
 
 import json
 import math
@@ -23,10 +23,10 @@ _AGAIN = "have it saved or pushed again"
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """An empty folder to fill, which takes the given name once the block ends without an error.
+    """Yield an empty folder to fill; it gets the given name when the block ends without an error.
 
-    An older folder of that name is replaced; on an error nothing of the new one remains and the
-    older one is as it was.
+    It replaces an older folder of that name. On an error the new folder is deleted and the older one stays as
+    it was.
     """
     folder = Path(os.path.abspath(folder))  # noqa: PTH100, a link at the end must stay a link
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -43,7 +43,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 
 def remove_partial(folder: Path) -> None:
-    """Delete what killed writers left in a folder."""
+    """Delete the partial files and folders that killed writers left in a folder."""
     for path in folder.glob(".*.partial-*"):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -70,15 +70,15 @@ def _swap(new: Path, final: Path) -> None:
 
 
 def to_json(values: Any) -> bytes:
-    """Indented JSON with a newline at its end; numbers that are not finite become null."""
+    """Return indented JSON that ends with a newline; numbers that are not finite become null."""
     return (json.dumps(finite(values), indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def read_json(path: Path, error: type[HMAError] = CheckpointError) -> dict[str, Any]:
-    """The object in a JSON file.
+    """Read the object in a JSON file.
 
     Raises:
-        error: it is missing, unreadable, larger than 16 MB, or not a JSON object.
+        error: the file is missing, unreadable, larger than 16 MB, or holds no JSON object.
     """
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
@@ -90,7 +90,7 @@ def read_json(path: Path, error: type[HMAError] = CheckpointError) -> dict[str, 
 
 
 def parse_json(content: bytes, where: object, error: type[HMAError] = CheckpointError) -> dict[str, Any]:
-    """The object in JSON bytes, which give no key twice; see `read_json`."""
+    """Parse the object in JSON bytes, which must not repeat a key; see `read_json`."""
     try:
         values = json_io.parse_json(content)
     except (ValueError, RecursionError) as fault:
@@ -101,10 +101,10 @@ def parse_json(content: bytes, where: object, error: type[HMAError] = Checkpoint
 
 
 def read_tensors(path: Path) -> dict[str, "Tensor"]:
-    """All tensors of a safetensors file, on the CPU.
+    """Read all tensors of a safetensors file to the CPU.
 
     Raises:
-        CheckpointError: it is damaged, truncated or of another format.
+        CheckpointError: the file is damaged, truncated or of another format.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -116,7 +116,7 @@ def read_tensors(path: Path) -> dict[str, "Tensor"]:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """The metadata in a safetensors file's header; see `read_tensors`."""
+    """Read the metadata in the header of a safetensors file; see `read_tensors`."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -127,12 +127,12 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[str, str]) -> None:
-    """A safetensors file; the same tensors give the same bytes, whatever device they are on."""
+    """Write a safetensors file; the same tensors give the same bytes, whatever device they are on."""
     from safetensors.torch import save_file
 
     plain = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
     save_file(plain, path, metadata)
-    with path.open("r+b") as file:  # it writes metadata in an order of its own, another one each time
+    with path.open("r+b") as file:  # safetensors writes the metadata in a different order each time
         length = int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(length))
         values = {"__metadata__": dict(sorted(header.pop("__metadata__").items())), **header}
@@ -143,7 +143,7 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[st
 
 
 def finite(values: Any) -> Any:
-    """The same plain values with null for numbers that JSON cannot hold."""
+    """Return the same plain values, with None for numbers that JSON cannot hold."""
     if isinstance(values, dict):
         return {str(key): finite(value) for key, value in values.items()}
     if isinstance(values, list | tuple):

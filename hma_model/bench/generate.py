@@ -1,9 +1,10 @@
-"""`hma bench generate`: how long a frame of a rollout takes, with the cache over time and without.
+"""Measure how long a generated frame takes, with the cache over time and without it (`hma bench generate`).
 
-Random weights and tokens, 32 layers of width 256 by default. The prompt leaves room for one more frame in
-the window, so that each measured frame is the last of `window`. With the cache, frame follows frame; without,
-each is computed from the prompt again. In a batch a frame's time is its share of the step. Each case runs in
-a process of its own. The fastest counts, since other work on the machine only ever slows one down.
+Weights and tokens are random; the model has 32 layers of width 256 by default. The prompt leaves room for one
+more frame in the window, so each measured frame is the last of `window`. With the cache, each frame follows
+the one before it. Without the cache, each frame is computed from the prompt again. In a batch, the time of a
+frame is the time of the step divided by the batch size. Each case runs in its own process. The fastest time
+counts, because other work on the machine can only slow a step down.
 """
 
 import time
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 ABOUT = "seconds a generated frame, with a cache over time and with full recomputation"
 DEFAULTS: dict[str, Any] = {
     "kind": "both",  # discrete | continuous | both
-    "cache": None,  # true | false; both where it is not given
+    "cache": None,  # true | false; None measures both
     "frames": 5,  # measured, after a warm-up
     "batch": 1,
     "window": 12,
@@ -45,14 +46,14 @@ DEFAULTS: dict[str, Any] = {
     "threads": 0,  # 0: torch's choice
 }
 PRECISIONS = ("fp32", "bf16")
-_KINDS = {"discrete": "fsq-16", "continuous": "vae-8"}  # and the tokenizers that decode them
+_KINDS = {"discrete": "fsq-16", "continuous": "vae-8"}  # each kind, and the tokenizer that decodes it
 _NETWORK = ("layers", "width", "heads", "conditioning", "action_tokens", "diffusion_width")
 _WARMUP = 2
 ROBOT = "arm"
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """One result for each kind, with the cache and without.
+    """Return one result for each kind, with the cache and without it.
 
     Raises:
         UsageError: a setting has a value that is not allowed.
@@ -79,13 +80,13 @@ def check(bench: str, settings: dict[str, Any], **allowed: tuple[Any, ...]) -> N
 
 
 def in_fresh_process(task: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
-    """Its result, computed where nothing has taken memory yet."""
+    """Return the task's result, computed in a new process where nothing has taken memory yet."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
         return fresh.submit(task, *arguments).result()
 
 
 def make_model(settings: dict[str, Any], kind: str = "discrete") -> "HMA":
-    """A model with one embodiment and random weights, on the device and in the precision asked for."""
+    """Return a model with one embodiment and random weights, on the device of the settings."""
     import torch
 
     from hma_model.config import ActionSpace, HMAConfig
@@ -106,7 +107,7 @@ def make_model(settings: dict[str, Any], kind: str = "discrete") -> "HMA":
 
 
 def measure(settings: dict[str, Any], kind: str, cache: bool) -> dict[str, Any]:
-    """The figures of one case."""
+    """Return the figures of one case."""
     model = make_model(settings, kind).eval()
     if settings["precision"] == "bf16":
         model.bfloat16()
@@ -129,14 +130,14 @@ def measure(settings: dict[str, Any], kind: str, cache: bool) -> dict[str, Any]:
 
 
 def device_name(device: "torch.device") -> str:
-    """What a GPU calls itself, else the device's type."""
+    """Return the name of a GPU, or the type of another device."""
     import torch
 
     return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
 
 
 def memory(device: "torch.device") -> dict[str, float]:
-    """What the process held at most, and on a GPU what was taken of it."""
+    """Return the peak memory of the process and, on a GPU, the peak memory allocated there, in MiB."""
     import torch
 
     from hma_data.bench import peak_rss_mib
@@ -148,7 +149,7 @@ def memory(device: "torch.device") -> dict[str, float]:
 
 
 def _step_seconds(model: "HMA", settings: dict[str, Any], cache: bool) -> list[float]:
-    """Of each measured step of the batch, decoding included where it is asked for."""
+    """Return the seconds of each measured step of the batch, with decoding if the settings ask for it."""
     import torch
 
     from hma_model.generation.rollout import Rollout
@@ -201,9 +202,9 @@ def finish(device: "torch.device") -> None:
 
 
 def _limit(model: "HMA", settings: dict[str, Any], seconds: float) -> dict[str, float]:
-    """How near a discrete frame comes to only reading weights and cache once a pass.
+    """Compare the time of a step with the time to read weights and cache once in each pass.
 
-    The diffusion head of the continuous model is left out: it is bound by its steps, not by memory.
+    The diffusion head of the continuous model is left out: its steps limit it, not memory.
     """
     config, size = model.config, next(model.trunk.parameters()).element_size()
     weights = sum(parameter.numel() for parameter in model.trunk.blocks.parameters()) * size
@@ -220,7 +221,7 @@ def _limit(model: "HMA", settings: dict[str, Any], seconds: float) -> dict[str, 
 
 
 def _bandwidth(device: "torch.device") -> float:
-    """Bytes a second that a copy within the device's memory reads and writes."""
+    """Return how many bytes a second a copy within the device's memory reads and writes."""
     import torch
 
     source = torch.empty(2**28, device=device)

@@ -1,8 +1,9 @@
-"""`hma bench mup`: whether a learning rate found at one width serves at another.
+"""Test whether the best learning rate at one width is also the best at another (`hma bench mup`).
 
-Small models of several widths learn a made world at several learning rates, with muP and without: patterns of
-tokens that actions move along a line. With muP the best rate should stay where it is as the width grows
-(Yang et al. 2022, arXiv 2203.03466); without, it moves. `plot=FILE.svg` draws the losses over the rates.
+Small models of several widths learn a synthetic world at several learning rates, with muP and without it. The
+world consists of patterns of tokens that actions move along a line. With muP the best rate should stay the
+same as the width grows (Yang et al. 2022, arXiv 2203.03466); without muP it moves. `plot=FILE.svg` draws the
+losses over the rates.
 """
 
 import math
@@ -29,7 +30,7 @@ _TAIL = 0.2  # the share of the steps, at the end, over which the loss is averag
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """A row for each parametrisation, width and rate: the mean loss at the end (None where it diverged)."""
+    """Return a row for each parametrisation, width and rate: the mean final loss (None if it diverged)."""
     widths, rates = _numbers(settings["widths"], int), _numbers(settings["rates"], float)
     rows: list[dict[str, Any]] = []
     for mup in (True, False):
@@ -75,7 +76,7 @@ def _numbers(text: Any, kind: type) -> list[Any]:
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Loss over learning rate, a curve a width with its best rate ringed: muP left, without it right."""
+    """Draw the loss over the learning rate: one curve a width, its best rate ringed; muP on the left."""
     import matplotlib
     from matplotlib.figure import Figure
 

@@ -1,6 +1,6 @@
-"""A small made world, and the training of a small model on it: for `hma bench mup` and the test of muP.
+"""Train a small model on a small synthetic world, for `hma bench mup` and the test of muP.
 
-Patterns of tokens that the action moves along a line, frame by frame.
+The world consists of patterns of tokens that the action moves along a line, frame by frame.
 
 B batch, T frames, h,w token grid.
 """
@@ -20,7 +20,7 @@ _GRID, _FRAMES, _DIGITS, _PATTERNS = (4, 4), 4, (16, 16), 16
 
 @dataclass
 class Windows:
-    """Windows of the made world; see `hma_model.network.objectives.Windows`."""
+    """Windows of the synthetic world; see `hma_model.network.objectives.Windows`."""
 
     tokens: torch.Tensor
     actions: torch.Tensor
@@ -30,7 +30,7 @@ class Windows:
 
 
 def windows(batch: int, generator: torch.Generator) -> Windows:
-    """A batch in which every frame is the last one, rolled along by the action (B, T, 1) of -1, 0 or 1."""
+    """Return a batch in which the action (B, T, 1) of -1, 0 or 1 shifts each frame to the next."""
     cells = _GRID[0] * _GRID[1]
     patterns = torch.randint(0, 256, (_PATTERNS, cells), generator=torch.Generator().manual_seed(0))
     moves = torch.randint(-1, 2, (batch, _FRAMES), generator=generator)
@@ -48,7 +48,7 @@ def windows(batch: int, generator: torch.Generator) -> Windows:
 
 
 def make_model(width: int, layers: int, mup: bool, base_width: int, seed: int = 0) -> HMA:
-    """A model of the made world."""
+    """Return a model of the synthetic world."""
     torch.manual_seed(seed)
     config = HMAConfig(
         layers=layers, width=width, heads=4, frames=_FRAMES, grid=_GRID, factored=_DIGITS, mup=mup,
@@ -60,7 +60,7 @@ def make_model(width: int, layers: int, mup: bool, base_width: int, seed: int = 
 
 
 def train(model: HMA, rate: float, steps: int, batch: int, seed: int = 0) -> list[float]:
-    """The loss of every step, nats a token, of AdamW at a constant rate; it ends early where it diverges."""
+    """Train with AdamW at a constant rate until a loss is not finite; return all losses in nats a token."""
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(parameter_groups(model, rate, 0.0), betas=(0.9, 0.95))
     losses = []

@@ -1,7 +1,8 @@
-"""`hma bench train`: how long a training step takes, and how much memory.
+"""Measure the time and memory of a training step (`hma bench train`).
 
-The loss of a batch of random windows, its gradients, their clipping and AdamW's step; 32 layers of width 256
-by default. The fastest step after a warm-up counts, since other work on the machine only ever slows one down.
+A step computes the loss of a batch of random windows and its gradients, clips them, and updates the weights
+with AdamW. The model has 32 layers of width 256 by default. The fastest step after a warm-up counts, because
+other work on the machine can only slow a step down.
 """
 
 import time
@@ -50,7 +51,7 @@ _PEAKS = {"H200": 989e12, "H100": 989e12, "A100": 312e12, "L40": 181e12, "4090":
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """One result for each kind.
+    """Return one result for each kind.
 
     Raises:
         UsageError: a setting has a value that is not allowed.
@@ -61,7 +62,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def measure(settings: dict[str, Any], kind: str) -> dict[str, Any]:
-    """The figures of one case."""
+    """Return the figures of one case."""
     model = make_model(settings, kind).train()
     model.trunk.checkpointing = settings["checkpointing"]
     if settings["compile"]:
@@ -123,9 +124,10 @@ def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator
 
 
 def step_flops(model: "HMA", settings: dict[str, Any]) -> int:
-    """Floating point operations of a step's products, without the readout; the backward pass counts twice.
+    """Return the floating point operations of a step's products, without the readout.
 
-    A recomputed forward pass does not count: it is no use in itself.
+    The backward pass counts as two forward passes. A recomputed forward pass does not count, because it is no
+    useful work.
     """
     config = model.config
     frames, tokens = settings["batch"] * settings["window"], config.tokens_per_frame + config.appended_tokens
@@ -136,7 +138,7 @@ def step_flops(model: "HMA", settings: dict[str, Any]) -> int:
 
 
 def _used(model: "HMA", settings: dict[str, Any], seconds: float) -> dict[str, float]:
-    """Operations a second, and the share of a known GPU's peak."""
+    """Return the operations a second and, for a known GPU, their share of its peak."""
     rate = step_flops(model, settings) / seconds
     figures = {"teraflop_per_second": round(rate / 1e12, 3)}
     peak = next((value for name, value in _PEAKS.items() if name in device_name(model.device)), None)

@@ -1,8 +1,9 @@
-"""`hma bench waiting`: how fast two threads are by how they wait for one another; see `hma_data.threads`.
+"""Compare the speed of threads by the way they wait for one another (`hma bench waiting`).
 
-Training steps and generated frames of a model as large as `hma demo`'s, for each way of waiting, alone on the
-machine and beside processes that keep every core busy. The cases are interleaved and measured several times;
-medians count, since other work on the machine disturbs single figures. CPU seconds show what spinning burns.
+See `hma_data.threads`. The bench measures training steps and generated frames of a model as large as that of
+`hma demo`, for each way of waiting, alone on the machine and beside processes that keep every core busy. The
+cases are interleaved and measured several times. The median counts, because other work on the machine
+disturbs single figures. The CPU seconds show the cost of spinning.
 """
 
 import multiprocessing
@@ -24,8 +25,8 @@ DEFAULTS: dict[str, Any] = {
     **bench_generate.DEFAULTS,
     **bench_train.DEFAULTS,
     "rounds": 3,  # of all cases
-    "steps": 6,  # of training, a round
-    "frames": 10,  # generated, a round
+    "steps": 6,  # of training, in each round
+    "frames": 10,  # generated, in each round
     "beside": "both",  # nothing | busy (processes on every core) | both
     "layers": 4,
     "width": 128,
@@ -65,7 +66,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def measure(settings: dict[str, Any]) -> dict[str, float]:
-    """Seconds of a step and of a frame: by the clock and of all cores together."""
+    """Return the speed of training and generation, and the CPU seconds that each took on all cores."""
     begun = time.process_time()
     train = median(bench_train._step_seconds(make_model(settings).train(), settings))
     trained = time.process_time()
@@ -85,7 +86,7 @@ def _medians(rounds: list[dict[str, float]]) -> dict[str, float]:
 
 @contextmanager
 def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Give processes that start in the block these of OpenMP's variables and no others."""
+    """Set exactly these variables of OpenMP for processes that start in the block."""
     before = {key: os.environ.pop(key) for key in _OURS if key in os.environ}
     os.environ.update(values)
     try:
@@ -98,7 +99,7 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _busy_cores(count: int) -> Iterator[None]:
-    """Keep so many cores busy in the block."""
+    """Keep `count` cores busy in the block."""
     context = multiprocessing.get_context("spawn")
     processes = [context.Process(target=_spin, daemon=True) for _ in range(count)]
     for process in processes:

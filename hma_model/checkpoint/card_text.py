@@ -1,13 +1,13 @@
-"""What both cards of the hub share: licences as the hub knows them, and values that cannot become markup.
+"""Format values for the hub's model and data cards: licences, and text that cannot become markup.
 
-Cards may come from strangers: every value is brought to one plain line before it enters a page.
+Cards may come from untrusted authors, so every value becomes one plain line before it enters a page.
 """
 
 import re
 from collections.abc import Iterable
 from typing import Any
 
-# Identifiers the hub accepts in a card's front matter; anything else is refused there.
+# The identifiers that the hub accepts in a card's front matter; it refuses any other.
 LICENCES = frozenset(
     [
         "apache-2.0",
@@ -61,7 +61,7 @@ LICENCES = frozenset(
 
 
 def licence(stated: Iterable[Any]) -> dict[str, str]:
-    """The front matter's licence for what the embodiments state; empty where they state none."""
+    """Return the licence fields of the front matter; empty if the embodiments state no licence."""
     names = sorted({line(value) for value in stated} - {"", "unknown"})
     if not names:
         return {}
@@ -72,16 +72,16 @@ def licence(stated: Iterable[Any]) -> dict[str, str]:
 
 
 def line(value: Any) -> str:
-    """A value as one line that cannot leave its cell, become markup, or turn the page's direction."""
+    """Return a value as one line that cannot leave its cell, become markup or change the text direction."""
     text = "".join(c if c.isprintable() else " " for c in str("" if value is None else value))
     text = " ".join(text.split())[:200]
     if re.fullmatch(r"[\w.-]*", text, re.ASCII):
         return text
     text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     text = re.sub(r"([|`\[\]\\*_~!#(){}$])", r"\\\1", text)
-    return re.sub(r"(?i)(\w)(://|@)", r"\1&#8203;\2", text)  # no address becomes a link by itself
+    return re.sub(r"(?i)(\w)(://|@)", r"\1&#8203;\2", text)  # prevents automatic links
 
 
 def number(value: Any) -> str:
-    """A float to four digits; anything else as `line`."""
+    """Return a float with four digits, or any other value as `line` does."""
     return f"{value:.4g}" if isinstance(value, float) else line(value)

@@ -1,14 +1,14 @@
-"""A checkpoint's folder (DESIGN section 9), opened and checked without reading weights.
+"""Open and check a checkpoint's folder without reading weights (DESIGN section 9).
 
     config.json                  format version, architecture, tokenizer spec
-    trunk.safetensors            what all embodiments share
+    trunk.safetensors            tensors that all embodiments share
     embodiments/<id>/            stem.safetensors, head.safetensors, embodiment.yaml, stats.json, card.json
     README.md                    the model card, made from the card.json files
     training/                    optimizer, sampler and rng state; never published
 
-The trunk's SHA-256 stands in every card and in every stem, with the digests of the tokenizer and of the
-statistics the stem was trained on, so that parts which do not belong together are refused. Only JSON,
-YAML and safetensors are ever read. Nothing outside the folder is followed.
+Every card and every stem holds the SHA-256 of the trunk, and the digests of the tokenizer and of the
+statistics that the stem was trained on. Parts that do not belong together are therefore refused. Only JSON,
+YAML and safetensors files are read. Links that lead out of the folder are not followed.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ CONFIG, TRUNK, README, TRAINING = "config.json", "trunk.safetensors", "README.md
 STEM, HEAD, YAML, STATS, CARD = (
     "stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json",
 )  # fmt: skip
-PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card last: it says that the others are there
+PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means that the others are there
 SAMPLE = "sample.png"  # optional, shown in the model card
 _APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was cut short: do it again"
@@ -55,10 +55,10 @@ class ActionStats:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint's folder, opened and checked as far as it can be without reading weights.
+    """A checkpoint's folder, checked as far as possible without reading weights.
 
     Attributes:
-        folder: where it is.
+        folder: the path of the folder.
         config: of the network; the tokenizer's spec is in it.
         embodiments: ids present, sorted.
         trunk_sha256: of the trunk, as config.json states it.
@@ -76,7 +76,7 @@ class Checkpoint:
 
     @classmethod
     def open(cls, folder: StrPath) -> "Checkpoint":
-        """The checkpoint in a folder, or the newest one of a training run's folder.
+        """Open the checkpoint in a folder, or the newest one in the folder of a training run.
 
         Args:
             folder: str or path of it.
@@ -94,7 +94,7 @@ class Checkpoint:
         return cls(folder, config, present, trunk, digest(values.get("tokenizer") or {}), version)
 
     def trunk(self) -> Path:
-        """trunk.safetensors.
+        """Return the path of trunk.safetensors, after checking its SHA-256.
 
         Raises:
             CheckpointError: it is not the file that config.json names.
@@ -111,7 +111,7 @@ class Checkpoint:
         return file_sha256(inside(self.folder, TRUNK))
 
     def path(self, embodiment: str, part: str) -> Path:
-        """A file of an embodiment.
+        """Return the path of a file of an embodiment.
 
         Raises:
             CheckpointError: not an id, no such embodiment or file, or a link out of the folder.
@@ -126,18 +126,18 @@ class Checkpoint:
         return inside(self.folder, f"embodiments/{embodiment}/{part}")
 
     def card(self, embodiment: str) -> dict[str, Any]:
-        """card.json of an embodiment."""
+        """Return card.json of an embodiment."""
         if embodiment not in self._cards:
             path = self.path(embodiment, CARD)
             self._cards[embodiment] = migrate.card(read_json(path), path)
         return self._cards[embodiment]
 
     def embodiment(self, embodiment: str) -> Embodiment:
-        """The embodiment as it was trained on."""
+        """Return the embodiment as it was at training."""
         return Embodiment.load(self.path(embodiment, YAML))
 
     def stats(self, embodiment: str) -> dict[str, Any]:
-        """stats.json of an embodiment: at least {"action": {"mean": [...], "std": [...]}}."""
+        """Return stats.json of an embodiment: at least {"action": {"mean": [...], "std": [...]}}."""
         path = self.path(embodiment, STATS)
         values = read_json(path)
         action_stats(values, path)
@@ -147,7 +147,7 @@ class Checkpoint:
         """Raise unless the embodiment's parts belong to this trunk, tokenizer and statistics.
 
         Raises:
-            CheckpointError: naming the first part that does not, and why.
+            CheckpointError: a part does not belong to them; it names the first such part and the reason.
         """
         path = self.path(embodiment, STEM)
         stem = read_metadata(path)
@@ -170,10 +170,10 @@ class Checkpoint:
 
 
 def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
-    """The network's config from config.json's values.
+    """Return the network's config, read from the values of config.json.
 
     Raises:
-        CheckpointError: of another library, another format version, or not valid.
+        CheckpointError: the values are of another library or format version, or are not valid.
     """
     if values.get("library") != LIBRARY:
         raise CheckpointError(
@@ -192,7 +192,7 @@ def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
 
 
 def resolve(folder: StrPath) -> Path:
-    """The checkpoint meant by a path: itself, or the newest below a training run's `checkpoints/`.
+    """Return the folder of a checkpoint: the path itself, or the newest of a run's `checkpoints/`.
 
     Args:
         folder: str or path of it.
@@ -211,17 +211,17 @@ def resolve(folder: StrPath) -> Path:
 
 
 def training_checkpoints(run: StrPath) -> list[Path]:
-    """Checkpoints of a training run (str or path of its folder), oldest first."""
+    """Return the checkpoints of a training run (str or path of its folder), oldest first."""
     return sorted(path for path in (as_path(run) / "checkpoints").glob("step-*") if (path / CONFIG).is_file())
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The path of a file that lies in the folder itself.
+    """Return the path of a file that lies in the folder itself.
 
-    A link is refused, but for those of a Hugging Face cache, which point at its blobs.
+    A link is refused, except a link of a Hugging Face cache to one of its blobs.
 
     Raises:
-        CheckpointError: there is none, or it leads out of the folder.
+        CheckpointError: there is no such file, or it is a link, or it lies outside the folder.
     """
     path = folder / name
     if not path.is_file():
@@ -241,14 +241,14 @@ def check_id(embodiment: str, where: object) -> None:
 
 
 def digest(tokenizer: Mapping[str, Any]) -> str:
-    """Sixteen hex digits over a tokenizer's spec."""
+    """Return sixteen hex digits of the SHA-256 of a tokenizer's spec."""
     return hashlib.sha256(json.dumps(dict(tokenizer), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -> None:
-    """Raise CheckpointError naming the difference unless the model was trained on this tokenizer.
+    """Raise CheckpointError, which names the difference, unless the model was trained on this tokenizer.
 
-    Which weights it had is not compared where the model does not know, as those of the release do not.
+    The hashes of the tokenizer's weights are not compared if the model states none, as in released models.
     """
     ours, theirs = dict(config.tokenizer), spec.to_json()
     if not ours.get("weights_sha256"):
@@ -265,7 +265,7 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
 
 
 def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
-    """Mean and std of the actions from stats.json's values.
+    """Return the mean and std of the actions from the values of stats.json.
 
     Raises:
         CheckpointError: they are not there, or not lists of numbers.

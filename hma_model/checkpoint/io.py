@@ -1,6 +1,7 @@
-"""Checkpoints: save a model with all its embodiments, load a trunk with some of them.
+"""Save a model with all its embodiments; load a trunk with some of them.
 
-One folder, which is also the layout of the hub; `hma_model.checkpoint.folder` describes and checks it.
+A checkpoint is one folder, in the same layout as on the hub. `hma_model.checkpoint.folder` describes and
+checks it.
 """
 
 import shutil
@@ -65,22 +66,22 @@ def save(
     base: Checkpoint | None = None,
     samples: Mapping[str, bytes] | None = None,
 ) -> Checkpoint:
-    """Write a model and all its embodiments; an existing checkpoint of that name is replaced in one step.
+    """Write a model and all its embodiments; replace an existing checkpoint of that name in one step.
 
     Args:
-        model: with every embodiment of `embodiment_yaml`.
-        folder: str or path of its folder; an error leaves an older checkpoint there as it was.
+        model: has exactly the embodiments of `embodiment_yaml`.
+        folder: str or path of the folder; an error leaves an older checkpoint there as it was.
         embodiment_yaml: id -> registry YAML.
         stats: id -> {"action": {"mean", "std", ...}, ...}.
-        cards: id -> what is known of its data and metrics; ids without one get an empty one.
+        cards: id -> the known facts of its data and metrics; an id without a card gets an empty one.
         tokenizer: the spec, plain values.
-        training: fills the folder `training/` it is given, for what only a resumed run needs.
-        base: a checkpoint whose trunk this is: its trunk, its configuration and the files of its other
-            embodiments are taken over as they are.
+        training: writes what only a resumed run needs into the folder `training/`, which it is given.
+        base: a checkpoint with the same trunk. Its trunk, its configuration and the files of its other
+            embodiments are taken over unchanged.
         samples: id -> a PNG shown in the model card.
 
     Raises:
-        CheckpointError: parts do not agree, the folder holds something else, or cannot be written.
+        CheckpointError: parts do not agree, the folder holds something else, or it cannot be written.
     """
     from safetensors import SafetensorError
 
@@ -122,16 +123,16 @@ def load(
     device: str = "cpu",
     tokenizer: "TokenizerSpec | None" = None,
 ) -> "HMA":
-    """The model of a checkpoint with the trunk and the embodiments asked for, and nothing else read.
+    """Return the model of a checkpoint with the chosen embodiments; read nothing else.
 
     Args:
         folder: str or path of a checkpoint, or of a training run.
-        embodiments: ids; None for all that are there.
+        embodiments: ids; None for all of the checkpoint.
         device: where the model goes.
-        tokenizer: refuse a model that was trained on another.
+        tokenizer: the expected tokenizer; a model that was trained on another one is refused.
 
     Raises:
-        CheckpointError: missing, damaged, or parts that do not belong together; each with its reason.
+        CheckpointError: the checkpoint is missing or damaged, or its parts do not belong together.
     """
     from hma_model.network.model import HMA
 
@@ -157,7 +158,7 @@ def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> Non
 def read_embodiment(
     checkpoint: Checkpoint, embodiment: str
 ) -> tuple[ActionSpace, weights.State, weights.State]:
-    """An embodiment's action space and the tensors of its stem and head, all checked.
+    """Return an embodiment's action space and the tensors of its stem and head, all checked.
 
     Raises:
         CheckpointError: parts do not belong together, or are damaged.
@@ -176,7 +177,7 @@ def read_embodiment(
 
 
 def update_card(folder: StrPath, embodiment: str, **facts: Any) -> dict[str, Any]:
-    """Add to an embodiment's card (`metrics` merges, all else replaces) and renew README.md."""
+    """Update an embodiment's card (`metrics` is merged, other facts are replaced), and README.md."""
     checkpoint = Checkpoint.open(folder)
     card = dict(checkpoint.card(embodiment))
     metrics = {**card.get("metrics", {}), **facts.pop("metrics", {})}
@@ -187,7 +188,7 @@ def update_card(folder: StrPath, embodiment: str, **facts: Any) -> dict[str, Any
 
 
 def write_readme(folder: StrPath) -> None:
-    """Make README.md from the cards in a checkpoint's folder."""
+    """Write README.md from the cards in a checkpoint's folder."""
     from hma_model.checkpoint.model_card import render
 
     folder = as_path(folder)
@@ -199,7 +200,7 @@ def write_readme(folder: StrPath) -> None:
 
 
 def remove(folder: StrPath) -> None:
-    """Delete a checkpoint so that a cut deletion leaves no half of one under its name."""
+    """Delete a checkpoint; an interrupted deletion leaves no partial checkpoint under its name."""
     folder = as_path(folder)
     doomed = folder.with_name(f".{folder.name}.partial-removed")
     shutil.rmtree(doomed, ignore_errors=True)
@@ -208,7 +209,7 @@ def remove(folder: StrPath) -> None:
 
 
 def config_json(config: HMAConfig, trunk_sha256: str) -> dict[str, Any]:
-    """What config.json holds."""
+    """Return the content of config.json."""
     model = config.to_json()
     tokenizer = model.pop("tokenizer")
     return {
@@ -221,7 +222,7 @@ def config_json(config: HMAConfig, trunk_sha256: str) -> dict[str, Any]:
 
 
 def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
-    """Put a checkpoint's trunk and embodiments, but for some, in a new folder; returns the trunk's hash."""
+    """Link or copy a checkpoint's trunk and embodiments, except `besides`; return the trunk's hash."""
     kept = [name for name in base.embodiments if name not in besides]
     names = [CONFIG, TRUNK]
     for name in kept:

@@ -1,7 +1,7 @@
-"""Older format versions of a checkpoint, brought to the newest as they are read; files stay as they are.
+"""Convert older format versions of a checkpoint to the newest when they are read; files do not change.
 
-`STEPS` has a step for each version that is followed by another: it takes what a file of that version holds to
-what one of the next holds. A release that raises the format version adds a step here and a test.
+`STEPS` has a step for each version but the newest. A step converts the content of a file to the next version.
+A release that raises the format version adds a step here and a test.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,12 +25,12 @@ def _same_tensors(part: str, tensors: Values) -> Values:
 
 @dataclass(frozen=True)
 class Step:
-    """From one version to the next.
+    """The conversion from one version to the next.
 
     Attributes:
-        config: config.json's values.
-        card: card.json's values.
-        tensors: the file's name without its suffix (trunk, stem, head), and its tensors by name.
+        config: converts the values of config.json.
+        card: converts the values of card.json.
+        tensors: converts the tensors of a file by name, given its name without suffix (trunk, stem, head).
     """
 
     config: Callable[[Values], Values] = _same
@@ -42,10 +42,10 @@ STEPS: dict[int, Step] = {}
 
 
 def config(values: Mapping[str, Any], where: object) -> Values:
-    """config.json's values in the newest version.
+    """Return the values of config.json in the newest version.
 
     Raises:
-        CheckpointError: of a version that this release does not know.
+        CheckpointError: the values are of a version that this release does not know.
     """
     new = deepcopy(dict(values))
     for version in _path(values.get("format_version"), where):
@@ -54,7 +54,7 @@ def config(values: Mapping[str, Any], where: object) -> Values:
 
 
 def card(values: Mapping[str, Any], where: object) -> Values:
-    """card.json's values in the newest version; see `config`."""
+    """Return the values of card.json in the newest version; see `config`."""
     new = deepcopy(dict(values))
     for version in _path(values.get("format_version", FORMAT_VERSION), where):
         new = STEPS[version].card(new) | {"format_version": version + 1}
@@ -62,14 +62,14 @@ def card(values: Mapping[str, Any], where: object) -> Values:
 
 
 def tensors(part: str, values: Values, version: int, where: object) -> Values:
-    """The tensors of a file of some version under the newest one's names and shapes; see `config`."""
+    """Return the tensors of a file with the names and shapes of the newest version; see `config`."""
     for step in _path(version, where):
         values = STEPS[step].tensors(part, values)
     return values
 
 
 def _path(version: object, where: object) -> range:
-    """The versions to step through."""
+    """Return the versions to convert from, one after the other."""
     oldest = min(STEPS, default=FORMAT_VERSION)
     if not isinstance(version, int) or isinstance(version, bool) or not oldest <= version <= FORMAT_VERSION:
         newer = isinstance(version, int) and version > FORMAT_VERSION

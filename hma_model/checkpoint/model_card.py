@@ -1,7 +1,7 @@
-"""README.md of a checkpoint, made from its config.json and card.json files alone.
+"""Write README.md of a checkpoint, from its config.json and card.json files alone.
 
-The same facts give the same text, so that whoever pushes last writes what everybody would.
-Cards may come from strangers: see `hma_model.checkpoint.card_text`.
+The same facts give the same text, so it does not matter who pushes last. Cards may come from untrusted
+authors: see `hma_model.checkpoint.card_text`.
 """
 
 from collections.abc import Collection, Mapping
@@ -21,12 +21,12 @@ def render(
     repo: str | None = None,
     samples: Collection[str] = (),
 ) -> bytes:
-    """The model card.
+    """Return the model card as bytes.
 
     Args:
-        config: config.json's values.
-        cards: id -> card.json's values.
-        repo: how a reader will name the checkpoint; None for a path of their own.
+        config: the values of config.json.
+        cards: id -> the values of card.json.
+        repo: the name of the checkpoint for a reader; None for the reader's own path.
         samples: ids that have a sample.png.
     """
     name = repo or "PATH"

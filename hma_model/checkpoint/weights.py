@@ -1,7 +1,7 @@
-"""The weights of a checkpoint, checked against its configuration before a network of that size is built.
+"""Read the weights of a checkpoint, and check its configuration against them before a network is built.
 
-A configuration may come from a stranger and ask for more memory than there is; its file of weights cannot,
-since it has the size that it has.
+A configuration from an untrusted author may ask for more memory than there is. The file of weights limits it:
+a network with more values than the file is refused.
 """
 
 from collections.abc import Mapping
@@ -18,20 +18,21 @@ if TYPE_CHECKING:
     from hma_model.config import ActionSpace, HMAConfig
 
 State = dict[str, "Tensor"]
-MOST = 1_000_000  # of anything a configuration counts
+MOST = 1_000_000  # upper limit of every count in a configuration
 _COUNTS = ("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "history_frames",
            "diffusion_depth", "diffusion_width", "diffusion_train_steps", "diffusion_sample_steps",
            "grid", "factored")  # fmt: skip
-MOST_TENSORS = 20_000  # of a file; the paper's largest has some 2,000
+MOST_TENSORS = 20_000  # upper limit of a file; the paper's largest has some 2,000
 _FLOATS = ("float16", "bfloat16", "float32", "float64")
 _REMEDY = "pull the checkpoint again; if it stays so, do not use it"
 
 
 def trunk(checkpoint: "Checkpoint") -> State:
-    """The trunk's tensors, in the newest format version.
+    """Read the trunk's tensors, in the newest format version.
 
     Raises:
-        CheckpointError: damaged, another trunk than config.json names, or not of its network.
+        CheckpointError: the file is damaged, is another trunk than config.json names, or does not fit its
+            network.
     """
     path = checkpoint.trunk()
     state: State = migrate.tensors("trunk", read_tensors(path), checkpoint.format_version, path)
@@ -41,10 +42,10 @@ def trunk(checkpoint: "Checkpoint") -> State:
 
 
 def embodiment(checkpoint: "Checkpoint", name: str, space: "ActionSpace") -> tuple[State, State]:
-    """The tensors of an embodiment's stem and head; `space` is what its YAML says.
+    """Read the tensors of an embodiment's stem and head; `space` is the action space of its YAML.
 
     Raises:
-        CheckpointError: damaged, or of fewer values than the action space has.
+        CheckpointError: a file is damaged, or too small for the action space.
     """
     states = []
     for part in ("stem", "head"):
@@ -63,7 +64,7 @@ def embodiment(checkpoint: "Checkpoint", name: str, space: "ActionSpace") -> tup
 
 
 def _require_values(where: object, state: Mapping[str, "Tensor"]) -> None:
-    """Raise where what should be weights are no finite floating point numbers, or are strangely many."""
+    """Raise if weights are not finite floating point numbers, or if there are too many tensors."""
     if len(state) > MOST_TENSORS:
         raise CheckpointError(where, f"has {len(state):,} tensors: no network of ours", _REMEDY)
     for name, tensor in state.items():
@@ -75,9 +76,10 @@ def _require_values(where: object, state: Mapping[str, "Tensor"]) -> None:
 
 
 def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: object) -> None:
-    """Raise where a network of this configuration has more values than the trunk's file.
+    """Raise if a network of this configuration has more values than the trunk's file.
 
-    Names and shapes are compared when they are loaded; this only keeps what is built before that small.
+    Names and shapes are compared later, on loading. This check limits the size of the network that is built
+    before.
     """
     for key in _COUNTS:
         value = getattr(config, key)

@@ -1,6 +1,6 @@
-"""The `hma` command: its entry point, the model verbs, and the data verbs of hma_data.cli.
+"""Define the `hma` command: its entry point, the model verbs, and the data verbs of hma_data.cli.
 
-Every verb imports what it needs when it runs, so that --help answers at once.
+Every verb imports its modules when it runs, so that --help answers at once.
 """
 
 import os
@@ -34,13 +34,13 @@ _Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; errors become one line on stderr.
+    """Run a command, and report an error as one line on stderr.
 
     Args:
         argv: the words after `hma`; None takes the process's own.
 
     Returns:
-        The exit code: 0 well, 1 failed or problems found, 2 wrong usage, 130 interrupted.
+        The exit code: 0 success, 1 failure or problems found, 2 wrong usage, 130 interrupted.
     """
     take_ordinary_priority()
     bound_spinning()
@@ -101,7 +101,7 @@ def demo(
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Of training.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of recording and training.")] = 0,
 ) -> None:
-    """The main job, small: record, convert, mix, train, publish, roll out, report.
+    """Run the whole pipeline, small: record, convert, mix, train, publish, roll out, report.
 
     Example: hma demo --out demo
     """
@@ -126,7 +126,7 @@ def evaluate(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the rollouts.")] = 0,
     json: Json = False,
 ) -> None:
-    """Loss beside its baseline, and rollouts with true and shuffled actions.
+    """Measure the loss and its baseline, and rollouts with true and shuffled actions.
 
     Example: hma evaluate runs/first shards/my_arm
     """
@@ -175,7 +175,7 @@ def generate(
     ] = 0.0,
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
 ) -> None:
-    """A rollout beside the truth, as a video.
+    """Write a video of a rollout beside the truth.
 
     Example: hma generate runs/first shards/my_arm --out rollout.mp4
     """

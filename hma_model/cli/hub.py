@@ -1,4 +1,4 @@
-"""The verbs of `hma hub`: checkpoints robot by robot, shard sets, and the release's layout in and out."""
+"""Define the verbs of `hma hub`: publish and fetch checkpoints and shard sets; convert released ones."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -46,7 +46,7 @@ def pull(
     out: Annotated[Path | None, typer.Option("--out", help="Folder; default the local cache.")] = None,
     revision: Revision = None,
 ) -> None:
-    """Fetch the trunk and the robots asked for, nothing else.
+    """Fetch the trunk and only the chosen robots.
 
     Example: hma hub pull team/model -e my_arm --out model
     """
@@ -61,7 +61,7 @@ def listing(
     revision: Revision = None,
     json: Json = False,
 ) -> None:
-    """The checkpoints there and their robots, and whether they can be used here.
+    """List checkpoints and their robots, and whether they can be used here.
 
     Example: hma hub list ./my-hub
     """
@@ -95,7 +95,7 @@ def push_data(
     target: Annotated[str, typer.Argument(help="org/name of a dataset on the hub, or a folder.")],
     private: Private = False,
 ) -> None:
-    """Publish a shard set as a dataset; run it again to go on after an interruption.
+    """Publish a shard set as a dataset; run it again to continue after an interruption.
 
     Example: hma hub push-data shards/my_arm team/my_arm
     """
@@ -110,7 +110,7 @@ def pull_data(
     out: Annotated[Path, typer.Option("--out", help="Folder of the shard set.")],
     revision: Revision = None,
 ) -> None:
-    """Fetch a published shard set; run it again to go on after an interruption.
+    """Fetch a published shard set; run it again to continue after an interruption.
 
     Example: hma hub pull-data team/my_arm --out shards/my_arm
     """
@@ -129,7 +129,7 @@ def import_released(
     revision: Revision = None,
     json: Json = False,
 ) -> None:
-    """Bring a checkpoint of the paper's release into our layout.
+    """Convert a checkpoint of the paper's release to our layout.
 
     Example: hma hub import liruiw/hma-base-disc --out hma-base-disc
     """
@@ -189,7 +189,7 @@ def _state(facts: dict[str, Any]) -> str:
 
 
 def _cell(value: Any, most: int = 80) -> Any:
-    """A stranger's value as a terminal may show it: numbers as they are, text without control characters."""
+    """Return an untrusted value that a terminal may show: a number, or text without control characters."""
     if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
         return value
     return "".join(c if c.isprintable() else "?" for c in str(value))[:most]

@@ -1,4 +1,4 @@
-"""`hma train` and `hma finetune`."""
+"""Define the commands `hma train` and `hma finetune`."""
 
 import os
 from pathlib import Path
@@ -66,7 +66,7 @@ def finetune(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """A new stem and head on a trained trunk; run it again to resume.
+    """Train a new stem and head on a trained trunk; run it again to resume.
 
     Example: hma finetune --from team/model --data shards/my_arm --freeze-trunk --out runs/my_arm
     """

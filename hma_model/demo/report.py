@@ -1,4 +1,4 @@
-"""The page that ends `hma demo`."""
+"""Write the report of `hma demo`."""
 
 import sys
 from pathlib import Path
@@ -37,7 +37,7 @@ hma hub push runs/my_arm ./my-hub/team/model --embodiment my_arm
 
 
 def write_report(made: "Demo") -> Path:
-    """Write `out`/report.html from what the demo has made."""
+    """Write `out`/report.html from the results of the demo."""
     from hma_model.demo.run import machine, save_page
 
     page = Page(
@@ -131,7 +131,7 @@ def _held_out(shards: ShardSet, count: int) -> list[dict[str, Any]]:
 
 
 def real_frames(made: "Demo", shards: ShardSet, episode: str, picks: Any) -> Any:
-    """The recording's own frames (n, S, S, 3), as the tokenizer saw them."""
+    """Return recorded frames (n, S, S, 3), as the tokenizer saw them."""
     robot = find(shards.embodiment.id)
     source = open_source(robot.source.format)
     clip = to_clip(source.read(str(made.recordings[robot.id]), episode, robot), robot)
@@ -142,7 +142,7 @@ def real_frames(made: "Demo", shards: ShardSet, episode: str, picks: Any) -> Any
 
 
 def decoded(shards: ShardSet, episode_index: int, picks: Any) -> Any:
-    """Frames (n, S, S, 3) decoded from an episode's tokens."""
+    """Return frames (n, S, S, 3) decoded from an episode's tokens."""
     tokens = shards.tokens(shards.episode_rows(episode_index, ["tokens"])["tokens"])
     return tokenizer_of(shards).decode(tokens[picks])
 

@@ -1,9 +1,9 @@
-"""`hma demo`: the whole road, small, over the same public functions as every other verb.
+"""Run the whole pipeline on two small robots (`hma demo`), with the same functions as every other verb.
 
-Two laboratory robots are recorded in two formats, converted to tokenized shards, mixed, trained
-on together, published to a folder hub, pulled back one robot at a time, rolled out on episodes the
-model has not seen, and reported on one page. Nothing is downloaded. Run again in the same folder it
-goes on where it was cut.
+The demo records two laboratory robots in two formats, converts the recordings to tokenized shards, mixes them
+and trains one model on both. It publishes the model to a folder hub, pulls it back one robot at a time, rolls
+it out on episodes that it has not seen, and writes a report of one page. It downloads nothing. A second run
+in the same folder continues an interrupted one.
 """
 
 import json
@@ -41,25 +41,25 @@ ROBOTS = ("pusht_fast", "pusht_slow")
 TOKENIZER = "fsq-8"
 TAU = 3.0
 TIMINGS, RESULTS = "timings.json", "results.json"
-WINDOWS = 24  # held-out windows of each robot that figures are means of
+WINDOWS = 24  # held-out windows of each robot; the figures are means over them
 LONGEST = 24  # frames of the film
 
 
 @dataclass
 class Demo:
-    """What the demo has made so far; the report is written from it.
+    """The results of the demo so far; the report is written from them.
 
     Attributes:
-        out: its folder.
+        out: the folder of the demo.
         recordings: robot -> URI.
         sets: robot -> shard set.
         mixture: over the train windows.
         training: result of the run.
-        published, pulled: folders of the hub and of what was pulled back.
-        figures: robot -> what `evaluate` found on its held-out windows.
+        published, pulled: folders of the hub, and of each robot's pulled checkpoint.
+        figures: robot -> the result of `evaluate` on its held-out windows.
         films: robot -> a held-out rollout.
         seconds: stage -> wall time.
-        sizes: what -> bytes.
+        sizes: name of a file or folder -> bytes.
     """
 
     out: Path
@@ -76,14 +76,14 @@ class Demo:
 
     @contextmanager
     def stage(self, number: int, name: str) -> Iterator[None]:
-        """Time a stage and say so."""
+        """Print the name of a stage, and measure its time."""
         print(f"[{number}/5] {name}", file=sys.stderr, flush=True)
         begun = time.monotonic()
         yield
         self.took(name, time.monotonic() - begun)
 
     def took(self, name: str, seconds: float) -> None:
-        """Note a stage's time; a run that goes on keeps what an earlier one needed for it."""
+        """Record the time of a stage; a continued run keeps the larger of the times of its runs."""
         path = self.out / TIMINGS
         known = json.loads(path.read_text()) if path.is_file() else {}
         known[name] = max(seconds, known.get(name, 0.0))
@@ -92,16 +92,16 @@ class Demo:
 
 
 def demo(out: StrPath, *, episodes: int = 24, steps: int | None = None, seed: int = 0) -> Path:
-    """Run the main job into `out`.
+    """Run the demo, with its results in `out`.
 
     Args:
         out: str or path of a folder.
-        episodes: recorded for each robot.
-        steps: of training; None takes the recipe's.
-        seed: of recording and training.
+        episodes: the number recorded for each robot.
+        steps: training steps; None takes the recipe's.
+        seed: the seed of recording and training.
 
     Returns:
-        The report, `out`/report.html.
+        The path of the report, `out`/report.html.
 
     Raises:
         OutputError: the folder holds something else.
@@ -128,7 +128,7 @@ def demo(out: StrPath, *, episodes: int = 24, steps: int | None = None, seed: in
 
 @dataclass(frozen=True)
 class Recorded:
-    """What the first stage makes of one robot.
+    """The result of the first stage for one robot.
 
     Attributes:
         refused: more episodes than allowed are in quarantine.
@@ -143,7 +143,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Recording:
-    """Makes a worker's function, from a robot's name to its recording and shard set; picklable."""
+    """A picklable factory of the function by which a worker records and converts a robot."""
 
     out: Path
     episodes: int
@@ -176,9 +176,9 @@ class Recording:
 
 
 def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
-    """Stage 1: a few dozen episodes of each robot from gym-pusht, to verified shard sets.
+    """Record episodes of each robot in gym-pusht, and convert them to verified shard sets (stage 1).
 
-    Each robot has a process of its own, which ends when this one does.
+    Each robot has its own process, which ends when this process ends.
     """
     finished = all((made.out / "shards" / robot / MANIFEST).is_file() for robot in ROBOTS)
     workers = 0 if finished or usable_cores() == 1 else len(ROBOTS)
@@ -198,7 +198,7 @@ def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
 
 
 def _take_shards(made: Demo, one: Recorded) -> None:
-    """Verify a robot's shard set and note it."""
+    """Verify a robot's shard set, and add it to the results."""
     robot, folder = one.robot, made.out / "shards" / one.robot
     problems = verify(folder)
     if problems or one.refused:
@@ -211,7 +211,7 @@ def _take_shards(made: Demo, one: Recorded) -> None:
 
 
 def mix(made: Demo) -> None:
-    """Stage 2: how often each robot is drawn."""
+    """Compute how often each robot is drawn (stage 2)."""
     from hma_model.training.recipe import load_recipe
 
     frames = load_recipe("demo").frames
@@ -223,7 +223,7 @@ def mix(made: Demo) -> None:
 
 
 def train_both(made: Demo, steps: int | None, seed: int) -> None:
-    """Stage 3: one small model on both robots."""
+    """Train one small model on both robots (stage 3)."""
     from hma_model.training.loop import train
     from hma_model.training.recipe import load_recipe
 
@@ -241,7 +241,7 @@ def train_both(made: Demo, steps: int | None, seed: int) -> None:
 
 
 def publish(made: Demo) -> None:
-    """Stage 4: push the checkpoint to a folder hub, pull each robot back alone."""
+    """Push the checkpoint to a folder hub, and pull each robot back alone (stage 4)."""
     from hma_model.hub import publish as hub
 
     made.published = made.out / "hub" / "demo" / "pusht"
@@ -253,9 +253,9 @@ def publish(made: Demo) -> None:
 
 
 def roll_out(made: Demo) -> None:
-    """Stage 5: each robot's figures and film, by the model that was pulled for it alone.
+    """Compute each robot's figures and film with the model pulled for it alone (stage 5).
 
-    The robots are worked on side by side, each by one thread: so many small products gain little from two.
+    The robots run in parallel, each in one thread, because a second thread speeds up small products little.
     """
     from hma_data.tokenizers.network import single_threads
 
@@ -271,7 +271,7 @@ def roll_out(made: Demo) -> None:
 
 
 def write_results(made: Demo) -> None:
-    """Write results.json: the seconds in all, and what the actions are worth in each robot's last frames."""
+    """Write results.json: the total seconds, and the PSNR of each robot's last frames."""
     names = {"true": "psnr_last", "shuffled": "psnr_last_shuffled", "copy": "psnr_last_copy"}
     figures = {
         robot: {name: found[key]["psnr_last"] for key, name in names.items()}
@@ -313,7 +313,7 @@ def _size(path: Path) -> int:
 
 
 def machine() -> str:
-    """What this ran on, in a line."""
+    """Return one line that describes the machine and the versions."""
     import torch
 
     versions = f"Python {platform.python_version()}, torch {torch.__version__}"
@@ -321,7 +321,7 @@ def machine() -> str:
 
 
 def save_page(made: Demo, html: str) -> Path:
-    """Write the report; returns its path."""
+    """Write the report, and return its path."""
     path = made.out / "report.html"
     write_atomic(path, html)
     total = human_seconds(sum(made.seconds.values()))

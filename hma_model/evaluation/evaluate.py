@@ -1,10 +1,10 @@
-"""How well a model predicts: its loss beside what ignoring everything reaches, and its rollouts.
+"""Measure how well a model predicts: its loss, a baseline that ignores all input, and its rollouts.
 
-The loss is the cross-entropy in nats a token of each frame, fully masked, given the true frames and
-actions before it; it is averaged over the frames from the second on. The same form is computed for
-the frequencies of the training tokens, which is what a model would reach that looks at nothing.
-Rollouts go on from their own predictions; they are made with the true actions and with those of another
-window, so that the difference shows what the actions are worth.
+The loss is the cross-entropy in nats a token of each fully masked frame, given the true frames and actions
+before it. It is averaged over the frames from the second on. The baseline is the same cross-entropy for the
+frequencies of the training tokens: a model that ignores its input would reach it. A rollout continues from
+its own predictions. Rollouts are made with the true actions and with the actions of another window; the
+difference shows how much the model uses the actions.
 
 B batch, T frames, P frames of the prompt, h,w grid, F digits, V values a digit, S pixels a side.
 """
@@ -32,30 +32,30 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 BASELINE_FRAMES = 200_000
-PSNR_LIMIT = 60.0  # dB; equal pictures would be infinite, and a mean over frames with them
+PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
 
 RealFrames = Callable[[int, NDArray[np.int64]], NDArray[np.uint8]]
 
 
 @dataclass
 class Means:
-    """Sums by embodiment, weighted by samples."""
+    """Sums and counts of sample values by embodiment."""
 
     sums: dict[str, float] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
 
     def add(self, names: Sequence[str], values: Tensor | NDArray[Any]) -> None:
-        """One value (B,) a sample."""
+        """Add one value a sample, (B,)."""
         for name, value in zip(names, values.tolist()):
             self.sums[name] = self.sums.get(name, 0.0) + value
             self.counts[name] = self.counts.get(name, 0) + 1
 
     def by_embodiment(self) -> dict[str, float]:
-        """Mean of each, sorted by id."""
+        """Return the mean of each embodiment, sorted by id."""
         return {name: self.sums[name] / self.counts[name] for name in sorted(self.sums)}
 
     def mean(self) -> float:
-        """Mean over all samples; not a number where there are none."""
+        """Return the mean over all samples; NaN if there are none."""
         return sum(self.sums.values()) / max(sum(self.counts.values()), 1) if self.counts else float("nan")
 
 
@@ -65,7 +65,7 @@ class Means:
 def windows(
     data: StrPath | ShardSet, split: str, frames: int, count: int, batch_size: int = 8
 ) -> Iterator[Batch]:
-    """Up to `count` windows of a split, evenly spaced and always the same, in batches."""
+    """Yield up to `count` windows of a split in batches; they are evenly spaced and always the same."""
     dataset = WindowDataset(data, split, frames)
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(np.int64))
     for start in range(0, len(chosen) if len(dataset) else 0, batch_size):
@@ -74,7 +74,7 @@ def windows(
 
 @torch.no_grad()
 def validation_losses(model: "HMA", batches: Iterable[Batch], seed: int = 0) -> tuple[Means, Means]:
-    """Loss and accuracy of each window, gathered by embodiment.
+    """Return the losses and accuracies of the windows, by embodiment.
 
     The continuous model's loss is its diffusion loss under masks and noise drawn from `seed`; it has no
     accuracy.
@@ -96,16 +96,17 @@ def validation_losses(model: "HMA", batches: Iterable[Batch], seed: int = 0) -> 
 
 
 def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
-    """Mean loss over windows: nats a token of each fully masked frame given the true past."""
+    """Return the mean loss over windows: nats a token of each fully masked frame given the true past."""
     return validation_losses(model, batches)[0].mean()
 
 
 def digit_frequencies(
     shards: ShardSet, split: str = "train", max_frames: int = BASELINE_FRAMES
 ) -> list[NDArray[np.float64]]:
-    """How often each digit takes each of its values: F arrays (V,), add-one smoothed, summing to one.
+    """Return the frequency of each value of each digit: F arrays (V,), add-one smoothed, summing to one.
 
-    Of a larger split, row groups spread evenly over it are counted, at most about `max_frames` frames.
+    In a split of more than `max_frames` frames, only row groups spread evenly over it are counted, about
+    `max_frames` frames at most.
     """
     factored = shards.spec.factored or (shards.spec.vocab_size or 1,)
     counts = [np.ones(values) for values in factored]
@@ -127,14 +128,14 @@ def digit_frequencies(
 def unconditional_baseline(
     train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet], batches: Iterable[Batch]
 ) -> Means:
-    """What looking at nothing reaches: cross-entropy of each embodiment's training frequencies.
+    """Return the cross-entropy of each embodiment's training frequencies, which ignores all input.
 
     Args:
         train: shard sets (or the str or path of each), whose train frames are counted, digit by digit.
         batches: validation windows of discrete tokens.
 
     Returns:
-        nats a token by embodiment, over the frames from the second on, as `masked_val_loss` counts.
+        Nats a token by embodiment, over the frames from the second on, as in `masked_val_loss`.
     """
     sets = train.values() if isinstance(train, Mapping) else [_opened(item) for item in train]
     scores = {s.embodiment.id: [np.log(p) for p in digit_frequencies(s)] for s in sets}
@@ -155,7 +156,7 @@ def unconditional_baseline(
 
 @dataclass(frozen=True)
 class Pictures:
-    """A rollout and what it is held against, all uint8 (B, T, S, S, 3); the first P frames are the prompt."""
+    """A rollout and the truth, both uint8 (B, T, S, S, 3); the first P frames are the prompt."""
 
     prompt: int
     predicted: NDArray[np.uint8]
@@ -176,21 +177,21 @@ def rollout(
     seed: int = 0,
     truth: NDArray[np.uint8] | None = None,
 ) -> Pictures:
-    """Go on from the first frames of each window with its actions.
+    """Predict the frames that follow the first frames of each window, given its actions.
 
     Args:
         model: in eval mode.
-        tokenizer: the one it was trained on.
+        tokenizer: the tokenizer that the model was trained on.
         batch: windows of T frames; their tokens are the truth.
         frames: how many to predict; by default all after the prompt.
         prompt: P true frames to start from; by default a third of the window, at least one.
-        actions: (B, T, K) raw instead of the window's own.
+        actions: (B, T, K) raw, which replace the actions of the windows.
         unmask_steps, temperature, sample_steps: as in `HMA.generate`.
         seed: of every random draw.
-        truth: the decoded frames of another rollout of the same windows, to spare decoding them again.
+        truth: the decoded frames of another rollout of the same windows, which are then not decoded again.
 
     Raises:
-        UsageError: more frames than the windows have.
+        UsageError: the prompt and the frames do not fit the windows, or one of them is empty.
     """
     length = batch.actions.shape[1]
     first = default_prompt(length) if prompt is None else prompt
@@ -216,12 +217,12 @@ def rollout(
 
 
 def default_prompt(length: int) -> int:
-    """Frames of a window of this length that a rollout starts from."""
+    """Return how many frames of a window of this length a rollout starts from."""
     return max(1, length // 3)
 
 
 def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
-    """(B, T, h, w) ids or (B, T, c, H, W) latents -> (B, T, S, S, 3) uint8."""
+    """Decode ids (B, T, h, w) or latents (B, T, c, H, W) to pictures (B, T, S, S, 3) uint8."""
     values = stored.flatten(0, 1).cpu().numpy()
     dtype = np.uint32 if tokenizer.spec.kind == "discrete" else np.dtype(tokenizer.spec.dtype)
     pictures = tokenizer.decode(values.astype(dtype))
@@ -229,9 +230,9 @@ def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
 
 
 def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0) -> Tensor:
-    """(B, T, K) each window's chunks from `begin` on replaced by another window's of the same embodiment.
+    """Replace each window's chunks from `begin` on by those of another window of the same embodiment.
 
-    A window that is the only one of its embodiment gets its own in reverse.
+    A window that is the only one of its embodiment gets its own chunks in reverse. Return (B, T, K).
     """
     actions = batch.actions.clone()
     source = batch.actions[:, begin:]
@@ -261,28 +262,29 @@ def evaluate(
     seed: int = 0,
     real: RealFrames | None = None,
 ) -> dict[str, Any]:
-    """A model's figures on one shard set.
+    """Compute a model's figures on one shard set.
 
     Args:
-        model: with the shard set's embodiment.
-        tokenizer: the shard set's.
+        model: a model that has the embodiment of the shard set.
+        tokenizer: the tokenizer of the shard set.
         data: str or path of the shard set, its URI, or the set itself.
         split: train or val.
-        count: windows, evenly spaced; where the split has fewer, all.
+        count: windows, evenly spaced; all windows if the split has fewer.
         frames: T of a window; by default the model's.
         prompt: true frames a rollout starts from.
-        unmask_steps, temperature, sample_steps, seed: of the rollouts.
-        real: gives the recording's own frames of (episode_index, (n,) frame indices) at the tokenizer's size,
-            to hold the rollouts against; by default they are held against the decoded true tokens.
+        unmask_steps, temperature, sample_steps, seed: settings of the rollouts.
+        real: returns the recorded frames of (episode_index, (n,) frame indices) at the tokenizer's size. The
+            rollouts are compared with them; by default they are compared with the decoded true tokens.
 
     Returns:
-        `loss` (nats a token), and of discrete models `shuffled_loss` (given another window's actions),
-        `baseline_loss`, `perplexity` and `accuracy`; and for rollouts with the
-        `true` actions, with `shuffled` ones and for `copy`, the last frame of the prompt repeated: `psnr` and
-        `ssim` over the horizon, `psnr_last`, `psnr_by_frame`. `psnr_action_gain_last` is true less shuffled.
+        `loss` (nats a token); for discrete models also `shuffled_loss` (given another window's actions),
+        `baseline_loss`, `perplexity` and `accuracy`. For rollouts with the `true` actions, with `shuffled`
+        actions, and for `copy`, which repeats the last frame of the prompt: `psnr` and `ssim` over the
+        horizon, `psnr_last` and `psnr_by_frame`. `psnr_action_gain_last` is `psnr_last` of true minus that of
+        shuffled.
 
     Raises:
-        CheckpointError: the model is of another tokenizer.
+        CheckpointError: the model was trained on another tokenizer.
         UsageError: the split has no window.
     """
     shards = _opened(data)

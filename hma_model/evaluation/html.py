@@ -1,6 +1,6 @@
-"""A report as one self-contained HTML page: text, tables, pictures and plots in sections.
+"""Build a report as one self-contained HTML page: text, tables, pictures and plots in sections.
 
-Nothing is fetched when it is opened; pictures are embedded. Readable in light and dark.
+Pictures are embedded, so opening the page fetches nothing. The page is readable in light and dark mode.
 """
 
 import base64
@@ -38,11 +38,11 @@ pre { background:var(--card); border:1px solid var(--line); border-radius:10px; 
 
 
 class Page:
-    """A page in the making; every method adds to its end.
+    """A page; every method but `html` adds to its end.
 
     Args:
-        title: of the page.
-        lead: a sentence below it.
+        title: the title of the page.
+        lead: a sentence below the title.
     """
 
     def __init__(self, title: str, lead: str) -> None:
@@ -50,18 +50,18 @@ class Page:
         self._parts = [f"<h1>{_text(title)}</h1><p class=soft>{_text(lead)}</p>"]
 
     def figures(self, values: Sequence[tuple[str, str]]) -> None:
-        """Key figures as tiles: (value, what it is)."""
+        """Add key figures as tiles: (value, description)."""
         tiles = "".join(
             f"<div><b>{_text(value)}</b><span>{_text(name)}</span></div>" for value, name in values
         )
         self._parts.append(f"<div class=figures>{tiles}</div>")
 
     def section(self, title: str, text: str = "") -> None:
-        """A heading and a paragraph."""
+        """Add a heading and a paragraph."""
         self._parts.append(f"<h2>{_text(title)}</h2>" + (f"<p>{_text(text)}</p>" if text else ""))
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-        """A table; numbers stand to the right."""
+        """Add a table; columns of numbers are aligned to the right."""
         right = [all(isinstance(row[i], int | float) for row in rows) for i in range(len(columns))]
         head = "".join(
             f"<th{' class=n' * r}>{_text(name)}</th>" for name, r in zip(columns, right, strict=True)
@@ -77,13 +77,13 @@ class Page:
     def picture(
         self, data: bytes, kind: str, caption: str, *, plot: bool = False, pixels: bool = False
     ) -> None:
-        """An embedded picture.
+        """Add an embedded picture.
 
         Args:
             data: the file's bytes.
             kind: png, webp or svg+xml.
-            caption: below it, and for those who cannot see it.
-            plot: drawn for white paper.
+            caption: the text below it, which is also its alternative text.
+            plot: the picture needs a white background.
             pixels: keep its pixels sharp.
         """
         source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
@@ -95,11 +95,11 @@ class Page:
         )
 
     def commands(self, text: str) -> None:
-        """Lines for a shell."""
+        """Add lines for a shell."""
         self._parts.append(f"<pre>{_text(text.strip())}</pre>")
 
     def html(self) -> str:
-        """The whole page."""
+        """Return the whole page."""
         head = (
             "<meta charset=utf-8>"
             '<meta name=viewport content="width=device-width, initial-scale=1">'

@@ -1,4 +1,4 @@
-"""How good pictures, tokens and distributions are.
+"""Compute metrics of predicted pictures and tokens.
 
 Picture metrics are numpy on uint8 or float pictures; token metrics are torch on logits.
 N pictures of (H, W, C); F factored digits, V values a digit.
@@ -20,7 +20,7 @@ SSIM_WINDOW = 7
 
 
 def psnr(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0) -> NDArray[np.float64]:
-    """Peak signal-to-noise ratio of each picture in dB; infinite where the two are equal.
+    """Return the peak signal-to-noise ratio of each picture in dB; infinite if the two are equal.
 
     Args:
         truth: (N, H, W, C) or (H, W, C).
@@ -37,10 +37,10 @@ def psnr(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0)
 
 
 def ssim(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0) -> NDArray[np.float64]:
-    """Structural similarity of each picture (Wang et al. 2004), averaged over its channels.
+    """Return the structural similarity of each picture (Wang et al. 2004), averaged over its channels.
 
-    A uniform 7x7 window, sample covariance, K1 0.01 and K2 0.03, windows inside the picture only:
-    the settings of the paper's evaluation.
+    The settings are those of the paper's evaluation: a uniform 7x7 window, sample covariance, K1 0.01 and
+    K2 0.03, and only windows inside the picture.
 
     Args:
         truth: (N, H, W, C) or (H, W, C), each side at least 7.
@@ -48,7 +48,7 @@ def ssim(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0)
         data_range: the span of the values.
 
     Returns:
-        (N,), 1 where the two are equal.
+        (N,), 1 if the two are equal.
     """
     truth, pictures = _pair(truth, pictures)
     if min(truth.shape[1:3]) < SSIM_WINDOW:
@@ -59,7 +59,7 @@ def ssim(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0)
 
 
 def _similarity(truth: NDArray[np.float64], picture: NDArray[np.float64], data_range: float) -> float:
-    """Of two pictures (H, W, C); one at a time, because what is in hand then fits a processor's cache."""
+    """Return the SSIM of two pictures (H, W, C); the arrays of one pair fit a processor's cache."""
     count = SSIM_WINDOW**2
     mean_x, mean_y = _box(truth), _box(picture)
     unbias = count / (count - 1)
@@ -82,7 +82,7 @@ def _pair(truth: NDArray[Any], pictures: NDArray[Any]) -> tuple[NDArray[np.float
 
 
 def _box(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Means over every 7x7 window inside (H, W, C), separable by running sums."""
+    """Return the mean over every 7x7 window inside (H, W, C), by running sums along each axis."""
     for axis in (0, 1):
         sums = np.zeros([n + (k == axis) for k, n in enumerate(values.shape)])
         behind, ahead = [slice(None)] * 3, [slice(None)] * 3
@@ -94,12 +94,12 @@ def _box(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def perplexity(nats: float) -> float:
-    """exp of a cross-entropy in nats a token; infinite rather than an overflow."""
+    """Return exp of a cross-entropy in nats a token; infinity in place of an overflow."""
     return math.exp(nats) if nats < 700 else math.inf
 
 
 def token_nats(logits: "Tensor", tokens: "Tensor", factored: Sequence[int]) -> "Tensor":
-    """Cross-entropy of each token in nats: the sum over its digits, no label smoothing.
+    """Return the cross-entropy of each token in nats: the sum over its digits, without label smoothing.
 
     Args:
         logits: (..., F, V).
@@ -121,7 +121,7 @@ def token_nats(logits: "Tensor", tokens: "Tensor", factored: Sequence[int]) -> "
 
 
 def token_hits(logits: "Tensor", tokens: "Tensor", factored: Sequence[int]) -> "Tensor":
-    """Where the likeliest id is the true one: every digit right. As `token_nats`, returns (...) bool."""
+    """Return (...) bool, True where every likeliest digit is the true one; arguments as in `token_nats`."""
     from hma_model.network.embed import to_digits
 
     return (logits.argmax(dim=-1) == to_digits(tokens, factored).to(logits.device)).all(dim=-1)

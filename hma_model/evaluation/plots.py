@@ -1,4 +1,4 @@
-"""Plots of training and rollouts as SVG: axes with units, told apart by dash and marker as well as colour."""
+"""Plot training and rollouts as SVG; curves differ in dash and marker as well as in colour."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ MARKERS = ("o", "s", "^", "D")
 def loss_curve(
     training: Sequence[tuple[int, float]], validation: Sequence[tuple[int, float]], baseline: float | None
 ) -> bytes:
-    """Training loss (thin, and its running mean), validation loss, and the baseline that looks at nothing.
+    """Plot the training loss with its running mean, the validation loss, and the token-frequency baseline.
 
     Args:
         training, validation: (step, nats a token).
@@ -47,11 +47,11 @@ def losses_by_robot(
     validation: Mapping[str, Sequence[tuple[int, float]]],
     label: str,
 ) -> bytes:
-    """Losses of each robot: training as a running mean, evaluations as markers.
+    """Plot the losses of each robot: training as a running mean, evaluations as markers.
 
     Args:
         training, validation: robot -> (step, loss).
-        label: of the losses' axis.
+        label: the label of the losses' axis.
     """
     figure, axes = _axes("training step", label)
     for i, name in enumerate(sorted(training)):
@@ -66,11 +66,11 @@ def losses_by_robot(
 
 
 def course(points: Sequence[tuple[int, float]], label: str, log: bool = False) -> bytes:
-    """One figure over the steps of a run.
+    """Plot one figure over the steps of a run.
 
     Args:
         points: (step, value).
-        label: of the value's axis, with its unit.
+        label: the label of the value's axis, with its unit.
         log: draw the values on a logarithmic axis.
     """
     figure, axes = _axes("training step", label)
@@ -82,11 +82,11 @@ def course(points: Sequence[tuple[int, float]], label: str, log: bool = False) -
 
 
 def psnr_over_horizon(curves: Mapping[str, Sequence[float]], seconds_per_frame: float) -> bytes:
-    """PSNR of each predicted frame.
+    """Plot the PSNR of each predicted frame.
 
     Args:
-        curves: name -> dB by frame after the prompt.
-        seconds_per_frame: of the model's grid.
+        curves: name -> PSNR in dB of each frame after the prompt.
+        seconds_per_frame: seconds between frames of the model.
     """
     figure, axes = _axes("seconds after the prompt", "PSNR, dB")
     for i, (name, values) in enumerate(curves.items()):
@@ -97,7 +97,7 @@ def psnr_over_horizon(curves: Mapping[str, Sequence[float]], seconds_per_frame: 
 
 
 def _running_mean(steps: Values, values: Values, parts: int) -> tuple[Values, Values]:
-    """Return steps and means over a `parts`-th of all values each."""
+    """Return steps and running means; each mean covers a `parts`-th of all values."""
     width = max(1, len(values) // parts)
     return steps[width - 1 :], np.convolve(values, np.ones(width) / width, "valid")
 

@@ -1,4 +1,4 @@
-"""A rollout as a film: truth, prediction with its actions, prediction with other actions, side by side."""
+"""Show a rollout as a film: truth, prediction with its actions, prediction with other actions."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
-SMALLEST = 192  # pixels a picture is shown at, at least
+SMALLEST = 192  # minimum width in pixels at which a picture is shown
 
 
 @dataclass(frozen=True)
 class Film:
-    """Frames (T, H, W, 3) uint8 at `fps`; the first `prompt` are given, not predicted."""
+    """Frames (T, H, W, 3) uint8 at `fps`; the first `prompt` of them are true frames, not predictions."""
 
     frames: NDArray[np.uint8]
     fps: float
@@ -49,13 +49,13 @@ def rollout_film(
 
     Args:
         model: in eval mode, with the shard set's embodiment.
-        window: its number among the windows of this length.
-        frames: to predict; None fills the model's window.
-        prompt: true frames to start from.
-        unmask_steps, temperature, sample_steps, seed: of the rollouts, as in `HMA.generate`.
+        window: the number of the window among the windows of this length.
+        frames: how many to predict; None fills the model's window.
+        prompt: how many true frames to start from.
+        unmask_steps, temperature, sample_steps, seed: settings of the rollouts, as in `HMA.generate`.
 
     Raises:
-        CheckpointError: the model is of another tokenizer.
+        CheckpointError: the model was trained on another tokenizer.
         UsageError: the split has no such window.
     """
     require_tokenizer(model.config, shards.spec, shards.folder)
@@ -102,10 +102,10 @@ def _side_by_side(panels: dict[str, NDArray[np.uint8]], prompt: int) -> NDArray[
 
 
 def write_film(path: StrPath, film: Film) -> None:
-    """An .mp4 or an animated .webp at a str or path, whole or absent.
+    """Write an .mp4 or an animated .webp to a str or path, atomically.
 
     Raises:
-        UsageError: another suffix.
+        UsageError: the path has another suffix.
     """
     path = as_path(path)
     if path.suffix == ".mp4":

@@ -1,4 +1,4 @@
-"""What the model predicts, as a picture a robot: truth, prediction, and prediction with other actions."""
+"""Draw a picture of each robot: truth, prediction, and prediction with other actions."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -24,16 +24,16 @@ def sample_pictures(
     """Write `pictures/step-N-ID.png` for each robot.
 
     Args:
-        model: as it is evaluated.
+        model: the evaluated model.
         sets: shard sets with validation windows.
         out: the run's folder.
-        step: steps done.
+        step: number of finished steps.
         frames: of a window.
         count: windows of each robot.
         seed: of the rollouts.
 
     Returns:
-        Why there are none, where the tokenizer cannot be had here; nothing otherwise.
+        The reason for no pictures if the tokenizer is not available here; else an empty string.
     """
     from hma_data.shards.preview import tokenizer_of
 
@@ -54,7 +54,7 @@ def sample_pictures(
 
 
 def newest_pictures(out: Path, names: Iterable[str]) -> dict[str, bytes]:
-    """The last picture of each robot that has one, PNG."""
+    """Return the last picture (PNG) of each robot that has one."""
     found = {}
     for name in names:
         paths = sorted((out / FOLDER).glob(f"step-????????-{name}.png"))

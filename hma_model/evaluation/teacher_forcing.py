@@ -1,7 +1,7 @@
-"""The loss of every frame of a window, fully masked, given the true past: in one pass over the network.
+"""Compute the loss of every frame of a window, fully masked, given the true past, in one pass.
 
-The window's frames come first, as they are; then each from the second on comes once more, masked, at the same
-time. A frame sees the true ones before it and itself, so that nothing has to be computed once a prefix.
+The input is the true frames of the window, then each frame from the second on again, masked, at the same
+time. A frame sees itself and the true frames before it, so one pass replaces one pass for each frame.
 
 B batch, T frames, h,w grid, S = h*w.
 """
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 @torch.no_grad()
 def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
-    """Each frame from the second on, fully masked, given as much of the true past as a window holds.
+    """Score each frame from the second on, fully masked, given as much true past as a window holds.
 
     Args:
-        model: discrete, in eval mode.
-        batch: on its device.
+        model: a discrete model in eval mode.
+        batch: a batch on the model's device.
 
     Returns:
         nats (B, T-1) float32 a token, averaged over the frame, and accuracy (B, T-1) of whole tokens.
@@ -39,7 +39,7 @@ def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
         return _scored(model, batch, _at_once(model, batch), slice(1, None))
     first = _part(batch, slice(held))
     parts = [_scored(model, first, _at_once(model, first), slice(1, None))]
-    for t in range(held, count):  # what such a frame sees begins later than the window
+    for t in range(held, count):  # the past of such a frame begins after the first frame of the batch
         own = _part(batch, slice(t + 1 - held, t + 1))
         assert own.tokens is not None
         seen = own.tokens.clone()
@@ -51,7 +51,7 @@ def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
 
 
 def _at_once(model: "HMA", batch: "Batch") -> Tensor:
-    """Scores (B, T-1, h, w, F, V) of the masked frames."""
+    """Return scores (B, T-1, h, w, F, V) of the masked frames, computed in one pass."""
     assert batch.tokens is not None
     config, frames = model.config, batch.tokens.flatten(2)
     count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
@@ -66,7 +66,7 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
 
 
 def _clock(config: "HMAConfig", frames: int, device: torch.device) -> Clock:
-    """Of a window's frames and all but the first once more; each sees the true ones before it and itself."""
+    """Return the clock of the true and the masked frames; each sees itself and the true frames before."""
     positions = torch.cat([torch.arange(frames), torch.arange(1, frames)]).to(device)
     true = torch.arange(len(positions), device=device) < frames
     before = positions.unsqueeze(1) > positions

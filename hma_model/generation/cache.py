@@ -1,8 +1,9 @@
-"""Keys and values of past frames, kept while a rollout goes on.
+"""Keep the keys and values of past frames during a rollout.
 
-Attention over time is causal, so a past frame's keys and values never change: only new frames need to be
-computed. A frame at time t lies in slot t mod R. With rotary positions the window rolls on for ever; there is
-one slot more than the window is long, for the pass that brings a finished frame and the next one together.
+Attention over time is causal, so the keys and values of a past frame never change: only new frames need to be
+computed. A frame at time t lies in slot t mod R. With rotary positions the length of a rollout has no limit.
+There is then one slot more than the window has frames, for the pass that computes a finished frame and the
+next one together.
 
 B batch, N tokens of a frame with its action tokens, L layers, R slots, n frames of a pass.
 """
@@ -17,13 +18,13 @@ _NEVER = -(1 << 40)
 
 
 class Cache:
-    """Every layer's keys and values, and when the frame in each slot takes place.
+    """The keys and values of every layer, and the time of the frame in each slot.
 
     Args:
         config: of the model.
         batch: B.
         tokens: N.
-        like: a tensor on the device and of the dtype that keys and values shall have.
+        like: a tensor whose device and dtype the keys and values get.
     """
 
     def __init__(self, config: HMAConfig, batch: int, tokens: int, like: Tensor) -> None:
@@ -45,14 +46,14 @@ class Cache:
         self.times.fill_(_NEVER)
 
     def hold_still(self) -> None:
-        """Promise a compiler that keys and values stay where they lie, so that it may write them in place."""
+        """Mark the addresses of keys and values as static, so that a compiler may write them in place."""
         for layer in self.layers:
             for kept in (layer.time, layer.action):
                 if kept is not None:
                     torch._dynamo.mark_static_address(kept)
 
     def clock(self, start: int, frames: int) -> Clock:
-        """The clock of a pass over n consecutive frames, which take their slots at once."""
+        """Return the clock of a pass over n consecutive frames, and record their times in their slots."""
         device = self.times.device
         positions = torch.arange(start, start + frames, device=device)
         slots = positions % self.slots

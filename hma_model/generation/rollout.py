@@ -1,11 +1,11 @@
-"""Rollouts: frame after frame from a prompt and actions, with a cache over time.
+"""Generate frame after frame from a prompt and actions, with a cache over time.
 
     rollout = Rollout(model, "arm", batch=1)
     rollout.prompt(tokens, actions)
-    frame = rollout.step(chunk)              # the frame the chunk leads to
+    frame = rollout.step(chunk)              # the frame that the chunk leads to
 
-A frame costs as many passes as it is unmasked in: the first also brings the frame before it, now finished,
-into the cache. `cache=False` computes the whole history in every pass, with the same result.
+A frame costs one pass for each step of unmasking. The first pass also adds the frame before it, now finished,
+to the cache. `cache=False` computes the whole history in every pass, with the same result.
 
 B batch, P frames of a prompt, h,w token grid, S = h*w, K = stride * action dim, c channels, H,W latent grid.
 """
@@ -28,11 +28,12 @@ from hma_model.network.trunk import Conditioning, Trunk, window_clock
 class Rollout:
     """B rollouts side by side, one frame a step.
 
-    A frame sees itself and the `frames` - 1 of the configuration before it. With rotary positions that window
-    rolls on, with learned ones it is computed anew for each frame beyond it.
+    A frame sees itself and the `frames` - 1 frames before it (`frames` of the configuration). With rotary
+    positions that window moves along. With learned positions the window is recomputed for each frame beyond
+    its length.
 
     Args:
-        model: any; it is used as it is, so call `eval()` on it before.
+        model: any model; it is used as it is, so call `eval()` on it before.
         embodiment: one id for all, or one a sample.
         batch: B.
         unmask_steps, temperature, order, sample_steps, generator: as in `HMA.generate`.
@@ -61,20 +62,20 @@ class Rollout:
         self.caching = cache
         self.compiled = _compiled(model.trunk) if compile and cache else None
         self.groups = Groups.of(embodiment, batch)
-        self.sorted = Groups(self.groups.parts)  # what is kept here is in this order
+        self.sorted = Groups(self.groups.parts)  # the rollout's state is kept in this order
         self.batch = batch
         self.width = max(model.stem(name).input.in_features for name, _ in self.groups.parts)
         self.cache: Cache | None = None
 
     @torch.no_grad()
     def prompt(self, frames: Tensor, actions: Tensor | None) -> None:
-        """Begin anew from frames that are known.
+        """Start a new rollout from known frames.
 
         Args:
-            frames: tokens (B, P, h, w) int64, or latents (B, P, c, H, W) as stored. Of more than the window
-                holds, the last are used.
-            actions: (B, P - 1 or more, K) raw, chunk k the commands from frame k to k+1; later ones are not
-                used. None for none.
+            frames: tokens (B, P, h, w) int64, or latents (B, P, c, H, W) as stored. If there are more than
+                the window holds, the last are used.
+            actions: (B, P - 1 or more, K) raw; chunk k holds the commands from frame k to k+1. Later chunks
+                are not used. None for no actions.
         """
         self._check_prompt(frames)
         if self.config.kind == "discrete":
@@ -91,12 +92,12 @@ class Rollout:
 
     @torch.no_grad()
     def step(self, chunk: Tensor | None = None, following: Tensor | None = None) -> Tensor:
-        """The next frame.
+        """Generate the next frame.
 
         Args:
-            chunk: (B, K) raw commands from the newest frame to the one asked for; None where there are none.
-            following: (B, K) the commands after it, which condition it where the configuration aligns actions
-                with the current frame (released weights); the same chunk again by default.
+            chunk: (B, K) raw commands from the newest frame to the next one; None for no actions.
+            following: (B, K) raw commands after the next frame. They condition it if the configuration aligns
+                actions with the current frame (released weights). By default `chunk` is used again.
 
         Returns:
             (B, h, w) int64 tokens, or (B, c, H, W) float32 latents as stored.
@@ -121,7 +122,7 @@ class Rollout:
     def _features(
         self, frame: TokenFrame | PatchFrame, conditioning: Conditioning, first: bool
     ) -> tuple[Tensor, Tensor]:
-        """The new frame's features (B, N, D) and its time (1,)."""
+        """Return the new frame's features (B, N, D) and its time (1,)."""
         fresh = self.fresh if first or not self.caching else 0
         x = self._embed(frame, fresh)
         if not self.caching:
@@ -135,7 +136,7 @@ class Rollout:
         return features[:, -1], clock.positions[-1:]
 
     def _embed(self, frame: TokenFrame | PatchFrame, fresh: int) -> Tensor:
-        """The frames not in the cache yet, and the new one (B, fresh + 1, S, D)."""
+        """Embed the last `fresh` frames and the new one as (B, fresh + 1, S, D)."""
         past = self.frames[:, self.frames.shape[1] - fresh :]
         values = torch.cat([past, frame.values.unsqueeze(1)], dim=1)
         if isinstance(frame, TokenFrame):
@@ -156,10 +157,10 @@ class Rollout:
                 self.cache.hold_still()
         return self.cache
 
-    # -- what is kept -------------------------------------------------------------------------------------
+    # -- state --------------------------------------------------------------------------------------------
 
     def _condition(self, frames: int) -> Conditioning:
-        """For the last frames, the new one among them; it does not change from pass to pass."""
+        """Return the conditioning of the last frames, the new one included; it is the same in every pass."""
         start = self.slots.known.shape[1] - frames
         slots = Slots(self.slots.chunks[:, start:], self.slots.known[:, start:])
         positions = torch.arange(self.time + 1 - frames, self.time + 1, device=self.model.device)
@@ -169,7 +170,7 @@ class Rollout:
         return self.passive and self.config.absent_action != "embedding"
 
     def _slots_of(self, actions: Tensor | None, frames: int) -> Slots:
-        """The chunk in force at each known frame; aligned with the current one, the last waits for `step`."""
+        """Return the chunk at each known frame; with `current` alignment `step` adds the last chunk."""
         shape, device = (self.batch, frames), self.model.device
         slots = Slots(
             torch.zeros(*shape, self.width, device=device),
@@ -187,7 +188,7 @@ class Rollout:
         return slots
 
     def _take(self, chunk: Tensor | None, following: Tensor | None) -> None:
-        """Put the chunk at the frame it conditions, and a slot for the new frame."""
+        """Store the chunk at the frame that it conditions, and add a slot for the new frame."""
         if self.begun and self.config.absent_action != "embedding" and self.passive != (chunk is None):
             raise HMAError("step", "actions came or went during a rollout", "give them always or never")
         self.passive = self.passive and chunk is None
@@ -217,7 +218,7 @@ class Rollout:
             self._keep(1)
 
     def _slide(self) -> None:
-        """With learned positions the window's frames change theirs as it moves, so they are computed anew."""
+        """Recompute the window when it moves with learned positions, which change for each of its frames."""
         if self.config.time_position == "learned" and self.time == self.config.frames:
             self._keep(self.config.frames - 1, ahead=1)
             self.fresh = self.time = self.frames.shape[1]
@@ -225,7 +226,7 @@ class Rollout:
                 self.cache.clear()
 
     def _keep(self, frames: int, ahead: int = 0) -> None:
-        """Forget all but the last frames, and all slots but theirs and the ones ahead of them."""
+        """Drop all but the last frames, and all slots but theirs and the `ahead` slots after them."""
         self.frames = self.frames[:, max(self.frames.shape[1] - frames, 0) :]
         start = max(self.slots.known.shape[1] - frames - ahead, 0)
         self.slots = Slots(self.slots.chunks[:, start:].clone(), self.slots.known[:, start:].clone())
@@ -233,7 +234,7 @@ class Rollout:
     # -- in and out ---------------------------------------------------------------------------------------
 
     def _blank(self) -> TokenFrame | PatchFrame:
-        """A new frame, all masked."""
+        """Return a new frame, wholly masked."""
         shape, device = (self.batch, self.config.tokens_per_frame), self.model.device
         if self.config.kind == "discrete":
             mask_id = self.config.vocab_size
@@ -262,7 +263,7 @@ class Rollout:
 
 
 def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
-    """The trunk for passes of a fixed shape; a result holds until the next pass."""
+    """Return the trunk compiled for passes of a fixed shape; a result is valid until the next pass."""
     mode = "reduce-overhead" if trunk.position.device.type == "cuda" else "default"
     compiled = torch.compile(trunk, dynamic=False, mode=mode)
 

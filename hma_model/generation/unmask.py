@@ -1,7 +1,7 @@
-"""A frame's tokens or patches, unmasked in a few passes (arXiv 2202.04200).
+"""Unmask a frame's tokens or patches in a few passes (arXiv 2202.04200).
 
-Each pass predicts the tokens still masked, and keeps some: which ones is drawn at random or decided by
-confidence, how many is the cosine schedule's. Tokens once kept stay.
+Each pass predicts the tokens that are still masked, and keeps some of them. The cosine schedule determines
+how many; they are chosen at random or by confidence. Kept tokens do not change any more.
 
 B batch, S tokens of a frame, k tokens unmasked in a pass, D width, C values of a patch.
 """
@@ -18,15 +18,15 @@ from hma_model.network.masking import uniform
 
 @dataclass(frozen=True)
 class Decoding:
-    """How frames are unmasked.
+    """The settings of unmasking.
 
     Attributes:
-        steps: passes a frame.
-        temperature: 0 takes the likeliest token, else it divides the logits; of the diffusion head, the share
-            of fresh noise in a step.
+        steps: number of passes a frame.
+        temperature: 0 takes the likeliest token, else it divides the logits; for the diffusion head it is the
+            share of fresh noise in a step.
         order: "random" or "confidence"; patches have no confidence.
-        sample_steps: of the diffusion head; None for the configuration's.
-        generator: of every random draw.
+        sample_steps: sampling steps of the diffusion head; None for the configuration's.
+        generator: the generator of every random draw.
     """
 
     steps: int = 2
@@ -37,10 +37,10 @@ class Decoding:
 
 
 class TokenFrame:
-    """A frame of discrete tokens on its way from all masked to none.
+    """A frame of discrete tokens that is unmasked step by step.
 
     Attributes:
-        values: (B, S) int64 ids, the vocabulary's size meaning masked.
+        values: (B, S) int64 ids; the vocabulary's size means masked.
     """
 
     def __init__(self, values: Tensor, mask_id: int, decoding: Decoding) -> None:
@@ -48,7 +48,7 @@ class TokenFrame:
         self.rank = uniform(values.shape, decoding.generator, values.device)
 
     def unmask(self, readout: TokenReadout, features: Tensor, position: Tensor, count: int) -> None:
-        """Predict from the frame's features (B, S, D) at its time (1,), and keep `count` more tokens."""
+        """Predict tokens from the frame's features (B, S, D) at its time (1,), and keep `count` more."""
         masked = self.values == self.mask_id
         if self.decoding.order == "random":
             chosen = _top(self.rank, masked, count)
@@ -60,7 +60,7 @@ class TokenFrame:
         self.values = self.values.scatter(1, chosen, tokens)
 
     def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Token ids (B, k) and the logarithm of their probabilities (B, k), each digit by itself."""
+        """Return token ids (B, k) and the sums (B, k) of the log probabilities of their digits."""
         digits, confidence = [], torch.zeros(features.shape[:2], device=features.device)
         for scores in readout(features).split(list(readout.factored), dim=-1):
             digit = _draw(scores, self.decoding)
@@ -71,11 +71,11 @@ class TokenFrame:
 
 
 class PatchFrame:
-    """A frame of patches on its way from all masked to none.
+    """A frame of patches that is unmasked step by step.
 
     Attributes:
         values: (B, S, C) scaled patches.
-        masked: (B, S) bool.
+        masked: (B, S) bool, True for masked patches.
     """
 
     def __init__(self, values: Tensor, decoding: Decoding) -> None:
@@ -96,20 +96,20 @@ class PatchFrame:
 
 
 def _top(score: Tensor, masked: Tensor, count: int) -> Tensor:
-    """The (B, k) masked tokens of the highest scores."""
+    """Return the indices (B, k) of the masked tokens with the highest scores."""
     return score.masked_fill(~masked, -torch.inf).topk(count, dim=1).indices
 
 
 def _gather(features: Tensor, chosen: Tensor) -> Tensor:
-    """(B, S, D) at the tokens (B, k) -> (B, k, D)."""
+    """Return the features (B, k, D) of the tokens (B, k) from (B, S, D)."""
     return features.gather(1, chosen.unsqueeze(-1).expand(-1, -1, features.shape[-1]))
 
 
 def _draw(scores: Tensor, decoding: Decoding) -> Tensor:
-    """A digit's value (B, k) from its scores (B, k, V)."""
+    """Choose the value (B, k) of a digit from its scores (B, k, V)."""
     if decoding.temperature > 0:
         noise = uniform(scores.shape, decoding.generator, scores.device).clamp(min=1e-20)
         scores = (
             scores / decoding.temperature - (-noise.log()).log()
-        )  # the largest is a draw from the softmax
+        )  # the largest is a sample from the softmax
     return scores.argmax(-1)

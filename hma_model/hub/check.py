@@ -1,4 +1,4 @@
-"""What can be known of a checkpoint before a byte of it is sent, or once all of it has come."""
+"""Check a checkpoint before it is pushed, or after it was pulled."""
 
 from collections.abc import Iterable
 
@@ -8,15 +8,15 @@ from hma_data.storage.folders import read_metadata
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.io import CARD, SAMPLE, YAML, Checkpoint
 
-MOST_PICTURE = 10_000_000  # bytes of a sample.png, which a page shows
+MOST_PICTURE = 10_000_000  # maximum bytes of a sample.png, which a page shows
 _PNG_BEGIN, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xae\x42\x60\x82"
 
 
 def require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
-    """Raise unless others could load it.
+    """Raise unless others can load the embodiments.
 
     Raises:
-        CheckpointError: parts do not belong together, are damaged, or hold what no model can use.
+        CheckpointError: parts do not belong together, are damaged, or hold values that no model can use.
         RegistryError: an embodiment's YAML is not valid.
     """
     read_metadata(source.trunk())
@@ -28,7 +28,7 @@ def require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
 
 
 def require_yaml(source: Checkpoint, name: str) -> None:
-    """Raise CheckpointError unless embodiment.yaml is the one that the embodiment was saved with."""
+    """Raise CheckpointError unless embodiment.yaml is the file that the embodiment was saved with."""
     files = source.card(name).get("files")
     recorded = files.get(YAML) if isinstance(files, dict) else None
     path = source.path(name, YAML)

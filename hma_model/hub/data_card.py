@@ -1,4 +1,4 @@
-"""README.md of a published shard set: what the hub's viewer and its filters read, and how to use the set."""
+"""Write README.md of a published shard set: the facts for the hub's viewer and filters, and the usage."""
 
 from typing import Any
 
@@ -8,15 +8,15 @@ from hma_model.checkpoint.card_text import licence, line, number
 
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"),
           (10**7, "1M<n<10M"), (10**8, "10M<n<100M"), (10**9, "100M<n<1B"), (10**10, "1B<n<10B"))  # fmt: skip
-_SPLITS = {"train": "train", "val": "validation"}  # ours, and what the hub calls them
+_SPLITS = {"train": "train", "val": "validation"}  # our names, and the hub's names
 
 
 def render(manifest: Manifest, repo: str | None) -> bytes:
-    """The card.
+    """Return the card as bytes.
 
     Args:
-        manifest: of the set.
-        repo: organisation/name; None where the set lies in a folder.
+        manifest: the manifest of the set.
+        repo: organisation/name; None if the set lies in a folder.
     """
     name, robot = repo or "PATH", manifest.embodiment
     parts = [
@@ -38,7 +38,7 @@ def _front(manifest: Manifest) -> dict[str, Any]:
     configs: list[dict[str, Any]] = [{"config_name": "frames", "data_files": frames, "default": True}]
     episodes = [
         {"split": "train", "path": EPISODES}
-    ]  # of both splits; "all" is a word of the datasets library
+    ]  # of both splits; the datasets library reserves the name "all"
     configs.append({"config_name": "episodes", "data_files": episodes})
     return {
         **licence([manifest.embodiment.license]),

@@ -1,6 +1,6 @@
-"""Publish and pull shard sets: a dataset repository of the hub, a folder, or any fsspec URI.
+"""Publish and pull shard sets: in a dataset repository of the hub, a folder, or any fsspec URI.
 
-The files lie as `docs/format.md` has them, and the card tells the hub's viewer which of them are tables.
+The files have the layout of `docs/format.md`. The card tells the hub's viewer which of them are tables.
 """
 
 import tempfile
@@ -22,7 +22,7 @@ _DATASETS = "hf://datasets/"
 
 
 class DataStore(Place, Protocol):
-    """Where a shard set is published; see `hma_model.hub.publish.Store`."""
+    """A place where a shard set is published; see `hma_model.hub.publish.Store`."""
 
     name: str
 
@@ -30,11 +30,11 @@ class DataStore(Place, Protocol):
     def repo(self) -> str | None: ...
 
     def check_card(self, page: bytes) -> None:
-        """Raise where the page would not be taken."""
+        """Raise if the hub would refuse the page."""
         ...
 
     def download(self, names: list[str], out: Path) -> None:
-        """Bring files to a folder."""
+        """Fetch files to a folder."""
         ...
 
 
@@ -42,16 +42,16 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
     """Publish a shard set.
 
     Args:
-        folder: str or path of what `hma convert` wrote.
+        folder: str or path of a folder that `hma convert` wrote.
         target: organisation/name of a dataset, `hf://datasets/organisation/name`, a folder or a URI.
         private: make a new repository a private one.
 
     Returns:
-        Where it is now.
+        The address of the published set.
 
     Raises:
         ShardError: the set is not finished, or a shard is not the one its manifest names.
-        HubError: another shard set is there, or it cannot be reached or written.
+        HubError: the target holds another shard set, or cannot be reached or written.
     """
     folder = as_path(folder)
     manifest = _whole(folder)
@@ -63,10 +63,10 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
 
 
 def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> Path:
-    """Fetch a published shard set; what is in `out` already is not transferred again.
+    """Fetch a published shard set; files that `out` already has are not transferred again.
 
     Args:
-        source: as `push_data`'s target.
+        source: an address, as the target of `push_data`.
         out: str or path of a new folder, or of one that an interrupted pull has left.
         revision: branch, tag or commit of a repository.
 
@@ -74,8 +74,8 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
         `out`.
 
     Raises:
-        HubError: no such dataset, no shard set, or out of reach.
-        ShardError: what came is not what the manifest names.
+        HubError: there is no such dataset or no shard set in it, or it cannot be reached.
+        ShardError: a fetched file is not the one that the manifest names.
     """
     out, store = as_path(out), _open(as_address(source), revision)
     files = store.files()
@@ -102,7 +102,7 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
 
 
 def _whole(folder: Path) -> Manifest:
-    """The manifest of a set whose files are all as it says."""
+    """Return the manifest of a set, after checking all its files against it."""
     manifest = Manifest.load(folder)
     if problem := seal_problem((folder / MANIFEST).read_bytes()):
         raise ShardError(folder / MANIFEST, problem, f"hma shards restat {folder} writes it anew")
@@ -138,11 +138,11 @@ def _open(
 
 
 def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[Manifest, bytes]:
-    """The manifest that is there, and its bytes.
+    """Return the published manifest and its bytes.
 
     Raises:
-        HubError: there is none.
-        ShardError: it is damaged.
+        HubError: there is no manifest.
+        ShardError: the manifest is damaged.
     """
     if MANIFEST not in store.files():
         raise HubError(store.name, f"has no {MANIFEST}", "is it a shard set, and has its push finished?")
@@ -155,7 +155,7 @@ def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[
 
 
 def _refuse_others(store: DataStore, manifest: Manifest) -> dict[str, int]:
-    """Return what is there; raise HubError unless it is nothing or this robot's set under this tokenizer."""
+    """Return the published files; raise HubError if they are of another robot, tokenizer or kind."""
     files = store.files()
     strange = [name for name in files if not (name in _OURS or SHARD_NAME.fullmatch(name))]
     if strange:

@@ -1,8 +1,9 @@
-"""A hub in a folder, on this machine or behind any fsspec URI.
+"""Publish to and pull from a folder, on this machine or at any fsspec URI.
 
-Files are staged beside their names; then, one push at a time, they are renamed one by one: first config and
-trunk, then an embodiment's parts with its card last. Who finds no card finds no embodiment, and a card names
-the digests of its parts. What killed pushes left staged is deleted by the next.
+A push first writes its files under temporary names. Then, while no other push does so, it renames them one by
+one: config and trunk first, then the parts of each embodiment with its card last. An embodiment without a
+card counts as absent, and a card holds the digests of its parts. The next push deletes the temporary files of
+killed pushes.
 """
 
 import hashlib
@@ -31,19 +32,19 @@ from hma_model.checkpoint.io import CARD, CONFIG, README, TRUNK, inside
 from hma_model.hub.swap import swap_in
 
 ATTEMPTS = 10
-PATIENCE = 240.0  # seconds to wait for another push; one that was killed elsewhere is forgotten after 180
+PATIENCE = 240.0  # seconds to wait for another push; the lock of a killed remote one expires after 180
 LOCK = ".hma-push.lock"
 
 
 class FolderStore:
-    """See `hma_model.hub.publish.Store`.
+    """A hub in a folder; see `hma_model.hub.publish.Store`.
 
     Args:
         address: a path or an fsspec URI.
-        write: make it where it is not there.
+        write: make the folder if it does not exist.
 
     Raises:
-        HubError: it is not there, or its file system is not known.
+        HubError: the folder does not exist, or its file system is not known.
     """
 
     repo: str | None = None
@@ -64,14 +65,14 @@ class FolderStore:
         if not self._local and not self._root.strip("/") and "memory" not in protocols:
             raise HubError(text, "names no folder", "write the bucket and a folder in it")
         there = self._ask("used", lambda: self._fs.isdir(self._root))
-        self._flat = bool(WHOLE_PUTS & set(protocols))  # folders are there when something is in them
+        self._flat = bool(WHOLE_PUTS & set(protocols))  # a folder exists only if it holds a file
         if write and not there and not self._flat:
             self._ask("made", lambda: self._fs.makedirs(self._root, exist_ok=True))
         if not write and not there:
             raise HubError(text, "no such folder", "for a repository of the hub write ORGANISATION/NAME")
 
     def files(self) -> dict[str, int]:
-        """Sizes by name, without what is being written."""
+        """Return the sizes of files by name, without partial files, locks and training state."""
         return {
             name: size
             for name, size in self._sizes().items()
@@ -79,10 +80,10 @@ class FolderStore:
         }
 
     def warm(self, names: list[str]) -> None:
-        """Nothing: reading files one by one is quick here."""
+        """Do nothing: reading files one by one is fast here."""
 
     def read(self, name: str) -> bytes:
-        """A file of at most 16 MB; links are refused."""
+        """Read a file of at most 16 MB; links are refused."""
         if self._local:
             inside(Path(self._root), name)
 
@@ -96,7 +97,7 @@ class FolderStore:
         return content
 
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
-        """Stage everything, then rename; README.md is made last, of what is there then."""
+        """Write all files under temporary names and rename them; make README.md last, from the new state."""
         self._sweep()
         for pause in range(ATTEMPTS):
             if self._put(dict(changes()), lambda: changes().get(README)):
@@ -105,20 +106,20 @@ class FolderStore:
         raise HubError(self.name, "somebody else keeps writing here", "push again later")
 
     def check_card(self, page: bytes) -> None:
-        """Nothing: a folder takes any."""
+        """Do nothing: a folder accepts any card."""
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
-        """Check whether a file has this content already; False where reading it again is not cheap."""
+        """Check whether a file has this content already; return False if reading it is expensive."""
         if not self._local or not isinstance(content, Path) or not (Path(self._root) / name).is_file():
             return False
         return file_sha256(inside(Path(self._root), name)) == (sha256 or file_sha256(content))
 
     def download(self, names: list[str], out: Path) -> None:
-        """As `pull`."""
+        """Fetch files as `pull` does."""
         self.pull(names, out)
 
     def pull(self, names: list[str], out: Path | None) -> Path:
-        """Copy files that are not there with the same content; a folder of this machine may stay in place."""
+        """Copy the files that `out` lacks or that differ there; without `out`, return the hub's folder."""
         if out is None:
             return Path(self._root)
         for name in names:
@@ -145,11 +146,11 @@ class FolderStore:
         except (OSError, ValueError) as fault:
             raise HubError(target, f"cannot be pulled: {fault}", "free space, or pull again") from fault
         finally:
-            with suppress(OSError, ValueError):  # where a folder is none, nothing was written
+            with suppress(OSError, ValueError):  # if the parent is not a folder, nothing was written
                 new.unlink(missing_ok=True)
 
     def _ask[T](self, doing: str, call: Callable[[], T], where: object = None) -> T:
-        """What a call of the file system returns; a remote one is asked again where that may help."""
+        """Return the result of a call of the file system; repeat a remote call if that may help."""
         where = self.name if where is None else where
         remedy = "free space, check the address and your access, and do it again"
         try:
@@ -183,7 +184,7 @@ class FolderStore:
         }
 
     def _sweep(self) -> None:
-        """Delete what is staged of pushes that are no more."""
+        """Delete the temporary files of pushes that have ended."""
         if self._local:
             remove_abandoned_folders(Path(self._root))
         for name in filter(is_partial, self._sizes()):
@@ -198,7 +199,7 @@ class FolderStore:
             return None
 
     def _put(self, files: dict[str, Path | bytes | None], page: Callable[[], Path | bytes | None]) -> bool:
-        """False where somebody else has put a config there first."""
+        """Write the files of a push; return False if another push was faster."""
         staged: dict[str, str] = {}
         readme = files.pop(README, None)
         try:
@@ -220,7 +221,7 @@ class FolderStore:
         except OSError as fault:
             remedy = "free space, check your access, and push again"
             raise HubError(self.name, f"cannot be written: {fault}", remedy) from fault
-        except OutputError:  # another was quicker to lock it
+        except OutputError:  # another push has taken the lock
             return False
         except (StorageError, StorageAwayError) as fault:
             raise HubError(self.name, fault.fault, fault.remedy) from fault
@@ -231,7 +232,7 @@ class FolderStore:
         return True
 
     def _replace_whole(self, files: Mapping[str, Path | bytes | None], staged: dict[str, str]) -> None:
-        """Put embodiments that are there already in place of their older selves, each in one step."""
+        """Replace embodiments that the folder already has, each in one step."""
         homes = (
             {name.rpartition("/")[0] for name in files if name.endswith(f"/{CARD}")} if self._local else set()
         )
@@ -243,12 +244,12 @@ class FolderStore:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """The only one who renames here; of a folder whose file system knows no locks that is only hoped."""
+        """Hold the lock for renaming; a local file system without locks gives no such guarantee."""
         with _folder_lock(Path(self._root)) if self._local else self._remote_lock():
             yield
 
     def _remote_lock(self) -> RemoteLock:
-        """Taken once it is free; to be given back by `with`."""
+        """Return the lock of the folder once no living push holds it; `with` takes and releases it."""
         end = time.monotonic() + PATIENCE
         place = RemotePath(self.name) / LOCK
         try:
@@ -259,7 +260,7 @@ class FolderStore:
         return RemoteLock(place, "this hub")
 
     def _stage(self, name: str, content: Path | bytes) -> str:
-        """Write a file under a name of its own: here at the top, as folders below may change places."""
+        """Write a temporary file; a local one lies in the top folder, as folders below may be swapped."""
         final = Path(self._path(name))
         if self._local:
             self._refuse_links(Path(self._root), final.parent)
@@ -278,7 +279,7 @@ class FolderStore:
         return new
 
     def _claim(self, new: str, final: str) -> bool:
-        """Give a file its name unless it is taken."""
+        """Rename a file unless the name is taken; return whether it was renamed."""
         if self._local:
             try:
                 os.link(new, final)
@@ -298,12 +299,12 @@ class FolderStore:
         self._settle(new, final)
 
     def _settle(self, new: str, final: str) -> None:
-        """Give a file of a store its name: copied where files appear as a whole only, moved where not."""
+        """Rename a remote file: copy it in a store where files appear only when complete, else move it."""
 
         def move() -> None:
             try:
                 self._fs.mv(new, final)
-            except FileNotFoundError:  # an earlier try whose answer was lost may have done it
+            except FileNotFoundError:  # an earlier try may have moved it, with a lost answer
                 if self._fs.exists(new) or not self._fs.exists(final):
                     raise
 
@@ -347,7 +348,7 @@ class FolderStore:
 
 @contextmanager
 def _folder_lock(folder: Path) -> Iterator[None]:
-    """A lock on the folder itself, which leaves nothing behind."""
+    """Hold a lock on the folder itself, which leaves no file behind."""
     import fcntl
 
     end = time.monotonic() + PATIENCE
@@ -362,14 +363,14 @@ def _folder_lock(folder: Path) -> Iterator[None]:
                     raise HubError(folder, "somebody else keeps writing here", "push again later") from fault
                 time.sleep(0.02)
             except OSError:
-                break  # its file system knows no locks
+                break  # the file system has no locks
         yield
     finally:
         os.close(handle)
 
 
 def _local_sizes(root: Path) -> dict[str, int]:
-    """Sizes by name; folders that are links are not entered, since they may lead in circles."""
+    """Return the sizes of files by name; do not follow links to folders, which may form a cycle."""
     sizes = {}
     for folder, _, names in os.walk(root):
         for path in (Path(folder, name) for name in names):

@@ -1,6 +1,6 @@
-"""What a hub holds: the checkpoints in a repository or folder, ours and the release's, and what fits here.
+"""List the checkpoints of a hub, ours and released ones, and whether they can be used here.
 
-A folder may hold one checkpoint or many, in folders of their own. Nothing but JSON is read.
+A folder may hold one checkpoint, or many in separate folders. Only JSON files are read.
 """
 
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ from hma_model.hub.publish import Store, embodiment_ids, open_store, total_bytes
 
 RELEASED_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
-MOST = 200  # checkpoints shown of a folder
+MOST = 200  # maximum number of checkpoints shown of a folder
 
 
 def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
-    """Every checkpoint there.
+    """Describe every checkpoint of a repository or folder.
 
     Args:
         source: str or path of a folder, a URI, or a repository.
@@ -28,11 +28,11 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
     Returns:
         For each: `checkpoint` (address), `format` (hma-toolkit or released), `format_version`, `model`,
         `tokenizer`, `trunk_sha256`, `trunk_bytes`, `problems` (why it cannot be used here, or none),
-        `from_cache` (the hub was out of reach: this is what the client's cache has of it) and `embodiments`:
+        `from_cache` (the hub was out of reach, and the facts are from the client's cache) and `embodiments`:
         rows of id, action, rate, figures, licence, bytes and problems. Bytes that the cache lacks are None.
 
     Raises:
-        HubError: not there, not reachable, or without any checkpoint.
+        HubError: the source does not exist, cannot be reached, or holds no checkpoint.
     """
     store = open_store(source, revision)
     files = store.files()
@@ -49,7 +49,7 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
 
 
 def listed(described: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A row an embodiment of what `hub.describe` returns."""
+    """Return a row for each embodiment in the result of `hub.describe`."""
     rows = []
     for name, facts in described["embodiments"].items():
         row = _row(name, facts["card"], facts["bytes"], [])
@@ -58,7 +58,7 @@ def listed(described: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, Any] | None:
-    """The checkpoint in a folder of a hub; None where config.json is of something else."""
+    """Describe the checkpoint in a folder of a hub; return None if config.json is of something else."""
     inside = {name.removeprefix(root): size for name, size in files.items() if name.startswith(root)}
     where = store.name + (f"/{root.rstrip('/')}" if root else "")
     try:
@@ -158,7 +158,7 @@ def _card_problems(card: Mapping[str, Any], config: Mapping[str, Any]) -> list[s
 
 
 def _tokenizer_problems(tokenizer: Any) -> list[str]:
-    """What stands between here and decoding what the model predicts."""
+    """Return the problems that prevent decoding the model's predictions here."""
     from hma_data.tokenizers.catalog import CATALOG
 
     name = _of(tokenizer, "name")

@@ -1,8 +1,9 @@
 """Publish and pull checkpoints, one embodiment at a time.
 
 A hub is a folder, any fsspec URI, or a repository of the Hugging Face Hub; all hold the layout of
-`hma_model.checkpoint`. `org/name` is a repository, `hf://org/name` too; `./org/name` or any other path is a
-folder. A push touches the files of its embodiments and README.md, and the trunk only when there is none yet.
+`hma_model.checkpoint`. `org/name` and `hf://org/name` are repositories; `./org/name` or any other path is a
+folder. A push writes the files of its embodiments and README.md. It writes the trunk only if there is none
+yet.
 """
 
 import hashlib
@@ -35,52 +36,55 @@ REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
 
 
 class Store(Protocol):
-    """Where a checkpoint is published."""
+    """A place where a checkpoint is published."""
 
     name: str  # for errors
 
     @property
     def from_cache(self) -> bool:
-        """Whether the hub was out of reach, so that `files` told what the cache has."""
+        """Check whether the hub was out of reach, so that `files` lists the content of the cache."""
         ...
 
     @property
     def repo(self) -> str | None:
-        """For the model card; None where it is only a path."""
+        """Return the repository's name for the model card; None for a path."""
         ...
 
     def files(self) -> dict[str, int]:
-        """Sizes by name of what is there."""
+        """Return the sizes of the published files by name."""
         ...
 
     def read(self, name: str) -> bytes:
-        """A small file."""
+        """Return the content of a small file."""
         ...
 
     def warm(self, names: list[str]) -> None:
-        """Say which small files will be read."""
+        """Announce which small files will be read."""
         ...
 
     def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str:
-        """Put files in place, delete where None, return the address; `changes` is asked again if somebody
-        else was faster."""
+        """Write the files of `changes`, delete those that are None, and return the address.
+
+        `changes` is called again if somebody else published in the meantime.
+        """
         ...
 
     def pull(self, names: list[str], out: Path | None) -> Path:
-        """Bring files here, card last; return their folder, which may be a cache and not `out`."""
+        """Fetch files, cards last, and return their folder, which may be a cache and not `out`."""
         ...
 
 
 def open_store(
     address: StrPath, revision: str | None = None, write: bool = False, private: bool | None = None
 ) -> Store:
-    """The hub behind an address; `private` is of a repository that is made now.
+    """Open the hub at an address.
 
     Args:
-        address: str or path, see `addressed`; to write without a revision.
+        address: str or path, see `addressed`; without a revision if `write` is true.
+        private: make a new repository a private one.
 
     Raises:
-        HubError: it is not there, or cannot be reached.
+        HubError: the hub does not exist, or cannot be reached.
     """
     place = as_address(address)
     if not write:
@@ -99,7 +103,7 @@ def open_store(
 def addressed[Address: str | Path](
     address: Address, revision: str | None = None
 ) -> tuple[Address | str, str | None]:
-    """`org/name@revision` as the repository and its branch, tag or commit; anything else stays as it is."""
+    """Split `org/name@revision` into repository and revision; return any other address unchanged."""
     repository, _, named = str(address).partition("@")
     if revision is None and named and not Path(address).exists() and is_repository(repository):
         return repository, named
@@ -107,7 +111,7 @@ def addressed[Address: str | Path](
 
 
 def is_repository(address: StrPath) -> bool:
-    """Whether an address means a repository of the hub: hf://org/name, or org/name that is no folder here."""
+    """Check whether an address is a repository: hf://org/name, or org/name unless it is a local folder."""
     place = as_address(address)
     if isinstance(place, Path):
         return False
@@ -124,21 +128,21 @@ def push(
     embodiments: Iterable[str] | None = None,
     private: bool | None = None,
 ) -> str:
-    """Publish embodiments of a checkpoint, with the trunk where there is none yet.
+    """Publish embodiments of a checkpoint, and its trunk if the hub has none yet.
 
     Args:
-        checkpoint: str or path of its folder, or of that of a training run.
-        target: str or path of a folder, a URI, or a repository; made where it is not there.
+        checkpoint: str or path of its folder, or of the folder of a training run.
+        target: str or path of a folder, a URI, or a repository; it is made if it does not exist.
         embodiments: ids; None for all.
         private: make a new repository a private one.
 
     Returns:
-        Where it is now: a path, URI or web address.
+        The address of the published checkpoint: a path, URI or web address.
 
     Raises:
         CheckpointError: the checkpoint's parts do not belong together or are damaged, or it lacks an
             embodiment; nothing is made or sent then.
-        HubError: what is there has another trunk or is something else, or it cannot be reached or written.
+        HubError: the target has another trunk or holds something else, or cannot be reached or written.
     """
     source = Checkpoint.open(checkpoint)
     ids = sorted(set(source.embodiments if embodiments is None else embodiments))
@@ -157,21 +161,21 @@ def pull(
     out: StrPath | None = None,
     revision: str | None = None,
 ) -> Path:
-    """Bring the trunk and the embodiments asked for, and nothing else.
+    """Fetch the trunk and the chosen embodiments, and nothing else.
 
     Args:
         source: str or path of a folder, a URI, or a repository.
         embodiments: ids; None for all.
-        out: str or path of a folder; what it has already is not transferred again. By default a local folder
-            stays where it is, and all else goes to the cache.
+        out: str or path of a folder; files that it already has are not transferred again. By default a local
+            folder stays where it is, and everything else goes to the cache.
         revision: branch, tag or commit of a repository.
 
     Returns:
-        A checkpoint's folder.
+        The checkpoint's folder.
 
     Raises:
-        HubError: not there, not reachable, no such embodiment or revision.
-        CheckpointError: what came does not belong together.
+        HubError: the source does not exist, cannot be reached, or has no such embodiment or revision.
+        CheckpointError: the fetched files do not belong together.
     """
     return _pull(as_address(source), embodiments, as_path(out) if out else None, revision)[0]
 
@@ -179,7 +183,7 @@ def pull(
 def _pull(
     source: str | Path, embodiments: Iterable[str] | None, out: Path | None, revision: str | None
 ) -> tuple[Path, list[str]]:
-    """The checkpoint's folder, and the ids that were asked for; the folder may hold others from before."""
+    """Return the checkpoint's folder and the requested ids; the folder may hold older ones too."""
     source, revision = addressed(source, revision)
     store = open_store(source, revision)
     files = store.files()
@@ -221,16 +225,16 @@ def _pull(
 
 
 def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
-    """What is published there, a row an embodiment: ids, action, rate, figures, licence, bytes."""
+    """Return a row for each published embodiment: ids, action, rate, figures, licence, bytes."""
     from hma_model.hub.listing import listed
 
     return listed(describe(source, revision))
 
 
 def describe(source: StrPath, revision: str | None = None) -> dict[str, Any]:
-    """Return what is published: the trunk's hash and bytes, tokenizer and model; of each id `card`, `bytes`.
+    """Return the published facts: the trunk's hash and bytes, tokenizer, model; each id's `card` and `bytes`.
 
-    Bytes are None where the hub is out of reach and the client's cache does not have the files.
+    Bytes are None if the hub is out of reach and the client's cache does not have the files.
     """
     store = open_store(source, revision)
     files = store.files()
@@ -251,7 +255,7 @@ def describe(source: StrPath, revision: str | None = None) -> dict[str, Any]:
 
 
 def total_bytes(store: Store, files: Mapping[str, int], names: Iterable[str]) -> int | None:
-    """Return the bytes of files; None where the hub is out of reach and the cache has not all of them."""
+    """Return the bytes of files; None if the hub is out of reach and the cache lacks one of them."""
     sizes = [files.get(name) for name in names]
     if store.from_cache and None in sizes:
         return None
@@ -264,7 +268,7 @@ def from_pretrained(
     revision: str | None = None,
     device: "str | torch.device" = "cpu",
 ) -> "HMA":
-    """See `HMA.from_pretrained`; the source may also be a training run's folder."""
+    """Load a model as `HMA.from_pretrained` does; the source may also be a training run's folder."""
     address, revision = addressed(as_address(source), revision)
     if not is_repository(address) and "://" not in str(address):
         address = checkpoints.resolve(Path(address).expanduser())
@@ -281,7 +285,7 @@ def import_released(
     tokenizer: str | None = None,
     revision: str | None = None,
 ) -> Checkpoint:
-    """Bring a checkpoint of the paper's release into our layout.
+    """Convert a checkpoint of the paper's release to our layout.
 
     Args:
         source: str or path of a folder or file, or a hub repository.
@@ -327,10 +331,10 @@ def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[
 
 
 def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None = None) -> str:
-    """See `HMA.push_to_hub`: YAML, statistics and cards are those the model was loaded with.
+    """Publish a model as `HMA.push_to_hub` does, with the YAML, statistics and cards that it was loaded with.
 
     Raises:
-        HubError: an embodiment has no YAML, neither where the model was loaded from nor in the registry.
+        HubError: an embodiment has no YAML, neither in the model's source nor in the registry.
     """
     origin = getattr(model, "origin", None)
     known = Checkpoint.open(origin) if origin else None
@@ -357,12 +361,12 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
 
 
 def cache_folder() -> Path:
-    """Where pulled URIs are kept: $HMA_CACHE, or below the user's cache."""
+    """Return the folder for pulled URIs: $HMA_CACHE, or a folder below the user's cache."""
     given = os.environ.get("HMA_CACHE")
     return Path(given) if given else Path.home() / ".cache" / "hma-toolkit"
 
 
-# -- what a push changes
+# -- the changes of a push
 
 
 def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
@@ -406,7 +410,7 @@ def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> Non
 
 
 def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
-    """config.json's values, checked."""
+    """Return the values of config.json, checked."""
     if CONFIG not in files:
         raise HubError(store.name, f"has no {CONFIG}", "it is no checkpoint of hma-toolkit; check the name")
     values = parse_json(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
@@ -418,7 +422,7 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
 
 
 def embodiment_ids(files: Iterable[str]) -> list[str]:
-    """Ids with a card, which is written last, in a listing of a checkpoint's files."""
+    """Return the ids that have a card, which is written last, in a listing of a checkpoint's files."""
     found = set()
     for path in files:
         parts = path.split("/")
@@ -435,7 +439,7 @@ def _card(store: Store, name: str) -> dict[str, Any]:
 
 
 def _readable_card(store: Store, name: str) -> dict[str, Any]:
-    """Somebody else's card for the table; an empty one where it is broken, which is theirs to mend."""
+    """Return the card of an embodiment that is not pushed now; an empty card if it cannot be read."""
     try:
         return _card(store, name)
     except HubError:

@@ -1,4 +1,4 @@
-"""The sample picture of a model card: a short rollout beside the truth, and one with other actions."""
+"""Make the sample picture of a model card: the truth, a short rollout, and one with other actions."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from hma_data.shards.reader import ShardSet
     from hma_data.tokenizers.base import Tokenizer
 
-COLUMNS, SIDE = 6, 128  # pictures of a row, and pixels a side
+COLUMNS, SIDE = 6, 128  # pictures in a row, and pixels of a side
 
 
 def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
-    """Put a sample.png beside each embodiment that has one of the shard sets, and renew the card.
+    """Write a sample.png for the embodiment of each shard set, and update the model card.
 
     Args:
-        checkpoint: str or path of its folder, or of that of a training run.
+        checkpoint: str or path of its folder, or of the folder of a training run.
         data: str or path of shard sets, one an embodiment.
 
     Returns:
-        The pictures' paths.
+        The paths of the pictures.
 
     Raises:
-        CheckpointError: the checkpoint lacks the embodiment, or is of another tokenizer.
+        CheckpointError: the checkpoint lacks the embodiment, or was trained on another tokenizer.
         UsageError: a shard set has no window long enough.
     """
     from hma_data.shards.reader import ShardSet
@@ -53,15 +53,15 @@ def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
 
 
 def sample(checkpoint: StrPath, shards: "ShardSet", tokenizer: "Tokenizer | None" = None) -> bytes:
-    """A PNG of one window of `shards`: truth, prediction and prediction with other actions, over time.
+    """Return a PNG of one window: truth, prediction, and prediction with other actions, over time.
 
     Args:
         checkpoint: str or path of its folder.
-        shards: of one of its embodiments; validation episodes are preferred.
-        tokenizer: the one that made the shards; None finds it.
+        shards: a shard set of one of its embodiments; validation episodes are preferred.
+        tokenizer: the tokenizer that made the shards; None finds it.
 
     Raises:
-        CheckpointError: the checkpoint is of another tokenizer.
+        CheckpointError: the checkpoint was trained on another tokenizer.
         UsageError: there is no window as long as the model's.
     """
     from hma_data.episodes.sheets import grid, png_bytes
@@ -86,7 +86,7 @@ def sample(checkpoint: StrPath, shards: "ShardSet", tokenizer: "Tokenizer | None
 
 
 def _window(shards: "ShardSet", frames: int) -> "Batch":
-    """The middle window of the validation split, or of training where that has none."""
+    """Return the middle window of the validation split, or of training if that has none."""
     from hma_data.loading.dataset import WindowDataset
 
     for split in ("val", "train"):
@@ -97,7 +97,7 @@ def _window(shards: "ShardSet", frames: int) -> "Batch":
 
 
 def _shown(frame: "NDArray[np.uint8]") -> "NDArray[np.uint8]":
-    """A frame at the size of the card: small ones enlarged, large ones thinned out."""
+    """Return a frame near the size of the card: a small one enlarged, a large one subsampled."""
     side = frame.shape[0]
     if side < SIDE:
         scale = -(-SIDE // side)

@@ -1,4 +1,4 @@
-"""Replace an embodiment's folder by another in one step, so that no reader ever sees half of each."""
+"""Replace an embodiment's folder by another in one step, so that no reader sees a mixture of both."""
 
 import ctypes
 import os
@@ -12,12 +12,13 @@ _HERE, _EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of renameat2(2)
 
 
 def swap_in(root: Path, home: Path, staged: Mapping[str, Path]) -> None:
-    """Give staged files their names in a folder that has older ones; what is not staged stays.
+    """Replace files of an embodiment's folder by staged ones in one step; its other files stay.
 
-    Where the folder holds more than files, or the file system cannot do it, they are renamed one by one.
+    If the folder holds more than plain files, or the file system cannot exchange folders, the files are
+    renamed one by one.
 
     Args:
-        root: of the hub, where the new folder is put together.
+        root: the hub's folder, in which the new folder is made.
         home: the embodiment's folder.
         staged: name -> file on the same file system, the card last.
     """
@@ -38,7 +39,7 @@ def swap_in(root: Path, home: Path, staged: Mapping[str, Path]) -> None:
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Let two folders change places in one step; False where the system or its file system cannot."""
+    """Exchange two folders in one step; return False if the system or the file system cannot do it."""
     call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if call is None:
         return False

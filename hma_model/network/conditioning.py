@@ -1,7 +1,7 @@
-"""From a batch's actions to what the trunk is conditioned on, embodiment by embodiment.
+"""Compute the trunk's conditioning from a batch's actions, embodiment by embodiment.
 
-A batch may mix embodiments. Its samples are sorted so that each embodiment's lie side by side: the trunk sees
-the batch whole, and each stem and modulation is called once.
+A batch may mix embodiments. Its samples are sorted so that the samples of an embodiment lie side by side. The
+trunk then processes the whole batch at once, and each stem and modulation is called once.
 
 B batch, T frames, D width, K = stride * action dim, L layers.
 """
@@ -28,7 +28,7 @@ class Groups:
 
     Attributes:
         parts: embodiment id and number of samples, in order.
-        order: (B,) where each sorted sample was, and inverse: the way back; None when sorted already.
+        order, inverse: (B,) indices that sort the samples, and that undo it; None if sorted already.
     """
 
     parts: tuple[tuple[str, int], ...]
@@ -54,15 +54,15 @@ class Groups:
         return cls(parts, order, inverse)
 
     def sort(self, x: Tensor) -> Tensor:
-        """Samples side by side by embodiment."""
+        """Return the samples sorted by embodiment."""
         return x if self.order is None else x[self.order]
 
     def unsort(self, x: Tensor) -> Tensor:
-        """Samples in the batch's own order."""
+        """Return sorted samples in the batch's own order."""
         return x if self.inverse is None else x[self.inverse]
 
     def spans(self) -> list[tuple[str, slice]]:
-        """Each embodiment's place among the sorted samples."""
+        """Return the slice of each embodiment among the sorted samples."""
         spans, start = [], 0
         for name, size in self.parts:
             spans.append((name, slice(start, start + size)))
@@ -76,7 +76,7 @@ class Slots:
 
     Attributes:
         chunks: (B, T, K) float32 raw.
-        known: (B, T) bool, False where there is none or it is hidden.
+        known: (B, T) bool, False where there is no chunk or it is hidden.
     """
 
     chunks: Tensor
@@ -84,7 +84,7 @@ class Slots:
 
 
 def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int) -> Slots:
-    """Put chunks (B, >= T-1, K), of which some are known (B, >= T-1), at the frames they condition."""
+    """Assign chunks (B, >= T-1, K), of which some are known (B, >= T-1), to the frames they condition."""
     late = config.action_alignment == "previous"
     if actions.shape[1] < frames - late:
         fault = f"{actions.shape[1]} action chunks for {frames} frames"
@@ -97,7 +97,7 @@ def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int)
 
 
 def unknown(model: "HMA", groups: Groups, frames: int) -> Slots:
-    """Slots of which none is known: conditioning on the absence of each."""
+    """Return slots without any known chunk, which condition on the absence of actions."""
     batch = sum(size for _, size in groups.parts)
     widest = max(model.stem(name).input.in_features for name, _ in groups.parts)
     shape = (batch, frames)
@@ -108,13 +108,13 @@ def unknown(model: "HMA", groups: Groups, frames: int) -> Slots:
 
 
 def condition(model: "HMA", slots: Slots | None, groups: Groups, positions: Tensor) -> Conditioning:
-    """What the trunk is conditioned on, for the samples as `groups` sorts them.
+    """Return the trunk's conditioning for the samples, in the order of `groups`.
 
     Args:
-        model: whose stems and modulation are used, once per embodiment.
+        model: the model, whose stems and modulation are used once per embodiment.
         slots: in the batch's order; None for no actions at all.
         groups: the batch's embodiments.
-        positions: (T,) int64, the frames' times.
+        positions: (T,) int64, the times of the frames.
     """
     config, absent = model.config, rows_at(model.trunk.absent, positions)
     if slots is None and config.absent_action == "skip":

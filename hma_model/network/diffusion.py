@@ -1,9 +1,9 @@
-"""The diffusion head: patches of latents, or action chunks, from what the trunk says of them.
+"""Predict patches of latents, or action chunks, by diffusion conditioned on the trunk's features.
 
 A small MLP, modulated by the noise level and the condition, predicts the noise (paper section 3, with the
-layers of arXiv 2406.11838) or the velocity (arXiv 2202.00512), which says what the sample is where there is
-nothing but noise. Training draws one of 1000 levels of a cosine schedule; sampling is DDIM with any number of
-steps (arXiv 2010.02502).
+layers of arXiv 2406.11838) or the velocity (arXiv 2202.00512). The velocity determines the sample even at
+full noise. Training draws one of 1000 levels of a cosine schedule by default. Sampling is DDIM with any
+number of steps (arXiv 2010.02502).
 
 M rows, C values of a sample, D width of the condition, W width of the head.
 """
@@ -21,7 +21,7 @@ _LEVEL_VALUES = 256  # sinusoids that describe a noise level
 
 
 def cosine_levels(steps: int) -> Tensor:
-    """(steps,) float64: the signal's share of variance at each noise level (arXiv 2102.09672)."""
+    """Return (steps,) float64, the signal's share of variance at each noise level (arXiv 2102.09672)."""
     time = torch.arange(steps + 1, dtype=torch.float64) / steps
     share = ((time + 0.008) / 1.008 * math.pi / 2).cos() ** 2
     noise = (1 - share[1:] / share[:-1]).clamp(max=0.999)
@@ -45,7 +45,7 @@ class _Block(nn.Module):
 
 
 class DiffusionHead(nn.Module):
-    """Noise prediction for samples of `values` numbers."""
+    """The network that predicts the noise or the velocity of samples of `values` numbers."""
 
     levels: Tensor
 
@@ -66,7 +66,7 @@ class DiffusionHead(nn.Module):
         self.initialize()
 
     def initialize(self) -> None:
-        """Gates, modulations and the output start at zero: each block begins as the identity."""
+        """Initialise the weights; modulations and the output start at zero, so each block is the identity."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -76,11 +76,11 @@ class DiffusionHead(nn.Module):
                 nn.init.zeros_(module.weight)
 
     def forward(self, noisy: Tensor, level: Tensor, condition: Tensor) -> Tensor:
-        """Noisy samples (M, C), noise levels (M,) int64, conditions (M, D) -> the target (M, C) float32."""
+        """Predict the target (M, C) float32 from samples (M, C), levels (M,) int64 and conditions (M, D)."""
         return self._predict(noisy, self._level(level), self.condition(condition))
 
     def loss(self, target: Tensor, condition: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Squared error of what is predicted, (M,) float32, for samples (M, C) and conditions (M, D)."""
+        """Return the squared error (M,) float32 of the prediction for samples (M, C), conditions (M, D)."""
         rows = target.shape[0]
         target, condition = (x.repeat(self.repeats, 1) for x in (target.float(), condition))
         draw = uniform((target.shape[0],), generator, target.device)
@@ -131,7 +131,7 @@ class DiffusionHead(nn.Module):
         eta: float,
         generator: torch.Generator | None,
     ) -> Tensor:
-        """One DDIM step from a level whose signal share is `share` to one where it is `after`."""
+        """Make one DDIM step from a level whose signal share is `share` to one where it is `after`."""
         signal, spread = math.sqrt(share), math.sqrt(1 - share)
         clean = signal * x - spread * predicted if self.velocity else (x - spread * predicted) / signal
         clean = clean.clamp(-self.clip, self.clip)

@@ -1,4 +1,4 @@
-"""The ways out of the trunk: video tokens, conditions of the diffusion head, action chunks.
+"""Read the trunk's features out as video tokens, conditions of the diffusion head and action chunks.
 
 B batch, T frames, S tokens of a frame, D width, F digits, V values of a digit, K = stride * action dim.
 """
@@ -13,7 +13,7 @@ from hma_model.network.trunk import rows_at
 
 
 class TokenReadout(nn.Module):
-    """Scores of every digit's values, and their cross-entropy."""
+    """The readout of the discrete model: scores of every digit's values, and their cross-entropy."""
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -24,11 +24,11 @@ class TokenReadout(nn.Module):
         nn.init.zeros_(self.linear.bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(..., D) -> (..., sum of V) float32, the digits after one another, low first."""
+        """Map features (..., D) to scores (..., sum of V) float32, digit after digit, low digit first."""
         return self.linear(features * self.multiplier if self.multiplier != 1 else features).float()
 
     def split(self, scores: Tensor) -> Tensor:
-        """(..., sum of V) -> (..., F, max V); digits with fewer values are filled with the lowest number."""
+        """Split scores (..., sum of V) into (..., F, max V); pad shorter digits with the lowest number."""
         widest = max(self.factored)
         if min(self.factored) == widest:
             return scores.unflatten(-1, (-1, widest))
@@ -39,7 +39,7 @@ class TokenReadout(nn.Module):
         )
 
     def loss(self, features: Tensor, digits: Tensor) -> Tensor:
-        """Cross-entropy summed over digits, (M,), of features (M, D) and digits (M, F)."""
+        """Return the cross-entropy (M,), summed over digits, of features (M, D) and digits (M, F)."""
         parts = self(features).split(list(self.factored), dim=-1)
         losses = [
             F.cross_entropy(part, digits[:, i], reduction="none", label_smoothing=self.smoothing)
@@ -49,7 +49,7 @@ class TokenReadout(nn.Module):
 
 
 class LatentReadout(nn.Module):
-    """What the diffusion head is conditioned on, and that head."""
+    """The readout of the continuous model: conditions for the diffusion head, and the head itself."""
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -62,14 +62,14 @@ class LatentReadout(nn.Module):
         nn.init.zeros_(self.proj.bias)
 
     def forward(self, features: Tensor, positions: Tensor) -> Tensor:
-        """(B, T, S, D) of frames at the times (T,) -> (B, T, S, D)."""
+        """Map features (B, T, S, D) of frames at the times (T,) to conditions (B, T, S, D)."""
         return self.norm(self.proj(features)) + rows_at(self.position, positions)
 
 
 class ActionHead(nn.Module):
-    """Action chunks of one embodiment from a frame's pooled features.
+    """The head that predicts action chunks of one embodiment from a frame's pooled features.
 
-    `policy` reads the chunk to be commanded from the frame on, `inverse` the one that led to it.
+    `policy` predicts the chunk to command from the frame on; `inverse` predicts the chunk that led to it.
     """
 
     def __init__(self, config: HMAConfig, space: ActionSpace) -> None:
@@ -87,21 +87,21 @@ class ActionHead(nn.Module):
             nn.init.zeros_(linear.bias)
 
     def forward(self, features: Tensor, readout: str) -> Tensor:
-        """(M, D) -> (M, K) chunks, or with a diffusion head its (M, D) conditions."""
+        """Map features (M, D) to chunks (M, K), or to the conditions (M, D) of a diffusion head."""
         linear = self.inverse if readout == "inverse" else self.policy
         return linear(features * self.multiplier if self.multiplier != 1 else features)
 
     def loss(
         self, features: Tensor, target: Tensor, readout: str, generator: torch.Generator | None = None
     ) -> Tensor:
-        """(M,) float32 of features (M, D) and target chunks (M, K)."""
+        """Return the loss (M,) float32 of features (M, D) and target chunks (M, K)."""
         predicted = self(features, readout)
         if self.diffusion is not None:
             return self.diffusion.loss(target, predicted, generator)
         return F.mse_loss(predicted.float(), target.float(), reduction="none").mean(-1)
 
     def predict(self, features: Tensor, readout: str, generator: torch.Generator | None = None) -> Tensor:
-        """(M, K) float32 chunks of features (M, D)."""
+        """Predict chunks (M, K) float32 from features (M, D)."""
         predicted = self(features, readout)
         return (
             predicted.float()

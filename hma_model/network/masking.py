@@ -1,6 +1,6 @@
-"""What is hidden and what is corrupted in training, and how many tokens stay masked in decoding.
+"""Draw what is hidden and corrupted in training, and compute how many tokens stay masked in decoding.
 
-Every draw comes from the given generator, on the generator's device, so that a run repeats exactly.
+Every draw uses the given generator, on the generator's device, so that a run can be repeated exactly.
 
 B batch, T frames, S tokens of a frame, F digits.
 """
@@ -19,7 +19,7 @@ from hma_model.network.embed import to_digits
 def uniform(
     shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """Float32 numbers in [0, 1), drawn on the generator's device and brought to `device`."""
+    """Return float32 numbers in [0, 1), drawn on the generator's device and moved to `device`."""
     source = "cpu" if generator is None else generator.device
     return torch.rand(tuple(shape), generator=generator, device=source).to(device)
 
@@ -27,17 +27,17 @@ def uniform(
 def randn(
     shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """Standard normal float32 numbers, drawn on the generator's device and brought to `device`."""
+    """Return standard normal float32 numbers, drawn on the generator's device and moved to `device`."""
     source = "cpu" if generator is None else generator.device
     return torch.randn(tuple(shape), generator=generator, device=source).to(device)
 
 
 @dataclass
 class VideoMask:
-    """Which tokens of a window are hidden from the model.
+    """The masked and corrupted tokens of windows.
 
     Attributes:
-        masked: (B, T, S) bool; frame 0 never is. The video loss is over these.
+        masked: (B, T, S) bool, the tokens of the video loss; never those of frame 0.
         corruption: (B, T) float32, the probability that a digit of a visible token is replaced.
     """
 
@@ -48,11 +48,11 @@ class VideoMask:
 def draw_video_mask(
     config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None
 ) -> VideoMask:
-    """Mask each frame with a probability cos(u pi/2), and corrupt a share of everything.
+    """Mask the tokens of each frame with probability cos(u pi/2), and corrupt a share of all tokens.
 
     With `history_probability` a sample keeps a history of at least `history_frames` frames unmasked, and each
     frame after it is corrupted more than the one before, as in a rollout of the model's own predictions.
-    Each sample draws for itself.
+    Each sample has its own draws.
     """
     tokens = config.tokens_per_frame
     where = "cpu" if generator is None else generator.device
@@ -76,7 +76,7 @@ def draw_video_mask(
 def _first_masked(
     config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor]:
-    """(B,) the first frame that may be masked, and (B,) whether the sample keeps a long history."""
+    """Return (B,) the first frame that may be masked, and (B,) whether a sample keeps a long history."""
     draw = uniform((2, batch), generator, "cpu" if generator is None else generator.device)
     start = min(config.history_frames, frames - 1)
     long = (draw[0] < config.history_probability) & (frames > 2)
@@ -87,7 +87,7 @@ def _first_masked(
 def corrupt_tokens(
     config: HMAConfig, tokens: Tensor, mask: VideoMask, generator: torch.Generator | None
 ) -> Tensor:
-    """Token ids (B, T, S) with digits replaced at random and masked ones set to the vocabulary's size."""
+    """Replace digits of token ids (B, T, S) at random, and set masked ids to the vocabulary's size."""
     digits = to_digits(tokens, config.factored)
     if config.corrupt_max:
         values = torch.tensor(config.factored, device=tokens.device)
@@ -104,7 +104,7 @@ def corrupt_tokens(
 
 
 def drop_chunks(present: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Which chunks to hide (B, T): each sample draws its rate U(0, 1) and hides at least one present."""
+    """Draw chunks to hide, (B, T) bool: each sample draws a rate U(0, 1) and hides at least one present."""
     draw = uniform(present.shape, generator, present.device)
     rate = uniform((present.shape[0], 1), generator, present.device)
     lowest = torch.where(present, draw, 2.0).argmin(1, keepdim=True)
@@ -112,7 +112,7 @@ def drop_chunks(present: Tensor, generator: torch.Generator | None) -> Tensor:
 
 
 def masked_after(step: int, steps: int, tokens: int) -> int:
-    """How many of a frame's tokens stay masked after step `step` of `steps`: the cosine schedule."""
+    """Return how many tokens of a frame stay masked after step `step` of `steps` (cosine schedule)."""
     if step + 1 >= steps:
         return 0
     return min(math.ceil(math.cos((step + 1) / steps * math.pi / 2) * tokens), tokens - 1)

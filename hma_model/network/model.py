@@ -1,8 +1,8 @@
-"""The world model: one trunk for all embodiments, a stem and a head for each.
+"""Define the world model: one trunk for all embodiments, a stem and a head for each.
 
     model = HMA(HMAConfig(layers=4, width=128))
     model.add_embodiment(embodiment, stats)
-    output = model(batch)                    # masks, corrupts, and gives the loss
+    output = model(batch)                    # masks, corrupts, and computes the loss
     frames = model.generate(prompt, actions, embodiment.id, frames=8)
 
 B batch, T frames, h,w token grid, S = h*w, N = S + action tokens, D width, K = stride * action dim,
@@ -35,8 +35,8 @@ class HMA(nn.Module):
     Attributes:
         config: the architecture.
         embodiments: the action space of each embodiment present, by id.
-        trunk, readout: what all embodiments share.
-        stems, heads: per embodiment; `stem(id)` and `head(id)` find them.
+        trunk, readout: the modules that all embodiments share.
+        stems, heads: the modules of each embodiment; `stem(id)` and `head(id)` find them.
     """
 
     def __init__(self, config: HMAConfig) -> None:
@@ -51,32 +51,32 @@ class HMA(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the trunk is."""
+        """Return the device of the trunk."""
         return self.trunk.position.device
 
     @property
     def token_readout(self) -> TokenReadout:
-        """The discrete model's way out."""
+        """Return the readout of a discrete model."""
         assert isinstance(self.readout, TokenReadout)
         return self.readout
 
     @property
     def latent_readout(self) -> LatentReadout:
-        """The continuous model's way out."""
+        """Return the readout of a continuous model."""
         assert isinstance(self.readout, LatentReadout)
         return self.readout
 
     # -- embodiments ------------------------------------------------------------------------------------
 
     def add_embodiment(self, embodiment: Any, stats: Any = None) -> None:
-        """Give an embodiment a stem and a head of its own, freshly initialised.
+        """Add an embodiment with a freshly initialised stem and head.
 
         Args:
             embodiment: a registry `Embodiment`, or an `ActionSpace`.
             stats: its `Stats`; without them actions are not normalised.
 
         Raises:
-            CheckpointError: the id is there with another action space. The same one again does nothing.
+            CheckpointError: the model has the id with another action space. With the same, nothing happens.
         """
         space = embodiment if isinstance(embodiment, ActionSpace) else ActionSpace.of(embodiment, stats)
         known = self.embodiments.get(space.id)
@@ -91,12 +91,12 @@ class HMA(nn.Module):
         self.embodiments[space.id] = space
 
     def stem(self, embodiment: str) -> Stem:
-        """The stem of an embodiment."""
+        """Return the stem of an embodiment."""
         self._known(embodiment)
         return self.stems[module_key(embodiment)]  # type: ignore[return-value]
 
     def head(self, embodiment: str) -> ActionHead:
-        """The action head of an embodiment."""
+        """Return the action head of an embodiment."""
         self._known(embodiment)
         return self.heads[module_key(embodiment)]  # type: ignore[return-value]
 
@@ -110,7 +110,7 @@ class HMA(nn.Module):
     # -- states -----------------------------------------------------------------------------------------
 
     def trunk_state(self) -> dict[str, Tensor]:
-        """Everything the embodiments share, names relative to the model."""
+        """Return the tensors that the embodiments share; names are relative to the model."""
         return {
             f"{part}.{name}": tensor
             for part in ("trunk", "readout")
@@ -118,15 +118,15 @@ class HMA(nn.Module):
         }
 
     def stem_state(self, embodiment: str) -> dict[str, Tensor]:
-        """An embodiment's action stem, statistics and modulation weights."""
+        """Return the tensors of an embodiment's action stem, statistics and modulation."""
         return self.stem(embodiment).state_dict()
 
     def head_state(self, embodiment: str) -> dict[str, Tensor]:
-        """An embodiment's action head."""
+        """Return the tensors of an embodiment's action head."""
         return self.head(embodiment).state_dict()
 
     def load_trunk(self, state: Mapping[str, Tensor]) -> None:
-        """Load what `trunk_state` gave; CheckpointError names every key that does not fit."""
+        """Load a result of `trunk_state`; a CheckpointError names the keys that do not fit."""
         check_fit("trunk", state, self.trunk_state())
         for part in ("trunk", "readout"):
             prefix = f"{part}."
@@ -136,7 +136,7 @@ class HMA(nn.Module):
     def load_embodiment(
         self, embodiment: str, stem: Mapping[str, Tensor], head: Mapping[str, Tensor]
     ) -> None:
-        """Load what `stem_state` and `head_state` gave; an embodiment not there yet is added from them."""
+        """Load results of `stem_state` and `head_state`; add the embodiment if the model lacks it."""
         self.add_embodiment(space_of_stem(embodiment, stem))
         check_fit(f"{embodiment}: stem", stem, self.stem_state(embodiment))
         check_fit(f"{embodiment}: head", head, self.head_state(embodiment))
@@ -151,11 +151,11 @@ class HMA(nn.Module):
         revision: str | None = None,
         device: str | torch.device = "cpu",
     ) -> "HMA":
-        """The trunk and the embodiments asked for, all by default.
+        """Load the trunk and the chosen embodiments, by default all.
 
         Args:
             source: str or path of a checkpoint or training run, a URI, or a hub repository.
-            embodiments: ids.
+            embodiments: ids; None for all.
             revision: branch, tag or commit of a repository.
             device: where the model goes.
         """
@@ -179,10 +179,10 @@ class HMA(nn.Module):
         Args:
             batch: windows of one or several embodiments, on the model's device.
             objective: forward, passive, policy, full or inverse; by default drawn by its weight.
-            generator: of every random draw; the draws take place on its device.
+            generator: the generator of every random draw; the draws take place on its device.
 
         Returns:
-            The losses, and outside training the logits; see `Output`.
+            The losses and, outside training, the logits; see `Output`.
         """
         from hma_model.network.objectives import compute
 
@@ -195,13 +195,13 @@ class HMA(nn.Module):
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
     ) -> Tensor:
-        """Scores of every token of a window.
+        """Compute the scores of every token of a window.
 
         Args:
             tokens: (B, T, h, w) int64; the vocabulary's size means masked.
-            actions: (B, T, K) raw chunks, or None for none at all.
+            actions: (B, T, K) raw chunks; None for no actions.
             embodiment: one id for all, or one a sample.
-            action_mask: (B, T) bool, True where the chunk is there; all by default.
+            action_mask: (B, T) bool, True where a chunk is known; by default all are.
 
         Returns:
             (B, T, h, w, F, V) float32, low digit first.
@@ -221,7 +221,7 @@ class HMA(nn.Module):
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
     ) -> Tensor:
-        """What the diffusion head is conditioned on.
+        """Compute the conditions of the diffusion head.
 
         Args:
             latents: (B, T, c, H, W), already multiplied by the configuration's `latent_scale`.
@@ -251,16 +251,16 @@ class HMA(nn.Module):
         readout: str = "policy",
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Action chunks from video.
+        """Predict action chunks from video.
 
         Args:
             frames: tokens (B, T, h, w) int64, or latents (B, T, c, H, W) as stored.
             embodiment: one id for all, or one a sample.
             actions: (B, T, K) raw chunks that are known; none by default.
-            action_mask: (B, T) bool, which of them are known; all by default.
-            readout: "policy", chunk k from frames up to k; "inverse", chunk k from frames up to k+1,
-                whose last chunk, without a frame after it, is the policy's.
-            generator: of the diffusion head's noise, where there is one.
+            action_mask: (B, T) bool, True where a chunk is known; by default all are.
+            readout: "policy": chunk k from frames up to k; "inverse": chunk k from frames up to k+1. No frame
+                follows the last chunk, so "inverse" takes it from the policy.
+            generator: the generator of the noise of a diffusion head.
 
         Returns:
             (B, T, K) float32 raw; narrower embodiments of a mixed batch are padded with zeros.
@@ -321,15 +321,15 @@ class HMA(nn.Module):
 
         Args:
             prompt: tokens (B, P, h, w) int64, or latents (B, P, c, H, W) as stored.
-            actions: (B, P + frames, K) raw, chunk k the commands from frame k to k+1; None for none.
+            actions: (B, P + frames, K) raw; chunk k holds the commands from frame k to k+1. None for none.
             embodiment: one id for all, or one a sample.
             frames: how many to add.
             unmask_steps: passes a frame.
-            temperature: 0 takes the likeliest, else it divides the logits (continuous: share of noise).
+            temperature: 0 takes the likeliest token, else it divides the logits (continuous: share of noise).
             generator: of every random draw.
-            order: in which tokens are unmasked, "random" or "confidence".
-            cache: keep keys and values of past frames; False computes everything again, with the same result.
-            sample_steps: of the diffusion head.
+            order: the order in which tokens are unmasked, "random" or "confidence".
+            cache: keep keys and values of past frames; False recomputes everything, with the same result.
+            sample_steps: sampling steps of the diffusion head.
 
         Returns:
             (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
@@ -344,32 +344,32 @@ class HMA(nn.Module):
     # -- parts that training and decoding share -----------------------------------------------------------
 
     def clock(self, frames: int) -> Clock:
-        """The clock of a window of this many frames."""
+        """Return the clock of a window of this many frames."""
         if frames > self.config.frames and self.config.time_position == "learned":
             fault = f"{frames} frames where the learned positions end at {self.config.frames}"
             raise HMAError("window", fault, "give a shorter window")
         return window_clock(self.config, frames, self.device)
 
     def embed_tokens(self, tokens: Tensor) -> Tensor:
-        """Ids (B, T, S) -> (B, T, S, D)."""
+        """Embed ids (B, T, S) as (B, T, S, D)."""
         assert isinstance(self.trunk.embed, TokenEmbedding)
         return self.trunk.embed(tokens)
 
     def embed_patches(self, patches: Tensor, masked: Tensor) -> Tensor:
-        """Patches (B, T, S, c*p*p), scaled, and masked pixels (B, T, S, p*p or 1) -> (B, T, S, D)."""
+        """Embed scaled patches (B, T, S, c*p*p) with masks of pixels (B, T, S, p*p or 1) as (B, T, S, D)."""
         assert isinstance(self.trunk.embed, LatentEmbedding)
         return self.trunk.embed(patches, masked)
 
     def video_features(self, features: Tensor) -> Tensor:
-        """(B, T, N, D) -> (B, T, S, D), without the action tokens."""
+        """Return the features (B, T, S, D) of (B, T, N, D) without the action tokens."""
         return features[:, :, : self.config.tokens_per_frame]
 
     def action_features(self, features: Tensor) -> Tensor:
-        """(B, T, N, D) -> (B, T, D): the mean of the action tokens, or without any, of the frame's own."""
+        """Return the mean (B, T, D) of the action tokens in (B, T, N, D), or of the frame's if none."""
         own = self.config.tokens_per_frame
         if features.shape[2] > own:
             return features[:, :, own:].mean(2)
-        if self.config.absent_action == "tokens":  # the released code takes as many of the frame's last
+        if self.config.absent_action == "tokens":  # the released code takes as many of the last tokens
             return features[:, :, -self.config.action_tokens :].mean(2)
         return features.mean(2)
 

@@ -1,7 +1,8 @@
-"""What the model is trained for, and the losses of each objective (paper section 3).
+"""Compute the losses of the training objectives (paper section 3).
 
-forward: masked video from past video and actions. passive: without actions. policy: the chunk to command from
-each frame on. inverse: the chunk that led from one frame to the next. full: video and policy together.
+forward: predict masked video from past video and actions. passive: the same without actions. policy: predict
+the chunk to command from each frame on. inverse: predict the chunk that led from one frame to the next. full:
+video and policy together.
 
 B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = stride * action dim.
 """
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Windows(Protocol):
-    """The batch a loader gives; see `hma_data.loading.dataset.Batch`."""
+    """The batch of a loader; see `hma_data.loader.Batch`."""
 
     embodiment: list[str]
     actions: Tensor
@@ -34,15 +35,15 @@ class Windows(Protocol):
 
 @dataclass
 class Output:
-    """What a training or validation pass gives.
+    """The result of a training or validation pass.
 
     Attributes:
         loss: scalar to minimise.
         video_loss: scalar, nats a token or squared error of the noise; None where video is not predicted.
         action_loss: scalar; None where actions are not predicted.
-        per_sample: (B,) detached, each sample's video loss, or its action loss where there is no other.
-        masked: (B, T, h, w) bool, the tokens the video loss is over.
-        objective: the one that was used.
+        per_sample: (B,) detached, each sample's video loss, or its action loss if there is no video loss.
+        masked: (B, T, h, w) bool, the tokens of the video loss.
+        objective: the objective of the pass.
         video_logits: (B, T, h, w, F, V) float32 of the discrete model outside training, else None.
     """
 
@@ -56,7 +57,7 @@ class Output:
 
 
 def compute(model: "HMA", batch: Windows, objective: str | None, generator: torch.Generator | None) -> Output:
-    """The losses of one batch; `HMA.forward` explains the arguments."""
+    """Compute the losses of one batch; `HMA.forward` explains the arguments."""
     config = model.config
     objective = objective or draw_objective(config, generator)
     if objective not in OBJECTIVES:
@@ -64,18 +65,18 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     frames, count, size = _frames(model, batch), batch.actions.shape[1], len(batch.actions)
     groups, clock = Groups.of(batch.embodiment, size), model.clock(count)
 
-    own = getattr(batch, "context", None)  # what the model sees where that is not the truth
+    own = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
     seen = frames if own is None else _frames(model, batch, own)
     video = draw_video_mask(config, size, count, generator)
     inside = getattr(batch, "frame_mask", None)
-    if inside is not None:  # no loss is due where a short episode was padded
+    if inside is not None:  # padding of a short episode has no loss
         video.masked &= inside.to(video.masked.device).unsqueeze(-1)
     if objective in ("policy", "inverse"):
         video.masked = torch.zeros_like(video.masked)
     dropped = torch.zeros_like(batch.action_mask)
     if objective in ("policy", "full"):
         dropped = drop_chunks(batch.action_mask, generator)
-    elif objective == "inverse":  # the last chunk has no frame after it to be read from
+    elif objective == "inverse":  # no frame follows the last chunk, so it stays
         dropped[:, :-1] = drop_chunks(batch.action_mask[:, :-1], generator)
 
     slots = None
@@ -106,7 +107,7 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
 
 
 def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
-    """An objective by the configuration's weights."""
+    """Draw an objective by the configuration's weights."""
     names, weights = zip(*config.objectives.items())
     if len(names) == 1:
         return names[0]
@@ -116,7 +117,7 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
 
 
 def _frames(model: "HMA", batch: Windows, instead: Tensor | None = None) -> Tensor:
-    """Token ids (B, T, S), or scaled patches (B, T, S, c*p*p), in the batch's order."""
+    """Return token ids (B, T, S), or scaled patches (B, T, S, c*p*p), in the batch's order."""
     config = model.config
     values = batch.tokens if config.kind == "discrete" else batch.latents
     values = values if instead is None else instead
@@ -135,7 +136,7 @@ def _frames(model: "HMA", batch: Windows, instead: Tensor | None = None) -> Tens
 def _embed(
     model: "HMA", frames: Tensor, video: VideoMask, groups: Groups, generator: torch.Generator | None
 ) -> Tensor:
-    """The masked and corrupted frames, embedded, samples sorted."""
+    """Mask, corrupt and embed the frames; return the samples sorted by embodiment."""
     if model.config.kind == "discrete":
         return model.embed_tokens(groups.sort(corrupt_tokens(model.config, frames, video, generator)))
     masked = video.masked.to(frames.device).unsqueeze(-1)
@@ -150,9 +151,9 @@ def _video_loss(
     groups: Groups,
     generator: torch.Generator | None,
 ) -> tuple[Tensor, Tensor]:
-    """The mean loss over masked tokens, and each sample's (B,), in the batch's order."""
+    """Return the mean loss over masked tokens, and each sample's (B,), in the batch's order."""
     masked = groups.sort(masked)
-    rows = masked.flatten().nonzero().squeeze(1)  # on the generator's device: no wait for an accelerator
+    rows = masked.flatten().nonzero().squeeze(1)  # on the generator's device, so no wait for an accelerator
     sample = (rows // masked[0].numel()).to(features.device)
     rows = rows.to(features.device)
     chosen, targets = features.flatten(0, 2)[rows], groups.sort(frames).flatten(0, 2)[rows]
@@ -172,11 +173,11 @@ def _action_loss(
     groups: Groups,
     generator: torch.Generator | None,
 ) -> tuple[Tensor, Tensor]:
-    """The mean loss over predicted chunks, and each sample's (B,), in the batch's order."""
+    """Return the mean loss over predicted chunks, and each sample's (B,), in the batch's order."""
     readout = "inverse" if objective == "inverse" else "policy"
     wanted = batch.action_mask.clone()
     if readout == "inverse" or model.config.action_alignment == "current":
-        wanted &= dropped  # a chunk the model was shown is nothing to predict
+        wanted &= dropped  # a chunk that the model saw is not predicted
     pooled = model.action_features(features)
     if readout == "inverse":
         pooled, wanted = pooled[:, 1:], wanted[:, :-1]
@@ -195,7 +196,7 @@ def _action_loss(
 
 
 def _means(losses: Tensor, sample: Tensor, batch: int) -> Tensor:
-    """Each sample's mean (B,) of losses (M,); 0 where it has none."""
+    """Return each sample's mean (B,) of losses (M,); 0 for a sample without any."""
     zeros = losses.new_zeros(batch)
     count = zeros.index_add(0, sample, torch.ones_like(losses))
     return zeros.index_add(0, sample, losses.detach()) / count.clamp(min=1)

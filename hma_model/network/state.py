@@ -1,4 +1,4 @@
-"""Names and shapes of a model's parts, checked before they are loaded."""
+"""Check names and shapes of a model's parts before they are loaded."""
 
 from collections.abc import Mapping
 
@@ -9,15 +9,15 @@ from hma_model.config import ActionSpace
 
 
 def module_key(embodiment: str) -> str:
-    """A module name for an id: no dots, and no clash with a module's own attributes."""
+    """Return a module name for an id, without dots and without a clash with a module's attributes."""
     return "id_" + embodiment.replace("%", "%25").replace(".", "%2E")
 
 
 def check_fit(where: str, state: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
-    """Compare a state with the one it is to replace.
+    """Check that a state has the names and shapes of the one that it replaces.
 
     Raises:
-        CheckpointError: naming every key that is missing, unknown or of another shape.
+        CheckpointError: the states differ; it names every key that is missing, unknown or of another shape.
     """
     missing, extra = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
     shapes = [
@@ -33,10 +33,10 @@ def check_fit(where: str, state: Mapping[str, Tensor], own: Mapping[str, Tensor]
 
 
 def space_of_stem(embodiment: str, stem: Mapping[str, Tensor]) -> ActionSpace:
-    """The action space that a stem's state was made for.
+    """Return the action space for which a stem's state was made.
 
     Raises:
-        CheckpointError: the state is not a stem's.
+        CheckpointError: the state is not that of a stem.
     """
     try:
         mean, std, mask = (stem[f"normalizer.{name}"] for name in ("mean", "std", "normalize"))

@@ -1,4 +1,4 @@
-"""An embodiment's way into the trunk: normalisation, action stem, and its modulation weights.
+"""Define the stem of an embodiment: action normalisation, action embedding and modulation weights.
 
 B batch, T frames, A values of an action, K = stride*A, D width, L layers.
 """
@@ -14,11 +14,10 @@ from hma_model.config import ActionSpace, HMAConfig
 
 
 class Normalizer(nn.Module):
-    """Raw actions to zero mean and unit variance, and back.
+    """The normalisation of raw actions to zero mean and unit variance, and its inverse.
 
-    Dims that never vary become 0 and come back as their mean, unless the action space says "divide"; dims
-    marked not to be normalised pass through.
-    The statistics stay float32 whatever the model is cast to.
+    Dims that never vary become 0 and are restored as their mean, unless the action space states "divide".
+    Dims that are marked not to be normalised pass through. The statistics stay float32 if the model is cast.
     """
 
     mean: Tensor
@@ -31,16 +30,16 @@ class Normalizer(nn.Module):
         self.register_buffer("mean", torch.tensor(space.mean, dtype=torch.float32))
         self.register_buffer("std", torch.tensor(space.std, dtype=torch.float32))
         self.register_buffer("normalize", torch.tensor(space.normalize, dtype=torch.bool))
-        released = space.zero_variance == "divide"  # in the state only where it is so
+        released = space.zero_variance == "divide"  # it is in the state only if true
         self.register_buffer("divide", torch.tensor(True) if released else None)
 
     def forward(self, actions: Tensor) -> Tensor:
-        """(..., K) raw -> (..., K) normalised, float32."""
+        """Normalise raw actions (..., K) to (..., K) float32."""
         mean, _, inverse = self._affine()
         return ((self._steps(actions) - mean) * inverse).flatten(-2)
 
     def undo(self, actions: Tensor) -> Tensor:
-        """(..., K) normalised -> (..., K) raw, float32."""
+        """Convert normalised actions (..., K) to raw ones (..., K) float32."""
         mean, scale, _ = self._affine()
         return (self._steps(actions) * scale + mean).flatten(-2)
 
@@ -65,13 +64,13 @@ class Normalizer(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Normalizer":
         kept = self.mean, self.std
         super()._apply(fn, recurse)
-        if self.mean.dtype != torch.float32:  # a cast of the model must not round them
+        if self.mean.dtype != torch.float32:  # a cast of the model must not round the statistics
             self.mean, self.std = (value.to(self.mean.device) for value in kept)
         return self
 
 
 class Modulation(nn.Module):
-    """From action embeddings to every layer's (shift, gain), all layers in two batched products.
+    """The map from action embeddings to every layer's (shift, gain), all layers in two batched products.
 
     Weights are stacked over layers, (L, in, out). With `modulation_out == "embodiment"` it also holds each
     layer's projection after the modulated norm, as the released code does.
@@ -92,13 +91,13 @@ class Modulation(nn.Module):
 
     @property
     def out(self) -> tuple[Tensor, Tensor] | None:
-        """The projections after the modulated norm, (L, D, D) and (L, D), if they are here."""
+        """Return the projections after the modulated norm, (L, D, D) and (L, D), or None."""
         if self.out_weight is None or self.out_bias is None:
             return None
         return self.out_weight, self.out_bias
 
     def forward(self, embedding: Tensor) -> Tensor:
-        """(B, T, D) -> (L, B, T, 2D): shift, then 1 + scale."""
+        """Map embeddings (B, T, D) to (L, B, T, 2D): shift, then 1 + scale."""
         rows = embedding.flatten(0, 1).expand(self.weight.shape[0], -1, -1)
         hidden = F.silu(torch.baddbmm(self.bias_in, rows, self.weight_in))
         values = torch.baddbmm(self.bias, hidden, self.weight)
@@ -107,7 +106,7 @@ class Modulation(nn.Module):
 
 
 class Stem(nn.Module):
-    """Everything on the input side that belongs to one embodiment."""
+    """The input modules of one embodiment."""
 
     def __init__(self, config: HMAConfig, space: ActionSpace) -> None:
         super().__init__()
@@ -123,6 +122,6 @@ class Stem(nn.Module):
             nn.init.zeros_(linear.bias)
 
     def forward(self, actions: Tensor) -> Tensor:
-        """(B, T, K) raw -> (B, T, D) action embeddings."""
+        """Map raw chunks (B, T, K) to action embeddings (B, T, D)."""
         values = self.normalizer(actions).to(self.input.weight.dtype)
         return self.output(F.relu(self.norm(self.input(values))))

@@ -1,8 +1,8 @@
-"""The space-time transformer that all embodiments share (paper section 3).
+"""Define the space-time transformer that all embodiments share (paper section 3).
 
-A block attends in both directions among a frame's tokens, is modulated by the action, attends to earlier
-frames at the same place, and ends with an MLP. Nothing ever flows backwards in time, so keys and values of
-past frames can be kept (`cache`).
+A block applies bidirectional attention among the tokens of a frame, modulation by the action, causal
+attention over time at each place of the frame, and an MLP. No information flows backwards in time, so keys
+and values of past frames can be cached (`cache`).
 
 B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers, R cache slots.
 """
@@ -23,14 +23,14 @@ from hma_model.network.stem import Modulation
 
 @dataclass
 class Conditioning:
-    """What actions tell the trunk.
+    """The conditioning of the trunk by actions.
 
     Attributes:
-        embedding: (B, T, D) of the chunk in force at each frame; None without conditioning.
-        tokens: (B, T, D) what is put after each frame's own tokens; None for nothing.
+        embedding: (B, T, D), the embedding of the chunk at each frame; None without conditioning.
+        tokens: (B, T, D), the action tokens after the tokens of each frame; None for no tokens.
         modulation: (L, B, T, 2D) shift and gain.
-        out: per group of samples, in batch order, its size and the embodiment's projections after the
-            modulated norm (L, D, D) and (L, D); None when the trunk has them.
+        out: for each group of samples, in batch order: its size and the embodiment's projections after the
+            modulated norm, (L, D, D) and (L, D). None if the trunk has them.
     """
 
     embedding: Tensor | None = None
@@ -39,7 +39,7 @@ class Conditioning:
     tokens: Tensor | None = None
 
     def last(self) -> "Conditioning":
-        """Of the last frame alone."""
+        """Return the conditioning of the last frame alone."""
         embedding, tokens = (None if x is None else x[:, -1:] for x in (self.embedding, self.tokens))
         modulation = None if self.modulation is None else self.modulation[:, :, -1:]
         return Conditioning(embedding, modulation, self.out, tokens)
@@ -47,14 +47,14 @@ class Conditioning:
 
 @dataclass
 class Clock:
-    """When the frames of a call take place.
+    """The times of the frames of a call, and which frames each may see.
 
     Attributes:
-        positions: (T,) int64, the frames' times.
+        positions: (T,) int64, the times of the frames.
         allowed: (T, keys) bool, which key frames each frame may see.
         rotary: cos and sin (T, head_dim / 2) of the rotary angles.
         causal: `allowed` is the plain lower triangle.
-        slots: (T,) int64, where in the cache the frames' keys and values go; None without a cache.
+        slots: (T,) int64, the cache slots for the frames' keys and values; None without a cache.
     """
 
     positions: Tensor
@@ -66,11 +66,11 @@ class Clock:
 
 @dataclass
 class LayerCache:
-    """Keys and values of one layer.
+    """The cached keys and values of one layer.
 
     Attributes:
-        time: (2, R, B, N, heads, head_dim); a frame's lie side by side, as they are computed.
-        action: (2, B, heads, R, head_dim), with cross-attention.
+        time: (2, R, B, N, heads, head_dim); the values of a frame are contiguous, as computed.
+        action: (2, B, heads, R, head_dim); None without cross-attention.
     """
 
     time: Tensor
@@ -78,12 +78,12 @@ class LayerCache:
 
 
 def rows_at(table: Tensor, positions: Tensor) -> Tensor:
-    """The rows of a table over absolute times, or the only row of one that has no times."""
+    """Return the rows of a table at absolute times, or its only row if it does not depend on time."""
     return table if table.shape[0] == 1 else table[positions]
 
 
 def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Cos and sin, float32 (T, head_dim / 2), of the rotary angles at the times (T,)."""
+    """Return cos and sin, float32 (T, head_dim / 2), of the rotary angles at the times (T,)."""
     half = max(config.head_dim // 2, 1)
     steps = torch.arange(half, device=positions.device, dtype=torch.float32) / half
     angles = positions.float().unsqueeze(-1) * config.rotary_base**-steps
@@ -91,7 +91,7 @@ def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]
 
 
 def window_clock(config: HMAConfig, frames: int, device: torch.device | str) -> Clock:
-    """The clock of `frames` consecutive frames, each seeing itself and the `config.frames` - 1 before it."""
+    """Return the clock of consecutive frames; each sees itself and the `config.frames` - 1 before it."""
     positions = torch.arange(frames, device=device)
     age = positions.unsqueeze(1) - positions
     allowed = (age >= 0) & (age < config.frames)
@@ -108,14 +108,15 @@ def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
 def rotate_qkv(
     qkv: Tensor, rotary: tuple[Tensor, Tensor], within: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotate queries and keys, the values staying; give the three.
+    """Rotate queries and keys, and return them with the unchanged values.
 
-    Without a compiler to fuse it, one complex product over contiguous memory is several times as fast.
+    Without a compiler to fuse the operations, one complex product over contiguous memory is several times as
+    fast.
 
     Args:
         qkv: (..., T, 3, heads, head_dim), or `within` frames (..., T, N, 3, heads, head_dim).
         rotary: cos and sin (T, head_dim / 2).
-        within: whether there are places between the times and the three.
+        within: whether there is an axis of places between the times and the axis of size 3.
     """
     cos, sin = (angle.unsqueeze(1) if within else angle for angle in rotary)
     if qkv.dtype != torch.float32 or torch.compiler.is_compiling():
@@ -130,10 +131,10 @@ def rotate_qkv(
 
 
 def light(function: Callable[..., Tensor], *inputs: Any) -> Tensor:
-    """Call a function that ends in a product, keeping for the backward pass no more than its inputs.
+    """Call a function that ends in a product, and keep only its inputs for the backward pass.
 
-    What leads to the product is computed again there; the product is not, since the recomputation ends when
-    what the backward pass wants is there.
+    The backward pass recomputes the operations before the product. It does not recompute the product, because
+    the recomputation stops once all tensors for the backward pass exist.
     """
     if not torch.is_grad_enabled():
         return function(*inputs)
@@ -142,7 +143,7 @@ def light(function: Callable[..., Tensor], *inputs: Any) -> Tensor:
 
 
 class Attention(nn.Module):
-    """Projections around scaled dot-product attention."""
+    """Scaled dot-product attention with its projections."""
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -157,7 +158,7 @@ class Attention(nn.Module):
     def project(
         self, x: Tensor, norm: nn.Module, rotary: tuple[Tensor, Tensor] | None, within: bool = False
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """(..., length, D), or `within` frames (..., T, N, D) -> three times (..., heads, head_dim)."""
+        """Project (..., length, D), or `within` frames (..., T, N, D), to q, k, v (..., heads, head_dim)."""
         qkv = light(lambda x: self.qkv(norm(x)), x).unflatten(-1, (3, self.heads, -1))
         if rotary is not None and not self.normed:
             return rotate_qkv(qkv, rotary, within)
@@ -170,21 +171,21 @@ class Attention(nn.Module):
     def merge(
         self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None, causal: bool = False
     ) -> Tensor:
-        """Attend over (M, length, heads, head_dim) and project back: (M, length, D)."""
+        """Attend over (M, length, heads, head_dim), and project the result to (M, length, D)."""
         q, k, v = (x.transpose(1, 2) for x in (q, k, v))
         mixed = F.scaled_dot_product_attention(q, k, v, mask, is_causal=causal, scale=self.scale)
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
 
 class TemporalAttention(Attention):
-    """Causal attention over time, at each place of the frame by itself."""
+    """Causal attention over time, separately at each place of the frame."""
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__(config)
         self.rotary = config.time_position == "rotary"
 
     def forward(self, x: Tensor, norm: nn.Module, clock: Clock, cache: LayerCache | None) -> Tensor:
-        """(B, T, N, D), to be normed -> the same shape."""
+        """Apply `norm` and attention over time to (B, T, N, D); keep the shape."""
         rotary = clock.rotary if self.rotary else None
         if cache is not None:
             q, k, v = self.project(x, norm, rotary, within=True)
@@ -198,15 +199,15 @@ class TemporalAttention(Attention):
         return self.merge(q, k, v, mask, clock.causal).view(b, n, t, width).transpose(1, 2)
 
     def _recall(self, q: Tensor, clock: Clock, cache: Tensor) -> Tensor:
-        """Attend to the whole cache: queries (B, T, N, heads, head_dim) -> (B, T, N, D)."""
+        """Attend from queries (B, T, N, heads, head_dim) to the whole cache; return (B, T, N, D)."""
         b, t, n, heads, size = q.shape
         if q.device.type != "cpu" or q.dtype != torch.float32:
             queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
             k, v = cache.flatten(2, 3).permute(0, 2, 3, 1, 4)
             mixed = F.scaled_dot_product_attention(queries, k, v, clock.allowed, scale=self.scale)
             return mixed.view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
-        # On a CPU so few frames a place take half as long in batched products as in the fused kernel, and the
-        # softmax a tenth where places, not frames, fill the vectors.
+        # On a CPU with so few frames a place, batched products take half as long as the fused kernel. The
+        # softmax takes a tenth of the time if its vectors run over places instead of frames.
         rows = q.permute(0, 2, 3, 1, 4).reshape(-1, t, size)
         k, v = cache.flatten(2, 4).transpose(1, 2)  # (B*N*heads, R, head_dim)
         hidden = torch.zeros_like(clock.allowed, dtype=q.dtype).masked_fill(~clock.allowed, -torch.inf)
@@ -216,7 +217,7 @@ class TemporalAttention(Attention):
 
 
 class ActionAttention(nn.Module):
-    """Cross-attention: a frame's tokens attend to the action embeddings up to that frame, in rotary time."""
+    """Cross-attention, with rotary time, of a frame's tokens to the action embeddings up to that frame."""
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -228,7 +229,7 @@ class ActionAttention(nn.Module):
         self.proj = nn.Linear(width, width, bias=config.proj_bias)
 
     def forward(self, x: Tensor, embedding: Tensor, clock: Clock, cache: LayerCache | None) -> Tensor:
-        """Tokens (B, T, N, D) and action embeddings (B, T, D) -> (B, T, N, D)."""
+        """Attend from tokens (B, T, N, D) to action embeddings (B, T, D); return (B, T, N, D)."""
         b, t, n, _ = x.shape
         q = rotate(
             self.q(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), clock.rotary
@@ -258,7 +259,7 @@ class MLP(nn.Module):
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, x: Tensor, norm: nn.Module) -> Tensor:
-        """(..., D), to be normed -> the same shape."""
+        """Apply `norm` and the two maps to (..., D); keep the shape."""
         hidden = light(lambda x: self.fc1(norm(x)), x)
         if self.dropout.p:
             return self.dropout(self._out(hidden))
@@ -269,7 +270,7 @@ class MLP(nn.Module):
 
 
 class Block(nn.Module):
-    """Space, action, time, MLP; each is added to the stream."""
+    """A transformer block: space, action, time and MLP, each with a residual connection."""
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -292,7 +293,7 @@ class Block(nn.Module):
     def forward(
         self, x: Tensor, conditioning: Conditioning, layer: int, clock: Clock, cache: LayerCache | None
     ) -> Tensor:
-        """(B, T, N, D) -> the same shape."""
+        """Apply the block to tokens (B, T, N, D); keep the shape."""
         qkv = self.space.project(x.flatten(0, 1), self.space_norm, None)
         x = x + self.space.merge(*qkv).view(x.shape)
         if self.adds and conditioning.embedding is not None:
@@ -305,7 +306,7 @@ class Block(nn.Module):
         return x + self.mlp(x, self.mlp_norm)
 
     def modulate(self, x: Tensor, conditioning: Conditioning, layer: int) -> Tensor:
-        """The modulated norm of all tokens, projected."""
+        """Return the modulated norm of all tokens, projected."""
         assert conditioning.modulation is not None
         shift, gain = conditioning.modulation[layer].unsqueeze(2).chunk(2, dim=-1)
         modulated = torch.addcmul(shift, F.layer_norm(x, x.shape[-1:], eps=1e-6), gain)
@@ -318,7 +319,7 @@ class Block(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Embedding, positions, blocks.
+    """The trunk: embedding, positions and blocks.
 
     Attributes:
         checkpointing: recompute each block in the backward pass instead of keeping its activations.
@@ -348,7 +349,7 @@ class Trunk(nn.Module):
     def forward(
         self, x: Tensor, conditioning: Conditioning, clock: Clock, caches: list[LayerCache] | None = None
     ) -> Tensor:
-        """Embedded tokens (B, T, S, D) -> features (B, T, N, D), action tokens after the frame's own."""
+        """Map embedded tokens (B, T, S, D) to features (B, T, N, D); action tokens come last in a frame."""
         x = self.embed_norm(self.join(x, conditioning, clock))
         for layer, block in enumerate(self.blocks):
             cache = None if caches is None else caches[layer]
@@ -370,7 +371,7 @@ class Trunk(nn.Module):
 
 
 def initialize(trunk: Trunk, config: HMAConfig) -> None:
-    """Unit-variance maps, with the ends of the residual branches scaled so that the stream stays level."""
+    """Initialise maps to keep unit variance; scale the ends of the branches to keep the stream's variance."""
     branches = (3 + bool({"modulation", "cross_attention"} & set(config.conditioning))) * config.layers
     for name, module in trunk.blocks.named_modules():
         if isinstance(module, nn.Linear):

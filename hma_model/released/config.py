@@ -1,10 +1,10 @@
-"""The configuration of the paper's released checkpoints in ours, and ours in theirs.
+"""Convert the configuration of the paper's released checkpoints to ours, and ours to theirs.
 
-The released layout differs from our default in what `_LAYOUT` sets: no norm before temporal attention nor
+The released layout differs from our default in the fields of `_LAYOUT`: no norm before temporal attention or
 after the last block, chunk k at frame k, learned positions over time and space, and action heads trained on
-raw actions. Its `action_network` says by substrings how actions enter: "concat" appends copies of the
-embedding to every frame, and one of "mlp" (added in every block), "cross_attention" and "modulate" acts in
-the blocks.
+raw actions. Substrings of its `action_network` state how actions enter the network: "concat" appends copies
+of the embedding to every frame; "mlp" (added in every block), "cross_attention" or "modulate" acts in the
+blocks.
 
 D width, T frames, S tokens of a frame.
 """
@@ -16,7 +16,7 @@ from typing import Any
 from hma_data.errors import CheckpointError, RecipeError
 from hma_model.config import HMAConfig
 
-LATENT_SCALE = 0.18215  # what the released loader multiplies stored latents by
+LATENT_SCALE = 0.18215  # the factor by which the released loader multiplies stored latents
 _WHERE = "config.json"
 _LAYOUT: dict[str, Any] = {
     "modulation_out": "embodiment",
@@ -27,7 +27,7 @@ _LAYOUT: dict[str, Any] = {
     "final_norm": False,
     "add_at": "layers",
 }
-# What a released file that does not state a field means by it.
+# The values of fields that a released file does not state.
 _DEFAULTS: dict[str, Any] = {
     "T": 12,
     "S": 256,
@@ -66,15 +66,15 @@ _COUNTS = {"num_layers": 1000, "diffloss_d": 1000, "num_factored_vocabs": 64} | 
 
 
 def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | None = None) -> HMAConfig:
-    """Our configuration of a released `config.json`.
+    """Convert a released `config.json` to our configuration.
 
     Args:
         config: the released configuration.
-        case: may give `grid`, the tokenizer's (h, w), where a frame is not square.
+        case: may give `grid`, the tokenizer's (h, w), if a frame is not square.
 
     Raises:
-        CheckpointError: the configuration asks for what the released code cannot do or does wrongly, lacks a
-            field, or has a value that is not allowed.
+        CheckpointError: the configuration needs something that the released code cannot do or does wrongly,
+            lacks a field, or has a value that is not allowed.
     """
     continuous = bool(config.get("Diffusion", config.get("image_vocab_size", 0) is None))
     given = {key: value for key, value in config.items() if value is not None}
@@ -96,7 +96,7 @@ def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | No
 
 
 def _check_counts(values: Mapping[str, Any]) -> None:
-    """Raise unless what counts something is a whole number, and no more than a network can have."""
+    """Raise unless every count is a whole number, from 1 to its limit."""
     for name, most in _COUNTS.items():
         value = values.get(name, 1)
         if type(value) is not int or not 1 <= value <= most:
@@ -136,7 +136,7 @@ def _shared(values: Mapping[str, Any], continuous: bool) -> dict[str, Any]:
 
 
 def _conditioning(network: str) -> tuple[str, ...]:
-    """What an action_network means, by the substrings that the released code looks for."""
+    """Return the conditioning of an action_network, by the substrings that the released code looks for."""
     if "cross_attention" in network and "mlp" not in network:
         fault = f"action_network {network!r}: the released cross-attention mixes up rows and samples"
         raise CheckpointError(_WHERE, fault, "it cannot be imported")
@@ -193,15 +193,15 @@ def _continuous(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _sample_steps(text: str) -> int:
-    """Steps of a respacing: a number, ddim and a number, numbers that add up, or nothing for all."""
+    """Return the steps of a respacing: `N`, `ddimN`, numbers to add up, or an empty text for all 1000."""
     return sum(int(part) for part in text.removeprefix("ddim").split(",")) if text else 1000
 
 
 def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
-    """The released `config.json` of a configuration, without its action domains.
+    """Convert a configuration to the released `config.json`, without its action domains.
 
     Raises:
-        CheckpointError: the released layout cannot express it; it names everything that stands against it.
+        CheckpointError: the released layout cannot express it; the error names every reason.
     """
     faults = _inexpressible(config)
     if faults:
@@ -255,7 +255,7 @@ def _continuous_fields(config: HMAConfig) -> dict[str, Any]:
 
 
 def _inexpressible(config: HMAConfig) -> list[str]:
-    """Each field and value that the released code has no equal of."""
+    """Return each field and value that the released code cannot express."""
     fixed = ("time_position", "action_alignment", "temporal_norm", "final_norm")
     faults = [f"{name} {getattr(config, name)!r}" for name in fixed if getattr(config, name) != _LAYOUT[name]]
     if config.absent_action == "embedding":

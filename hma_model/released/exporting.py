@@ -1,8 +1,8 @@
 """Export a checkpoint to the paper's released layout, so that the released code reads it.
 
-What the embodiments share in ours is repeated for each of them; raw action targets and normalised ones,
-variance outputs and readouts before a diffusion head are folded into what the layout has. A configuration
-that the layout cannot express is refused, with everything that stands against it.
+Weights that our embodiments share are repeated for each of them. The normalisation of action targets,
+variance outputs and readouts before a diffusion head are folded into the weights of the layout. A
+configuration that the layout cannot express is refused, with every reason.
 """
 
 import keyword
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 
 def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[str] | None = None) -> Path:
-    """Write config.json and model.safetensors as the released code's `from_pretrained` reads them.
+    """Write config.json and model.safetensors so that the released code's `from_pretrained` reads them.
 
     Args:
-        checkpoint: str or path of its folder, or of that of a training run.
-        out: str or path of a folder that is not there yet or is empty.
+        checkpoint: str or path of its folder, or of the folder of a training run.
+        out: str or path of a folder that does not exist or is empty.
         embodiments: ids; all by default.
 
     Returns:
@@ -74,7 +74,7 @@ def _write(out: Path, values: dict[str, Any], state: State, failure: type[Except
 
 
 def _domains(model: "HMA", where: object) -> dict[str, str]:
-    """A released name for each id: a module's name in their code, so without dots."""
+    """Return the id of each released name, which has no dots because it is a module's name in their code."""
     domains: dict[str, str] = {}
     for name in model.embodiments:
         domain = name.replace(".", "_")
@@ -97,7 +97,7 @@ def _actions(model: "HMA", domains: dict[str, str]) -> dict[str, Any]:
 
 
 def _check_norms(model: "HMA", where: object) -> None:
-    """The released code norms queries and keys by one set of weights."""
+    """Raise unless queries and keys have equal norms: the released code has one norm for both."""
     state = model.trunk_state()
     for name in state:
         if ".q_norm." in name and not torch.equal(state[name], state[name.replace(".q_norm.", ".k_norm.")]):

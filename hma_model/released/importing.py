@@ -1,8 +1,8 @@
-"""Import the paper's released checkpoints: a folder or repository of theirs becomes a checkpoint of ours.
+"""Convert the paper's released checkpoints, from a folder or repository, to checkpoints of our format.
 
 A released folder holds config.json and model.safetensors, or pytorch_model.bin. Everything is read and
-checked before anything is written. What the release does not state (cameras, rates, units) is marked unknown
-in the embodiments' YAML, unless the registry has an embodiment of the domain's name and width.
+checked before anything is written. Facts that the release does not state (cameras, rates, units) are marked
+unknown in the embodiments' YAML, unless the registry has an embodiment of the domain's name and width.
 """
 
 import pickle
@@ -30,7 +30,7 @@ from hma_model.released.state import State, domains_of, state_from_released, sta
 
 CONFIG, WEIGHTS = "config.json", ("model.safetensors", "pytorch_model.bin")
 _PREFIXES = ("module.", "_orig_mod.")
-_SHOWN = 3  # names an error lists
+_SHOWN = 3  # maximum number of names in an error
 
 
 def import_released(
@@ -42,7 +42,7 @@ def import_released(
     tokenizer: str | None = None,
     origin: str | Path | None = None,
 ) -> Checkpoint:
-    """Bring a released checkpoint that is on this machine into our layout.
+    """Convert a released checkpoint of this machine to our layout.
 
     Args:
         source: str or path of a folder with config.json and weights, or of the weights' file in it.
@@ -84,7 +84,7 @@ def import_released(
 
 
 def _files(source: str | Path) -> tuple[Path, Path]:
-    """The folder that holds config.json, and the weights' file."""
+    """Return the folder of config.json, and the file of the weights."""
     path = Path(source).expanduser()
     if path.is_file():
         return path.parent, path
@@ -109,7 +109,7 @@ def _config_values(path: Path) -> dict[str, Any]:
 
 
 def _read_state(path: Path) -> State:
-    """The tensors of a weights file, without the prefixes that wrappers put before their names."""
+    """Read the tensors of a weights file, without the prefixes that wrappers add to their names."""
     state: Any = read_tensors(path) if path.suffix == ".safetensors" else _unpickled(path)
     for key in ("state_dict", "model"):
         if isinstance(state, Mapping) and isinstance(state.get(key), Mapping):
@@ -125,7 +125,7 @@ def _read_state(path: Path) -> State:
 def _unpickled(path: Path) -> Any:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of old protocols, which the error below covers
+            warnings.simplefilter("ignore")  # warnings of old protocols; the error below covers them
             return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as fault:
         raise CheckpointError(
@@ -149,7 +149,7 @@ def _unpickled(path: Path) -> Any:
 
 
 def _explained(folder: Path, make: Any) -> HMAConfig:
-    """The configuration, with the file's path in its error."""
+    """Return the configuration; an error names the path of its file."""
     try:
         config: HMAConfig = make()
     except CheckpointError as fault:
@@ -158,7 +158,7 @@ def _explained(folder: Path, make: Any) -> HMAConfig:
 
 
 def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str, Any]) -> None:
-    """Raise unless names and shapes are those of the released architecture that config.json describes."""
+    """Raise unless names and shapes fit the released architecture that config.json describes."""
     domains = domains_of(state)
     named = values.get("action_domains") or []
     lacking = [name for name in named if name not in domains]
@@ -184,7 +184,7 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
 
 
 def _expected(path: Path, state: State, config: HMAConfig, domains: list[str]) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the released layout, found by writing an empty model of ours in it."""
+    """Return names and shapes of the released layout, by converting a model without data to it."""
     with torch.device("meta"):
         model = HMA(config)
         for domain in domains:
@@ -195,7 +195,7 @@ def _expected(path: Path, state: State, config: HMAConfig, domains: list[str]) -
 
 
 def _space(path: Path, state: State, domain: str) -> ActionSpace:
-    """The width and stride of a domain, by the shapes of its tensors."""
+    """Return the action space of a domain, with the width and stride that its tensors' shapes imply."""
     names = f"action_preprocessor.{domain}.mean", f"action_mlp.{domain}.model.0.weight"
     if any(name not in state for name in names):
         lacking = next(name for name in names if name not in state)
@@ -224,7 +224,7 @@ def _some(names: list[str]) -> str:
 
 
 def _ids(domains: list[str], path: Path) -> dict[str, str]:
-    """An id of ours for each released domain."""
+    """Return our id for each released domain."""
     ids: dict[str, str] = {}
     for domain in domains:
         name = re.sub(r"[^a-z0-9_-]+", "_", domain.lower())[:100]
@@ -250,7 +250,7 @@ def _choose(ids: dict[str, str], wanted: Iterable[str] | None, path: Path) -> di
 
 
 def _tokenizer_spec(config: HMAConfig, name: str | None, folder: Path) -> TokenizerSpec:
-    """The tokenizer's spec; which weights it had, the release does not say."""
+    """Return the tokenizer's spec, without the hash of its weights, which the release does not state."""
     discrete = config.kind == "discrete"
     paper = config.vocab_size == 2**18 if discrete else config.channels == 4
     known = CATALOG.get(name) if name else None
@@ -276,7 +276,7 @@ def _tokenizer_spec(config: HMAConfig, name: str | None, folder: Path) -> Tokeni
 
 
 def _yaml(domain: str, space: ActionSpace) -> str:
-    """The registry's embodiment of this id, where its width is the domain's; else one that says unknown."""
+    """Return the YAML of the registry's embodiment, if its width fits; else one with unknown values."""
     try:
         values = find(space.id).to_dict()
     except HMAError:

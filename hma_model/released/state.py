@@ -1,9 +1,9 @@
-"""The tensors of the paper's released checkpoints under our names, and ours under theirs.
+"""Convert the tensors of the paper's released checkpoints to our names and layout, and ours to theirs.
 
-Most modules are only renamed (`_renamed`). The rest: a patch's values lie channels first in ours and pixels
-first in theirs; the modulation of all layers is stacked in ours, its maps kept (in, out); the released action
-heads read the pooled features directly, so our readout before a diffusion head is the identity or folded
-into the head.
+Most modules are only renamed (`_renamed`). The others differ as follows. The values of a patch lie channels
+first in ours and pixels first in theirs. In ours the modulation of all layers is stacked, with maps of shape
+(in, out). The released action heads read the pooled features directly; our readout before a diffusion head is
+therefore the identity after an import, and is folded into the head by an export.
 
 D width, T frames, S tokens of a frame, K = stride * action dim, c channels, p patch side.
 """
@@ -44,19 +44,19 @@ _MODULATION = {"adaLN_modulation.0": "_in", "adaLN_modulation.2": ""}
 
 
 def domains_of(state: Mapping[str, Tensor]) -> list[str]:
-    """The embodiments of a released state, in its own names."""
+    """Return the released names of the embodiments in a released state."""
     return sorted({name.split(".")[1] for name in state if name.startswith("action_mlp.")})
 
 
 def state_from_released(state: Mapping[str, Tensor], config: HMAConfig) -> tuple[State, Parts]:
-    """A released state, divided and renamed.
+    """Split and rename a released state.
 
     Args:
         state: the released names and tensors.
-        config: from `config_from_released`.
+        config: the result of `config_from_released`.
 
     Returns:
-        What `HMA.load_trunk` takes, and per embodiment the stem and head for `HMA.load_embodiment`; float32.
+        The state for `HMA.load_trunk`, and the stem and head of each embodiment, all float32.
 
     Raises:
         CheckpointError: a tensor is missing.
@@ -75,9 +75,9 @@ def state_from_released(state: Mapping[str, Tensor], config: HMAConfig) -> tuple
 def state_to_released(
     trunk: Mapping[str, Tensor], parts: Mapping[str, tuple[State, State]], config: HMAConfig
 ) -> State:
-    """The released names and tensors of a trunk and of embodiments' (stem, head), by the released names.
+    """Convert a trunk and the (stem, head) of embodiments, by released name, to a released state.
 
-    The configuration must be one that `config_to_released` takes. Tensors may be on the meta device.
+    The configuration must be one that `config_to_released` accepts. Tensors may be on the meta device.
     """
     released = _back(trunk, _renamed(config))
     released |= _positions_back(trunk, config)
@@ -93,7 +93,7 @@ def state_to_released(
 
 
 def _renamed(config: HMAConfig) -> dict[str, str]:
-    """Modules of the trunk that are only renamed: theirs -> ours."""
+    """Return the modules of the trunk that are only renamed: their name -> our name."""
     names = {}
     for layer in range(config.layers):
         for theirs, ours in _BLOCK.items():
@@ -114,7 +114,7 @@ def _diffusion(theirs: str, ours: str, config: HMAConfig) -> dict[str, str]:
 
 
 def _move(source: Mapping[str, Tensor], old: str, new: str) -> State:
-    """The weight and, if there is one, the bias of a module under its new name."""
+    """Return the weight and, if there is one, the bias of a module under its new name."""
     names = {f"{new}.weight": source[f"{old}.weight"]}
     if f"{old}.bias" in source:
         names[f"{new}.bias"] = source[f"{old}.bias"]
@@ -175,7 +175,7 @@ def _positions_back(trunk: Mapping[str, Tensor], config: HMAConfig) -> State:
 
 
 def _latents(source: State, renamed: State, config: HMAConfig) -> State:
-    """Ends of the continuous model; the diffusion head's inputs and outputs are patches, so reordered too."""
+    """Convert embedding, positions and diffusion head of the continuous model; reorder their patches."""
     prefix = "readout.diffusion"
     halves = renamed[f"{prefix}.output.weight"].unflatten(0, (2, -1))  # the noise, then its variance
     weight = _channels_first(halves.movedim(-1, 0), config).movedim(0, -1).flatten(0, 1)
@@ -217,7 +217,7 @@ def _pixels_first(values: Tensor, config: HMAConfig) -> Tensor:
 
 
 def _with_variance(weight: Tensor, bias: Tensor, values: int) -> tuple[Tensor, Tensor]:
-    """An output layer with variance outputs; where there are none they say the middle of their range."""
+    """Return an output layer with variance outputs; missing ones become 0, the middle of their range."""
     if len(bias) == 2 * values:
         return weight, bias
     return torch.cat([weight, torch.zeros_like(weight)]), torch.cat([bias, torch.zeros_like(bias)])
@@ -255,7 +255,11 @@ def _modulation(source: State, domain: str, config: HMAConfig) -> State:
 
 
 def _stem_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HMAConfig) -> State:
-    """Dims that pass through get mean 0 and std 1; those that never vary, which ours set to 0, no weight."""
+    """Convert a stem to released names.
+
+    Dims that pass through get mean 0 and std 1. Dims that never vary get no weight, because our stem sets
+    them to 0.
+    """
     mean, std = stem["normalizer.mean"].float(), stem["normalizer.std"].float()
     plain, still = ~stem["normalizer.normalize"], _still(stem)
     weight = stem["input.weight"]
@@ -273,7 +277,7 @@ def _stem_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HM
 
 
 def _still(stem: State) -> Tensor:
-    """(A,) bool: dims that `Normalizer` sets to 0."""
+    """Return (A,) bool, True for dims that `Normalizer` sets to 0."""
     mean, std, normalize = (stem[f"normalizer.{name}"] for name in ("mean", "std", "normalize"))
     if "normalizer.divide" in stem:
         return torch.zeros_like(normalize)
@@ -281,7 +285,7 @@ def _still(stem: State) -> Tensor:
 
 
 def _modulation_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HMAConfig) -> State:
-    """What the embodiments share in ours, each gets for itself."""
+    """Convert the modulation of one embodiment; shared weights are repeated for each embodiment."""
     source, prefix = (trunk, "trunk.modulation") if config.shared_modulation else (stem, "modulation")
     released = {}
     for layer in range(config.layers):
@@ -298,7 +302,7 @@ def _modulation_back(stem: State, trunk: Mapping[str, Tensor], domain: str, conf
 
 
 def _head(source: State, domain: str, config: HMAConfig) -> State:
-    """Their only readout serves as both of ours; a diffusion head was given the features as they are."""
+    """Convert a head: its one readout becomes both of ours, or the identity before a diffusion head."""
     if config.action_loss == "diffusion":
         weight, bias = torch.eye(config.width), torch.zeros(config.width)
         head = _forth(source, _diffusion(f"action_diff_losses.{domain}.net", "diffusion", config))

@@ -1,8 +1,8 @@
-"""The batches of a step, the same whatever number of ranks shares them.
+"""Draw the batches of a training step, the same for every number of ranks.
 
-A step is so many passes, each over a batch of its own; rank r of W makes passes r, r + W and so on. Pass p
-draws from the mixture as if it were rank p of as many as there are passes: what it sees does not depend on W,
-and a run may go on with another number of ranks.
+A step consists of a number of passes, each over its own batch. Rank r of W makes the passes r, r + W and so
+on. Pass p draws from the mixture as if it were rank p and every pass were a rank. Its data do not depend on
+W, so a run may continue with another number of ranks.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,14 +19,14 @@ from hma_model.training.resume import seed_for
 if TYPE_CHECKING:
     from hma_model.training.recipe import Recipe
 
-MEMORY_MIB = 2048  # of decoded rows, of all passes together, so that it is the same on any number of ranks
+MEMORY_MIB = 2048  # of decoded rows; all passes share it, so it does not depend on the number of ranks
 
 
 def share(recipe: "Recipe", ranks: int) -> tuple[int, int]:
-    """How the windows of a step are shared: (passes of all ranks together, windows a pass).
+    """Return (passes of all ranks together, windows a pass) of a step.
 
     Raises:
-        RecipeError: they cannot be shared evenly.
+        RecipeError: the windows cannot be shared evenly.
     """
     total = recipe.windows_per_step
     passes = recipe.accumulate if recipe.accumulate % ranks == 0 else ranks
@@ -41,10 +41,10 @@ def share(recipe: "Recipe", ranks: int) -> tuple[int, int]:
 
 @contextmanager
 def _workers_alive() -> Iterator[None]:
-    """Around the wait for what other processes decode.
+    """Convert an error of the block, if it shows that a decoding process has ended.
 
     Raises:
-        TrainingError: one of them has ended.
+        TrainingError: a process that decodes batches has ended.
     """
     try:
         yield
@@ -60,7 +60,7 @@ def _workers_alive() -> Iterator[None]:
 
 
 class Feed:
-    """This rank's batches.
+    """The batches of this rank.
 
     Args:
         recipe: states mixture, windows and seed.
@@ -68,12 +68,12 @@ class Feed:
         world: the ranks.
 
     Attributes:
-        passes: of a step, of all ranks together.
-        own: numbers of those that are this rank's.
+        passes: passes of a step, of all ranks together.
+        own: the numbers of this rank's passes.
 
     Raises:
-        RecipeError: a step has more windows than there are, or they cannot be shared.
-        ShardError: a set without a single window.
+        RecipeError: a step needs more windows than there are, or the windows cannot be shared evenly.
+        ShardError: a set has no window.
     """
 
     def __init__(self, recipe: "Recipe", sets: Mapping[str, ShardSet], world: World) -> None:
@@ -120,11 +120,11 @@ class Feed:
 
     @property
     def mixture(self) -> Mixture:
-        """How often each embodiment is drawn."""
+        """Return the mixture, which states how often each embodiment is drawn."""
         return self._data[0].mixture
 
     def step(self) -> Iterator[tuple[int, Batch]]:
-        """This rank's batches of the next step, each with the number of its pass.
+        """Yield this rank's batches of the next step, each with the number of its pass.
 
         Raises:
             ShardError: a shard is missing or damaged.
@@ -138,21 +138,21 @@ class Feed:
             yield number, batch
 
     def realised(self) -> list[dict[str, Any]]:
-        """What this rank has drawn of each embodiment, beside what was intended: `Mixture.table`."""
+        """Return `Mixture.table`: the samples this rank drew of each embodiment, beside the intended ones."""
         drawn = [[int(row["samples"]) for row in data.realised()] for data in self._data]
         return self.mixture.table([sum(column) for column in zip(*drawn, strict=True)])
 
     def state(self, world: World) -> dict[str, Any]:
-        """Where all passes stand after whole steps; every rank must ask."""
+        """Return the state of all passes after whole steps; every rank must call it."""
         mine = dict(zip(self.own, (data.state_dict() for data in self._data)))
         known = {number: state for part in world.gather(mine) for number, state in part.items()}
         return {"passes": [known[number] for number in range(self.passes)]}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state`, saved by any number of ranks.
+        """Continue from `state`, which any number of ranks may have saved.
 
         Raises:
-            UsageError: it is of another mixture, or of a step that was shared otherwise.
+            UsageError: the state is of another mixture, or of another number of passes a step.
         """
         kept = state.get("passes")
         if not isinstance(kept, list) or len(kept) != self.passes:
@@ -162,6 +162,6 @@ class Feed:
             data.load_state_dict(kept[number])
 
     def shared_otherwise(self, state: Mapping[str, Any]) -> bool:
-        """Whether a state is of the same windows a step, made in another number of passes."""
+        """Check whether a state has another number of passes a step."""
         kept = state.get("passes")
         return isinstance(kept, list) and len(kept) != self.passes

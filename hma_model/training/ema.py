@@ -1,7 +1,7 @@
-"""Averaged weights: what is evaluated and published where a recipe asks for them.
+"""Average the weights during training, for evaluation and publication, if the recipe asks for it.
 
-After each step the average moves towards the weights by 1 - decay; in the first steps by more, so that it
-does not hold on to where the run began (decay is at most (1 + step) / (10 + step)).
+After each step the average moves towards the weights by 1 - decay. In the first steps it moves by more, so
+that it soon forgets the initial weights (decay is at most (1 + step) / (10 + step)).
 """
 
 from collections.abc import Mapping
@@ -13,11 +13,11 @@ from hma_model.training.parallel import gathered, like, local
 
 
 class Average:
-    """Moving average of a network's parameters, each rank its part.
+    """A moving average of a network's parameters; each rank averages its part.
 
     Args:
-        model: as it is trained.
-        decay: of the average, 0 to 1.
+        model: the network in training.
+        decay: the decay of the average, 0 to 1.
     """
 
     def __init__(self, model: nn.Module, decay: float) -> None:
@@ -27,7 +27,7 @@ class Average:
 
     @torch.no_grad()
     def update(self, step: int) -> None:
-        """Take in the weights after step `step`, counted from 1."""
+        """Update the average with the weights after step `step`, counted from 1."""
         weight = 1 - min(self.decay, (1 + step) / (10 + step))
         moving = {n: p for n, p in self._model.named_parameters() if n in self._own}
         own = [local(value) for value in self._own.values()]
@@ -35,11 +35,11 @@ class Average:
 
     @torch.no_grad()
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Put back whole averages by parameter name; others keep what they are."""
+        """Restore unsharded averages by parameter name; a parameter that is not named keeps its average."""
         for name, own in self._own.items():
             if name in state:
                 own.copy_(like(state[name], own))
 
     def state(self) -> dict[str, Tensor]:
-        """The network's state with averages in place of parameters, whole; every rank must ask."""
+        """Return the unsharded state of the network with averaged parameters; every rank must call it."""
         return {**gathered(self._model.state_dict().items()), **gathered(self._own.items())}

@@ -1,8 +1,8 @@
-"""Bring a robot to a trained trunk: a new stem and head on it, with the trunk as it is or tuned along.
+"""Train a new stem and head for a robot on a trained trunk, which is frozen or tuned too.
 
     result = finetune("runs/base", ["shards/my_arm"], out="runs/my_arm", freeze_trunk=True)
 
-With the trunk frozen the result can be pushed to the hub that the trunk came from, beside its other robots.
+With a frozen trunk the result can be pushed to the hub that the trunk came from, beside its other robots.
 """
 
 from collections.abc import Sequence
@@ -36,15 +36,15 @@ def finetune(
         source: str or path of a checkpoint or a run's folder, a URI, or a hub repository, also
             `org/name@revision`.
         data: str or path of folders of shards, made with the checkpoint's tokenizer.
-        out: str or path of the run's folder; by default that of the overrides.
-        freeze_trunk: train stems and heads alone.
-        overrides: `key=value` over the recipe.
+        out: str or path of the run's folder; by default the one that the overrides name.
+        freeze_trunk: train only the stems and heads.
+        overrides: `key=value` strings that override the recipe.
         recipe: name, or str or path of a YAML.
         options: `show`, `force`, `on_progress` of `hma_model.training.loop.train`.
 
     Raises:
         UsageError: no shards, or no folder for the run.
-        CheckpointError: the shards are of another tokenizer, or know the robot with other actions.
+        CheckpointError: the shards are of another tokenizer, or state other actions for the robot.
         HubError: there is no such checkpoint.
     """
     from hma_model.training.loop import train

@@ -1,6 +1,6 @@
-"""When a step is not to be trusted: a loss that is no number, or a gradient far beyond what it was.
+"""Detect bad training steps: a loss that is not finite, or a gradient far above its running mean.
 
-What the run does then is the recipe's: stop and name the windows, or leave the step out and count it.
+The recipe decides what the run does then: stop and name the windows, or skip the step and count it.
 """
 
 import math
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hma_data.shards.reader import ShardSet
 
 NAMED = 4  # windows named in an error
-MEMORY = 0.98  # of the running mean of norms
+MEMORY = 0.98  # decay of the running mean of norms
 SETTLED = 20  # steps before a norm can be a spike
 
 
@@ -28,9 +28,9 @@ class Pulse:
     """The running mean of gradient norms.
 
     Attributes:
-        limit: a norm above this many times the mean is a spike; 0 never.
-        mean: of the norms of steps that were taken.
-        count: of these steps.
+        limit: a norm above this many times the mean is a spike; with 0 no norm is.
+        mean: running mean of the norms of steps that were taken.
+        count: number of these steps.
     """
 
     limit: float = 0.0
@@ -38,7 +38,7 @@ class Pulse:
     count: int = 0
 
     def fault(self, loss: float, norm: float) -> str:
-        """What is wrong with a step; nothing for one that may be taken."""
+        """Return the fault of a step; an empty string if the step may be taken."""
         if not math.isfinite(loss) or not math.isfinite(norm):
             return f"the loss is {loss}, the gradient's norm {norm}"
         if self.limit and self.count >= SETTLED and norm > self.limit * self.mean:
@@ -47,7 +47,7 @@ class Pulse:
         return ""
 
     def take(self, norm: float) -> None:
-        """Count in the norm of a step that was taken."""
+        """Update the mean with the norm of a step that was taken."""
         weight = max(1 - MEMORY, 1 / (self.count + 1))
         self.mean += weight * (norm - self.mean)
         self.count += 1
@@ -56,10 +56,10 @@ class Pulse:
 def suspects(
     batches: Sequence[tuple[Batch, Tensor]], sets: "Mapping[str, ShardSet]"
 ) -> list[tuple[float, str]]:
-    """The windows of this rank's part of a step that may be at fault, each with its loss.
+    """Return the windows of this rank that may be the cause of a bad step, each with its loss.
 
     Args:
-        batches: with the loss (B,) of each window.
+        batches: the batches of the step, each with the loss (B,) of its windows.
         sets: shard sets by embodiment, for the episodes' names.
     """
     found = []
@@ -79,7 +79,7 @@ def suspects(
 
 
 def culprits(suspected: Sequence[tuple[float, str]]) -> list[str]:
-    """Of the suspects of all ranks those whose losses are not numbers; else all, the largest losses first."""
+    """Return the suspects of all ranks whose losses are not finite; else all, the largest losses first."""
     return [text for _, text in _worst(suspected)]
 
 
@@ -89,13 +89,13 @@ def _worst[Item: tuple[Any, ...]](found: Sequence[Item]) -> list[Item]:
 
 
 def listed(windows: Sequence[str]) -> str:
-    """The first few, and how many more."""
+    """Return a text that names the first few windows and counts the others."""
     more = len(windows) - NAMED
     return "; ".join(windows[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _span(shards: "ShardSet | None", first: object, length: int) -> str:
-    """The rows of `frame_index` that a window of so many frames goes over."""
+    """Return a text that names the frames of the episode that a window of `length` frames spans."""
     if shards is None or not isinstance(first, int):
         return f"frame {first} and on"
     return f"frames {first} to {first + (length - 1) * shards.row_stride}"

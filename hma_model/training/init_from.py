@@ -1,10 +1,10 @@
-"""Where a run begins that does not begin from nothing: another run's checkpoint, or one from a hub.
+"""Start a run from a checkpoint, of another run or from a hub.
 
-The run keeps its own copy in `.start/`, so that it goes on whatever becomes of the source. Robots of the data
-that the checkpoint knows go on from their stem and head, with the statistics these were trained with; others
-get fresh ones. Of a hub the trunk and the robots of the data are fetched, nothing else. With the trunk frozen
-the run's checkpoints carry the very files of the trunk and, from a checkpoint on this machine, of all other
-robots; a tuned trunk leaves them behind, because they belong to the trunk as it was.
+The run keeps its own copy in `.start/`, so it can resume even if the source changes or is deleted. Robots of
+the data that the checkpoint has continue from their stem and head, with the statistics these were trained
+with; other robots get fresh ones. From a hub only the trunk and the robots of the data are fetched. With a
+frozen trunk, the run's checkpoints keep the same files of the trunk and, if the source is on this machine, of
+all other robots. With a tuned trunk they do not keep the other robots, because these belong to the old trunk.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
     from hma_model.training.recipe import Recipe
 
-# what may differ from the checkpoint's network, because no weight's meaning depends on it
+# fields that may differ from the checkpoint's network, because no weight's meaning depends on them
 TRAINED_BY = {
     *("dropout", "action_loss_weight", "label_smoothing", "corrupt_max", "history_probability"),
     *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
@@ -34,12 +34,12 @@ TRAINED_BY = {
 
 @dataclass(frozen=True)
 class Start:
-    """A checkpoint to begin from.
+    """A checkpoint from which a run starts.
 
     Attributes:
         checkpoint: the run's own copy.
-        frozen: the trunk stays as it is.
-        source: where it came from, for notes.
+        frozen: the trunk is not trained.
+        source: the source of the checkpoint, for notes.
     """
 
     checkpoint: Checkpoint
@@ -48,10 +48,10 @@ class Start:
 
     @classmethod
     def bring(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> None:
-        """Bring the recipe's checkpoint into the run's folder, unless it is there.
+        """Fetch the recipe's checkpoint into the run's folder, unless it is there already.
 
         Raises:
-            HubError, CheckpointError: it is not there, or damaged.
+            HubError, CheckpointError: the checkpoint does not exist, or is damaged.
             CheckpointError: the data is of another tokenizer.
         """
         from hma_model.hub import publish as hub
@@ -82,17 +82,17 @@ class Start:
 
     @classmethod
     def open(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> "Start":
-        """What `bring` has brought.
+        """Open the copy that `bring` has fetched.
 
         Raises:
-            CheckpointError: it is damaged, or the data is of another tokenizer.
+            CheckpointError: the copy is damaged, or the data is of another tokenizer.
         """
         start = cls(Checkpoint.open(out / START), recipe.freeze == "trunk", str(recipe.start))
         require_tokenizer(start.checkpoint.config, _spec(sets), start.source)
         return start
 
     def network(self, recipe: "Recipe") -> HMAConfig:
-        """The checkpoint's network, trained as the recipe says.
+        """Return the configuration of the checkpoint's network, with the recipe's training options.
 
         Raises:
             RecipeError: the recipe asks for another network.
@@ -117,10 +117,10 @@ class Start:
         return config.replace(**changes)
 
     def stats(self, shards: ShardSet) -> dict[str, Any]:
-        """A robot's statistics: the checkpoint's where it knows the robot, else those of the shards.
+        """Return a robot's statistics: those of the checkpoint if it has the robot, else those of the shards.
 
         Raises:
-            CheckpointError: it knows the robot with other actions.
+            CheckpointError: the checkpoint has the robot with other actions.
         """
         name = shards.embodiment.id
         if name not in self.checkpoint.embodiments:
@@ -137,7 +137,7 @@ class Start:
         return self.checkpoint.stats(name)
 
     def fill(self, model: "HMA") -> None:
-        """Put the checkpoint's weights in a model that has its embodiments, and freeze what stays."""
+        """Load the checkpoint's weights for the model's embodiments; freeze trunk and readout if required."""
         model.load_trunk(weights.trunk(self.checkpoint))
         for name in model.embodiments:
             if name in self.checkpoint.embodiments:
@@ -147,7 +147,7 @@ class Start:
                 part.requires_grad_(False)
 
     def remarks(self, names: Mapping[str, Any]) -> list[str]:
-        """What becomes of the checkpoint's robots and of those of the data."""
+        """Return notes on the trunk, and on which robots continue and which get a fresh stem and head."""
         known = [name for name in names if name in self.checkpoint.embodiments]
         fresh = [name for name in names if name not in known]
         notes = [f"from {self.source}: trunk {'frozen' if self.frozen else 'tuned'}"]
@@ -159,9 +159,10 @@ class Start:
 
 
 def _require_source(source: str, out: Path) -> None:
-    """Raise where a run is asked to go on from another checkpoint than the one it was begun from.
+    """Raise if a resumed run names another checkpoint than the one it was started from.
 
-    The same one may have moved; a source that is gone, or a run that trained on, is no other one.
+    The checkpoint is the same if its trunk is, so it may have moved. A source that does not exist any more is
+    accepted.
     """
     from hma_model.hub import publish as hub
 

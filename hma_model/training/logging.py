@@ -1,7 +1,7 @@
-"""What a training run leaves to read, and what a person sees while it runs.
+"""Write the metrics of a training run, and show its progress.
 
-`metrics.jsonl` has one line a step (`"kind": "train"`) and one an evaluation (`"kind": "eval"`). On a
-terminal there is a live table; elsewhere a plain line every few seconds.
+`metrics.jsonl` has one line a step (`"kind": "train"`) and one line an evaluation (`"kind": "eval"`). A
+terminal shows a live table; any other output gets a plain line every few seconds.
 """
 
 import json
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 METRICS, KINDS = "metrics.jsonl", ("train", "eval")
 PLAIN_SECONDS = 10.0
-SMOOTHING = 20  # steps a shown loss is averaged over
-PACING = 50  # steps that the speed and the time left are told from
+SMOOTHING = 20  # steps over which a shown loss is averaged
+PACING = 50  # steps from which the speed and the remaining time are estimated
 
 
 def read_metrics(out: StrPath) -> list[dict[str, Any]]:
-    """Every whole line of metrics.jsonl in a run's folder (str or path); none where there is no such file."""
+    """Read the complete lines of metrics.jsonl in a run's folder (str or path); none without the file."""
     path = as_path(out) / METRICS
     if not path.is_file():
         return []
@@ -51,16 +51,16 @@ def read_metrics(out: StrPath) -> list[dict[str, Any]]:
 
 
 class RunLog:
-    """Context manager around the steps of a run.
+    """The log of a run, a context manager around its steps.
 
     Args:
         out: the run's folder.
-        steps: how many the whole run has.
-        begin: steps done before; later lines of an earlier, killed run are dropped.
-        show: anything at all on standard error.
-        write: keep metrics.jsonl; the ranks but the first do not.
-        trackers: get the same figures.
-        nats: losses are nats a token, of which a perplexity can be told.
+        steps: the number of steps of the whole run.
+        begin: the number of finished steps; later lines of an earlier, killed run are dropped.
+        show: print progress to standard error.
+        write: write metrics.jsonl; only the first rank does.
+        trackers: the trackers that get the same figures.
+        nats: losses are nats a token, so a perplexity can be shown.
     """
 
     def __init__(
@@ -105,30 +105,30 @@ class RunLog:
             tracker.close()
 
     def note(self, text: str) -> None:
-        """A sentence for the person who watches."""
+        """Print a note for the user."""
         if self._live:
             self._live.console.print(text, markup=False, highlight=False)
         elif self._show:
             print(text, file=sys.stderr, flush=True)
 
     def step(self, facts: dict[str, Any]) -> None:
-        """One line of kind train; `facts` has step, loss_by_embodiment, lr, step_seconds and more."""
+        """Add a line of kind train; `facts` has step, loss_by_embodiment, lr, step_seconds and more."""
         self._write({"kind": "train", **facts})
         self._track("train", facts, ("loss", "lr", "grad_norm", "step_seconds", "memory_mib", "skipped"))
         self._last = facts
         self._spent += facts["step_seconds"]
-        first = facts["step"] == self._begin + 1  # it also waits for workers to start, and compiles
+        first = facts["step"] == self._begin + 1  # it includes compilation and starting workers
         if facts["step"] == self._begin + 2:
             self._paces.clear()
         self._paces.append(facts["step_seconds"] - first * facts.get("data_seconds", 0.0))
         for name, loss in facts["loss_by_embodiment"].items():
             recent = self._recent.setdefault(name, deque(maxlen=SMOOTHING))
-            if math.isfinite(loss):  # steps that are left out are counted beside it
+            if math.isfinite(loss):  # skipped steps are counted separately
                 recent.append(loss)
         self._present()
 
     def evaluation(self, facts: dict[str, Any]) -> None:
-        """One line of kind eval."""
+        """Add a line of kind eval."""
         self._write({"kind": "eval", **facts})
         self._track("eval", facts, ("loss", "perplexity", "accuracy", "baseline"))
         self._evaluation = facts
@@ -136,7 +136,7 @@ class RunLog:
             self._present(force=True)
 
     def sync(self) -> None:
-        """Make the lines so far durable: a checkpoint that is about to be written goes on from them."""
+        """Flush the lines to disk, because the checkpoint that is written next continues from them."""
         if self._file is None:
             return
         try:
@@ -145,7 +145,7 @@ class RunLog:
             raise OutputError(self._path, f"cannot be written: {fault.strerror}", "free space") from fault
 
     def pictures(self, out: Path, step: int) -> None:
-        """Hand the pictures of an evaluation on to the trackers."""
+        """Pass the pictures of an evaluation to the trackers."""
         for path in sorted((out / PICTURES).glob(f"step-{step:08d}-*.png")) if self._trackers else ():
             for tracker in self._trackers:
                 tracker.picture(step, f"rollout/{path.stem[14:]}", path)
@@ -182,7 +182,7 @@ class RunLog:
             self._said = text
 
     def _pace(self) -> tuple[float, str]:
-        """Windows a second of the last steps, and the time left by them and by what else this session did."""
+        """Return windows a second of the last steps, and the remaining time, other work included."""
         done = max(self._last["step"] - self._begin, 1)
         seconds = max(sum(self._paces) / max(len(self._paces), 1), 1e-9)
         besides = max(time.monotonic() - self._opened - self._spent, 0.0) / done

@@ -1,10 +1,10 @@
-"""Training: one plain loop that goes on where it was cut.
+"""Train a model in one plain loop, which resumes an interrupted run.
 
     result = train(load_recipe("discrete_tiny", ["data=[shards/arm, shards/hand]"]), out="runs/first")
 
 The run's folder holds recipe.json, environment.json, metrics.jsonl and checkpoints/step-XXXXXXXX. Running it
-again resumes from the newest checkpoint: on a CPU bit for bit as if it had never stopped. SIGTERM and SIGINT
-save before they end the run.
+again resumes from the newest checkpoint; on a CPU the result is bit for bit that of a run without the
+interruption. On SIGTERM and SIGINT the run saves a checkpoint before it ends.
 """
 
 import re
@@ -31,20 +31,20 @@ from hma_model.training.trackers import Tracker, open_trackers
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What a run came to.
+    """The result of a run.
 
     Attributes:
         out: the run's folder.
-        checkpoint: its newest checkpoint, which can be pushed, evaluated and generated from.
-        step: steps done; less than the recipe's where the run was interrupted.
+        checkpoint: the newest checkpoint, to push, to evaluate or to generate from.
+        step: number of finished steps; fewer than the recipe's if the run was interrupted.
         losses: (step, training loss) of every step.
         evaluations: lines of kind eval in metrics.jsonl.
-        masked_val_loss: of the last evaluation: nats a token of fully masked frames given the true past
-            (continuous: the diffusion loss); None where there are no validation windows.
-        baseline: nats a token of the training frequencies on the same windows; None likewise.
+        masked_val_loss: the loss of the last evaluation: nats a token of fully masked frames given the true
+            past (continuous: the diffusion loss); None without validation windows.
+        baseline: nats a token of the training frequencies on the same windows; None without a baseline.
         interrupted: a signal ended the run early.
-        skipped: steps left out for losses that were not numbers.
-        seconds: spent in steps, all sessions together.
+        skipped: number of steps skipped because of a bad loss or gradient.
+        seconds: time spent in steps, all sessions together.
     """
 
     out: Path
@@ -67,22 +67,22 @@ def train(
     show: bool = True,
     force: bool = False,
 ) -> TrainResult:
-    """Train, or go on training.
+    """Train a model, or resume its training.
 
     Args:
         recipe: see `hma_model.training.recipe`.
         out: str or path of the run's folder; by default the recipe's.
         on_progress: called after every step with its line of metrics.jsonl.
-        show: progress on standard error.
-        force: go on although the recipe or the shards have changed.
+        show: print progress to standard error.
+        force: resume although the recipe or the shards have changed.
 
     Raises:
         UsageError: no folder is named.
         RecipeError: the recipe does not fit the data, or differs from that of the run in the folder.
-        ShardError: the shards do not go together.
-        OutputError: the folder holds something else, cannot be written, or another run is at work in it.
-        TrainingError: a loss is not a number, and it names the windows; memory is short; a rank is lost.
-        CheckpointError: a checkpoint cannot be written or none of them can be read.
+        ShardError: the shard sets cannot be combined.
+        OutputError: the folder holds something else, cannot be written, or another run uses it.
+        TrainingError: a loss or gradient is bad (it names the windows); memory is short; a rank is lost.
+        CheckpointError: a checkpoint cannot be written, or none of them can be read.
     """
     chosen = recipe.out if out is None else out
     if chosen is None:
@@ -164,7 +164,7 @@ def _shares(run: Run) -> str:
 
 
 def _agreed(world: World, stop: threading.Event) -> bool:
-    """Whether any rank was asked to stop: all do so after the same step."""
+    """Check whether any rank was asked to stop, so that all stop after the same step."""
     return bool(world.sum(torch.tensor([float(stop.is_set())]))[0])
 
 

@@ -1,8 +1,8 @@
-"""AdamW as the model needs it: what decays, how muP scales, how the learning rate moves.
+"""Set up AdamW for the model: weight decay, muP's learning rates, and the learning rate schedule.
 
-Matrices decay; norms, biases, embeddings, positions and mask vectors do not. With muP the matrices of which
-both sides grow with the width learn at lr / (width / base_width), and their decay is raised by as much, so
-that lr and decay found at one width serve at another (Yang et al. 2022, table 8).
+Matrices have weight decay; norms, biases, embeddings, positions and mask vectors have none. With muP,
+matrices of which both sides grow with the width learn at lr / (width / base_width). Their decay is multiplied
+by width / base_width, so that lr and decay found at one width suit another (Yang et al. 2022, table 8).
 """
 
 import math
@@ -23,7 +23,7 @@ _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
 
 
 def make_optimizer(model: "HMA", recipe: "Recipe") -> torch.optim.AdamW:
-    """AdamW over all parameters of the model; each group carries its `base_lr` and parameters' `names`."""
+    """Return AdamW for the trained parameters; each group has its `base_lr` and its parameters' `names`."""
     lr = learning_rate(recipe)
     groups = parameter_groups(model, lr, recipe.weight_decay)
     fused = model.device.type == "cuda"
@@ -31,14 +31,14 @@ def make_optimizer(model: "HMA", recipe: "Recipe") -> torch.optim.AdamW:
 
 
 def learning_rate(recipe: "Recipe") -> float:
-    """The schedule's peak; the paper's rule multiplies lr by the windows a step over 64, from 1 to 8."""
+    """Return the schedule's peak; the paper's rule scales lr by windows a step / 64, limited to 1 to 8."""
     if recipe.lr_rule == "paper":
         return recipe.lr * min(max(recipe.windows_per_step / 64, 1.0), 8.0)
     return recipe.lr
 
 
 def lr_scale(step: int, recipe: "Recipe") -> float:
-    """What the peak is multiplied by in step `step`, counted from 0."""
+    """Return the factor of the peak in step `step`, counted from 0."""
     if step < recipe.warmup:
         return (step + 1) / recipe.warmup
     if recipe.schedule == "constant_with_warmup":
@@ -48,14 +48,14 @@ def lr_scale(step: int, recipe: "Recipe") -> float:
 
 
 def set_lr(optimizer: torch.optim.Optimizer, scale: float) -> float:
-    """Scale every group from its `base_lr`; returns the largest."""
+    """Set the lr of every group to `base_lr` times the scale, and return the largest."""
     for group in optimizer.param_groups:
         group["lr"] = group["base_lr"] * scale
     return max(group["lr"] for group in optimizer.param_groups)
 
 
 def parameter_groups(model: "HMA", lr: float, weight_decay: float) -> list[dict[str, Any]]:
-    """Groups of AdamW: with and without decay, and with muP the matrices apart."""
+    """Return the groups of AdamW, by weight decay, muP's scaling and sharding."""
     multiplier = model.config.width / model.config.base_width if model.config.mup else 1.0
     matrices = _growing_matrices(model) if multiplier != 1.0 else set()
     plain = _undecayed(model)
@@ -76,7 +76,7 @@ def parameter_groups(model: "HMA", lr: float, weight_decay: float) -> list[dict[
 
 
 def _undecayed(model: nn.Module) -> set[str]:
-    """Names of norms', biases', embeddings', positions' and mask parameters."""
+    """Return the names of the parameters of norms, biases, embeddings, positions and masks."""
     names = set()
     for prefix, module in model.named_modules():
         own = isinstance(module, nn.LayerNorm | nn.GroupNorm | nn.RMSNorm | nn.Embedding)
@@ -87,7 +87,7 @@ def _undecayed(model: nn.Module) -> set[str]:
 
 
 def _growing_matrices(model: "HMA") -> set[str]:
-    """Parameters with two sides that grow with the width, found by comparing with a model twice as wide."""
+    """Return the parameters with two sides that grow with the width, by comparison with a wider model."""
     with torch.device("meta"):
         wider = type(model)(model.config.replace(width=2 * model.config.width))
         for space in model.embodiments.values():
@@ -101,9 +101,9 @@ def _growing_matrices(model: "HMA") -> set[str]:
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Whole moments by parameter name: `<name>/exp_avg` and so on; parameters never updated have none.
+    """Return unsharded moments by name: `<parameter>/exp_avg` and so on; only updated parameters have any.
 
-    Every rank must ask.
+    Every rank must call it.
     """
     return {
         f"{name}/{moment}": whole(torch.as_tensor(optimizer.state[parameter][moment]))
@@ -117,10 +117,10 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
 def load_optimizer_state(
     optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor], where: object
 ) -> None:
-    """Put back what `optimizer_state` gave.
+    """Restore a result of `optimizer_state`.
 
     Raises:
-        CheckpointError: moments of unknown parameters, or of other shapes.
+        CheckpointError: moments are of unknown parameters, or have other shapes.
     """
     known = {n: p for g in optimizer.param_groups for n, p in zip(g["names"], g["params"])}
     for key in state:

@@ -1,10 +1,10 @@
-"""Training on several ranks under torchrun: who takes part, what they share, how the network is spread.
+"""Train on several ranks under torchrun: join them, exchange values, and distribute the network.
 
     torchrun --nproc-per-node 8 --no-python hma train discrete_base data=[…] --out runs/base
 
-A recipe states the whole step; ranks share its passes, so that any number of them trains the same way. DDP
-keeps the network whole on every rank. FSDP2 shards the trunk's blocks; stems, heads, embeddings and readouts
-stay whole, because the ranks of one step may use different ones.
+A recipe states the whole step, and the ranks share its passes. Training is therefore the same on any number
+of ranks. DDP keeps the whole network on every rank. FSDP2 shards the trunk's blocks; stems, heads, embeddings
+and readouts stay whole, because the ranks may use different ones in the same step.
 """
 
 import os
@@ -33,9 +33,9 @@ class World:
     """The ranks of a run.
 
     Attributes:
-        rank: of this process, from 0.
-        size: how many there are.
-        local_rank: among those of this machine.
+        rank: the number of this process, from 0.
+        size: the number of ranks.
+        local_rank: the number of this process among those of this machine.
     """
 
     rank: int = 0
@@ -44,17 +44,17 @@ class World:
 
     @property
     def main(self) -> bool:
-        """Whether this rank writes and speaks."""
+        """Check whether this is rank 0, which writes files and prints."""
         return self.rank == 0
 
     def sum(self, values: Tensor) -> Tensor:
-        """The sum over ranks, in place."""
+        """Sum values over all ranks, in place."""
         if self.size > 1:
             dist.all_reduce(values)
         return values
 
     def gather[T](self, value: T) -> list[T]:
-        """Every rank's value, in their order."""
+        """Return the values of all ranks, in the order of ranks."""
         if self.size == 1:
             return [value]
         found: list[Any] = [None] * self.size
@@ -62,7 +62,7 @@ class World:
         return found
 
     def once[T](self, action: Callable[[], T]) -> T:
-        """What `action` gives on rank 0, to all ranks; an error is raised on all of them."""
+        """Run `action` on rank 0 and return its result on all ranks; raise its error on all of them."""
         if self.size == 1:
             return action()
         outcome: list[Any] = [None, None]
@@ -70,7 +70,7 @@ class World:
         if self.main:
             try:
                 outcome[0] = action()
-            except Exception as fault:  # whatever it is, the others must not wait for a rank that has ended
+            except Exception as fault:  # any error: the others must not wait for a rank that has ended
                 own, outcome[1] = fault, _told(fault)
         dist.broadcast_object_list(outcome, src=0)
         if own is not None:
@@ -81,7 +81,7 @@ class World:
 
 
 def _told(fault: Exception) -> HMAError:
-    """An error as the other ranks raise it."""
+    """Convert an error of rank 0 to the one that the other ranks raise."""
     if isinstance(fault, HMAError):
         return fault
     if isinstance(fault, OSError):
@@ -91,14 +91,14 @@ def _told(fault: Exception) -> HMAError:
 
 @contextmanager
 def join(device: torch.device) -> Iterator[World]:
-    """The ranks that torchrun has started, or this process alone.
+    """Join the ranks that torchrun has started, or run as a single process.
 
     Args:
-        device: what the run trains on; it decides how ranks talk.
+        device: the device of the run; it decides how the ranks communicate.
 
     Raises:
         RecipeError: the ranks cannot find each other.
-        TrainingError: another rank has ended, and why where it has said so.
+        TrainingError: another rank has ended; it states the reason if that rank reported one.
     """
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1 and not dist.is_initialized():
@@ -111,18 +111,18 @@ def join(device: torch.device) -> Iterator[World]:
         yield world
     except Exception as fault:
         error = _explained(fault, world, store)
-        write_error(store, world.rank, error)  # before the group goes, by which the others find out
+        write_error(store, world.rank, error)  # before the group ends: the others then look for it
         if error is fault:
             raise
         raise error from fault
     finally:
-        waits = device.type == "cuda" and sys.exc_info()[0] is not None  # NCCL, for a rank that is gone
+        waits = device.type == "cuda" and sys.exc_info()[0] is not None  # NCCL waits for ended ranks
         if ours and dist.is_initialized() and not waits:
             dist.destroy_process_group()
 
 
 def _met(device: torch.device) -> dist.Store:
-    """Meet the other ranks; returns the store they have met by."""
+    """Form the process group with the other ranks, and return a store for errors."""
     backend = "cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo"
     try:
         store, rank, size = next(dist.rendezvous("env://", timeout=PATIENCE))
@@ -136,7 +136,7 @@ def _met(device: torch.device) -> dist.Store:
 
 
 def _explained(fault: Exception, world: World, store: dist.Store | None) -> Exception:
-    """Return the error to raise for a fault: where this rank has lost the others, what has ended them."""
+    """Return the error to raise for a fault; if this rank lost the others, the error that ended them."""
     if isinstance(fault, HMAError) or not isinstance(fault, RuntimeError):
         return fault
     said = (str(fault).splitlines() or [""])[0][:200]
@@ -150,20 +150,20 @@ def _explained(fault: Exception, world: World, store: dist.Store | None) -> Exce
 
 
 def local_rank() -> int:
-    """This process among those of its machine."""
+    """Return the number of this process among those of its machine."""
     return int(os.environ.get("LOCAL_RANK", "0"))
 
 
-# -- how the network is spread
+# -- the distributed network
 
 
 class _DDP(nn.parallel.DistributedDataParallel):
     """DDP that frees its reducer before the last Python reference to its process group.
 
-    To free a group is to wait for its threads, and these take the GIL to free the tensors of their last
-    collectives. A Python reference frees the group without the GIL; the reducer would free it with the GIL,
-    and the process would hang. It is the last owner where an error, or somebody's variable, keeps the network
-    past `destroy_process_group()`.
+    Freeing a group waits for its threads, and these threads take the GIL to free the tensors of their last
+    collectives. A Python reference frees the group without the GIL. The reducer would free it with the GIL,
+    and the process would hang. The reducer is the last owner if an error or a variable keeps the network
+    alive past `destroy_process_group()`.
     """
 
     def __del__(self) -> None:
@@ -174,12 +174,12 @@ class _DDP(nn.parallel.DistributedDataParallel):
 
 
 class Spread:
-    """A network as the ranks of a run hold it.
+    """A network that is distributed over the ranks of a run.
 
     Args:
-        model: on its device, the same on every rank; sharded in place by fsdp.
+        model: the model on its device, the same on every rank; fsdp shards it in place.
         world: the ranks.
-        mode: ddp or fsdp; without meaning for one rank.
+        mode: ddp or fsdp; it has no effect with one rank.
     """
 
     def __init__(self, model: "HMA", world: World, mode: str) -> None:
@@ -193,11 +193,11 @@ class Spread:
             self._call = _DDP(model, device_ids=device, find_unused_parameters=True, broadcast_buffers=False)
 
     def __call__(self, *given: Any, **named: Any) -> Any:
-        """The network's forward pass."""
+        """Run the network's forward pass."""
         return self._call(*given, **named)
 
     def passing(self, last: bool) -> AbstractContextManager[None]:
-        """Around a forward and backward pass; gradients are averaged in the step's last one."""
+        """Return a context for a forward and backward pass; the last pass of a step averages gradients."""
         if isinstance(self._call, nn.parallel.DistributedDataParallel):
             return nullcontext() if last else self._call.no_sync()
         if self.sharded:
@@ -205,14 +205,14 @@ class Spread:
         return nullcontext()
 
     def average(self) -> None:
-        """After the last pass: average the gradients that neither DDP nor FSDP has averaged."""
+        """Average, after the last pass, the gradients that neither DDP nor FSDP has averaged."""
         if self.sharded:
             _average(
                 [p for p in self.model.parameters() if p.requires_grad and not is_sharded(p)], self.world
             )
 
     def clip(self, limit: float) -> float:
-        """Scale the gradients to at most this norm, over all ranks; returns the norm they had."""
+        """Scale the gradients to at most this norm over all ranks, and return the norm they had."""
         parameters = [p for p in self.model.parameters() if p.grad is not None]
         if not self.sharded:
             return float(nn.utils.clip_grad_norm_(parameters, limit))
@@ -240,7 +240,7 @@ def _shard(model: "HMA", world: World) -> None:
 
 
 def _average(parameters: list[nn.Parameter], world: World) -> None:
-    """A gradient that only some ranks have is zero on the others; one that none has stays away."""
+    """Average gradients over ranks; a missing one counts as zero, unless no rank has it."""
     there = torch.tensor([float(p.grad is not None) for p in parameters], device=parameters[0].device)
     used = [p for p, count in zip(parameters, world.sum(there).tolist()) if count]
     for p in used:
@@ -253,24 +253,24 @@ def _average(parameters: list[nn.Parameter], world: World) -> None:
 
 
 def is_sharded(tensor: Tensor) -> bool:
-    """Whether each rank holds a part of the tensor."""
+    """Check whether each rank holds only a part of the tensor."""
     from torch.distributed.tensor import DTensor
 
     return isinstance(tensor, DTensor)
 
 
 def local(tensor: Tensor) -> Tensor:
-    """The part of a tensor that this rank holds; all of one that is whole."""
+    """Return the part of a tensor that this rank holds; the tensor itself if it is not sharded."""
     return tensor.to_local() if is_sharded(tensor) else tensor  # type: ignore[attr-defined]
 
 
 def whole(tensor: Tensor) -> Tensor:
-    """All of a tensor; every rank must ask in the same order."""
+    """Return the unsharded tensor; every rank must call it, in the same order."""
     return tensor.full_tensor() if is_sharded(tensor) else tensor  # type: ignore[attr-defined]
 
 
 def like(tensor: Tensor, own: Tensor) -> Tensor:
-    """A whole tensor, the same on all ranks, spread as `own` is and on its device."""
+    """Distribute a tensor, the same on all ranks, as `own` is distributed, on the device of `own`."""
     if not is_sharded(own):
         return tensor.to(own.device)
     from torch.distributed.tensor import distribute_tensor
@@ -279,5 +279,5 @@ def like(tensor: Tensor, own: Tensor) -> Tensor:
 
 
 def gathered(named: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:
-    """Whole tensors by name."""
+    """Return unsharded tensors by name."""
     return {name: whole(tensor.detach()) for name, tensor in named}

@@ -1,10 +1,10 @@
 """Report the error that ends a distributed run exactly once.
 
-A rank that fails writes its error into the store of the run, where a rank that has only lost the others finds
-it. Of the ranks that fail, the first to claim the report prints its error; the others exit silently. A rank
-exits only after the report is claimed, and the reporter ignores the signal by which torchrun then ends it.
+A rank that fails writes its error into the store of the run. A rank that has only lost the others finds it
+there. The first failing rank to claim the report prints its error; the others exit silently. A rank exits
+only after the report is claimed, and the reporting rank ignores the signal by which torchrun then ends it.
 
-The claim needs a store that outlives the ranks, which torchrun has. Ranks that are started otherwise each
+The claim needs a store that outlives the ranks; torchrun has one. Ranks that are started in another way each
 print their own error.
 """
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from torch.distributed import Store
 
 PREFIX, ERROR, REPORTS = "errors", "error", "reports"  # of the keys in the store
-ANSWER = timedelta(seconds=30)  # that torchrun's store has to answer
+ANSWER = timedelta(seconds=30)  # the time limit for an answer of torchrun's store
 
 
 def write_error(store: "Store | None", rank: int, error: Exception) -> None:
@@ -36,7 +36,7 @@ def write_error(store: "Store | None", rank: int, error: Exception) -> None:
 
 
 def read_error(store: "Store | None") -> TrainingError | None:
-    """Return the error that another rank has written; None where there is none."""
+    """Return the error that another rank has written, or None."""
     try:
         if store is None or not store.check([ERROR]):
             return None
@@ -51,7 +51,7 @@ def report_once() -> Iterator[None]:
     """Let one rank of a failed run raise its error; end the others silently with its exit code.
 
     Raises:
-        SystemExit: another rank reports.
+        SystemExit: another rank reports its error.
     """
     try:
         yield
@@ -66,7 +66,7 @@ def report_once() -> Iterator[None]:
 
 
 def _claim_report() -> bool:
-    """Whether this rank is to report: it is the first to ask, or there is no store to ask."""
+    """Check whether this rank must report: it is the first to claim it, or there is no store."""
     if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
         return True
     import torch.distributed as dist

@@ -1,12 +1,12 @@
-"""What to train, stated whole before it begins: a frozen recipe from YAML and dotted overrides.
+"""Read a training recipe, a frozen object, from YAML and dotted overrides.
 
     extends: discrete_tiny          # another recipe, by name or path beside this one
     data: [shards/arm, shards/hand]
     model: {layers: 4, width: 128}
     lr: 1e-3
 
-A recipe refuses what it does not know. What the shards state (kind, grid, vocabulary, latents) is
-derived from them and cannot be given.
+A recipe refuses unknown keys. The values that the shards state (kind, grid, vocabulary, latents) are derived
+from them and cannot be given.
 """
 
 import os
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from hma_data.tokenizers.base import TokenizerSpec
 
 MAX_EXTENDS = 8
-MAX_NAME = 200  # characters of a name that are shown
-# what may differ when a run goes on: where and how often, but nothing that changes the weights
+MAX_NAME = 200  # maximum characters of a name in an error
+# keys that may change when a run is resumed: places and intervals, but nothing that changes the weights
 _FREE = {
     *("data", "out", "start", "device", "workers", "parallel", "compile", "checkpointing"),
     *("eval_every", "eval_windows", "pictures", "pictures_share", "checkpoint_every", "keep_last"),
@@ -50,7 +50,7 @@ def _listed(value: Any) -> Any:
 def _named(value: str) -> str:
     if not value.strip():
         raise ValueError("must name a folder or URI")
-    # in YAML and in key=value no shell has done it; a URI must not go through Path
+    # no shell expands ~ in YAML and in key=value; a URI must not go through Path
     return str(Path(value).expanduser()) if value.startswith("~") else value
 
 
@@ -66,7 +66,7 @@ class _Settings(BaseModel):
 
 
 class MixtureSettings(_Settings):
-    """How often each embodiment is drawn; see `hma_data.loading.mixture`."""
+    """The settings of how often each embodiment is drawn; see `hma_data.loading.mixture`."""
 
     temperature: Number = Field(3.0, gt=0)
     draw: Literal["per_sample", "per_batch"] = "per_sample"
@@ -77,7 +77,7 @@ class MixtureSettings(_Settings):
 
 
 class Recipe(_Settings):
-    """A training run. Made by `load_recipe`, which explains its errors."""
+    """The settings of a training run. `load_recipe` makes it and explains its errors."""
 
     data: Annotated[tuple[Place, ...], BeforeValidator(_listed)] = Field(
         (), description="folders of shards, one an embodiment"
@@ -148,19 +148,19 @@ class Recipe(_Settings):
 
     @property
     def windows_per_step(self) -> int:
-        """Windows between two updates of the weights."""
+        """Return the number of windows of a step, between two updates of the weights."""
         return self.batch_size * self.accumulate
 
     def values(self) -> dict[str, Any]:
-        """Plain values, all of them."""
+        """Return all settings as plain values."""
         return self.model_dump(mode="json")
 
     def identity(self) -> dict[str, Any]:
-        """What must be the same for a run to go on."""
+        """Return the settings that must be the same when a run is resumed."""
         return {key: value for key, value in self.values().items() if key not in _FREE}
 
     def network(self, spec: "TokenizerSpec") -> HMAConfig:
-        """The network's config for tokens of this tokenizer.
+        """Return the network's config for tokens of this tokenizer.
 
         Raises:
             RecipeError: a value of `model` is not allowed.
@@ -178,14 +178,14 @@ class Recipe(_Settings):
 
 
 def load_recipe(name_or_path: StrPath, overrides: Sequence[str] = ()) -> Recipe:
-    """The recipe of a YAML file, with overrides.
+    """Read the recipe of a YAML file, with overrides.
 
     Args:
         name_or_path: str or path of a file, or the name of a recipe that comes with the package.
         overrides: `key=value` with dots for keys inside keys, values as YAML: `model.layers=4`.
 
     Raises:
-        RecipeError: no such recipe, or all its problems, each with key, value and what is allowed.
+        RecipeError: there is no such recipe; or all its problems, each with key, value and allowed values.
         UsageError: an override is not key=value.
     """
     path = find_recipe(name_or_path)
@@ -194,7 +194,7 @@ def load_recipe(name_or_path: StrPath, overrides: Sequence[str] = ()) -> Recipe:
 
 
 def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
-    """The recipe of plain values; errors as `load_recipe`."""
+    """Make a recipe of plain values; it raises the errors of `load_recipe`."""
     found: list[str] = []
     model = network_values(values.get("model", {}), values.get("objectives", {"forward": 1.0}), found)
     given = {**values, "model": model} if isinstance(values.get("model"), dict) else dict(values)
@@ -210,14 +210,14 @@ def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
 
 
 def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
-    """The file of a recipe: a path, or a name below the shipped `recipes/` or `recipes/train/`.
+    """Return the file of a recipe: a path, or a name below the shipped `recipes/` or `recipes/train/`.
 
     Args:
-        name_or_path: what was given.
+        name_or_path: the path or name.
         where: the recipe that extends it, for the error.
 
     Raises:
-        RecipeError: there is none.
+        RecipeError: there is no such recipe.
     """
     name_or_path = as_text(name_or_path)
     given, folder = Path(name_or_path), shipped("recipes")
@@ -243,10 +243,10 @@ def _is_file(path: Path) -> bool:
 
 
 def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
-    """`["model.layers=4", "lr=1e-3"]` as nested values.
+    """Parse overrides such as `["model.layers=4", "lr=1e-3"]` to nested values.
 
     Raises:
-        UsageError: one is not key=value.
+        UsageError: an override is not key=value.
     """
     values: dict[str, Any] = {}
     for override in overrides:
@@ -262,7 +262,7 @@ def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any], where: object) -> dict[str, Any]:
-    """Mappings merge key by key; anything else of `over` replaces what `base` has."""
+    """Merge mappings key by key; other values, and objectives, of `over` replace those of `base`."""
     merged = dict(base)
     for key, value in over.items():
         if isinstance(value, dict) and isinstance(merged.get(key), dict) and key != "objectives":
@@ -273,7 +273,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any], where: object) -> di
 
 
 def differences(old: Any, new: Any, path: str = "") -> list[str]:
-    """What differs between two recipes' values: `lr: 0.001, now 0.002`, one an entry."""
+    """Return the differences of two recipes' values, one an entry, such as `lr: 0.001, now 0.002`."""
     if isinstance(old, dict) and isinstance(new, dict):
         return [
             line

@@ -1,7 +1,7 @@
-"""What is wrong with a recipe's values, in words: the key, what is allowed, what it is, and what was meant.
+"""Describe the faults of a recipe's values: the key, the allowed values, the value, and a likely correction.
 
-The network's fields are checked here as well, before any shard is opened: what depends on the shards (grid,
-vocabulary, latents) stands at values that allow everything.
+The network's fields are checked here too, before any shard is opened. The fields that depend on the shards
+(grid, vocabulary, latents) have values for this check that allow everything.
 """
 
 import math
@@ -14,7 +14,7 @@ from hma_data.errors import RecipeError
 from hma_model.config import HMAConfig
 
 DERIVED = {"kind", "grid", "factored", "channels", "latent_scale", "frames", "objectives", "tokenizer"}
-# far above any network there is: a slip of the hand must not ask a machine for all its memory
+# far above any existing network: a typing error must not allocate all of a machine's memory
 MOST = {"layers": 2048, "width": 131_072, "heads": 4096, "mlp_ratio": 256, "action_tokens": 4096}
 MOST_OTHER = 1_000_000
 _PLAIN = {
@@ -36,12 +36,12 @@ _PLAIN = {
 
 
 def network_values(values: Any, objectives: Any, found: list[str]) -> dict[str, Any]:
-    """A recipe's `model` with its numbers as numbers; what is wrong with it is added to `found`.
+    """Return a recipe's `model` with its values converted to numbers, and add its faults to `found`.
 
     Args:
-        values: of the key `model`.
-        objectives: of the key `objectives`, where it is a mapping.
-        found: faults so far.
+        values: the value of the key `model`.
+        objectives: the value of the key `objectives`.
+        found: the faults so far.
     """
     if not isinstance(values, dict):
         return {}
@@ -60,7 +60,7 @@ def network_values(values: Any, objectives: Any, found: list[str]) -> dict[str, 
 
 
 def problem(item: Any, known: Mapping[str, list[str]]) -> str:
-    """One of pydantic's errors in words; `known` has the keys of each mapping by its path."""
+    """Describe one of pydantic's errors; `known` has the keys of each mapping by its path."""
     path = ".".join(str(part) for part in item["loc"] if part != "[key]")
     if item["type"] == "extra_forbidden":
         return unknown(path, known[path.rpartition(".")[0]], known)
@@ -78,7 +78,7 @@ def problem(item: Any, known: Mapping[str, list[str]]) -> str:
 
 
 def unknown(path: str, known: list[str], others: Mapping[str, list[str]] | None = None) -> str:
-    """That a key is not known, and the one that was meant: one of `known`, or one of another mapping."""
+    """Describe an unknown key, and suggest one of `known`, or a key of another mapping."""
     home, _, key = path.rpartition(".")
     if not home and key == "extends":
         return "extends: cannot be an override: write it in the recipe's file"
@@ -100,7 +100,7 @@ def _short(value: Any, quote: bool = True) -> str:
 
 
 def _typed(key: str, value: Any, kind: Any, found: list[str]) -> Any:
-    """A value as its field's type; YAML reads 1e-3 as a text."""
+    """Convert a value to the type of its field; YAML reads 1e-3 as a text."""
     path, is_number = f"model.{key}", isinstance(value, int | float) and not isinstance(value, bool)
     if kind is bool:
         if not isinstance(value, bool):

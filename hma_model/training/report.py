@@ -1,7 +1,7 @@
-"""A run's `report.html`: what was trained, how the losses went, what the model predicts.
+"""Write `report.html` of a run: the recipe, the losses, and pictures of predictions.
 
-One file that fetches nothing, made from the files of the run's folder alone: it can be made again at any
-time.
+The page is one file that fetches nothing. It is made from the files of the run's folder alone, so it can be
+made again at any time.
 """
 
 import json
@@ -17,14 +17,14 @@ from hma_model.training.logging import read_metrics
 from hma_model.training.runtime import ENVIRONMENT, RECIPE
 
 REPORT = "report.html"
-RECENT = 50  # steps that closing figures are averaged over
+RECENT = 50  # number of last steps over which the closing figures are averaged
 
 
 def write_report(out: StrPath) -> None:
     """Write `report.html` into a run's folder, a str or path.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     out = as_path(out)
     lines = read_metrics(out)

@@ -1,13 +1,13 @@
-"""What a training run needs to go on exactly: the folder `training/` of its checkpoints.
+"""Write and read the state from which a training run resumes exactly: `training/` of its checkpoints.
 
-    state.json                step, recipe, the shards' digests, where the sampler stands
+    state.json                step, recipe, digests of the shards, state of the sampler
     optimizer.safetensors     moments by parameter name
-    weights.safetensors       of training, where the checkpoint's own are averages of them
+    weights.safetensors       the weights of training, if the checkpoint's own are averages
 
-There is no state of random numbers: every draw of a step comes from (seed, what, step) by `seed_for`.
+There is no state of random numbers: `seed_for` derives the seed of every draw from (seed, what, step).
 
-A run goes on only in the format versions that it was written in: what an optimizer knows of its weights
-cannot be brought to others. The weights can: a new run starts from such a checkpoint with `start`.
+A run resumes only from the format versions of this release, because the state of an optimizer cannot be
+converted to another version. The weights can: a new run starts from such a checkpoint with `start`.
 """
 
 import dataclasses
@@ -35,26 +35,26 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 STATE, OPTIMIZER, WEIGHTS = "state.json", "optimizer.safetensors", "weights.safetensors"
-VERSION = 1  # of `training/`; it rises with any change of what its files mean
+VERSION = 1  # of `training/`; any change in the meaning of its files raises it
 
 
 class OtherVersionError(CheckpointError):
-    """A checkpoint of another format version: whole, but not to be passed over for an older one."""
+    """A checkpoint of another format version: it is intact, so an older one must not replace it."""
 
 
 @dataclass(frozen=True)
 class State:
-    """Where a run stood when its checkpoint was written.
+    """The state of a run when its checkpoint was written.
 
     Attributes:
-        step: steps done.
+        step: number of finished steps.
         recipe: `Recipe.identity` of the run.
         data: embodiment id -> digest of its shards.
         sampler: `Feed.state`.
-        skipped: steps left out for losses that were not numbers.
-        seconds: spent in steps so far.
-        evaluation: the last one's figures.
-        norms: running mean of the gradients' norms, and over how many.
+        skipped: number of steps skipped because of a bad loss or gradient.
+        seconds: time spent in steps so far.
+        evaluation: the figures of the last evaluation.
+        norms: running mean of the gradients' norms, and the number of norms.
     """
 
     step: int
@@ -68,7 +68,7 @@ class State:
 
     def require_same(self, recipe: dict[str, Any], data: dict[str, str], where: object) -> None:
         """Raise RecipeError with the differences unless recipe and shards are those of the run."""
-        before = {**Recipe().identity(), **self.recipe}  # keys that came later had their defaults
+        before = {**Recipe().identity(), **self.recipe}  # keys added by later releases had their defaults
         changed = differences(before, recipe) + differences(self.data, data, "data")
         if changed:
             raise RecipeError(
@@ -79,7 +79,7 @@ class State:
 
 
 def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
-    """Raise RecipeError where a run would go on with another network or tokenizer, which nothing allows."""
+    """Raise RecipeError if a run would resume with another network or tokenizer; --force does not help."""
     free = TRAINED_BY | {"objectives"} | ({"frames"} if before.time_position == "rotary" else set())
     for item in dataclasses.fields(HMAConfig):
         old, new = getattr(before, item.name), getattr(now, item.name)
@@ -93,13 +93,13 @@ def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
 
 
 def seed_for(seed: int, what: str, *index: int) -> int:
-    """A seed of its own for each purpose and place, below 2**63."""
+    """Return a seed below 2**63 that differs for each purpose and index."""
     content = repr((seed, what, index)).encode()
     return int.from_bytes(hashlib.sha256(content).digest()[:8], "little") >> 1
 
 
 def data_digests(sets: Mapping[str, "ShardSet"]) -> dict[str, str]:
-    """Sixteen hex digits over the shards of each embodiment."""
+    """Return sixteen hex digits of a SHA-256 over the shards of each embodiment."""
     return {
         name: hashlib.sha256("".join(s.sha256 for s in shards.manifest.shards).encode()).hexdigest()[:16]
         for name, shards in sets.items()
@@ -109,7 +109,7 @@ def data_digests(sets: Mapping[str, "ShardSet"]) -> dict[str, str]:
 def write_state(
     folder: Path, state: State, moments: Mapping[str, "Tensor"], weights: Mapping[str, "Tensor"]
 ) -> None:
-    """Fill a checkpoint's `training/`; without `weights` those of the checkpoint are the run's."""
+    """Write the files of `training/`; without `weights` the checkpoint's weights are those of training."""
     write_tensors(folder / OPTIMIZER, moments, {"format": "pt"})
     if weights:
         write_tensors(folder / WEIGHTS, weights, {"format": "pt"})
@@ -124,11 +124,11 @@ def _digest(values: Mapping[str, Any]) -> str:
 
 
 def require_version(path: Path) -> None:
-    """Raise unless a run can go on from the checkpoint in a folder with this release.
+    """Raise unless this release can resume a run from the checkpoint in a folder.
 
     Raises:
-        OtherVersionError: it names both versions.
-        CheckpointError: a file that says so is missing or damaged.
+        OtherVersionError: the checkpoint is of another version; the error names both versions.
+        CheckpointError: a file that states a version is missing or damaged.
     """
     checks = (
         (path / CONFIG, "format_version", FORMAT_VERSION, None),
@@ -144,13 +144,13 @@ def require_version(path: Path) -> None:
 
 @dataclass(frozen=True)
 class Kept:
-    """What a checkpoint keeps of a run, read whole so that nothing can fail half way.
+    """The content of a checkpoint for a run, read completely before the model changes.
 
     Attributes:
-        state: where the run stood.
-        shown: of the trunk ("") and each embodiment's stem and head, as published.
-        weights: of training, where these differ.
-        moments: of the optimizer.
+        state: the state of the run.
+        shown: the published tensors of the trunk ("") and of each embodiment's stem and head.
+        weights: the weights of training, if they differ from the published ones.
+        moments: the moments of the optimizer.
     """
 
     state: State
@@ -161,14 +161,14 @@ class Kept:
 
     @property
     def averages(self) -> dict[str, "Tensor"]:
-        """Averaged parameters by name, once `fill` has seen them."""
+        """Return the averaged parameters by name; `fill` collects them."""
         return self._averages
 
     def fill(self, model: "HMA") -> None:
-        """Bring the weights of training into a whole model.
+        """Load the weights of training into an unsharded model.
 
         Raises:
-            CheckpointError: parts that do not fit the model.
+            CheckpointError: parts do not fit the model.
         """
         model.load_trunk(self.shown[""][0])
         for name in self.shown.keys() - {""}:
@@ -188,7 +188,7 @@ def _prefixes(embodiments: Iterable[str]) -> tuple[str, ...]:
 
 
 def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) -> Kept:
-    """What a checkpoint keeps of a run with these embodiments; of those it does not know, nothing.
+    """Read the content of a checkpoint for a run; embodiments that the checkpoint lacks are left out.
 
     Raises:
         CheckpointError: parts are missing, damaged, or do not belong together.
@@ -203,7 +203,7 @@ def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) 
 
 
 def _files(checkpoint: Checkpoint) -> dict[str, str]:
-    """The files of `training/` by their hashes; an older release has left none of these."""
+    """Return the hashes of the files of `training/`; files of an older release have empty ones."""
     folder = checkpoint.folder / TRAINING
     there = {name: "" for name in (OPTIMIZER, WEIGHTS) if (folder / name).is_file()}
     files = read_json(folder / STATE).get("files")
@@ -219,10 +219,10 @@ def _own_file(checkpoint: Checkpoint, name: str) -> "dict[str, Tensor]":
 
 
 def read_state(checkpoint: Checkpoint) -> State:
-    """Where the run stood.
+    """Read the state of the run.
 
     Raises:
-        CheckpointError: it is not said, or damaged.
+        CheckpointError: the state is missing or damaged.
     """
     path = inside(checkpoint.folder, f"{TRAINING}/{STATE}")
     values = read_json(path)

@@ -1,6 +1,7 @@
-"""A run's model, optimizer and data, and what is done with them step by step.
+"""Hold a run's model, optimizer and data, and carry out its steps, evaluations and checkpoints.
 
-`hma_model.training.loop` runs the loop. Every rank takes part in gathering weights; rank 0 writes files.
+`hma_model.training.loop` is the loop around it. Every rank takes part in gathering weights; only rank 0
+writes files.
 """
 
 import time
@@ -50,17 +51,17 @@ from hma_model.training.validation import main_objective, validate
 
 
 class Run:
-    """What a run is made of.
+    """A training run: its model, optimizer, data and progress.
 
     Args:
-        recipe: what to train.
-        out: the run's folder; it is there.
-        device: where the model is.
-        world: the ranks it is trained by.
+        recipe: the recipe of the run.
+        out: the run's folder, which must exist.
+        device: the device of the model.
+        world: the ranks of the run.
 
     Attributes:
-        step, skipped, seconds: steps done, those of them left out, and the time they took.
-        evaluation: the last one's figures.
+        step, skipped, seconds: finished steps, how many of them were skipped, and the time they took.
+        evaluation: the figures of the last evaluation.
     """
 
     def __init__(self, recipe: Recipe, out: Path, device: torch.device, world: World | None = None) -> None:
@@ -96,7 +97,7 @@ class Run:
         self._baseline: Means | None = None
         self._twin: HMA | None = None
         self._unseen, self._complained = "", False
-        self._painted, self._painting = 0.0, 0.0  # seconds for pictures so far, and for the last ones
+        self._painted, self._painting = 0.0, 0.0  # seconds for all pictures, and for the last ones
 
     def _fetch(self, recipe: Recipe) -> Start | None:
         if recipe.start is None:
@@ -122,12 +123,12 @@ class Run:
 
     @property
     def nats(self) -> bool:
-        """Whether the losses are nats a token."""
+        """Check whether the losses are nats a token."""
         video = main_objective(self.recipe.objectives) in ("forward", "passive", "full")
         return self.model.config.kind == "discrete" and video
 
     def remarks(self) -> list[str]:
-        """What somebody who watches should know."""
+        """Return notes for the user."""
         missing = sorted(set(self.sets) - set(self.held_out))
         frames = self.recipe.frames
         notes = [f"no validation windows of {frames} frames: {', '.join(missing)}"] if missing else []
@@ -144,7 +145,7 @@ class Run:
 
     @torch.no_grad()
     def begin(self) -> None:
-        """Give a fresh readout the training tokens' log frequencies, so that no step is spent on them."""
+        """Set a fresh readout's bias to the training tokens' log frequencies, so no step must learn them."""
         plain = self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete"
         if plain or self.start:
             return
@@ -157,10 +158,10 @@ class Run:
         own.copy_(torch.from_numpy(bias).to(own))
 
     def prepare(self, kept: Kept | None) -> None:
-        """Spread the model over the ranks, and make what moves it; `kept` is what a checkpoint knows of that.
+        """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given.
 
         Raises:
-            CheckpointError: moments that fit no parameter.
+            CheckpointError: moments fit no parameter.
         """
         if self.recipe.compile:
             for block in self.model.trunk.blocks:
@@ -179,7 +180,7 @@ class Run:
     # -- a step
 
     def advance(self) -> dict[str, Any]:
-        """One update of the weights; returns its line of metrics.jsonl."""
+        """Update the weights once, and return the step's line of metrics.jsonl."""
         recipe, begun = self.recipe, time.monotonic()
         lr = set_lr(self.optimizer, lr_scale(self.step, recipe))
         self.optimizer.zero_grad(set_to_none=True)
@@ -221,7 +222,7 @@ class Run:
         }
 
     def _pass(self, number: int, batch: Batch, last: bool) -> Any:
-        """Forward and backward; the step's loss is the mean over its passes, whoever makes them."""
+        """Run a forward and backward pass; the loss of a step is the mean over the passes of all ranks."""
         torch.manual_seed(seed_for(self.recipe.seed, "dropout", self.step, number))
         generator = torch.Generator().manual_seed(seed_for(self.recipe.seed, "masks", self.step, number))
         with self.spread.passing(last):
@@ -235,7 +236,7 @@ class Run:
         return output
 
     def _past(self, number: int, batch: Batch) -> Batch:
-        """The batch as the model is to see it: with frames of its own where the recipe asks for them."""
+        """Return the batch, with frames predicted by the model itself if the recipe asks for them."""
         share = share_at(self.step, self.recipe)
         if not share:
             return batch
@@ -262,7 +263,7 @@ class Run:
     # -- evaluation and checkpoints
 
     def shown(self) -> HMA:
-        """The model that is evaluated and saved, whole on this rank; every rank must ask."""
+        """Return the model to evaluate and save, unsharded on rank 0; every rank must call it."""
         if not self.average and not self.spread.sharded:
             return self.model
         state = self.average.state() if self.average else gathered(self.model.state_dict().items())
@@ -272,7 +273,7 @@ class Run:
         return self._twin or self.model
 
     def evaluate(self) -> dict[str, Any]:
-        """Validation loss beside its baseline; returns the line of metrics.jsonl."""
+        """Compute the validation loss and its baseline, and return the line of metrics.jsonl."""
         model = self.shown()
         self.evaluation = self.world.once(lambda: self._evaluated(model))
         return self.evaluation
@@ -306,19 +307,19 @@ class Run:
         return facts
 
     def _picture_due(self) -> bool:
-        """Whether this evaluation leaves pictures: the last one does, others as far as time allows."""
+        """Check whether to make pictures: at the last evaluation always, at others if the time allows."""
         last = self.step == self.recipe.steps
         spare = self.recipe.pictures_share * self.seconds - self._painted - self._painting
         return bool(self.recipe.pictures) and (last or spare > 0)
 
     def complaint(self) -> str:
-        """Why there are no pictures, once; nothing where there are."""
+        """Return the reason for missing pictures, only once; else an empty string."""
         text = "" if self._complained else self._unseen
         self._complained = self._complained or bool(text)
         return text
 
     def save(self) -> Path:
-        """Write checkpoints/step-N, and delete all but the last few; every rank must ask."""
+        """Write checkpoints/step-N, and delete all but the last few; every rank must call it."""
         model, sampler = self.shown(), self.feed.state(self.world)
         moments = optimizer_state(self.optimizer)
         weights = gathered(self.model.state_dict().items()) if self.average else {}
@@ -361,7 +362,7 @@ class Run:
         }
         train = shards.manifest.splits.get("train", {})
         data: dict[str, Any] = {key: train.get(key) for key in ("episodes", "frames")}
-        if "://" in shards.manifest.source:  # a path would only be of use here
+        if "://" in shards.manifest.source:  # a path is of no use on another machine
             data["source"] = shards.manifest.source
         training: dict[str, Any] = {"steps": self.step, "seed": self.recipe.seed}
         if self.start:
@@ -370,13 +371,13 @@ class Run:
         return {"data": data, "metrics": metrics, "training": training}
 
     def resume(self, force: bool) -> tuple[Kept | None, list[str]]:
-        """Go to where the newest readable checkpoint stands.
+        """Load the weights and the state of the newest readable checkpoint.
 
         Returns:
-            What `prepare` needs of it, and what there is to say about it.
+            The content of the checkpoint for `prepare`, or None, and notes for the user.
 
         Raises:
-            RecipeError: recipe or shards differ from the run's.
+            RecipeError: the recipe or the shards differ from those of the run.
             OtherVersionError: the newest checkpoint is of another format version.
             CheckpointError: there are checkpoints, and none can be read.
         """
@@ -409,7 +410,7 @@ class Run:
         return kept, notes
 
     def _adopt(self, checkpoint: Checkpoint) -> list[str]:
-        """Keep the statistics that stems were trained with, where the shards have others by now."""
+        """Keep the statistics that the stems were trained with, if those of the shards have changed."""
         left = sorted(set(checkpoint.embodiments) - set(self.sets)) if not self._carries_others else []
         notes, gone = [], [f"left out of checkpoints from here on: {', '.join(left)}"] if left else []
         for name, shards in self.sets.items():
@@ -430,7 +431,7 @@ class Run:
 
     @property
     def _carries_others(self) -> bool:
-        """Whether checkpoints keep robots that are not trained: those of a frozen trunk's source."""
+        """Check whether checkpoints keep untrained robots, which they do with a frozen trunk."""
         return bool(self.start and self.start.frozen)
 
     def _describe(self) -> None:

@@ -1,4 +1,4 @@
-"""A run's ground: its folder, its device, the signals that end it, and what its figures may depend on."""
+"""Manage a run's folder, device, memory limits and signals, and describe its environment."""
 
 import fcntl
 import os
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from hma_model.config import HMAConfig
 
 RECIPE, ENVIRONMENT = "recipe.json", "environment.json"
-LOCK, START = ".lock", ".start"  # START: the checkpoint that the run begins from
+LOCK, START = ".lock", ".start"  # START: the checkpoint that the run starts from
 _NO_MEMORY = re.compile("out of memory|can't allocate memory|not enough memory|bad_alloc", re.IGNORECASE)
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of a recipe's `device`; auto takes an accelerator where there is one.
+    """Return the device of a recipe's `device`; auto takes an accelerator if there is one.
 
     Raises:
-        RecipeError: the device is not there.
+        RecipeError: the device does not exist here.
     """
     cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
     if name == "auto":
@@ -45,7 +45,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def environment(device: torch.device) -> dict[str, Any]:
-    """What the run's figures may depend on besides the recipe."""
+    """Return the facts besides the recipe on which the run's figures may depend."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -74,12 +74,12 @@ def _git_revision() -> str:
 
 @contextmanager
 def own_folder(out: Path) -> Iterator[None]:
-    """The run's folder, made if need be, and nobody else's while the block runs.
+    """Make the run's folder if necessary, and lock it while the block runs.
 
-    A block that fails before it has left anything in it leaves no folder either, where there was none before.
+    If the block fails before it has written anything, a folder that was made here is removed again.
 
     Raises:
-        OutputError: it cannot be made, holds something else, or another run is at work in it.
+        OutputError: the folder cannot be made, holds something else, or another run uses it.
     """
     made = [path for path in (out, *out.parents) if not path.exists()]
     try:
@@ -114,7 +114,7 @@ def _hold(lock: TextIO, out: Path) -> None:
 
 
 def _remove_empty(out: Path, made: list[Path]) -> None:
-    with suppress(OSError):  # somebody has put something there meanwhile
+    with suppress(OSError):  # another process has written something there in the meantime
         shutil.rmtree(out / START, ignore_errors=True)
         (out / LOCK).unlink()
         for path in made:
@@ -123,7 +123,7 @@ def _remove_empty(out: Path, made: list[Path]) -> None:
 
 @contextmanager
 def writable(out: Path) -> Iterator[None]:
-    """Around what writes into a run's folder.
+    """Convert an OSError of the block, which writes into a run's folder.
 
     Raises:
         OutputError: something cannot be written.
@@ -138,10 +138,10 @@ def writable(out: Path) -> Iterator[None]:
 
 @contextmanager
 def enough_memory() -> Iterator[None]:
-    """Around what may ask for more memory than there is.
+    """Convert an out-of-memory error of the block.
 
     Raises:
-        TrainingError: it did.
+        TrainingError: the block needed more memory than there is.
     """
     try:
         yield
@@ -157,12 +157,12 @@ def enough_memory() -> Iterator[None]:
 
 
 def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen: bool) -> None:
-    """Refuse a network of which the weights and what training keeps for each cannot fit.
+    """Refuse a network that is too large for the memory, with its gradients and moments.
 
     Args:
-        config: of the network.
-        device: where it is to be.
-        parts: over how many ranks it is spread.
+        config: the configuration of the network.
+        device: the device of the network.
+        parts: the number of ranks over which the network is sharded.
         frozen: the trunk's weights have no gradients and moments.
 
     Raises:
@@ -187,7 +187,7 @@ def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that SIGTERM and the first SIGINT set; a second SIGINT ends the process as usual."""
+    """Yield an event that SIGTERM and the first SIGINT set; a second SIGINT ends the process as usual."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop

@@ -1,10 +1,10 @@
-"""Training on the model's own past, so that long rollouts drift less.
+"""Replace past frames by the model's own predictions in training, so that long rollouts drift less.
 
-In a rollout the frames that the model goes on from are its own. Here some windows of a batch get a few frames
-of their past replaced by what the model itself predicts for them, one after the other, each from the true
-frames before and those already replaced; the loss still asks for the truth. The share of such windows may
-rise over the run: predictions of an untrained model teach nothing. (The paper corrupts the past at random
-instead; that is `corrupt_max` and `history_probability` of the model.)
+In a rollout the model continues from its own frames. Here, in some windows of a batch, a few past frames are
+replaced by the model's predictions, one after the other. Each is predicted from the true frames before it and
+those already replaced. The target of the loss stays the true frame. The share of such windows may rise over
+the run, because predictions of an untrained model teach nothing. (The paper corrupts the past at random
+instead; see `corrupt_max` and `history_probability` of the model.)
 
 B batch, T frames, h,w token grid, c,H,W latents, D frames replaced.
 """
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
     from hma_model.training.recipe import Recipe
 
-SAMPLE_STEPS = 8  # of the diffusion head: a past good enough to learn from
+SAMPLE_STEPS = 8  # of the diffusion head; enough for a past to learn from
 
 
 @dataclass
 class Forwarded(Batch):
-    """A batch of which the model sees another past than the one it is to predict.
+    """A batch in which the model sees other frames than those of the loss.
 
     Attributes:
         context: (B, T, h, w) tokens or (B, T, c, H, W) latents that the model sees.
@@ -38,7 +38,7 @@ class Forwarded(Batch):
 
 
 def share_at(step: int, recipe: "Recipe") -> float:
-    """The share of windows with a past of their own in step `step`, counted from 0."""
+    """Return the share of windows with predicted past frames in step `step`, counted from 0."""
     if step < recipe.self_forward_from or not recipe.self_forward:
         return 0.0
     along = (step + 1 - recipe.self_forward_from) / max(recipe.self_forward_over, 1)
@@ -49,15 +49,15 @@ def share_at(step: int, recipe: "Recipe") -> float:
 def forwarded(
     model: "HMA", batch: Batch, share: float, depth: int, generator: torch.Generator | None = None
 ) -> Batch:
-    """The batch with the model's own past in some windows.
+    """Return the batch, with past frames predicted by the model in some windows.
 
     Args:
-        model: as it is trained; its mode is as before afterwards.
-        batch: on the model's device.
-        share: of the windows that get one, drawn one by one.
-        depth: D, frames in a row that are replaced; where they begin is drawn, and the first frame and the
-            last one stay true.
-        generator: of every draw.
+        model: the model in training; its mode is restored afterwards.
+        batch: a batch on the model's device.
+        share: the probability that a window gets predicted frames.
+        depth: D, the number of consecutive frames that are replaced. Their start is drawn; the first and the
+            last frame of the window stay true.
+        generator: the generator of every draw.
     """
     true = batch.tokens if batch.tokens is not None else batch.latents
     assert true is not None
@@ -92,7 +92,7 @@ def _predicted(
     names: list[str],
     generator: torch.Generator | None,
 ) -> Tensor:
-    """Frame `at` (n,) of each window, wholly hidden, from the frames before it."""
+    """Predict frame `at` (n,) of each window, wholly masked, from the frames before it."""
     config, rows = model.config, torch.arange(len(at), device=at.device)
     actions = None
     if any(weight for name, weight in config.objectives.items() if name != "passive"):

@@ -1,4 +1,4 @@
-"""A step's losses over passes and ranks, and what the step has taken of memory."""
+"""Sum the losses of a step over passes and ranks, and measure peak memory."""
 
 import resource
 import sys
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 class Tally:
-    """Losses added up on the device they are on: one transfer a step.
+    """Sums of losses, kept on the device of the losses, so that a step needs only one transfer.
 
     Args:
-        names: of the embodiments.
-        device: of the losses.
+        names: the ids of the embodiments.
+        device: the device of the losses.
     """
 
     def __init__(self, names: list[str], device: torch.device) -> None:
@@ -29,7 +29,7 @@ class Tally:
         self._objectives = torch.zeros(len(OBJECTIVES), device=device)
 
     def add(self, embodiment: list[str], output: "Output") -> None:
-        """A pass's loss, each sample's, and its objective."""
+        """Add the loss of a pass, the loss of each sample, and the objective."""
         index = torch.tensor([self._place[name] for name in embodiment], device=self._sums.device)
         losses = output.per_sample.to(self._sums)
         self._loss += output.loss.detach().to(self._loss)
@@ -37,7 +37,7 @@ class Tally:
         self._objectives[OBJECTIVES.index(output.objective)] += 1
 
     def whole(self, world: World, passes: int) -> tuple[float, dict[str, float], list[str]]:
-        """Over all ranks: the mean loss, the mean by embodiment, and the objectives there were."""
+        """Return the mean loss over all ranks, the mean by embodiment, and the objectives of the step."""
         flat = world.sum(torch.cat([self._loss, self._sums.flatten(), self._objectives])).tolist()
         count = len(self._names)
         sums, counts, objectives = flat[1 : 1 + count], flat[1 + count : 1 + 2 * count], flat[1 + 2 * count :]
@@ -46,7 +46,7 @@ class Tally:
 
 
 def peak_memory_mib(device: torch.device) -> float:
-    """The most that the accelerator's tensors, or on a CPU the process, have taken so far."""
+    """Return the peak memory in MiB of the GPU's tensors, or of the process on another device."""
     if device.type == "cuda":
         return round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
     unit = 2**20 if sys.platform == "darwin" else 2**10

@@ -1,4 +1,4 @@
-"""Where else a run's figures go, on request: TensorBoard event files, trackio or wandb.
+"""Send a run's figures to TensorBoard event files, trackio or wandb, if the recipe asks for it.
 
 Event files lie in `tensorboard/` of the run's folder; `tensorboard --logdir RUN` shows them.
 """
@@ -19,28 +19,28 @@ FOLDER = "tensorboard"
 
 
 class Tracker(Protocol):
-    """Takes figures and pictures as they come."""
+    """A receiver of figures and pictures."""
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Figures of a step by tag, such as `train/loss`."""
+        """Record figures of a step by tag, such as `train/loss`."""
         ...
 
     def picture(self, step: int, tag: str, path: Path) -> None:
-        """A PNG file."""
+        """Record a PNG file."""
         ...
 
     def close(self) -> None:
-        """Nothing more will come."""
+        """End the record."""
         ...
 
 
 def open_trackers(recipe: "Recipe", out: Path, step: int) -> list[Tracker]:
-    """The trackers a recipe asks for.
+    """Open the trackers that a recipe names.
 
     Args:
         recipe: `track` names them.
         out: the run's folder.
-        step: steps done; what an earlier, killed session has written beyond it is superseded.
+        step: number of finished steps; later figures of an earlier, killed session are superseded.
 
     Raises:
         MissingDependencyError: a package is not installed.
@@ -56,12 +56,12 @@ def open_trackers(recipe: "Recipe", out: Path, step: int) -> list[Tracker]:
 
 
 class Remote:
-    """trackio or wandb, which share their functions.
+    """A tracker for trackio or wandb, which have the same functions.
 
     Args:
-        name: of the package.
-        recipe: kept with the run.
-        out: the run's folder, whose name is the run's.
+        name: the name of the package.
+        recipe: the recipe, which is recorded with the run.
+        out: the run's folder; its name is the name of the run.
     """
 
     def __init__(self, name: str, recipe: "Recipe", out: Path) -> None:
@@ -73,7 +73,7 @@ class Remote:
             ) from fault
         run = out.absolute().name
         given = {"project": recipe.project, "name": run, "config": recipe.values(), "resume": "allow"}
-        if name == "wandb":  # knows a run that goes on by its id, trackio by its name
+        if name == "wandb":  # wandb resumes a run by its id, trackio by its name
             folder = hashlib.sha256(str(out.absolute()).encode()).hexdigest()
             given["id"] = f"{run[:40]}-{folder[:12]}"
         self._package.init(**given)
@@ -97,7 +97,7 @@ class EventFile:
     `torch.utils.tensorboard.SummaryWriter` is not used: it imports TensorFlow wherever that is installed.
 
     Args:
-        folder: made where it is not there; every session adds a file.
+        folder: the folder, made if it does not exist; every session adds a file.
         step: figures of later steps in older files are superseded.
     """
 
@@ -119,7 +119,7 @@ class EventFile:
         except OSError as fault:
             raise OutputError(folder, f"cannot be written: {fault.strerror}", "free space") from fault
         self._write(file_version="brain.Event:2")
-        if count:  # what comes after this step in older files is to be forgotten
+        if count:  # tells readers to drop later steps of older files
             self._write(step=step + 1, session_log={"status": self._protos.SessionLog.START})
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:

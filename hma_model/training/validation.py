@@ -1,8 +1,8 @@
-"""What a run's evaluations measure: the held-out loss of what it is trained for.
+"""Evaluate a run: the held-out loss of its main objective.
 
-For forward and full: nats a token of each frame fully masked, given the true past and actions, beside what
-the training tokens' frequencies reach. For passive, policy and inverse: the training loss itself on held-out
-windows, under masks that are the same at every evaluation.
+For forward and full: nats a token of each fully masked frame, given the true past and actions, with the loss
+of the training tokens' frequencies as a baseline. For passive, policy and inverse: the training loss on
+held-out windows, under masks that are the same at every evaluation.
 """
 
 import time
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def main_objective(weights: Mapping[str, float]) -> str:
-    """The objective drawn most often."""
+    """Return the objective that is drawn most often."""
     return max(weights, key=lambda name: weights[name])
 
 
@@ -31,14 +31,14 @@ def validate(
     seed: int,
     step: int,
 ) -> dict[str, Any]:
-    """An evaluation's line of metrics.jsonl.
+    """Evaluate the model, and return the line of metrics.jsonl.
 
     Args:
-        model: as it is shown.
+        model: the model to evaluate.
         held_out: validation windows, the same at every call.
-        baseline: what looking at nothing reaches on them; asked for only where it is comparable.
-        seed: of the masks.
-        step: steps done.
+        baseline: returns the loss of the training frequencies on them; called only if it is comparable.
+        seed: the seed of the masks.
+        step: number of finished steps.
     """
     begun, objective = time.monotonic(), main_objective(model.config.objectives)
     video = objective in ("forward", "full")
