@@ -1,6 +1,6 @@
-"""Recordings of any robot in, tokenized parquet shards out.
+"""Convert recordings of any robot to tokenized parquet shards, and read them in training.
 
-Registry, sources, alignment, tokenizers, shards, mixtures, loader.
+The package holds the registry, sources, alignment, tokenizers, shards, mixtures and the loader.
 """
 
 __version__ = "0.1.0"
