@@ -27,7 +27,7 @@ ROUNDING_S = 1e-7  # the error of periods added up over hours; far below any sen
 
 
 def rounding(*clocks: Floats) -> float:
-    """Return the seconds by which equal times may differ: 100 ns and 4 units in the last place of the latest.
+    """Return the seconds by which equal times may differ: 100 ns and 4 units in the largest's last place.
 
     A float64 of seconds since 1970 is exact to 0.24 µs, so the result is 1.1 µs for such times.
     """
