@@ -70,7 +70,10 @@ class HubOutput:
         self._repository.prepare(self._name(MANIFEST))
 
     def refuse_other(self, facts: dict[str, Any]) -> None:
-        """Raise OutputError where the repository holds a set of a plan other than `facts` or its bases."""
+        """Raise OutputError where the repository holds a set of another plan.
+
+        The plan `facts` and the plans that it extends are accepted.
+        """
         if self._name(MANIFEST) not in self._repository.files():
             return
         theirs = Manifest.load(RemotePath(self.uri)).plan
