@@ -373,7 +373,7 @@ _COUNTED = ("frames", "episodes", "quarantined", "bytes")
 
 
 class _Counter:
-    """Add up what units report; when a unit is retried, take back what it had counted."""
+    """A counter of what units report; when a unit is retried, its earlier counts are taken back."""
 
     def __init__(self, progress: Progress, on_progress: Callable[[Progress], None]) -> None:
         self._progress, self._on_progress = progress, on_progress

@@ -58,7 +58,7 @@ def spread(rows: Ints, span: int, rng: np.random.Generator) -> tuple[Ints, int]:
 
 @dataclass(frozen=True)
 class Deal:
-    """Which reader reads which units.
+    """The assignment of units to readers.
 
     A unit is (row group, part); a part has every `parts`-th window of the group.
 
