@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hma_data.convert_recipe import ConversionJob
     from hma_data.output import Share
 
-SHOWN = 20  # reasons of quarantine
+SHOWN = 20  # reasons of quarantine that are printed
 Option = typer.Option
 
 

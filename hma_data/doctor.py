@@ -24,7 +24,7 @@ from hma_data.spec import Camera
 from hma_data.store import is_remote, place
 
 WINDOW = 12  # frames of the model's window, by default
-LOOKS = ("blank", "still", "colour", "size")  # checks of pictures, which matter for cameras that are used
+LOOKS = ("blank", "still", "colour", "size")  # checks of pictures; they count only for cameras that are used
 
 
 def examine(target: StrPath, embodiment: StrPath | None = None, sample: int = SAMPLE) -> list[Finding]:
@@ -54,7 +54,7 @@ def _is_shard_set(target: str) -> bool:
             return True
         return not is_remote(folder) and any(folder.glob("train/shard-*.parquet"))  # an unfinished set
     except HMAError:
-        return False  # a source's own schemes
+        return False  # a scheme that only a source knows
 
 
 # -- recordings

@@ -12,7 +12,7 @@ import fsspec
 from hma_data.errors import HMAError, MissingDependencyError, SourceError, StorageAwayError
 from hma_data.retry import ABSENT, address_hint, may_pass, retried, said
 
-CONNECT_S = 3.0  # seconds until a server that does not answer is given up on
+CONNECT_S = 3.0  # seconds to wait for a server to answer
 WAITS_S = (0.2, 0.6, 1.8)  # before the second, third and fourth try
 PACKAGES = {
     "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",

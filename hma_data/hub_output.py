@@ -98,7 +98,7 @@ class HubOutput:
         before = {name: repository.stated(self._name(name)) for name in ours}
 
         def refuse_foreign() -> dict[str, int]:
-            """Return the files that are there; raise where one is neither ours nor there since the start."""
+            """Return the files that are there; raise where one is foreign and was not there at the start."""
             files = repository.files()
             for name, sha256 in ours.items():
                 now = repository.stated(self._name(name))

@@ -164,7 +164,7 @@ def space_of(keys: Iterable[KeyInfo], facts: Mapping[str, str]) -> str | None:
     arms = [key for key in keys if not is_gripper(key.key)]
     moved = any(
         {"rotation", "delta"} <= set(words(key.key)) for key in keys
-    )  # a world_vector beside it is a step
+    )  # then a world_vector beside it is a change
     spaces = {
         "eef_delta" if moved and snake(key.key).endswith("world_vector") else _space(key) for key in arms
     }

@@ -15,7 +15,7 @@ from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another
 from hma_data.sources.findings import SEVERITIES, Finding
 from hma_data.sources.survey import CHECKS
 
-TRIED = 20  # episodes looked at for one that can be read
+TRIED = 20  # episodes tried until one can be read
 
 
 def inspect_recording(

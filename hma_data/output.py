@@ -272,7 +272,7 @@ class Journal:
 
     def _put(self) -> None:
         if isinstance(self._path, RemotePath) and self._lines:
-            with suppress(HMAError, OSError):  # without it, finishing reads the shards again
+            with suppress(HMAError, OSError):  # without a journal, finishing reads the shards again
                 put_bytes("".join(self._lines).encode(), self._path)
         self._due = time.monotonic() + JOURNAL_S
 

@@ -47,7 +47,7 @@ def spread(rows: Ints, span: int, rng: np.random.Generator) -> tuple[Ints, int]:
     for b in rng.permutation(m):
         column = rng.permutation(np.arange(b, count, m))
         if columns and apart:
-            near = np.zeros(lines + 2, np.bool_)  # by line, one more at either end
+            near = np.zeros(lines + 2, np.bool_)  # by row of the table, one more at either end
             line = (columns[-1][-apart:] - b) // m + 1
             near[line] = near[line + 1] = True
             late = near[column // m + 1]
@@ -86,7 +86,7 @@ class Deal:
         windows = np.diff(index.unit_first)[units[:, 0]]
         sizes = np.maximum(0, windows - units[:, 1] + parts - 1) // parts
         units, sizes = units[sizes > 0], sizes[sizes > 0]
-        order = np.argsort(-sizes, kind="stable")  # the largest first, to and fro: sums come out even
+        order = np.argsort(-sizes, kind="stable")  # the largest first, in alternating direction: equal sums
         turn, place = np.divmod(np.arange(len(units)), readers)
         owner = np.empty(len(units), np.int64)
         owner[order] = np.where(turn % 2, readers - 1 - place, place)

@@ -165,7 +165,7 @@ def _age(path: RemotePath, holder: Holder) -> float | None:
         return float((now - then).total_seconds())
     except FileNotFoundError:
         return None
-    except (NotImplementedError, TypeError, AttributeError, KeyError):  # a store that tells no times
+    except (NotImplementedError, TypeError, AttributeError, KeyError):  # a store without times
         return time.time() - holder.time
     finally:
         probe.unlink(missing_ok=True)

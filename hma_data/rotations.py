@@ -59,7 +59,10 @@ def _linear(source_times: Floats, values: Floats, target_times: Floats) -> Float
 
 
 def _quaternions(source_times: Floats, values: Floats, target_times: Floats) -> Floats:
-    """Interpolate quaternions along the shorter arc, with continuous sign; lengths are interpolated too."""
+    """Interpolate quaternions evenly along the shorter arc, with continuous sign.
+
+    Their lengths are interpolated too; they are 1 where the samples have length 1.
+    """
     turns = np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     steady = values * np.cumprod(np.concatenate([[1.0], turns]))[:, None]
     lengths = np.linalg.norm(values, axis=1)

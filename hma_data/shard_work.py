@@ -53,7 +53,7 @@ FATAL = (
     ShardError,
     RegistryError,
     MissingDependencyError,
-)  # not one episode's fault
+)  # not the fault of one episode
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class MakeWork:
         job = self.job
 
         def work(unit: ShardUnit, report: Report, attempt: Attempt) -> Made:
-            if threads and "torch" in sys.modules:  # holds for the calling thread alone
+            if threads and "torch" in sys.modules:  # applies to the calling thread alone
                 sys.modules["torch"].set_num_threads(threads)
             done = make_shard(job, unit, tokenizer, report, attempt)
             report(Tick(bytes=done.bytes))
@@ -347,7 +347,7 @@ def prefetch[T](items: Iterable[T], depth: int = 2) -> Iterator[T]:
                 if stop.is_set():
                     return
             queue.put(("end", None))
-        except BaseException as fault:  # handed over, not handled
+        except BaseException as fault:  # the reader raises it
             queue.put(("fault", fault))
 
     thread = Thread(target=produce, daemon=True)

@@ -319,7 +319,7 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
         return attempt(to, "written", once)
     except StorageAwayError:
         raise
-    except (FileNotFoundError, StorageError):  # refused: the condition, or any writing
+    except (FileNotFoundError, StorageError):  # the store refused the condition, or refuses any write
         put_bytes(content, to)
         return True
 

@@ -50,9 +50,9 @@ class WindowIndex:
     edges: Ints
     groups: Ints
     _starts: Ints  # (N,) first row of each episode that has windows
-    _lengths: Ints  # (N,) its rows
-    _cameras: NDArray[np.int16]  # (N,) which camera saw it
-    _before: Ints  # (N+1,) windows before each
+    _lengths: Ints  # (N,) rows of each episode
+    _cameras: NDArray[np.int16]  # (N,) index of each episode's camera
+    _before: Ints  # (N+1,) number of windows before each episode
 
     @classmethod
     def of(
