@@ -16,6 +16,7 @@ from hma_data.cli import mount
 from hma_data.console import print_json, print_table
 from hma_data.errors import HMAError
 from hma_data.priority import take_ordinary_priority
+from hma_data.threads import bound_spinning
 from hma_model import cli_train
 from hma_model.cli_hub import Json, hub_app
 
@@ -42,8 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0 well, 1 failed or problems found, 2 wrong usage, 130 interrupted.
     """
     take_ordinary_priority()
-    # Threads that spin at a barrier starve each other on a busy machine: steps took ten times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is first imported
+    bound_spinning()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or bool(os.environ.get("HMA_DEBUG"))
     try:
@@ -211,7 +211,7 @@ def _model(checkpoint: str, embodiment: str) -> Any:
 
 mount(app)
 cli_train.mount(app)
-BENCHES.update({name: f"hma_model.bench_{name}" for name in ("generate", "mup", "train")})
+BENCHES.update({name: f"hma_model.bench_{name}" for name in ("generate", "mup", "train", "waiting")})
 app.add_typer(hub_app, name="hub")
 
 

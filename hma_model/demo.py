@@ -10,16 +10,18 @@ import json
 import platform
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hma_data import lab
 from hma_data.console import human_bytes, human_seconds, progress
-from hma_data.convert import Progress, convert
-from hma_data.embodiment import Embodiment, find
+from hma_data.convert import convert
+from hma_data.embodiment import find
+from hma_data.engines.base import Attempt, Retry
+from hma_data.engines.local import run as run_local
 from hma_data.engines.local import usable_cores
 from hma_data.errors import OutputError, ShardError
 from hma_data.files import write_atomic
@@ -27,14 +29,20 @@ from hma_data.loader import open_sets
 from hma_data.mixture import Mixture
 from hma_data.paths import StrPath, as_path
 from hma_data.plan import Settings
+from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.windows import WindowIndex
 
+if TYPE_CHECKING:
+    from hma_model.film import Film
+
 ROBOTS = ("pusht_fast", "pusht_slow")
 TOKENIZER = "fsq-8"
 TAU = 3.0
-TIMINGS = "timings.json"
+TIMINGS, RESULTS = "timings.json", "results.json"
+WINDOWS = 24  # held-out windows of each robot that figures are means of
+LONGEST = 24  # frames of the film
 
 
 @dataclass
@@ -49,6 +57,7 @@ class Demo:
         training: result of the run.
         published, pulled: folders of the hub and of what was pulled back.
         figures: robot -> what `evaluate` found on its held-out windows.
+        films: robot -> a held-out rollout.
         seconds: stage -> wall time.
         sizes: what -> bytes.
     """
@@ -61,13 +70,14 @@ class Demo:
     published: Path | None = None
     pulled: dict[str, Path] = field(default_factory=dict)
     figures: dict[str, dict[str, Any]] = field(default_factory=dict)
+    films: dict[str, "Film"] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     sizes: dict[str, int] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, number: int, name: str) -> Iterator[None]:
         """Time a stage and say so."""
-        print(f"[{number}/6] {name}", file=sys.stderr, flush=True)
+        print(f"[{number}/5] {name}", file=sys.stderr, flush=True)
         begun = time.monotonic()
         yield
         self.took(name, time.monotonic() - begun)
@@ -100,69 +110,108 @@ def demo(out: StrPath, *, episodes: int = 24, steps: int | None = None, seed: in
     out = as_path(out)
     _refuse_foreign(out)
     made = Demo(out)
-    with made.stage(1, "record"):
-        record(made, episodes, seed)
-    with made.stage(2, "convert"):
-        for robot in ROBOTS:
-            convert_one(made, find_robot(robot))
-    with made.stage(3, "mix"):
+    with made.stage(1, "record and convert"):
+        record_and_convert(made, episodes, seed)
+    with made.stage(2, "mix"):
         mix(made)
-    with made.stage(4, "train"):
+    with made.stage(3, "train"):
         train_both(made, steps, seed)
-    with made.stage(5, "publish and pull"):
+    with made.stage(4, "publish and pull"):
         publish(made)
-    with made.stage(6, "roll out"):
-        evaluate_pulled(made)
+    with made.stage(5, "roll out"):
+        roll_out(made)
+    write_results(made)
     from hma_model.demo_report import write_report
 
     return write_report(made)
 
 
-def find_robot(robot: str) -> Embodiment:
-    """The laboratory robot's embodiment from the registry."""
-    return find(robot)
+@dataclass(frozen=True)
+class Recorded:
+    """What the first stage makes of one robot.
+
+    Attributes:
+        refused: more episodes than allowed are in quarantine.
+    """
+
+    robot: str
+    recording: Path
+    splits: dict[str, int]
+    shard_bytes: int
+    refused: bool
 
 
-def record(made: Demo, episodes: int, seed: int) -> None:
-    """Stage 1: a few dozen episodes of each robot from gym-pusht, each in its own format."""
-    folder = made.out / "recordings"
-    with progress("record", 2 * episodes, "episodes") as update:
-        for i, robot in enumerate(ROBOTS):
-            found = sorted(folder.glob(f"{robot}*"))
-            if found:
-                made.recordings[robot] = found[0]
-            else:
-                count = lambda done, total, first=i * episodes: update(first + done)  # noqa: E731
-                made.recordings[robot] = lab.record(robot, folder, episodes, seed, count)
-            made.sizes[f"recording {robot}"] = _size(made.recordings[robot])
+@dataclass(frozen=True)
+class Recording:
+    """Makes a worker's function, from a robot's name to its recording and shard set; picklable."""
+
+    out: Path
+    episodes: int
+    seed: int
+
+    def __call__(self, workers: int) -> Callable[[str, Callable[[Any], None], Attempt], Recorded]:
+        """Return the function; it reports ("recorded" or "converted", episodes so far)."""
+
+        def work(robot: str, report: Callable[[Any], None], attempt: Attempt) -> Recorded:
+            folder = self.out / "recordings"
+            there = sorted(folder.glob(f"{robot}*"))
+            recording = (
+                there[0]
+                if there
+                else lab.record(
+                    robot, folder, self.episodes, self.seed, lambda done, total: report(("recorded", done))
+                )
+            )
+            report(("recorded", self.episodes))
+            summary = convert(
+                find(robot), str(recording), TOKENIZER, self.out / "shards" / robot,
+                settings=Settings(val_fraction=0.15),
+                on_progress=lambda state: report(("converted", state.episodes)),
+            )  # fmt: skip
+            splits = {name: split["episodes"] for name, split in summary.manifest.splits.items()}
+            size = summary.manifest.to_json()["totals"]["bytes"]
+            return Recorded(robot, recording, splits, size, summary.too_many)
+
+        return work
 
 
-def convert_one(made: Demo, robot: Embodiment) -> None:
-    """Stage 2: a recording to a verified shard set."""
-    folder = made.out / "shards" / robot.id
-    with progress(f"convert {robot.id}") as update:
+def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
+    """Stage 1: a few dozen episodes of each robot from gym-pusht, to verified shard sets.
 
-        def show(state: Progress) -> None:
-            update(state.frames, f"{state.episodes}/{state.total_episodes} episodes", state.total_frames)
+    Each robot has a process of its own, which ends when this one does.
+    """
+    finished = all((made.out / "shards" / robot / MANIFEST).is_file() for robot in ROBOTS)
+    workers = 0 if finished or usable_cores() == 1 else len(ROBOTS)
+    counts: dict[tuple[int, str], int] = {}
+    done: dict[str, Recorded] = {}
+    with progress("record and convert", 2 * len(ROBOTS) * episodes, "episodes") as update:
 
-        settings = Settings(val_fraction=0.15)
-        summary = convert(
-            robot, str(made.recordings[robot.id]), TOKENIZER, folder, settings=settings, on_progress=show
-        )
+        def show(number: int, event: Any) -> None:
+            if not isinstance(event, Retry):
+                counts[number, event[0]] = event[1]
+                update(sum(counts.values()))
+
+        for one in run_local(ROBOTS, Recording(made.out, episodes, seed), workers, show):
+            done[one.robot] = one
+    for robot in ROBOTS:
+        _take_shards(made, done[robot])
+
+
+def _take_shards(made: Demo, one: Recorded) -> None:
+    """Verify a robot's shard set and note it."""
+    robot, folder = one.robot, made.out / "shards" / one.robot
     problems = verify(folder)
-    if problems or summary.too_many:
+    if problems or one.refused:
         raise ShardError(folder, "; ".join(problems) or "too many episodes are in quarantine")
-    made.sets[robot.id] = ShardSet(folder)
-    made.sizes[f"shards {robot.id}"] = summary.manifest.to_json()["totals"]["bytes"]
-    splits = ", ".join(f"{name} {split['episodes']}" for name, split in summary.manifest.splits.items())
-    print(
-        f"  {robot.id}: {splits} episodes, {human_bytes(made.sizes[f'shards {robot.id}'])}, verified",
-        flush=True,
-    )
+    made.recordings[robot], made.sets[robot] = one.recording, ShardSet(folder)
+    made.sizes[f"recording {robot}"] = _size(one.recording)
+    made.sizes[f"shards {robot}"] = one.shard_bytes
+    splits = ", ".join(f"{name} {count}" for name, count in one.splits.items())
+    print(f"  {robot}: {splits} episodes, {human_bytes(one.shard_bytes)}, verified", flush=True)
 
 
 def mix(made: Demo) -> None:
-    """Stage 3: how often each robot is drawn."""
+    """Stage 2: how often each robot is drawn."""
     from hma_model.recipe import load_recipe
 
     frames = load_recipe("demo").frames
@@ -174,7 +223,7 @@ def mix(made: Demo) -> None:
 
 
 def train_both(made: Demo, steps: int | None, seed: int) -> None:
-    """Stage 4: one small model on both robots."""
+    """Stage 3: one small model on both robots."""
     from hma_model.recipe import load_recipe
     from hma_model.train import train
 
@@ -192,7 +241,7 @@ def train_both(made: Demo, steps: int | None, seed: int) -> None:
 
 
 def publish(made: Demo) -> None:
-    """Stage 5: push the checkpoint to a folder hub, pull each robot back alone."""
+    """Stage 4: push the checkpoint to a folder hub, pull each robot back alone."""
     from hma_model import hub
 
     made.published = made.out / "hub" / "demo" / "pusht"
@@ -203,16 +252,17 @@ def publish(made: Demo) -> None:
     made.sizes["checkpoint of both"] = _size(made.published)
 
 
-def evaluate_pulled(made: Demo) -> None:
-    """Stage 6: each robot's figures, by the model that was pulled for it alone."""
-    from hma_data.shards.preview import tokenizer_of
-    from hma_model.evaluate import evaluate
-    from hma_model.model import HMA
+def roll_out(made: Demo) -> None:
+    """Stage 5: each robot's figures and film, by the model that was pulled for it alone.
 
-    for robot, shards in made.sets.items():
-        model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
-        found = evaluate(model, tokenizer_of(shards), shards, count=24, batch_size=8)
-        made.figures[robot] = found
+    The robots are worked on side by side, each by one thread: so many small products gain little from two.
+    """
+    from hma_data.tokenizers.network import single_threads
+
+    with single_threads(len(made.sets)) as pool:
+        results = list(pool.map(lambda robot: _rolled_out(made, robot), made.sets))
+    for robot, (found, film) in zip(made.sets, results, strict=True):
+        made.figures[robot], made.films[robot] = found, film
         print(
             f"  {robot}: last frame PSNR {found['true']['psnr_last']:.1f} dB with its actions, "
             f"{found['shuffled']['psnr_last']:.1f} dB with another window's",
@@ -220,8 +270,35 @@ def evaluate_pulled(made: Demo) -> None:
         )
 
 
+def write_results(made: Demo) -> None:
+    """Write results.json: the seconds in all, and what the actions are worth in each robot's last frames."""
+    names = {"true": "psnr_last", "shuffled": "psnr_last_shuffled", "copy": "psnr_last_copy"}
+    figures = {
+        robot: {name: found[key]["psnr_last"] for key, name in names.items()}
+        for robot, found in made.figures.items()
+    }
+    results = {"seconds": sum(made.seconds.values()), "embodiments": figures}
+    write_atomic(made.out / RESULTS, json.dumps(results, indent=1))
+
+
+def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "Film"]:
+    from hma_data.shards.preview import tokenizer_of
+    from hma_model.evaluate import default_prompt, evaluate
+    from hma_model.film import rollout_film
+    from hma_model.model import HMA
+
+    shards = made.sets[robot]
+    model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
+    tokenizer = tokenizer_of(shards)
+    found = evaluate(model, tokenizer, shards, count=WINDOWS, batch_size=8)
+    lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
+    prompt = max(2, default_prompt(model.config.frames))
+    frames = min(LONGEST, max(lengths) // shards.row_stride) - prompt
+    return found, rollout_film(model, tokenizer, shards, frames=frames, prompt=prompt)
+
+
 def _refuse_foreign(out: Path) -> None:
-    ours = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS}
+    ours = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, RESULTS}
     if out.is_dir():
         foreign = sorted(item.name for item in out.iterdir() if item.name not in ours)
         if foreign:

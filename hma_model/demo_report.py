@@ -16,15 +16,11 @@ from hma_data.shards.reader import ShardSet
 from hma_data.sheets import grid, png_bytes, webp_bytes
 from hma_data.sources.base import open_source
 from hma_data.video import prepare
-from hma_model.film import Film, rollout_film
-from hma_model.model import HMA
 from hma_model.page import Page
 from hma_model.plots import loss_curve, psnr_over_horizon
 
 if TYPE_CHECKING:
     from hma_model.demo import Demo
-
-LONGEST = 24  # frames of the animated rollout
 
 OWN_DATA = """
 hma inspect DATA                                          # what is in the recording
@@ -184,7 +180,7 @@ def _rollouts(page: Page, made: "Demo") -> None:
         "shows it, PSNR after so short a training hardly, because the disc covers few pixels.",
     )
     for robot, shards in made.sets.items():
-        film = _film(made, shards)
+        film = made.films[robot]
         caption = f"{robot}: truth, prediction with the true actions, with another window's; actions as bars"
         page.picture(webp_bytes(film.frames, film.fps), "webp", caption)
         found = made.figures[robot]
@@ -220,17 +216,6 @@ def _rollouts(page: Page, made: "Demo") -> None:
         for robot, found in made.figures.items()
     ]
     page.table(names, rows)
-
-
-def _film(made: "Demo", shards: ShardSet) -> Film:
-    """The longest held-out rollout, by the model pulled for this robot."""
-    robot = shards.embodiment.id
-    model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
-    longest = max(row["length"] for row in _held_out(shards, 100)) // shards.row_stride
-    prompt = max(2, model.config.frames // 3)
-    return rollout_film(
-        model, tokenizer_of(shards), shards, frames=min(LONGEST, longest) - prompt, prompt=prompt
-    )
 
 
 def _accounts(page: Page, made: "Demo") -> None:

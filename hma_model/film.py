@@ -1,7 +1,7 @@
 """A rollout as a film: truth, prediction with its actions, prediction with other actions, side by side."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,20 +70,12 @@ def rollout_film(
     other = windows.batch([(window + len(windows) // 2) % len(windows)]).actions if len(windows) > 1 else None
     swapped = batch.actions.clone()
     swapped[:, prompt - 1 :] = (batch.actions.flip(1) if other is None else other)[:, prompt - 1 :]
-    true, changed = (
-        rollout(
-            model,
-            tokenizer,
-            batch,
-            prompt=prompt,
-            actions=actions,
-            unmask_steps=unmask_steps,
-            temperature=temperature,
-            sample_steps=sample_steps,
-            seed=seed,
-        )
-        for actions in (batch.actions, swapped)
-    )
+    options: dict[str, Any] = {
+        "prompt": prompt, "unmask_steps": unmask_steps, "temperature": temperature,
+        "sample_steps": sample_steps, "seed": seed,
+    }  # fmt: skip
+    true = rollout(model, tokenizer, batch, **options)
+    changed = rollout(model, tokenizer, batch, actions=swapped, truth=true.truth, **options)
     stats = shards.manifest.stats["action"]
     low, high = np.array(stats["min"]), np.array(stats["max"])
     own, foreign = (actions[0, :, : len(low)].numpy() for actions in (batch.actions, swapped))

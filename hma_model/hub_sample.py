@@ -73,7 +73,7 @@ def sample(checkpoint: StrPath, shards: "ShardSet", tokenizer: "Tokenizer | None
     batch = _window(shards, model.config.frames)
     tokenizer = tokenizer or tokenizer_of(shards)
     true = rollout(model, tokenizer, batch)
-    other = rollout(model, tokenizer, batch, actions=batch.actions.flip(1))
+    other = rollout(model, tokenizer, batch, actions=batch.actions.flip(1), truth=true.truth)
     picks = np.unique(np.linspace(0, true.truth.shape[1] - 1, COLUMNS).astype(int))
     rows = {
         "truth": true.truth[0],

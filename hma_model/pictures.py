@@ -70,7 +70,7 @@ def _picture(model: "HMA", tokenizer: "Tokenizer", shards: ShardSet, recipe: "Re
     (batch,) = windows(shards, "val", recipe.frames, recipe.pictures, recipe.pictures)
     true = rollout(model, tokenizer, batch, seed=recipe.seed)
     swapped = shuffled_actions(batch, true.prompt - 1, recipe.seed)
-    other = rollout(model, tokenizer, batch, actions=swapped, seed=recipe.seed)
+    other = rollout(model, tokenizer, batch, actions=swapped, seed=recipe.seed, truth=true.truth)
     picks = np.unique(np.linspace(0, recipe.frames - 1, COLUMNS).astype(int))
     for i in range(len(true.truth)):
         for label, frames in (

@@ -1,6 +1,8 @@
-"""Tests. A thread each: several workers of pytest share the cores, and waiting threads sleep."""
+"""Tests. A thread each, since several workers share the cores; threads wait as they do under the command."""
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+from hma_data.threads import bound_spinning
+
+bound_spinning()
 os.environ.setdefault("OMP_NUM_THREADS", "1")

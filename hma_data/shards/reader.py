@@ -178,7 +178,8 @@ class ShardSet:
         Raises:
             ShardError: no such episode.
         """
-        found = self.episodes.filter(pc.equal(self.episodes["episode_index"], episode_index)).to_pylist()
+        wanted = pa.scalar(episode_index)  # for a plain number pyarrow would import pandas
+        found = self.episodes.filter(pc.equal(self.episodes["episode_index"], wanted)).to_pylist()
         if not found:
             raise ShardError(self.folder, f"has no episode {episode_index}")
         row = found[0]

@@ -103,7 +103,7 @@ class NetworkTokenizer:
         side by side, each on one thread, where they are to be computed alone."""
         parts = [items[start : start + self.batch] for start in range(0, len(items), self.batch)]
         if alone and parts and self.device.type == "cpu":
-            with _single_threads(len(parts)) as pool:
+            with single_threads(len(parts)) as pool:
                 self._store(out, pool.map(step, parts))
         else:
             self._store(out, map(step, parts))
@@ -152,8 +152,8 @@ class NetworkTokenizer:
 
 
 @contextmanager
-def _single_threads(tasks: int) -> Iterator[ThreadPoolExecutor]:
-    """A pool as wide as torch may use threads, each of which computes alone."""
+def single_threads(tasks: int) -> Iterator[ThreadPoolExecutor]:
+    """Give a pool for so many tasks, as wide as torch may use threads, each of which computes alone."""
     threads = torch.get_num_threads()
     try:
         with ThreadPoolExecutor(min(threads, tasks), initializer=lambda: torch.set_num_threads(1)) as pool:

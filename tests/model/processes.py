@@ -103,7 +103,7 @@ def command(*words: str, out: Path | None = None, env: dict[str, str] | None = N
     if out:
         os.dup2(os.open(out, os.O_CREAT | os.O_WRONLY), 1)
     sys.argv = ["hma", *words]
-    main()
+    sys.exit(main())
 
 
 def kill_at_write(number: int, place: str, work: Callable[[], Any]) -> None:

@@ -1,6 +1,7 @@
 """`hma bench generate` and `hma bench train`: what their results say."""
 
 import json
+import os
 from typing import Any
 
 import pytest
@@ -8,7 +9,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
-from hma_model import bench_generate, bench_train
+from hma_model import bench_generate, bench_train, bench_waiting
 from hma_model.cli import app
 from tests.model.network_parts import small_batch, small_model
 
@@ -90,3 +91,19 @@ def test_the_operations_of_a_step_are_those_torch_counts() -> None:
     counts = bench_train.step_flops(model, {"batch": 2, "window": 3})
     counted = sum(counter.get_flop_counts()["HMA.trunk"].values())
     assert counts == pytest.approx(counted, rel=0.1)
+
+
+def test_ways_of_waiting_are_measured_each_in_its_own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+    seen = []
+
+    def fake(task: Any, settings: dict[str, Any]) -> dict[str, float]:
+        seen.append({key: os.environ[key] for key in bench_waiting._OURS if key in os.environ})
+        return {"steps_per_second": float(len(seen))}
+
+    monkeypatch.setattr(bench_waiting, "in_fresh_process", fake)
+    results = bench_waiting.run(bench_waiting.DEFAULTS | {"beside": "nothing", "rounds": 3})
+    assert seen == list(bench_waiting.WAITS.values()) * 3
+    assert [result["wait"] for result in results] == list(bench_waiting.WAITS)
+    assert results[0] == {"wait": "PASSIVE", "beside": "nothing", "steps_per_second": 1 + len(results)}
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"

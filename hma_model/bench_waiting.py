@@ -1,0 +1,112 @@
+"""`hma bench waiting`: how fast two threads are by how they wait for one another; see `hma_data.threads`.
+
+Training steps and generated frames of a model as large as `hma demo`'s, for each way of waiting, alone on the
+machine and beside processes that keep every core busy. The cases are interleaved and measured several times;
+medians count, since other work on the machine disturbs single figures. CPU seconds show what spinning burns.
+"""
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from statistics import median
+from typing import Any
+
+from hma_data.engines.local import usable_cores
+from hma_model import bench_generate, bench_train
+from hma_model.bench_generate import check, in_fresh_process, make_model
+
+ABOUT = "training steps and frames a second by how threads wait for one another"
+DEFAULTS: dict[str, Any] = {
+    **bench_generate.DEFAULTS,
+    **bench_train.DEFAULTS,
+    "rounds": 3,  # of all cases
+    "steps": 6,  # of training, a round
+    "frames": 10,  # generated, a round
+    "beside": "both",  # nothing | busy (processes on every core) | both
+    "layers": 4,
+    "width": 128,
+    "heads": 4,
+    "window": 8,
+}
+WAITS: dict[str, dict[str, str]] = {
+    "PASSIVE": {"OMP_WAIT_POLICY": "PASSIVE"},
+    "ACTIVE": {"OMP_WAIT_POLICY": "ACTIVE"},
+    **{f"{count:,} spins": {"GOMP_SPINCOUNT": str(count)} for count in (1_000, 10_000, 50_000, 200_000)},
+    "one thread": {"OMP_NUM_THREADS": "1"},
+}
+_OURS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS")
+
+
+def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Measure each way of waiting, alone and beside busy processes.
+
+    Raises:
+        UsageError: a setting has a value that is not allowed.
+    """
+    check("waiting", settings, kind=("discrete",), beside=("nothing", "busy", "both"))
+    beside = {"busy": (True,), "nothing": (False,), "both": (False, True)}[settings["beside"]]
+    cases = [(wait, busy) for busy in beside for wait in WAITS]
+    rounds: dict[tuple[str, bool], list[dict[str, float]]] = {case: [] for case in cases}
+    for _ in range(settings["rounds"]):
+        for wait, busy in cases:
+            with _environment(WAITS[wait]), _busy_cores(usable_cores() if busy else 0):
+                rounds[wait, busy].append(in_fresh_process(measure, settings))
+    return [
+        {"wait": wait, "beside": "busy cores" if busy else "nothing", **_medians(found)}
+        for (wait, busy), found in rounds.items()
+    ]
+
+
+def measure(settings: dict[str, Any]) -> dict[str, float]:
+    """Seconds of a step and of a frame: by the clock and of all cores together."""
+    begun = time.process_time()
+    train = median(bench_train._step_seconds(make_model(settings).train(), settings))
+    trained = time.process_time()
+    frame = median(bench_generate._step_seconds(make_model(settings).eval(), settings, True))
+    return {
+        "seconds_per_step": train,
+        "steps_per_second": 1 / train,
+        "training_cpu_seconds": trained - begun,
+        "frames_per_second": settings["batch"] / frame,
+        "generation_cpu_seconds": time.process_time() - trained,
+    }
+
+
+def _medians(rounds: list[dict[str, float]]) -> dict[str, float]:
+    return {key: round(median(found[key] for found in rounds), 4) for key in rounds[0]}
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Give processes that start in the block these of OpenMP's variables and no others."""
+    before = {key: os.environ.pop(key) for key in _OURS if key in os.environ}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for key in values:
+            del os.environ[key]
+        os.environ.update(before)
+
+
+@contextmanager
+def _busy_cores(count: int) -> Iterator[None]:
+    """Keep so many cores busy in the block."""
+    context = multiprocessing.get_context("spawn")
+    processes = [context.Process(target=_spin, daemon=True) for _ in range(count)]
+    for process in processes:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+def _spin() -> None:
+    parent = os.getppid()
+    while os.getppid() == parent:
+        sum(range(100_000))
