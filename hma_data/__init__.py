@@ -1,4 +1,4 @@
-"""Recordings of any robot in, tokenized parquet shards out.
+"""Convert recordings of any robot to tokenized parquet shards, and read them in training.
 
 Rooms in the road's order: storage, hub, registry, episodes, sources, tokenizers, shards, inspection,
 conversion, loading; beside them lab, bench and cli. A room imports only from rooms before it. The names

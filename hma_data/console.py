@@ -1,6 +1,6 @@
-"""How commands speak: tables and progress on a terminal, JSON for programs, errors in one line.
+"""Print what commands show: tables, lines and progress on a terminal, JSON for programs.
 
-Shared by the data and model verbs. rich is imported when something is shown.
+The data and the model verbs share this module. rich is imported when something is shown.
 """
 
 import json
@@ -14,24 +14,24 @@ from typing import Any, Protocol
 
 
 class Update(Protocol):
-    """Moves a progress display on."""
+    """A function that updates a progress display."""
 
     def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
-        """`done` so far, a few words beside the bar, and the total where it has become known."""
+        """Show the amount done so far, a few words beside the bar, and the total once it is known."""
         ...
 
 
 def print_json(values: Any) -> None:
-    """Plain values to standard output."""
+    """Print plain values as JSON to standard output."""
     print(json.dumps(values, indent=1, ensure_ascii=False, default=str))
 
 
-MAX_TITLE = 40  # of a line; a longer one pushes its text to the right
+MAX_TITLE = 40  # letters in the column of titles; a longer title pushes its text to the right
 MANY_ROWS = 500  # laying out more than this with rich takes seconds
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "") -> None:
-    """A table to standard output; numbers to the right; full width when it is not a terminal."""
+    """Print a table to standard output: numbers aligned right, full width when it is not a terminal."""
     if len(rows) > MANY_ROWS:
         _print_columns(columns, rows)
         return
@@ -40,7 +40,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
     from rich.table import Table
 
     table = Table(*columns, title=title or None, title_justify="left", box=SIMPLE, pad_edge=False)
-    table.columns[0].overflow = "fold"  # what is typed into the next command is never cut short
+    table.columns[0].overflow = "fold"  # users type it into the next command, so it is never cut short
     for i, column in enumerate(table.columns):
         values = [row[i] for row in rows]
         if any(isinstance(value, int | float) for value in values) and not any(map(_is_word, values)):
@@ -51,7 +51,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
 
 
 def stdout() -> Any:
-    """A console on standard output, wide when nobody sees it as a terminal."""
+    """Return a console on standard output; it is wide where standard output is not a terminal."""
     from rich.console import Console
 
     return Console(
@@ -81,7 +81,7 @@ def _cell(value: Any) -> str:
 
 
 def print_lines(lines: Iterable[tuple[str, str]]) -> None:
-    """Pairs of a title and a text, the texts below each other; on a terminal folded to its width."""
+    """Print pairs of a title and a text with the texts in one column, folded to a terminal's width."""
     pairs = list(lines)
     width = min(max((len(title) for title, _ in pairs), default=0), MAX_TITLE)
     room = shutil.get_terminal_size().columns - width - 2 if sys.stdout.isatty() else 0
@@ -95,14 +95,14 @@ def print_lines(lines: Iterable[tuple[str, str]]) -> None:
 
 
 def human_number(value: float | None) -> str | None:
-    """Three digits: 0.00123, 12.3, 1.23e+09."""
+    """Return a number as text with three digits: 0.00123, 12.3, 1.23e+09."""
     if value is None:
         return None
     return f"{value:.0f}" if float(value).is_integer() and abs(value) < 1e6 else f"{value:.3g}"
 
 
 def human_bytes(count: float) -> str:
-    """1234567 -> 1.2 MB."""
+    """Return a number of bytes as text: 1234567 -> 1.2 MB."""
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if count < 1000 or unit == "TB":
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
@@ -111,7 +111,7 @@ def human_bytes(count: float) -> str:
 
 
 def human_seconds(seconds: float) -> str:
-    """3725 -> 1 h 02 min."""
+    """Return a duration as text: 3725 -> 1 h 02 min."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     if seconds < 3600:
@@ -121,7 +121,7 @@ def human_seconds(seconds: float) -> str:
 
 @contextmanager
 def progress(description: str, total: float = 0, unit: str = "frames") -> Iterator[Update]:
-    """A bar with rate and time left on standard error; a line every ten seconds where it is no terminal."""
+    """Show progress on standard error: a bar with rate and time left, or a line every 10 s off a terminal."""
     if sys.stderr.isatty():
         with _bar(description, total, unit) as update:
             yield update
@@ -171,7 +171,7 @@ class _Lines:
     def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
         self._done, self._extra, self._total = done, extra, total or self._total
         if self._first is None:
-            self._first = done  # what an earlier run had done does not count for the rate
+            self._first = done  # work of an earlier run does not count for the rate
         if time.monotonic() - self._shown >= 10:
             self._show()
 

@@ -1,17 +1,17 @@
-"""Every error of ours names where, what is wrong, and what to do about it.
+"""Define the errors: each names where the fault is, what is wrong, and what to do about it.
 
-The command line prints one line of it and exits with `exit_code`; programs read the attributes.
+The command line prints an error as one line and exits with `exit_code`; programs read the attributes.
 """
 
 
 class HMAError(Exception):
-    """Base of all.
+    """The base class of all errors here.
 
     Attributes:
         where: the file, folder, URI or YAML path at fault.
-        fault: what is wrong, with the value met.
-        remedy: what to do; may be empty where the fault says it.
-        exit_code: of the command line, 1 failed, 2 wrong usage.
+        fault: what is wrong, with the value found.
+        remedy: what to do; may be empty where the fault makes it clear.
+        exit_code: of the command line: 1 failed, 2 wrong usage.
     """
 
     exit_code = 1
@@ -43,15 +43,15 @@ class SourceError(HMAError):
 
 
 class StorageAwayError(SourceError):
-    """Storage did not answer, however often it was asked: no fault of what is recorded there."""
+    """Storage did not answer after several tries; this is no fault of the recording."""
 
 
 class StorageError(HMAError):
-    """A store refuses what is asked of it: no access, no such bucket, no room."""
+    """A store refuses a request: no access, no such bucket, or no space."""
 
 
 class EpisodeError(HMAError):
-    """One episode of a readable recording is bad: it goes to quarantine, the job goes on."""
+    """One episode of a readable recording cannot be used: it goes to quarantine, and the job goes on."""
 
 
 class AlignmentError(EpisodeError):
@@ -63,11 +63,11 @@ class TokenizerError(HMAError):
 
 
 class ShardError(HMAError):
-    """A shard or its manifest is damaged, or does not fit what is asked of it."""
+    """A shard or its manifest is damaged, or does not fit the request."""
 
 
 class OutputError(HMAError):
-    """An output folder holds something else than this job would write."""
+    """An output folder cannot be used: it holds something else than this job would write, for example."""
 
 
 class RecipeError(HMAError):
@@ -79,11 +79,11 @@ class TrainingError(HMAError):
 
 
 class CheckpointError(HMAError):
-    """A checkpoint is damaged, or does not fit what is asked of it."""
+    """A checkpoint is damaged, or does not fit the request."""
 
 
 class HubError(HMAError):
-    """Publishing or pulling failed."""
+    """Publishing to a hub, or pulling from it, failed."""
 
 
 class MissingDependencyError(HMAError):

@@ -1,7 +1,7 @@
-"""Real-time priority, which SVT-AV1 gives to a process of root that encodes, and what it starts inherits.
+"""Take away real-time priority, which SVT-AV1 sets for a process of root that encodes.
 
-Threads that spin while they wait for one another then never let the others run: training of a second took
-minutes or did not end.
+Threads and processes that the process starts inherit this priority. Threads that spin while they wait for
+one another then never let the others run: a training that takes a second took minutes or did not end.
 """
 
 import os
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 
 def take_ordinary_priority() -> None:
-    """Be scheduled as processes are by default, where this thread is not and may be."""
+    """Set the default scheduling for this thread where it has real-time priority."""
     if not hasattr(os, "sched_getscheduler") or os.sched_getscheduler(0) not in (os.SCHED_FIFO, os.SCHED_RR):
         return
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
@@ -18,7 +18,7 @@ def take_ordinary_priority() -> None:
 
 @contextmanager
 def ordinary_priority() -> Iterator[None]:
-    """For a block that may encode video: what comes after it has ordinary priority."""
+    """Restore ordinary priority after a block that may encode video."""
     try:
         yield
     finally:

@@ -1,8 +1,8 @@
-"""How the threads of a product wait for one another.
+"""Bound the time that threads of a matrix product spin while they wait for one another.
 
-GCC's OpenMP, which torch brings, lets a thread that has done its share turn in a loop for a while before it
-sleeps. Sleeping at once (OMP_WAIT_POLICY=PASSIVE) costs a wake-up a product, which slows small ones; turning
-long takes the core from the thread that is waited for, where others work on the machine too. So the loop is
+GCC's OpenMP, which torch brings, lets a thread that has done its share spin in a loop before it sleeps. Sleeping
+at once (OMP_WAIT_POLICY=PASSIVE) costs one wake-up per product, which slows small products. Spinning long
+takes the core from the thread that is waited for, where other processes use the machine too. So the loop is
 short. `hma bench waiting` compares the choices; figures are in docs/results.md.
 """
 
@@ -12,7 +12,7 @@ SPINS = 1_000  # turns of the loop: on a quiet machine nearly as quick as more, 
 
 
 def bound_spinning() -> None:
-    """Bound how long threads turn, unless the environment says; call before importing torch."""
+    """Bound how long threads spin, unless the environment does; call this before importing torch."""
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", str(SPINS))
 

@@ -1,4 +1,4 @@
-"""`hma convert`: one conversion, a recipe of several, a share of one, or only its plan."""
+"""Run `hma convert`: one conversion, a recipe of several, a share of one, or only its plan."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hma_data.conversion.output import Share
     from hma_data.conversion.recipe import ConversionJob
 
-SHOWN = 20  # reasons of quarantine
+SHOWN = 20  # reasons of quarantine that are printed
 Option = typer.Option
 
 
@@ -87,7 +87,7 @@ def convert(
     ] = False,
     json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Recordings to tokenized shards; run it again to continue.
+    """Convert recordings to tokenized shards; run it again to continue.
 
     Example: hma convert -e my_arm.yaml --source ./demo.hdf5 --out shards/my_arm
     """
@@ -144,7 +144,7 @@ def _fraction(value: float) -> float:
 
 
 def _run_all(jobs: "list[ConversionJob]", run: "Callable[[ConversionJob], bool]") -> None:
-    """Each job; of several, one that fails does not stop the others."""
+    """Run each job and exit; of several jobs, one that fails does not stop the others."""
     if len(jobs) == 1:
         raise typer.Exit(0 if run(jobs[0]) else 1)
     failed = 0

@@ -1,4 +1,4 @@
-"""`hma inspect` and `hma doctor`: what is in a recording, and what of it will hurt training."""
+"""Run `hma inspect` (what is in a recording) and `hma doctor` (what in it will hurt training)."""
 
 from enum import StrEnum
 from typing import Annotated, Any
@@ -10,7 +10,7 @@ from hma_data.console import human_number, print_json, print_lines, print_table
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Episodes = Annotated[int, typer.Option("--episodes", min=1, help="How many are looked into.")]
 COLUMNS = ["key", "shape", "dtype", "Hz", "jitter ms", "skew ms", "count", "values"]
-NO_JITTER_MS = 0.001  # less is the rounding of the stamps
+NO_JITTER_MS = 0.001  # a smaller jitter comes from rounded stamps
 
 
 def inspect(
@@ -21,7 +21,7 @@ def inspect(
     episodes: Episodes = 20,
     json: Json = False,
 ) -> None:
-    """What is in a recording.
+    """Show what is in a recording.
 
     Example: hma inspect ./demo.hdf5
     """
@@ -60,7 +60,7 @@ def _print_inspection(report: dict[str, Any]) -> None:
 
 
 def _row(key: dict[str, Any]) -> list[Any]:
-    """One key: pictures with their codec, the skew as p50/p95/max."""
+    """Return the table row of one key: pictures with their codec, the skew as p50/p95/max."""
     skew = "/".join(f"{part:.3g}" for part in key["skew_ms"]) if key["skew_ms"] else None
     kind = {"camera": f"{key['dtype']} {key['codec'] or ''}", "text": "text"}.get(key["kind"], key["dtype"])
     bounds = [human_number(key[side]) for side in ("low", "high")]
@@ -78,7 +78,7 @@ def _row(key: dict[str, Any]) -> list[Any]:
 
 
 def _print_checks(report: dict[str, Any]) -> None:
-    """Every check with its result; a line for each finding."""
+    """Print every check with its result, and one line for each finding."""
     from hma_data.sources.common.survey import CHECKS
 
     findings: dict[str, list[str]] = {}
@@ -112,7 +112,7 @@ def doctor(
     ] = Limit.error,
     json: Json = False,
 ) -> None:
-    """Health checks: what of a recording or shard set will hurt training.
+    """Check the health of a recording or shard set: report what in it will hurt training.
 
     Example: hma doctor ./demo.hdf5 -e my_arm.yaml --fail-on warn
     """

@@ -1,4 +1,4 @@
-"""`hma mixture`: how often each embodiment is drawn, as a table and a plot."""
+"""Run `hma mixture`: show how often each embodiment is drawn, as a table and a plot."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -39,7 +39,7 @@ def mixture(
     plot: Annotated[Path | None, typer.Option("--plot", help="PNG, SVG or PDF to draw.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """How often each embodiment is drawn.
+    """Show how often each embodiment is drawn.
 
     Example: hma mixture shards/a shards/b --temperature 3 --plot mixture.png
     """

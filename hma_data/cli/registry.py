@@ -1,4 +1,4 @@
-"""`hma registry`: look at embodiments, check their YAML, write the YAML of a new robot, export it."""
+"""Run `hma registry`: list and show embodiments, check their YAML, write a new robot's YAML, export it."""
 
 import sys
 from enum import StrEnum
@@ -12,7 +12,7 @@ from hma_data.console import print_json, print_table
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Id = Annotated[str, typer.Argument(help="Registry id, or a YAML file.")]
-SCHEMA = "embodiment.schema.json"  # found by editors through the first line of a YAML
+SCHEMA = "embodiment.schema.json"  # the first line of a YAML names it for editors
 LISTED = {  # column -> fact
     "id": "id",
     "kind": "kind",
@@ -51,7 +51,7 @@ def registry_list(
     hz: Annotated[str | None, typer.Option("--hz", help="Only this rate, or: unknown.")] = None,
     json: Json = False,
 ) -> None:
-    """Every embodiment that an id finds.
+    """List every embodiment that can be found by its id.
 
     Example: hma registry list franka --source rlds
     """
@@ -98,7 +98,7 @@ def _rate_is(rate: float | str | None, wanted: str) -> bool:
 def _print_list(rows: list[dict[str, Any]]) -> None:
     cells = [[row[fact] for fact in LISTED.values()] for row in rows]
     for row, shown in zip(rows, cells, strict=True):
-        if row["rate_hz"] is None:  # the word tells more than a blank
+        if row["rate_hz"] is None:  # a word such as "unknown" says more than a blank
             shown[list(LISTED).index("Hz")] = row["frequency_hz"]
     print_table(list(LISTED), [[", ".join(v) if isinstance(v, list) else v for v in row] for row in cells])
     print(f"{len(rows):,} embodiment{'s' if len(rows) != 1 else ''}")
@@ -106,7 +106,7 @@ def _print_list(rows: list[dict[str, Any]]) -> None:
 
 @registry_app.command("show")
 def registry_show(id: Id, json: Json = False) -> None:
-    """One embodiment and what follows from it.
+    """Show one embodiment and the values derived from it.
 
     Example: hma registry show pusht_fast
     """
@@ -136,7 +136,7 @@ def registry_validate(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Every problem of every YAML, listed at once.
+    """List every problem of every YAML.
 
     Example: hma registry validate my_robot.yaml
     """
@@ -163,7 +163,7 @@ def registry_validate(
 
 
 def _line(problem: dict[str, str | None]) -> str:
-    """As hma_data.registry.embodiment.Problem says it, without importing it."""
+    """Return a problem as text, as hma_data.registry.embodiment.Problem does, without importing that module."""
     text = f"{problem['path']}: {problem['fault']}" if problem["path"] else str(problem["fault"])
     if problem["value"] is not None:
         text += f" (is {problem['value']})"
@@ -174,7 +174,7 @@ def _line(problem: dict[str, str | None]) -> str:
 def registry_schema(
     out: Annotated[Path | None, typer.Option("--out", help="File to write; default: print.")] = None,
 ) -> None:
-    """The JSON Schema of a registry YAML, for editors.
+    """Print or write the JSON Schema of a registry YAML, for editors.
 
     Example: hma registry schema --out registry/embodiment.schema.json
     """
@@ -203,7 +203,7 @@ def registry_export(
     to: Annotated[Convention, typer.Option("--to", help="Whose convention.")],
     out: Annotated[Path | None, typer.Option("--out", help="File to write; default: print.")] = None,
 ) -> None:
-    """An embodiment in another project's words: GR00T's modality.json, or the features of a LeRobotDataset.
+    """Export an embodiment to another project's format: GR00T's modality.json, or LeRobotDataset features.
 
     Example: hma registry export so100 --to modality.json --out meta/modality.json
     """
@@ -251,7 +251,7 @@ def registry_infer(
 
 
 def _schema_for(out: Path) -> str:
-    """Where editors find the schema of a YAML: its registry's, else one written beside it."""
+    """Return the path of a YAML's schema, relative to the YAML; write one beside it where there is none."""
     for up in range(3):
         place = Path(*[".."] * up, SCHEMA)
         if (out.parent / place).is_file():

@@ -1,6 +1,6 @@
-"""`hma shards`: look at shard sets, verify them, and make others of them.
+"""Run `hma shards`: look at shard sets, verify them, and make new sets from them.
 
-Only what is light is imported here; each verb imports what it needs.
+Only light modules are imported here. Each verb imports what it needs when it runs.
 """
 
 from collections.abc import Callable
@@ -35,13 +35,13 @@ class Together(StrEnum):
 
 
 def _in(update: Update, unit: float = 1) -> Callable[[int, int], None]:
-    """A progress display that counts in `unit`."""
+    """Return a progress callback that counts in `unit`."""
     return lambda done, total: update(done / unit, total=total / unit)
 
 
 @shards_app.command("info")
 def shards_info(folder: Annotated[Path, typer.Argument(help="A shard set.")], json: Json = False) -> None:
-    """Totals of a shard set.
+    """Show the totals of a shard set.
 
     Example: hma shards info shards/my_arm
     """
@@ -101,7 +101,7 @@ def shards_verify(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Every hash, row count and invariant.
+    """Check every hash, row count and invariant.
 
     Example: hma shards verify shards/my_arm
     """
@@ -134,7 +134,7 @@ def shards_preview(
         str | None, typer.Option("--weights", help="The tokenizer's weights, if not the usual.")
     ] = None,
 ) -> None:
-    """Contact sheet and video decoded from the tokens, with the actions drawn.
+    """Write a contact sheet and a video decoded from the tokens, with the actions drawn.
 
     Example: hma shards preview shards/my_arm
     """
@@ -165,7 +165,7 @@ def shards_merge(
     workers: Workers = None,
     json: Json = False,
 ) -> None:
-    """One set of several; every episode keeps its split.
+    """Merge several shard sets into one; every episode keeps its split.
 
     Example: hma shards merge shards/monday shards/tuesday --out shards/week
     """
@@ -191,7 +191,7 @@ def shards_split(
     workers: Workers = None,
     json: Json = False,
 ) -> None:
-    """The same episodes, divided anew into train and val.
+    """Divide the episodes of a set anew into train and val, as a new set.
 
     Example: hma shards split shards/my_arm --val-fraction 0.1 --out shards/my_arm_10
     """
@@ -238,7 +238,7 @@ def shards_export(
     ] = None,
     camera: Annotated[str | None, typer.Option("--camera", help="Which; default: the first.")] = None,
 ) -> None:
-    """Flat files as the paper's code reads them: video.bin, actions, segment_ids.bin, metadata.json.
+    """Export flat files as the paper's code reads them: video.bin, actions, segment_ids.bin, metadata.json.
 
     Example: hma shards export shards/my_arm --to memmap --out flat/my_arm
     """

@@ -1,4 +1,4 @@
-"""`hma tokenizer`: list, train and measure tokenizers."""
+"""Run `hma tokenizer`: list, train and measure tokenizers."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 @tokenizer_app.command("list")
 def tokenizer_list(json: Json = False) -> None:
-    """Names that --tokenizer takes: what is usable here, what is downloaded, sizes, licences.
+    """List the names that --tokenizer takes: what is usable here, what is downloaded, sizes, licences.
 
     Example: hma tokenizer list
     """
@@ -48,7 +48,7 @@ def tokenizer_train(
     device: Annotated[str, typer.Option("--device", help="cpu, cuda, mps.")] = "cpu",
     workers: Annotated[int, typer.Option("--workers", min=0, help="Threads that draw crops ahead.")] = 0,
 ) -> None:
-    """Train a tokenizer; run it again to go on.
+    """Train a tokenizer; run it again to continue.
 
     Example: hma tokenizer train recipes/tokenizer/fsq.yaml --out fsq.safetensors
     """
@@ -97,7 +97,7 @@ def tokenizer_eval(
     device: Annotated[str, typer.Option("--device", help="cpu, cuda, mps.")] = "cpu",
     json: Json = False,
 ) -> None:
-    """PSNR, SSIM, LPIPS, use of the vocabulary, bits, speed, and the worst frames.
+    """Measure a tokenizer: PSNR, SSIM, LPIPS, use of the vocabulary, bits, speed, and the worst frames.
 
     Example: hma tokenizer eval fsq-16 ./videos --out eval
     """
@@ -131,7 +131,7 @@ def tokenizer_eval(
 
 
 def _perceptual(wanted: bool | None, device: str) -> tuple[Any, str]:
-    """What measures LPIPS, or None and why not; what is asked for and missing is an error."""
+    """Return what measures LPIPS, or None and the reason; raise where LPIPS is asked for and missing."""
     from hma_data.errors import MissingDependencyError
     from hma_data.tokenizers.training.perceptual import open_lpips
 

@@ -1,6 +1,6 @@
-"""The data verbs of `hma`, each in a module of its own.
+"""Add the data verbs to the command `hma`; each verb has a module of its own.
 
-Only what is light is imported here; each verb imports what it needs.
+Only light modules are imported here. Each verb imports what it needs when it runs.
 """
 
 from typing import Annotated
@@ -37,7 +37,7 @@ def bench(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Benchmarks on generated data; nothing is downloaded.
+    """Run a benchmark on generated data; nothing is downloaded.
 
     Example: hma bench loader frames=1000000 --json
     """

@@ -1,4 +1,4 @@
-"""Frames of many episodes through a tokenizer in full batches; tokens come back episode by episode.
+"""Tokenize the frames of many episodes in full batches, and return the tokens of each episode.
 
 n frames of a camera, S×S pixels.
 """
@@ -14,11 +14,11 @@ Frames = NDArray[np.uint8]
 
 
 class Batches:
-    """A queue of frames before `encode`, which sees `size` at a time whatever the episodes' lengths.
+    """A queue of frames for `encode`, which gets `size` frames at a time whatever the episodes' lengths.
 
     Args:
-        encode: frames (n, S, S, 3) -> tokens (n, …); the same for a frame whatever its neighbours.
-        size: frames a call; only `flush` makes a smaller one.
+        encode: frames (n, S, S, 3) -> tokens (n, …); a frame's tokens do not depend on the other frames.
+        size: frames a call; only `flush` makes a smaller call.
     """
 
     def __init__(self, encode: Callable[[Frames], NDArray[Any]], size: int) -> None:
@@ -31,7 +31,7 @@ class Batches:
         )
 
     def add(self, episode: int, camera: str, frames: Frames) -> int:
-        """Frames of an episode's camera, after those before; how many left the queue for it."""
+        """Queue the next frames of an episode's camera; return how many frames were encoded by this call."""
         self._queue.append((episode, camera, frames))
         self._queued += len(frames)
         self._waiting[episode] += len(frames)
@@ -41,7 +41,7 @@ class Batches:
         return encoded
 
     def flush(self) -> int:
-        """Encode what is left; how many frames that were."""
+        """Encode the frames that are left; return their number."""
         return self._next(self._queued) if self._queued else 0
 
     def drop(self, episode: int) -> None:
@@ -51,11 +51,11 @@ class Batches:
         self._tokens.pop(episode, None)
 
     def whole(self, episode: int) -> bool:
-        """Whether all frames it was given are encoded."""
+        """Check whether all frames added for an episode are encoded."""
         return not self._waiting[episode]
 
     def take(self, episode: int) -> dict[str, NDArray[Any]]:
-        """Camera -> tokens of a whole episode, which is forgotten."""
+        """Return camera -> tokens of a whole episode, and forget the episode."""
         self._waiting.pop(episode, None)
         return {camera: np.concatenate(parts) for camera, parts in self._tokens.pop(episode).items()}
 

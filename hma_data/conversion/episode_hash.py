@@ -1,7 +1,7 @@
-"""What a shard set keeps of an episode, as one hash made before it is tokenized.
+"""Hash the content of an episode before it is tokenized.
 
-A file that holds several episodes changes when one is added, and says nothing of the others. This tells
-whether they are as they were: numbers, times and texts are hashed whole, of the pictures three a camera.
+A file that holds several episodes changes when one is added. That does not tell whether the other episodes
+changed; the hash of each episode does. It covers all numbers, times and texts, and three pictures a camera.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 
 
 class Content:
-    """The hash of an episode; pictures are added camera after camera, in their order.
+    """The hash of an episode; the caller adds pictures camera after camera, in their order.
 
     Args:
         kept: (N,) frames of the clip that become rows of a camera.
@@ -33,13 +33,13 @@ class Content:
         self._looked_at = looked_at(len(kept))
 
     def add(self, start: int, frames: NDArray[np.uint8]) -> None:
-        """The next pictures (n, H, W, 3) of a camera, the first of which is its row `start`."""
+        """Add the next pictures (n, H, W, 3) of a camera; the first of them is its row `start`."""
         for row in self._looked_at:
             if start <= row < start + len(frames):
                 self._add(frames[row - start])
 
     def text(self) -> str:
-        """Sixteen hex digits."""
+        """Return the hash as sixteen hex digits."""
         return self._digest.hexdigest()[:16]
 
     def _add(self, numbers: NDArray[Any] | None) -> None:
@@ -51,18 +51,18 @@ class Content:
 
 
 def looked_at(rows: int) -> list[int]:
-    """The rows of a camera whose pictures are hashed: the first, the middle and the last."""
+    """Return the rows of a camera whose pictures are hashed: the first, the middle and the last."""
     return sorted({0, rows // 2, rows - 1}) if rows else []
 
 
 def rows_kept(clip: Clip, embodiment: Embodiment, frames: str) -> NDArray[np.int64]:
-    """(N,) frames of the clip that become rows of a camera.
+    """Return the frames (N,) of the clip that become rows of a camera.
 
     Args:
         frames: "all" or "strided", as in the plan.
 
     Raises:
-        EpisodeError: it is shorter than a stride.
+        EpisodeError: the clip is shorter than a stride.
     """
     stride = embodiment.stride if frames == "strided" else 1
     if len(clip) < stride:
@@ -73,13 +73,13 @@ def rows_kept(clip: Clip, embodiment: Embodiment, frames: str) -> NDArray[np.int
 def content_of(
     source: Source, uri: str, episode_id: str, embodiment: Embodiment, facts: dict[str, Any]
 ) -> str:
-    """The hash of an episode as it is recorded now; see `Content`.
+    """Return the hash of an episode as it is recorded now; see `Content`.
 
     Args:
         facts: of the plan: which cameras and frames, and the tokenizer's spec.
 
     Raises:
-        EpisodeError: it cannot be read any more.
+        EpisodeError: the episode cannot be read any more.
     """
     spec = TokenizerSpec.from_json(facts["tokenizer"])
     clip = to_clip(source.read(uri, episode_id, embodiment), embodiment)

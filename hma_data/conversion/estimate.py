@@ -1,4 +1,4 @@
-"""How large and how long a conversion would be: by its plan, and by one episode that is really tokenized."""
+"""Estimate the size and the time of a conversion from its plan and from one episode that is tokenized."""
 
 import math
 import time
@@ -20,12 +20,12 @@ FRAMES, TRIED = 64, 5  # pictures tokenized, episodes tried
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a conversion would cost.
+    """The estimated size and time of a conversion.
 
     Attributes:
         bytes: of all shards.
         frames_per_second: of one worker, decoding included; None when no episode could be read.
-        seconds: in all, with the workers that were asked for; None likewise.
+        seconds: in all, with the requested number of workers; None when no episode could be read.
         fault: why no episode could be read.
     """
 
@@ -38,7 +38,7 @@ class Estimate:
 def estimate(
     plan: Plan, uri: StrPath, embodiment: Embodiment, tokenizer: Tokenizer, workers: int
 ) -> Estimate:
-    """Read and tokenize a little of the first readable episode, and multiply."""
+    """Estimate a conversion: tokenize some frames of the first readable episode, and scale up."""
     stride = plan.facts["frame_stride"]
     cameras = plan.facts["cameras"]
     rows = plan.frames // stride * len(cameras)
@@ -61,7 +61,11 @@ def estimate(
 
 
 def bytes_a_row(spec: TokenizerSpec, embodiment: Embodiment, stride: int) -> float:
-    """Of one frame: tokens at the width of the vocabulary, latents and pixels as they are, numbers whole."""
+    """Return the bytes of one row.
+
+    Tokens count with log2 of the vocabulary's size, latents and pixels with the size of their dtype, and
+    numbers with 4 bytes each.
+    """
     h, w = spec.grid
     if spec.kind == "discrete":
         picture = h * w * math.ceil(math.log2(spec.vocab_size or 2)) / 8

@@ -1,6 +1,7 @@
-"""Adding episodes to a finished shard set: its shards stay as they are, the new ones come after them.
+"""Add episodes to a finished shard set: its shards stay as they are, new shards come after them.
 
-The extended plan knows the hashes of the plans before it (`extends`), and new shards carry its own.
+The extended plan lists the hashes of the plans before it (`extends`). New shards carry the hash of the
+extended plan.
 """
 
 import json
@@ -21,7 +22,7 @@ _OF_THE_CUT = ("recording", "shards", "hash", "extends")
 
 
 def hashes(facts: dict[str, Any]) -> set[str]:
-    """The plans whose shards belong to a set: its own, and those it extends."""
+    """Return the hashes of the plans whose shards belong to a set: its own, and those it extends."""
     return {facts["hash"], *facts.get("extends", ())}
 
 
@@ -32,21 +33,21 @@ def extended(
     shard_frames: int | None,
     content: Callable[[EpisodeRef], str],
 ) -> Plan:
-    """The plan of `base` with the episodes that are new in `plan`.
+    """Return the plan of `base` with the episodes that are new in `plan`.
 
     Args:
         out: the shard set.
         base: its manifest.
         plan: of the recordings as they are now, made as for an empty folder.
-        shard_frames: about how many frames a shard.
-        content: returns the hash of an episode as it is recorded now (`hma_data.conversion.episode_hash`);
-            asked for where the fingerprint is another, as when a file has grown.
+        shard_frames: frames a shard, about.
+        content: returns the hash of an episode as it is recorded now; see `hma_data.conversion.episode_hash`. It is called
+            where the fingerprint differs, for example because a file has grown.
 
     Returns:
-        a plan whose units are the new shards alone; without any, its facts are those of `base`.
+        a plan whose units are the new shards alone; where there are none, its facts are those of `base`.
 
     Raises:
-        OutputError: the set was made in another way, lacks something, or an episode of it has changed since.
+        OutputError: the set was made in another way or lacks something, or one of its episodes has changed.
     """
     _refuse_damaged(out, base)
     here, there = ways(plan.facts), ways(base.plan)
@@ -69,7 +70,7 @@ def extended(
 
 
 def _refuse_damaged(out: Path, base: Manifest) -> None:
-    """What is kept must be there: shards by their size, the files derived from them by their bytes."""
+    """Raise OutputError unless all shards have their size and the derived files have their bytes."""
     sizes = out.listing() if isinstance(out, RemotePath) else None
     for shard in base.shards:
         path = out / shard.path
@@ -87,12 +88,12 @@ def _refuse_damaged(out: Path, base: Manifest) -> None:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a local file, -1 where there is none."""
+    """Return the bytes of a local file; -1 where there is none."""
     return path.stat().st_size if path.is_file() else -1
 
 
 def _known(out: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Fingerprints and contents of a set's episodes by their ids; sets written before say no contents."""
+    """Return id -> fingerprint and id -> content of a set's episodes; older sets state no contents."""
     file = parquet_file(out / EPISODES)
     names = [name for name in ("id", "fingerprint", "content") if name in file.schema_arrow.names]
     known = file.read(columns=names).to_pydict()
@@ -103,7 +104,7 @@ def _known(out: Path) -> tuple[dict[str, str], dict[str, str]]:
 def _refuse_changed(
     out: Path, refs: Sequence[EpisodeRef], contents: dict[str, str], content: Callable[[EpisodeRef], str]
 ) -> None:
-    """Of episodes whose files have other bytes now: all are as they were, or it cannot be extended."""
+    """Raise OutputError unless all episodes whose files have changed still have the same content."""
 
     def is_changed(ref: EpisodeRef) -> bool:
         try:
@@ -145,7 +146,7 @@ def _with(base: Manifest, new: list[tuple[EpisodeRef, str]], first: int, shard_f
 
 
 def ways(facts: dict[str, Any]) -> dict[str, Any]:
-    """What must not differ between a set and what extends it; --limit and the like may."""
+    """Return the facts that a set and its extension must share; --limit and --shard-frames may differ."""
     ways = {key: value for key, value in facts.items() if key not in _OF_THE_CUT}
     settings = ways["settings"]
     free = ("limit", "shard_frames")

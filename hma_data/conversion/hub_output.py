@@ -1,9 +1,9 @@
-"""Conversions that end in a dataset repository of the Hugging Face Hub: `hf://datasets/org/name[@branch]/path`.
+"""Convert into a dataset repository of the Hugging Face Hub: `hf://datasets/org/name[@branch]/path`.
 
-A repository takes commits, few of them, not files one by one. So the shard set is made in a staging
-folder of this machine ($HMA_CACHE/staging), where it is resumed as any other, and then published. What is
-there already with the same content is left out, so the same command also goes on with an upload that was
-cut off.
+A repository takes few commits, not files one by one. The shard set is therefore made in a staging folder of
+this machine ($HMA_CACHE/staging), where it can be resumed like any other, and then published. Files that the
+repository has already with the same content are not uploaded again, so the same command also continues an
+interrupted upload.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ _URI = re.compile(r"hf://datasets/([^/@]+/[^/@]+)(?:@([^/]+))?(?:/(.+))?")
 
 @dataclass(frozen=True)
 class HubOutput:
-    """Where in a repository a shard set goes.
+    """The place of a shard set in a repository.
 
     Attributes:
         uri: as the user gave it.
@@ -43,7 +43,7 @@ class HubOutput:
 
     @classmethod
     def of(cls, out: Path) -> "HubOutput | None":
-        """Return that of an `hf://` path; None for any other.
+        """Return the output of an `hf://` path; None for any other path.
 
         Raises:
             OutputError: it names no dataset repository.
@@ -57,20 +57,23 @@ class HubOutput:
 
     @property
     def staging(self) -> Path:
-        """The folder of this machine that is uploaded from."""
+        """Return the folder of this machine from which the set is uploaded."""
         mark = hashlib.sha256(self.uri.encode()).hexdigest()[:8]
         return cache_folder() / "staging" / f"{self.repo.replace('/', '--')}-{mark}"
 
     def prepare(self) -> None:
-        """Make the repository and branch where they are not there, so that a lack of rights is known at once.
+        """Create the repository and the branch where they are missing; a lack of rights shows at once.
 
         Raises:
-            HubError: there is no token, or it may not write there, or the hub is out of reach.
+            HubError: there is no token, or it may not write there, or the hub cannot be reached.
         """
         self._repository.prepare(self._name(MANIFEST))
 
     def refuse_other(self, facts: dict[str, Any]) -> None:
-        """Raise OutputError where another plan's set is there than that of `facts` or one it extends."""
+        """Raise OutputError where the repository holds a set of another plan.
+
+        The plan `facts` and the plans that it extends are accepted.
+        """
         if self._name(MANIFEST) not in self._repository.files():
             return
         theirs = Manifest.load(RemotePath(self.uri)).plan
@@ -95,7 +98,7 @@ class HubOutput:
         before = {name: repository.stated(self._name(name)) for name in ours}
 
         def refuse_foreign() -> dict[str, int]:
-            """Return what is there; raise where it is neither ours nor what was there when we began."""
+            """Return the files that are there; raise where one is foreign and was not there at the start."""
             files = repository.files()
             for name, sha256 in ours.items():
                 now = repository.stated(self._name(name))

@@ -1,9 +1,9 @@
-"""Recordings to tokenized shards: plan, run, finish; run again to continue.
+"""Convert recordings to tokenized shards: plan, run, finish; run again to continue.
 
-A shard is made whole or not at all, and says in its footer what it was made from. So a job
-that was killed is continued by the same command: finished shards are recognised and kept, and
-the manifest is derived from footers at the end. An episode that cannot be used goes to
-quarantine with its reason; the rest goes on.
+A shard is written whole or not at all, and its footer says what it was made from. The same command
+therefore continues a job that was killed: it recognises finished shards and keeps them, and derives the
+manifest from the footers at the end. An episode that cannot be used goes to quarantine with its reason, and
+the job goes on.
 """
 
 import json
@@ -50,7 +50,7 @@ from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 @dataclass
 class Progress:
-    """Where a conversion stands; what the console shows."""
+    """The progress of a conversion, as the console shows it."""
 
     episodes: int = 0
     frames: int = 0
@@ -65,12 +65,13 @@ class Progress:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a conversion did.
+    """The result of a conversion.
 
     Attributes:
-        reasons: error type and message (without the ids where there are several) -> episodes refused for it.
+        reasons: error type and message (without the ids where there are several) -> number of episodes
+            refused for it.
         flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
-        too_many: more than `max_quarantine` was refused; the command ends with exit code 1.
+        too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
     """
 
     out: Path
@@ -85,10 +86,10 @@ class Summary:
 
 @dataclass(frozen=True)
 class Shared:
-    """What one share of a conversion did; the shard set is finished by whoever comes last.
+    """The result of one share of a conversion; the last share to end finishes the shard set.
 
     Attributes:
-        missing: shards that other shares have still to make.
+        missing: number of shards that other shares have still to make.
     """
 
     out: Path
@@ -101,7 +102,7 @@ class Shared:
 def plan_conversion(
     embodiment: Embodiment, source: StrPath | None, tokenizer: Tokenizer, settings: Settings
 ) -> tuple[Plan, str]:
-    """The plan of a conversion and the URI it reads; see `convert`."""
+    """Return the plan of a conversion and the URI it reads; see `convert`."""
     uri = embodiment.source.uri if source is None else as_text(source)
     if source is not None and not (uri or "").strip():
         raise UsageError("--source", "is empty", "name a recording, or leave it out to take the YAML's")
@@ -148,9 +149,9 @@ def convert(
         weights, device: of the tokenizer; the weights as str or path.
         limits: when a worker counts as hanging, and how often it may be lost.
         max_quarantine: fraction of episodes that may be refused.
-        overwrite: throw away what `out` holds, if it is a shard set.
+        overwrite: delete what `out` holds, if it is a shard set.
         extend: add the episodes that a finished set in `out` does not have yet.
-        on_progress: called after every batch of frames or so.
+        on_progress: called about once for every batch of frames.
 
     Raises:
         OutputError: `out` holds something else, or another job is writing it.
@@ -211,9 +212,9 @@ def convert_share(
     extend: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> Shared:
-    """One share of a conversion, for an array of jobs over one folder that all of them see.
+    """Run one share of a conversion, for an array of jobs that write one folder which all of them see.
 
-    The bytes are those that `convert` alone would make. Arguments as there.
+    The bytes are those that `convert` alone would write. The arguments are those of `convert`.
     """
     begun, out = time.monotonic(), place(out)
     conversion = _Conversion(
@@ -224,7 +225,7 @@ def convert_share(
         done, made = conversion.make(plan, base, share, on_progress)
     missing = len({unit.name for unit in plan.units} - shard_names(out))
     if not missing:
-        with suppress(OutputError), locked(out):  # others are still writing: the last of them comes here
+        with suppress(OutputError), locked(out):  # others are still writing: the last of them finishes
             missing = len(plan.units) - len(finished_shards(out, plan, base, shared=False))
             if not missing:
                 conversion.finish(plan, base, True)
@@ -232,7 +233,7 @@ def convert_share(
 
 
 class _Conversion:
-    """What `convert` and `convert_share` have in common."""
+    """The common part of `convert` and `convert_share`."""
 
     def __init__(
         self,
@@ -249,7 +250,7 @@ class _Conversion:
     ) -> None:
         self._embodiment, self._out, self._settings = embodiment, out, settings
         self._named = isinstance(tokenizer, str)
-        alone = not self._named or str(out).startswith("memory:")  # which no other process would see
+        alone = not self._named or str(out).startswith("memory:")  # no other process sees them
         self._workers, self._engine, self._limits = 0 if alone else workers, engine, limits
         self._weights, self._device = None if weights is None else as_text(weights), device
         self._tokenizer = (
@@ -260,7 +261,10 @@ class _Conversion:
         self._whole, self.uri = plan_conversion(embodiment, source, self._tokenizer, settings)
 
     def plan(self, extend: bool) -> tuple[Plan, Manifest | None]:
-        """What is to be made, and the set it extends; a set that was extended before may be continued."""
+        """Return the plan, and the manifest it extends or None.
+
+        A set that was extended before can be continued without `extend`.
+        """
         base = base_manifest(self._out)
         if base is None or not (extend or "extends" in base.plan):
             return self._whole, None
@@ -285,7 +289,7 @@ class _Conversion:
         share: Share | None,
         on_progress: Callable[[Progress], None],
     ) -> tuple[int, int]:
-        """Make the shards that are not there; how many were, and how many are made."""
+        """Make the shards that are missing; return how many shards were kept and how many were made."""
         mine = plan.units[share.index :: share.count] if share else plan.units
         there = finished_shards(self._out, plan, base, share is not None)
         todo = [unit for unit in mine if unit.name not in there]
@@ -319,7 +323,7 @@ class _Conversion:
         return run_local(todo, make_work, self._workers, on_event, self._limits)
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
-        """The manifest and what else is derived from footers; nothing where nothing changed."""
+        """Return the manifest; write it and the other files derived from footers, unless nothing changed."""
         out = self._out
         remove_parts(out)  # of workers that died
         if not changed and (out / MANIFEST).is_file():
@@ -343,7 +347,7 @@ class _Conversion:
 
 
 def _reasons(out: Path) -> dict[str, int]:
-    """Reason -> episodes refused for it; reasons that differ in the episode's id alone are one."""
+    """Return reason -> number of refused episodes; reasons that differ in the episode's id alone are one."""
     told: dict[str, list[str]] = {}
     for line in (out / QUARANTINE).read_text(encoding="utf-8").splitlines():
         item = json.loads(line)
@@ -355,7 +359,7 @@ def _reasons(out: Path) -> dict[str, int]:
 
 
 def _flags(out: Path) -> dict[str, int]:
-    """Counts of the episodes' flags, added up."""
+    """Return the counts of all episodes' flags, added up."""
     totals: Counter[str] = Counter()
     for item in (
         pq.read_table(parquet_input(out / EPISODES), columns=["flags"])["flags"].value_counts().to_pylist()
@@ -369,7 +373,7 @@ _COUNTED = ("frames", "episodes", "quarantined", "bytes")
 
 
 class _Counter:
-    """Adds up what units report; what a unit had counted is taken back when it is done again."""
+    """A counter of what units report; when a unit is retried, its earlier counts are taken back."""
 
     def __init__(self, progress: Progress, on_progress: Callable[[Progress], None]) -> None:
         self._progress, self._on_progress = progress, on_progress

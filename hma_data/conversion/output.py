@@ -1,5 +1,6 @@
-"""The folder a conversion writes: locked while it runs (in a store, claimed for its plan), never mixed
-with anything else.
+"""Guard the folder that a conversion writes: it holds one conversion's shard set and nothing else.
+
+The folder is locked while the conversion runs. A folder of a store is claimed for the plan instead.
 """
 
 import errno
@@ -24,20 +25,20 @@ from hma_data.storage.files import PART, remove_parts
 from hma_data.storage.remote import RemotePath, create_bytes, is_remote, put_bytes
 
 LOCK, JOURNAL, PLAN = WORKING
-READERS, JOURNAL_S = 16, 20.0  # footers asked for at a time, and seconds between two writes, in a store
+READERS, JOURNAL_S = 16, 20.0  # in a store: footers read at a time, seconds between writes of a journal
 OURS = {"train", "val", MANIFEST, EPISODES, EMBODIMENT, QUARANTINE}
 
 
 @dataclass(frozen=True)
 class Share:
-    """This job does every `count`-th shard from `index` on; others, on any machine, do the rest."""
+    """One job's part of a conversion: every `count`-th shard from `index` on; other jobs do the rest."""
 
     index: int
     count: int
 
     @property
     def name(self) -> str:
-        """For files that each share has of its own."""
+        """Return the name of the share, for files that each share has of its own."""
         return f"{self.index}-of-{self.count}"
 
 
@@ -46,10 +47,10 @@ class Share:
 
 @contextmanager
 def locked(out: Path, share: Share | None = None) -> Iterator[None]:
-    """Let one job alone write a folder, or a share of it; the kernel's lock goes with the process.
+    """Let only one job write a folder, or a share of it; the kernel releases the lock when the process ends.
 
-    A store has no such lock. Jobs of one plan write the same bytes there; another plan is refused by
-    `finished_shards`.
+    A store has no such lock. There, jobs of one plan write the same bytes, and `finished_shards` refuses
+    another plan.
 
     Raises:
         OutputError: another job is writing, or the folder cannot be written.
@@ -97,7 +98,7 @@ def _lock(path: Path, kind: int) -> Iterator[None]:
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
-        if not path.exists():  # its last owner deleted it between our two calls
+        if not path.exists():  # its last owner deleted it between the two calls above
             raise OSError(errno.EAGAIN, "")
         try:
             yield
@@ -149,17 +150,17 @@ def _working(name: str) -> bool:
 
 
 def base_manifest(out: Path) -> Manifest | None:
-    """The manifest of the set that is there, when there is one."""
+    """Return the manifest of the set in a folder; None where there is none."""
     _refuse_foreign(out)
     return Manifest.load(out) if (out / MANIFEST).is_file() else None
 
 
 def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
-    """Return the names of the plan's shards that are there and whole; in a store, claim it for the plan.
+    """Return the names of the plan's shards that are there and whole; claim a folder of a store for the plan.
 
     Args:
-        base: the set the plan extends; its shards belong.
-        shared: others may be writing, so what is unfinished is left alone.
+        base: the set that the plan extends; its shards may be there too.
+        shared: True where other jobs may be writing: unfinished files are then not deleted.
 
     Raises:
         OutputError: the folder holds another conversion's shards, or something else.
@@ -176,7 +177,7 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
         if footer.plan["hash"] == plan.facts["hash"] and name in planned:
             done.add(name)
         elif base and footer.plan.get("extends") and hashes(base.plan) & hashes(footer.plan):
-            (out / name).unlink()  # of an extension that was not finished, and differs from this one
+            (out / name).unlink()  # of an unfinished extension that differs from this one
         else:
             raise _other(out, plan, footer.plan)
     if not done and base is None and (out / MANIFEST).is_file():
@@ -185,12 +186,12 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
             raise _other(out, plan, theirs)
     if isinstance(out, RemotePath) and done != planned:
         create_bytes(json.dumps(plan.facts).encode(), out / PLAN)
-        _refuse_claimed(out, plan)  # of two that came at once
+        _refuse_claimed(out, plan)  # two jobs may have come at once
     return done
 
 
 def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
-    """Raise OutputError where another plan is being written into a store."""
+    """Raise OutputError where another plan is being written into this folder of a store."""
     try:
         theirs = json.loads((out / PLAN).read_bytes())
     except FileNotFoundError:
@@ -204,12 +205,12 @@ def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
 
 
 def shard_names(out: Path) -> set[str]:
-    """What is in the folders of the splits."""
+    """Return the names of the files in the folders of the splits."""
     return {path.relative_to(out).as_posix() for split in SPLITS for path in out.glob(f"{split}/[!.]*")}
 
 
 def _footers(out: Path, names: list[str]) -> Iterator[tuple[str, Footer]]:
-    """Of each shard; many are asked for at a time in a store, where each takes a while."""
+    """Yield (name, footer) of each shard; in a store, read many at a time because each is slow."""
     readers = READERS if is_remote(out) else 1
     with ThreadPoolExecutor(readers) as pool:
         for start in range(0, len(names), 4 * readers):
@@ -230,7 +231,7 @@ def _other(out: Path, plan: Plan, theirs: dict[str, Any]) -> OutputError:
 
 @dataclass(frozen=True)
 class Made:
-    """A shard that was made: what the manifest needs and the footer cannot hold."""
+    """A finished shard: the values that the manifest needs and the footer cannot hold."""
 
     name: str
     bytes: int
@@ -238,9 +239,10 @@ class Made:
 
 
 class Journal:
-    """What this job's shards hash to, so that finishing reads none of them again; lines are only appended.
+    """The hashes of this job's shards, one line each, so that finishing does not read the shards again.
 
-    A store cannot append: there the whole is written now and then, and when the block ends.
+    Lines are only appended. A store cannot append: there, the whole journal is written from time to time
+    and when the block ends.
     """
 
     def __init__(self, out: Path, share: Share | None) -> None:
@@ -254,11 +256,11 @@ class Journal:
         return self
 
     def __exit__(self, kind: object, fault: BaseException | None, trace: object) -> None:
-        if not isinstance(fault, StorageAwayError):  # else it would only wait for the store once more
+        if not isinstance(fault, StorageAwayError):  # otherwise it would wait for the store once more
             self._put()
 
     def add(self, made: Made) -> None:
-        """Note a shard."""
+        """Add the line of a shard."""
         line = json.dumps(asdict(made)) + "\n"
         if not is_remote(self._path):
             with self._path.open("a", encoding="utf-8") as file:
@@ -270,13 +272,13 @@ class Journal:
 
     def _put(self) -> None:
         if isinstance(self._path, RemotePath) and self._lines:
-            with suppress(HMAError, OSError):  # without it, finishing reads the shards again
+            with suppress(HMAError, OSError):  # without a journal, finishing reads the shards again
                 put_bytes("".join(self._lines).encode(), self._path)
         self._due = time.monotonic() + JOURNAL_S
 
 
 def known_hashes(out: Path) -> dict[str, str]:
-    """Shard -> sha256, of every journal's shards whose size still is what it was; the rest must be read."""
+    """Return shard -> sha256 for the shards in all journals whose size is unchanged; others must be read."""
     found: dict[str, str] = {}
     sizes = out.listing() if isinstance(out, RemotePath) else None
     for path in sorted(out.glob(f"{JOURNAL}*")):
@@ -290,6 +292,6 @@ def known_hashes(out: Path) -> dict[str, str]:
 
 
 def remove_notes(out: Path) -> None:
-    """Delete the journals and the claim of a set whose manifest is there."""
+    """Delete the journals and the claim of a set once its manifest is written."""
     for path in [*out.glob(f"{JOURNAL}*"), out / PLAN]:
         path.unlink(missing_ok=True)

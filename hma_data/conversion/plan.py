@@ -1,4 +1,4 @@
-"""Which episode goes into which shard: decided before anything is decoded.
+"""Plan which episode goes into which shard, before anything is decoded.
 
 The plan depends on the recording, the embodiment, the tokenizer and the settings alone, never
 on the number of workers, so that every run and every machine makes the same files.
@@ -20,15 +20,15 @@ SMALLEST_SHARD, LARGEST_SHARD, SHARDS_WANTED = 4_096, 170_000, 32  # frames; 170
 
 @dataclass(frozen=True)
 class Settings:
-    """What the user chose about a conversion.
+    """The settings of a conversion that the user chooses.
 
     Attributes:
         frames: all rows at the recording's rate, or only the model's grid with whole action chunks.
-        cameras: names, the first by default.
-        val_fraction: of episodes, by hash of their id.
+        cameras: names; the primary camera by default.
+        val_fraction: fraction of episodes for validation, chosen by hash of their id.
         seed: of that hash.
-        limit: first episodes only.
-        shard_frames: about how many a shard; None lets the size of the recording decide.
+        limit: take only so many episodes, from the first on; None takes all.
+        shard_frames: frames a shard, about; None lets the size of the recording decide.
     """
 
     frames: Literal["all", "strided"] = "all"
@@ -57,25 +57,25 @@ class ShardUnit:
 
     @property
     def frames(self) -> int:
-        """As the source estimates them."""
+        """Return the number of frames, as the source estimates it."""
         return sum(ref.frames for _, ref in self.episodes)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All shards, and the facts that tell this conversion from another."""
+    """All shards of a conversion, and the facts that distinguish it from others."""
 
     units: tuple[ShardUnit, ...]
     facts: dict[str, Any]
 
     @property
     def episodes(self) -> int:
-        """In all."""
+        """Return the number of episodes in all shards."""
         return sum(len(unit.episodes) for unit in self.units)
 
     @property
     def frames(self) -> int:
-        """In all, as the source estimates them."""
+        """Return the number of frames in all shards, as the source estimates it."""
         return sum(unit.frames for unit in self.units)
 
 
@@ -86,15 +86,15 @@ def make_plan(
     settings: Settings,
     source: str,
 ) -> Plan:
-    """Shards of whole episodes, train and val apart.
+    """Plan shards of whole episodes, with train and val in different shards.
 
     Args:
         refs: every episode of the source, in its order.
         source: URI, for errors.
 
     Raises:
-        SourceError: no episodes, or two with one id.
-        RegistryError: a camera the embodiment does not have, or a stride that is needed and unknown.
+        SourceError: there are no episodes, or two with one id.
+        RegistryError: the embodiment lacks a camera, or its stride is needed and unknown.
     """
     if not refs:
         raise SourceError(source, "has no episodes")
@@ -129,10 +129,10 @@ def make_plan(
 
 
 def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) -> list[str]:
-    """train or val for each episode: the source's own where it has one, else by hash of its group's id.
+    """Return train or val for each episode: the source's own split, or else by hash of the group's id.
 
-    An episode without a group is one of its own. With two or more groups and a fraction above zero,
-    at least one is val and at least one train.
+    An episode without a group is a group of its own. With two or more groups and a fraction above zero, at
+    least one group is val and at least one is train.
     """
     if any(ref.split for ref in refs):
         return [ref.split or "train" for ref in refs]
@@ -146,12 +146,12 @@ def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) ->
 
 
 def shard_size(frames: int) -> int:
-    """Frames a shard: enough shards to share out, none larger than about 100 MB."""
+    """Return the frames a shard: few enough for many shards, and for at most about 100 MB a shard."""
     return min(LARGEST_SHARD, max(SMALLEST_SHARD, frames // SHARDS_WANTED))
 
 
 def pack(split: str, episodes: list[tuple[int, EpisodeRef]], target: int, begun: int = 0) -> list[ShardUnit]:
-    """Episodes into shards of about `target` frames; `begun` shards of the split are there already."""
+    """Pack episodes into shards of about `target` frames; `begun` shards of the split exist already."""
     groups: list[list[tuple[int, EpisodeRef]]] = []
     filled = target
     for item in episodes:
@@ -171,12 +171,12 @@ def _unit_interval(text: str) -> float:
 
 
 def digest(value: Any) -> str:
-    """Sixteen hex digits over plain values."""
+    """Return a hash of plain values as sixteen hex digits."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
-    """What tells two plans apart, in words."""
+    """Return the differences of two plans in words."""
     words = {
         "embodiment": "embodiment",
         "embodiment_hash": "content of the embodiment's YAML",

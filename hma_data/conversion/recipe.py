@@ -1,11 +1,11 @@
-"""Several conversions in one YAML: `hma convert --recipe recipes/convert/four_robots.yaml`.
+"""Read several conversions from one YAML: `hma convert --recipe recipes/convert/four_robots.yaml`.
 
     defaults: {tokenizer: fsq-16, workers: 4}     # optional; any key of a job
     jobs:
       - {embodiment: bridge_dataset, source: "gs://…", out: shards/bridge}
       - {embodiment: ./my_arm.yaml, source: ./demos, out: shards/my_arm, frames: strided}
 
-Keys are those of `hma convert`, with `_` for `-`.
+The keys are the options of `hma convert`, with `_` for `-`.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from hma_data.storage.yaml_io import read_yaml
 
 
 class ConversionJob(BaseModel):
-    """One conversion; defaults are those of the command."""
+    """One conversion; its defaults are those of the command."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -46,17 +46,17 @@ class ConversionJob(BaseModel):
 
     @property
     def settings(self) -> Settings:
-        """What of it decides the plan."""
+        """Return the settings that decide the plan."""
         return Settings(
             self.frames, self.cameras, self.val_fraction, self.seed, self.limit, self.shard_frames
         )
 
 
 def job_of_options(**values: Any) -> ConversionJob:
-    """The conversion that the command's options state.
+    """Return the conversion that the command's options state.
 
     Raises:
-        UsageError: one has a value that is not allowed.
+        UsageError: an option has a value that is not allowed.
     """
     try:
         return ConversionJob(**values)
@@ -67,13 +67,13 @@ def job_of_options(**values: Any) -> ConversionJob:
 
 
 def load_jobs(path: StrPath) -> list[ConversionJob]:
-    """The conversions of a recipe, in its order.
+    """Return the conversions of a recipe, in its order.
 
     Args:
         path: str or path of the YAML.
 
     Raises:
-        RecipeError: an unknown key, a value of another type, two jobs with one `out`.
+        RecipeError: it has an unknown key, a value of another type, or two jobs with one `out`.
     """
     path = as_path(path)
     values = read_yaml(path, RecipeError)

@@ -1,7 +1,7 @@
-"""The work of one shard: read, align, tokenize and write its episodes.
+"""Make one shard: read, align, tokenize and write its episodes.
 
-An episode that cannot be used becomes a line of quarantine in the shard's footer; the shard is
-whole or absent. Whatever engine runs it, the bytes are the same.
+An episode that cannot be used is listed with its reason in the shard's footer. The shard is whole or
+absent. Its bytes do not depend on the engine that runs the work.
 """
 
 import json
@@ -53,12 +53,12 @@ FATAL = (
     ShardError,
     RegistryError,
     MissingDependencyError,
-)  # not one episode's fault
+)  # not the fault of one episode
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything a worker needs to make any shard of a conversion."""
+    """The values a worker needs to make any shard of a conversion."""
 
     source: str
     embodiment: Embodiment
@@ -71,7 +71,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Tick:
-    """What a worker tells the console."""
+    """Counts that a worker reports to the console."""
 
     frames: int = 0
     episodes: int = 0
@@ -81,13 +81,13 @@ class Tick:
 
 @dataclass(frozen=True)
 class MakeWork:
-    """Makes a worker's function; picklable, so that any engine can send it."""
+    """A maker of a worker's function; it can be pickled, so that any engine can send it."""
 
     job: Job
     tokenizer: Tokenizer | None = None
 
     def __call__(self, workers: int) -> Work:
-        """Open the tokenizer once for this worker."""
+        """Open the tokenizer once for this worker, and return the worker's function."""
         tokenizer = self.tokenizer
         if tokenizer is None:
             tokenizer = get_tokenizer(self.job.tokenizer, weights=self.job.weights, device=self.job.device)
@@ -95,7 +95,7 @@ class MakeWork:
         job = self.job
 
         def work(unit: ShardUnit, report: Report, attempt: Attempt) -> Made:
-            if threads and "torch" in sys.modules:  # holds for the calling thread alone
+            if threads and "torch" in sys.modules:  # applies to the calling thread alone
                 sys.modules["torch"].set_num_threads(threads)
             done = make_shard(job, unit, tokenizer, report, attempt)
             report(Tick(bytes=done.bytes))
@@ -122,7 +122,7 @@ def make_shard(
     with ExitStack() as committing:
         writer = committing.enter_context(ShardWriter(job.out / unit.name, schema, tokenizer.spec))
         decoded = _decoded(job, unit, tokenizer, report, attempt)
-        ahead = prefetch(decoded) if not attempt.number else decoded  # one at a time shows whose fault it is
+        ahead = prefetch(decoded) if not attempt.number else decoded  # one at a time: shows whose fault it is
         for item in _tokenized(ahead, tokenizer, report):
             if isinstance(item, Refused):
                 refused.append(item)
@@ -137,7 +137,7 @@ def make_shard(
             rows.append(_row(item, unit, start, writer.rows - start, len(cameras)))
             report(Tick(episodes=1))
         writer.close(Footer(job.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
-        with _signs_of_life(report):  # an upload may take longer than a hanging episode is waited for
+        with _signs_of_life(report):  # an upload may take longer than the limit for a hanging worker
             committing.close()
     return Made(unit.name, writer.bytes, writer.sha256)
 
@@ -175,7 +175,7 @@ class _Frames:
 
 @dataclass
 class _End:
-    """Of the episode that was begun."""
+    """The end of the episode that was begun."""
 
 
 @dataclass
@@ -193,9 +193,10 @@ Decoded = _Begin | _Frames | _End | Refused
 def _decoded(
     job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt
 ) -> Iterator[Decoded]:
-    """Runs ahead in a thread: per episode a _Begin, its pictures in batches, an _End; or a Refused.
+    """Yield for each episode a _Begin, its pictures in batches, and an _End; or a Refused.
 
-    An episode may be begun again, or refused, after some of its pictures; what came of it before is void.
+    This runs ahead in a thread. An episode may begin again, or be refused, after some of its pictures; its
+    earlier items are then void.
     """
     source = open_source(job.embodiment.source.format)
     for index, ref in unit.episodes:
@@ -209,7 +210,7 @@ def _decoded(
                 break
             except (*FATAL, MemoryError):
                 raise
-            except Exception as fault:  # whatever one recording does to a decoder must not end the job
+            except Exception as fault:  # no fault of a decoder on one recording may end the job
                 if disk_is_full(fault):
                     raise OutputError(
                         ref.id, f"there is no space to unpack it: {fault}", "free space"
@@ -242,7 +243,7 @@ def _episode(job: Job, source: Source, spec: TokenizerSpec, index: int, ref: Epi
 
 
 def _tokenized(items: Iterator[Decoded], tokenizer: Tokenizer, report: Report) -> Iterator[_Whole | Refused]:
-    """Whole episodes and refused ones, in order; batches cross the borders of episodes."""
+    """Yield whole and refused episodes in order; a batch may hold frames of several episodes."""
     batches = Batches(tokenizer.encode, BATCH)
     waiting: deque[_Begin | Refused] = deque()
     begun: _Begin | None = None
@@ -260,7 +261,7 @@ def _tokenized(items: Iterator[Decoded], tokenizer: Tokenizer, report: Report) -
             waiting.popleft()
 
     for item in items:
-        if begun and isinstance(item, _Begin | Refused):  # what came of it before is void
+        if begun and isinstance(item, _Begin | Refused):  # its earlier items are void
             batches.drop(begun.index)
             waiting.pop()
             begun = None
@@ -280,7 +281,7 @@ def _tokenized(items: Iterator[Decoded], tokenizer: Tokenizer, report: Report) -
 
 
 def _cut(item: _Whole, cameras: list[str], stride: int) -> Iterator[EpisodeRows]:
-    """The episode's rows, camera after camera; strided rows carry the whole chunk of actions."""
+    """Yield the episode's rows, camera after camera; strided rows hold the whole chunk of actions."""
     clip = item.clip
     kept = len(clip) // stride
     actions: NDArray[np.float32] = clip.actions[: kept * stride].reshape(kept, -1)
@@ -328,11 +329,13 @@ def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> 
 
 
 def prefetch[T](items: Iterable[T], depth: int = 2) -> Iterator[T]:
-    """The same items in the same order; errors surface where the item would have.
+    """Yield the same items in the same order, read ahead by a thread.
+
+    An error of `items` is raised in the place of the item.
 
     Args:
         items: used in the thread only.
-        depth: how many may wait.
+        depth: how many items may wait.
     """
     queue: Queue[tuple[str, T | BaseException | None]] = Queue(maxsize=depth)
     stop = Event()
@@ -344,7 +347,7 @@ def prefetch[T](items: Iterable[T], depth: int = 2) -> Iterator[T]:
                 if stop.is_set():
                     return
             queue.put(("end", None))
-        except BaseException as fault:  # handed over, not handled
+        except BaseException as fault:  # the reader raises it
             queue.put(("fault", fault))
 
     thread = Thread(target=produce, daemon=True)

@@ -1,11 +1,12 @@
-"""Put the streams of a recording on one clock.
+"""Align the streams of a recording on one clock.
 
-Cameras, actions and states tick at their own rates. Here they are brought onto the times of
-the embodiment's primary camera, or onto a fixed grid; how far each had to be moved is the skew.
+Cameras, actions and states tick at their own rates. This module moves them onto the times of the
+embodiment's primary camera, or onto a fixed grid. The skew is the distance by which a value was moved.
 
-Times that differ by rounding alone are one time (see `rounding`). Samples may bear equal stamps: `hold` and
-`interpolate` take the last of them, which is in force from there on, `nearest` the first; a primary camera's
-frames of one stamp are one frame of the grid. Stamps that go back are refused.
+Times that differ by rounding alone count as one time (see `rounding`). Samples may have equal stamps:
+`hold` and `interpolate` take the last of them, which is in force from then on; `nearest` takes the first.
+Frames of the primary camera with equal stamps give one frame of the grid. Stamps that go back in time are
+refused.
 
 Times are float64 seconds. T target times, S source times, A values a sample.
 """
@@ -22,22 +23,22 @@ from hma_data.registry.components import Component, Sync, Vector
 from hma_data.registry.embodiment import Embodiment
 
 Moved = tuple[NDArray[np.int64], Floats]
-ROUNDING_S = 1e-7  # what hours of added periods gather, and far below any sensor's interval
+ROUNDING_S = 1e-7  # the error of periods added up over hours; far below any sensor's interval
 
 
 def rounding(*clocks: Floats) -> float:
-    """Seconds by which equal times may differ: 100 ns, and 4 units in the last place of the largest.
+    """Return the seconds by which equal times may differ: 100 ns and 4 units in the largest's last place.
 
-    A float64 of seconds since 1970 is exact to 0.24 µs, so that there it is 1.1 µs.
+    A float64 of seconds since 1970 is exact to 0.24 µs, so the result is 1.1 µs for such times.
     """
     largest = max((float(np.abs(times[[0, -1]]).max()) for times in clocks if len(times)), default=0.0)
     return ROUNDING_S + 4 * float(np.spacing(largest))
 
 
 def nearest(source_times: Floats, target_times: Floats) -> Moved:
-    """Index (T,) of the sample nearest to each target time, and skew_ms (T,).
+    """Return the index (T,) of the sample nearest to each target time, and skew_ms (T,).
 
-    Of two equally near the earlier, of equal stamps the first.
+    Of two samples equally near, the earlier one is taken; of samples with equal stamps, the first.
     """
     after = np.clip(
         np.searchsorted(source_times, target_times, side="left"), 1, max(len(source_times) - 1, 1)
@@ -51,9 +52,10 @@ def nearest(source_times: Floats, target_times: Floats) -> Moved:
 
 
 def hold(source_times: Floats, target_times: Floats) -> Moved:
-    """Index (T,) of the sample in force at each target time, the last stamped at or before it; its age in ms.
+    """Return the index (T,) of the sample in force at each target time, and its age in ms (T,).
 
-    Target times before the first sample get index 0 and a negative age; `to_clip` trims them.
+    The sample in force is the last one stamped at or before the target time. Target times before the first
+    sample get index 0 and a negative age; `to_clip` trims them.
     """
     close = rounding(source_times, target_times)
     found = np.searchsorted(source_times, target_times + close, side="right") - 1
@@ -65,7 +67,7 @@ def hold(source_times: Floats, target_times: Floats) -> Moved:
 def interpolate(
     source_times: Floats, values: NDArray[np.float32], target_times: Floats
 ) -> tuple[NDArray[np.float32], Floats]:
-    """Values (T, A) linear between neighbours, and skew_ms (T,): the distance to the nearest sample."""
+    """Return values (T, A), linear between neighbours, and skew_ms (T,), the distance to the nearest one."""
     columns = [np.interp(target_times, source_times, column) for column in values.T.astype(np.float64)]
     return np.stack(columns, axis=1).astype(np.float32), nearest(source_times, target_times)[1]
 
@@ -78,11 +80,11 @@ _INDEX: dict[str, Callable[[Floats, Floats], Moved]] = {
 
 
 def to_clip(episode: Episode, embodiment: Embodiment) -> Clip:
-    """The episode on the embodiment's grid.
+    """Return the episode on the embodiment's grid.
 
     Raises:
-        EpisodeError: no frames, no actions or none that is known, values that are not finite.
-        AlignmentError: times that go back, streams that do not overlap, or one that is further off than
+        EpisodeError: it has no frames, no actions or none that is known, or values that are not finite.
+        AlignmentError: times go back, streams do not overlap, or a stream is further off than
             `sync.max_skew_ms` and may not be masked.
     """
     if not episode.actions:
@@ -101,7 +103,7 @@ def to_clip(episode: Episode, embodiment: Embodiment) -> Clip:
 
 
 def _shared_index(episode: Episode, embodiment: Embodiment) -> Clip:
-    """RLDS, HDF5, LeRobot: frame i, action i and state i belong together."""
+    """Build the clip of an RLDS, HDF5 or LeRobot episode: frame i, action i and state i belong together."""
     lengths = [(name, len(stream.timestamps)) for name, stream in episode.streams.items()]
     lengths += [(name, len(signal.values)) for name, signal, _, _ in _signals(episode, embodiment)]
     if len({length for _, length in lengths}) != 1:
@@ -138,7 +140,7 @@ def _join(signals: Sequence[Signal], index: NDArray[np.int64]) -> tuple[NDArray[
 def _masked(
     values: NDArray[np.float32], marks: Sequence[NDArray[np.bool_]]
 ) -> tuple[NDArray[np.float32], Known]:
-    """Values with zeros where a mark says that one is unknown, and where all are known."""
+    """Return the values with zeros in rows where a mark is False, and the known rows (None without marks)."""
     if not marks:
         return values, None
     known: NDArray[np.bool_] = np.logical_and.reduce(list(marks))
@@ -148,10 +150,10 @@ def _masked(
 def _signals(
     episode: Episode, embodiment: Embodiment
 ) -> list[tuple[str, Signal, tuple[Component, ...], str]]:
-    """Each signal of actions, then states: a name, the signal, its components, its method.
+    """Return name, signal, components and method of each signal: first of the actions, then of the states.
 
-    The name is the component's key, as the YAML has it; before a key that cameras or actions have, what it
-    is of. Components of one key share a name.
+    The name is the component's key, as in the YAML. Where a camera or an action has that name already, the
+    kind (action or state) comes before it. Components of one key share a name.
     """
     sync, taken = embodiment.sync, {*episode.streams}
     vectors: tuple[tuple[str, tuple[Signal, ...], Vector | None, str], ...] = (
@@ -174,7 +176,7 @@ def _signals(
 
 
 def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
-    """Bags: every stream is moved onto the grid by the method the embodiment names."""
+    """Build the clip of a bag: move every stream onto the grid by the method that the embodiment names."""
     sync, primary = embodiment.sync, embodiment.primary_camera.name
     signals = _signals(episode, embodiment)
     clocks: list[tuple[str, Floats, str]] = [
@@ -225,7 +227,7 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
 def _moved(
     signal: Signal, parts: tuple[Component, ...], method: str, grid: Floats
 ) -> tuple[NDArray[np.float32], Known, Floats]:
-    """Values (T, A) of a signal on the grid, which of them are known, and skew_ms (T,)."""
+    """Return the values (T, A) of a signal on the grid, which of them are known (T,), and skew_ms (T,)."""
     if method != "interpolate":
         index, skew = _INDEX[method](signal.timestamps, grid)
         return signal.values[index], None if signal.known is None else signal.known[index], skew
@@ -248,10 +250,10 @@ def _moved(
 def _grid(
     episode_id: str, frames: Floats, embodiment: Embodiment, clocks: list[tuple[str, Floats, str]]
 ) -> tuple[Floats, int]:
-    """Target times where every stream is running, and how many frames lie outside.
+    """Return the target times at which every stream is running, and the number of frames outside them.
 
-    A held value stays in force after its last sample; anything else ends with it. Edges may reach
-    `max_skew_ms` (half a period without one) beyond a stream's samples.
+    A held value stays in force after its last sample; every other stream ends with its last sample. The grid
+    may reach `max_skew_ms` (without one, half a period) beyond a stream's samples.
     """
     sync = embodiment.sync
     close = rounding(*(times for _, times, _ in clocks))

@@ -1,6 +1,6 @@
-"""What every source yields, and what it becomes on the embodiment's clock.
+"""Define the Episode that every source yields, and the Clip it becomes on the embodiment's grid.
 
-An Episode is lazy: it knows its times and values, and decodes a picture when asked for it.
+An Episode is lazy: it knows its times and values, and decodes a picture only when it is requested.
 T frames, A values a sample; times are float64 seconds, pictures uint8 RGB.
 """
 
@@ -23,16 +23,16 @@ class Stream(Protocol):
     timestamps: Floats  # (T,) seconds
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Pictures (n, H, W, 3) RGB of those indices, decoding only them."""
+        """Return the pictures (n, H, W, 3) RGB of those indices; decode no others."""
         ...
 
 
 @runtime_checkable
 class OneByOne(Protocol):
-    """A Stream that can give its pictures one by one, so that large ones are never held together."""
+    """A Stream that can give its pictures one by one, so that large ones are not in memory together."""
 
     def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-        """(H, W, 3) RGB of each of those indices, in that order; it is there until the next is asked for."""
+        """Yield (H, W, 3) RGB of each of those indices in order; each is valid until the next request."""
         ...
 
 
@@ -43,7 +43,7 @@ class Signal:
     Attributes:
         timestamps: (T,) seconds.
         values: (T, A) float32, in the order of the embodiment's components, sign and offset applied.
-        known: (T,) False where the recording has no value; None where it has all.
+        known: (T,) bool, False where the recording has no value; None where it has all values.
     """
 
     timestamps: Floats
@@ -64,12 +64,13 @@ class Episode:
     Attributes:
         id: unique and stable within its source.
         streams: camera name of the embodiment -> Stream.
-        actions, states: whole vectors, or one Signal a component, in order, where components tick apart.
-        rate_stamped: True where all streams share one index (RLDS, HDF5, LeRobot): nothing needs aligning.
-        instruction: what was asked, empty when nothing was.
+        actions, states: one Signal with the whole vector; or one Signal per component, in order, where the
+            components have different times.
+        rate_stamped: True where all streams share one index (RLDS, HDF5, LeRobot) and need no alignment.
+        instruction: the instruction in words; empty when there is none.
         success: None when the recording does not say.
         source: the file or URI it comes from.
-        metadata: plain values worth keeping; `flags`, name -> count, stand in episodes.parquet and are
+        metadata: plain values worth keeping; `flags`, name -> count, are written to episodes.parquet and
             added up in the summary of a conversion.
     """
 
@@ -96,9 +97,10 @@ class Clip:
         states: (T, A') float32, or None.
         frame_indices: camera -> (T,) index into its stream.
         skew_ms: stream -> (T,) milliseconds by which it was moved onto the grid.
-        trimmed: frames left out at both ends, where not every stream was running.
-        repeated: frames left out because they bear the stamp of the one before.
-        action_known, state_known: (T,) False where there is no value and zeros stand; None: all are known.
+        trimmed: number of frames left out at both ends, where not every stream was running.
+        repeated: number of frames left out because they have the stamp of the frame before.
+        action_known, state_known: (T,) bool, False where there is no value and zeros take its place; None
+            where all are known.
     """
 
     episode: Episode
@@ -117,19 +119,19 @@ class Clip:
 
     @property
     def known_actions(self) -> NDArray[np.float32]:
-        """(N, A) the actions that are known."""
+        """Return the actions (N, A) that are known."""
         return self.actions if self.action_known is None else self.actions[self.action_known]
 
     @property
     def known_states(self) -> NDArray[np.float32] | None:
-        """(N, A') the states that are known, or None."""
+        """Return the states (N, A') that are known; None where there are no states."""
         return (
             self.states if self.states is None or self.state_known is None else self.states[self.state_known]
         )
 
     @property
     def flags(self) -> dict[str, int]:
-        """What is worth counting: the source's own, then frames that are masked or repeated."""
+        """Return flag -> count, without zeros: the source's own flags, then masked and repeated frames."""
         found: dict[str, int] = dict(self.episode.metadata.get("flags", {}))
         for name, known in (("masked_actions", self.action_known), ("masked_states", self.state_known)):
             found[name] = 0 if known is None else int((~known).sum())
@@ -137,7 +139,7 @@ class Clip:
         return {name: count for name, count in found.items() if count}
 
     def frames_at(self, camera: str, grid: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Pictures (n, H, W, 3) of those grid frames."""
+        """Return the pictures (n, H, W, 3) of those grid frames."""
         return self.episode.streams[camera].frames(self.frame_indices[camera][grid])
 
 
@@ -154,7 +156,7 @@ class Pictures:
         self._decode = decode
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """See Stream."""
+        """Return pictures by index; see Stream."""
         if not len(indices):
             return np.zeros((0, 1, 1, 3), np.uint8)
         first = self._decode(int(indices[0]))
@@ -171,16 +173,16 @@ class Pictures:
         return pictures
 
     def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
-        """See OneByOne."""
+        """Yield pictures one by one; see OneByOne."""
         return (self._decode(int(index)) for index in indices)
 
 
 class Decode(Protocol):
-    """Decodes one picture."""
+    """A function that decodes one picture."""
 
     def __call__(self, index: int, /) -> NDArray[np.uint8]: ...
 
 
 def rate_times(length: int, hz: float) -> Floats:
-    """(length,) seconds of frames that tick at a fixed rate."""
+    """Return the times (length,) in seconds of frames that tick at a fixed rate."""
     return np.arange(length, dtype=np.float64) / hz

@@ -1,7 +1,7 @@
-"""Pictures: decode, rotate, crop, and bring to the tokenizer's square.
+"""Decode pictures, rotate, crop, and resize them to the tokenizer's square.
 
-N pictures, H×W pixels; uint8 RGB everywhere. Resizing happens here and nowhere else; its filter
-is part of the tokenizer's spec because it changes the tokens.
+N pictures, H×W pixels; uint8 RGB everywhere. Only this module resizes pictures; the filter is part of the
+tokenizer's spec because it changes the tokens.
 """
 
 import os
@@ -17,11 +17,11 @@ from hma_data.registry.components import Camera
 
 Images = NDArray[np.uint8]
 Filter = Literal["area", "linear"]
-MAX_PIXELS = 64_000_000  # a picture that claims more is a bomb or an error
+MAX_PIXELS = 64_000_000  # a picture that claims more is a decompression bomb or an error
 
 
 def opencv() -> Any:
-    """The cv2 module.
+    """Import and return the cv2 module.
 
     Raises:
         MissingDependencyError: it cannot be imported, usually because a build
@@ -40,10 +40,10 @@ def opencv() -> Any:
 
 
 def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
-    """A JPEG, PNG or other still picture -> (H, W, 3) RGB.
+    """Decode a JPEG, PNG or other still picture to (H, W, 3) RGB.
 
     Raises:
-        EpisodeError: the bytes are not a picture.
+        EpisodeError: the bytes are not a colour picture, or the picture claims too many pixels.
     """
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
@@ -66,7 +66,7 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
 
 
 def claimed_size(head: bytes) -> tuple[int, int]:
-    """Width and height that a PNG's or JPEG's first bytes claim; (0, 0) for anything else."""
+    """Return the width and height that the first bytes of a PNG or JPEG claim; (0, 0) for anything else."""
     if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
         return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
     at = 2
@@ -81,10 +81,12 @@ def claimed_size(head: bytes) -> tuple[int, int]:
 def prepare(
     frames: Images, camera: Camera, size: int, resize_filter: Filter = "area", out: Images | None = None
 ) -> Images:
-    """Raw frames of a camera -> (N, size, size, 3) RGB: colours, flip, rotation, crop, resize by its YAML.
+    """Return raw frames of a camera as (N, size, size, 3) RGB.
+
+    Colour order, flip, rotation, crop and resizing follow the camera's YAML.
 
     Args:
-        out: (N, size, size, 3) where they are put; new memory by default.
+        out: (N, size, size, 3) to write the result to; new memory by default.
     """
     if camera.color == "bgr":
         frames = frames[..., ::-1]
@@ -110,9 +112,10 @@ def prepared(
     size: int,
     resize_filter: Filter = "area",
 ) -> Images:
-    """Pictures of a stream -> (n, size, size, 3) RGB, as `prepare` makes them of `stream.frames`.
+    """Return pictures of a stream as (n, size, size, 3) RGB, as `prepare` makes them of `stream.frames`.
 
-    Pictures that can be had one by one are made square one by one: large ones are never held together.
+    Where the stream can give pictures one by one, they are resized one by one, so that large pictures are not
+    in memory together.
     """
     if not isinstance(stream, OneByOne) or not len(indices):
         return prepare(stream.frames(indices), camera, size, resize_filter)
@@ -130,13 +133,13 @@ def resize(
     resize_filter: Filter = "area",
     out: Images | None = None,
 ) -> Images:
-    """(N, H, W, 3) -> (N, size, size, 3).
+    """Resize pictures (N, H, W, 3) to (N, size, size, 3).
 
     Args:
         rule: short_side_crop (short side to `size`, centre crop), letterbox (long
             side to `size`, black borders) or stretch.
         resize_filter: area averages when shrinking and is linear when enlarging; linear is always linear.
-        out: (N, size, size, 3) where they are put; new memory by default.
+        out: (N, size, size, 3) to write the result to; new memory by default.
     """
     cv2 = opencv()
     height, width = frames.shape[1:3]
@@ -168,7 +171,7 @@ def resize(
 
 
 def _packed(frame: Images) -> Images:
-    """The picture as OpenCV takes it: rows may lie apart, pixels may not."""
+    """Return the picture in a memory layout that OpenCV takes: gaps between rows, but not between pixels."""
     rows, *pixel = frame.strides
     return frame if rows > 0 and pixel == [3, 1] else np.ascontiguousarray(frame)
 

@@ -1,9 +1,10 @@
-"""Rotations between two samples, by how they are represented.
+"""Interpolate rotations between two samples, by their representation.
 
-Taken number by number, a quaternion between q and -q would be none, and an angle between 179° and -179° would
-be 0°. Here neighbours are brought to one side first, and each result is in the form of the samples beside it.
+Interpolated number by number, a quaternion between q and -q would be no rotation, and an angle between 179°
+and -179° would be 0°. This module first brings neighbours to the same side; each result then has the form of
+the samples beside it.
 
-S samples, T target times, A numbers of a component. A pose of 6 or 7 numbers is a place and then a rotation.
+S samples, T target times, A numbers of a component. A pose of 6 or 7 numbers is a position and a rotation.
 """
 
 import numpy as np
@@ -26,13 +27,13 @@ _DEGREES = ("deg", "degree", "degrees", "°")
 def between(
     source_times: Floats, values: Values, target_times: Floats, representation: str, unit: str | None = None
 ) -> Values:
-    """Values (T, A) of a component between its samples.
+    """Return the values (T, A) of a component between its samples.
 
     Args:
         source_times: (S,) ascending.
         values: (S, A).
         target_times: (T,).
-        representation: as in the YAML; a component of any other width is taken number by number.
+        representation: as in the YAML; a component of any other width is interpolated number by number.
         unit: of angles, rad unless it says degrees.
     """
     width = _WIDTHS[representation]
@@ -58,7 +59,10 @@ def _linear(source_times: Floats, values: Floats, target_times: Floats) -> Float
 
 
 def _quaternions(source_times: Floats, values: Floats, target_times: Floats) -> Floats:
-    """Evenly along the shorter arc, continuous in sign; lengths are kept, 1 where the samples have 1."""
+    """Interpolate quaternions evenly along the shorter arc, with continuous sign.
+
+    Their lengths are interpolated too; they are 1 where the samples have length 1.
+    """
     turns = np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     steady = values * np.cumprod(np.concatenate([[1.0], turns]))[:, None]
     lengths = np.linalg.norm(values, axis=1)
@@ -79,7 +83,10 @@ def _quaternions(source_times: Floats, values: Floats, target_times: Floats) -> 
 
 
 def _angles(source_times: Floats, values: Floats, target_times: Floats, period: float) -> Floats:
-    """Along the shorter arc, in -half to half a period or 0 to one where the samples keep to it."""
+    """Interpolate angles along the shorter arc.
+
+    Results lie in -half to half a period, or in 0 to one period, where all samples do.
+    """
     steady: Floats = np.unwrap(values, period=period, axis=0).astype(np.float64)
     at = _index_of_nearest(source_times, target_times)
     found = _linear(source_times, steady, target_times) - (steady - values)[at]
@@ -96,7 +103,10 @@ def _angles(source_times: Floats, values: Floats, target_times: Floats, period: 
 
 
 def _axis_angle(source_times: Floats, values: Floats, target_times: Floats, period: float) -> Floats:
-    """By way of quaternions; of the vectors of one rotation the one nearest to the nearest sample."""
+    """Interpolate axis-angle vectors as quaternions.
+
+    Of the vectors that stand for one rotation, return the one closest to the sample nearest in time.
+    """
     scale = 2 * np.pi / period
     angle = np.linalg.norm(values, axis=1, keepdims=True) * scale
     half = np.sinc(angle / (2 * np.pi)) / 2  # sin(angle/2) / angle, 1/2 at 0
@@ -117,7 +127,7 @@ def _directions(vectors: Floats) -> Floats:
 
 
 def _nearest_rotation(values: Floats) -> Floats:
-    """Matrices (T, 9) made orthogonal again; what is no rotation to begin with stays as it is."""
+    """Make matrices (T, 9) orthogonal again; matrices that are no rotations stay as they are."""
     matrices = values.reshape(-1, 3, 3)
     if not np.isfinite(matrices).all():
         return values

@@ -1,4 +1,4 @@
-"""What a person looks at: contact sheets, action bars, PNG, MP4 and animated WebP.
+"""Draw and write pictures for people: contact sheets, action bars, PNG, MP4 and animated WebP.
 
 N pictures, H×W pixels, A action dims; pictures are uint8 RGB.
 """
@@ -25,7 +25,7 @@ INK, PAPER, BAR, NEGATIVE = (
 
 
 def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = (), gap: int = 4) -> Images:
-    """Pictures of one size in rows, with a label above each row -> (H, W, 3)."""
+    """Return a picture (H, W, 3) of pictures of one size in rows, with a label above each row."""
     label_height = 18 if labels else 0
     height, width = rows[0][0].shape[:2]
     columns = max(map(len, rows))
@@ -43,7 +43,7 @@ def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = ()
 
 
 def write_text(picture: Images, text: str, at: tuple[int, int], scale: float = 0.42) -> None:
-    """Text in place, its lower left corner at (x, y)."""
+    """Write text into a picture in place, with its lower left corner at (x, y)."""
     cv2 = opencv()
     plain = text.encode("ascii", "replace").decode()
     cv2.putText(picture, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, INK, 1, cv2.LINE_AA)
@@ -52,7 +52,7 @@ def write_text(picture: Images, text: str, at: tuple[int, int], scale: float = 0
 def with_actions(
     frames: Images, actions: NDArray[np.float32], low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> Images:
-    """Frames (N, H, W, 3) with a bar for each action dim below it, from `low` to `high` (A,)."""
+    """Return frames (N, H, W, 3) with a bar below them for each action dim, from `low` to `high` (A,)."""
     count, height, width = frames.shape[:3]
     dims = actions.shape[1]
     line = max(3, min(8, 96 // max(dims, 1)))
@@ -70,13 +70,13 @@ def with_actions(
 
 
 def png_bytes(picture: Images) -> bytes:
-    """(H, W, 3) -> PNG."""
+    """Return a picture (H, W, 3) as the bytes of a PNG."""
     cv2 = opencv()
     return cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
 def webp_bytes(frames: Images, fps: float) -> bytes:
-    """(N, H, W, 3) -> an animated WebP that loops."""
+    """Return frames (N, H, W, 3) as the bytes of an animated WebP that loops."""
     from PIL import Image
 
     pictures = [Image.fromarray(frame) for frame in frames]
@@ -95,15 +95,16 @@ def webp_bytes(frames: Images, fps: float) -> bytes:
 
 
 def write_png(path: Path, picture: Images) -> None:
-    """A PNG file, whole or absent."""
+    """Write a PNG file, whole or not at all."""
     with atomic_path(path) as part:
         part.write_bytes(png_bytes(picture))
 
 
 def write_mp4(path: Path, frames: Iterable[Images], fps: float) -> None:
-    """An H.264 file of frames (H, W, 3) of one size, whole or absent; odd sides are padded by a pixel.
+    """Write frames (H, W, 3) of one size as an H.264 file, whole or not at all.
 
-    Frames are taken one by one, so that a generator of any length may give them; there is at least one.
+    Odd sides are padded by one pixel. Frames are taken one by one, so `frames` may be a generator of any
+    length; it must give at least one frame.
     """
     import av
 

@@ -1,8 +1,8 @@
-"""Health checks of recordings and shard sets: what will hurt training, by severity.
+"""Check recordings and shard sets for what will hurt training, by severity.
 
-Of a recording, what its own inspection finds; with an embodiment, also what a sample of its episodes
-shows once they are read and aligned as this robot's. Of a shard set, its integrity and what its
-statistics show.
+For a recording, the checks are those of its inspection. With an embodiment, a sample of the episodes is also
+read and aligned as this robot's, and checked. For a shard set, the checks cover its integrity and its
+statistics.
 """
 
 from collections.abc import Iterator
@@ -24,20 +24,20 @@ from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
 
 WINDOW = 12  # frames of the model's window, by default
-LOOKS = ("blank", "still", "colour", "size")  # checks of pictures, which matter for cameras that are used
+LOOKS = ("blank", "still", "colour", "size")  # checks of pictures; they count only for cameras that are used
 
 
 def examine(target: StrPath, embodiment: StrPath | None = None, sample: int = SAMPLE) -> list[Finding]:
-    """Everything the checks find, worst first.
+    """Return all findings of the checks, worst first.
 
     Args:
         target: str or path (or URI) of a recording, or of the folder of a shard set.
         embodiment: id, or str or path of a YAML; with it a recording's episodes are read and aligned as this
             robot's.
-        sample: how many episodes are looked into, evenly spaced.
+        sample: number of episodes to look into, evenly spaced.
 
     Raises:
-        RegistryError: no such embodiment.
+        RegistryError: there is no such embodiment.
     """
     target = as_text(target)
     if _is_shard_set(target):
@@ -52,9 +52,9 @@ def _is_shard_set(target: str) -> bool:
         folder = place(target)
         if (folder / "manifest.json").is_file():
             return True
-        return not is_remote(folder) and any(folder.glob("train/shard-*.parquet"))  # one that is not finished
+        return not is_remote(folder) and any(folder.glob("train/shard-*.parquet"))  # an unfinished set
     except HMAError:
-        return False  # a source's own schemes
+        return False  # a scheme that only a source knows
 
 
 # -- recordings
@@ -81,7 +81,10 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
 
 
 def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
-    """What the inspection found, weighed by what this robot uses; constants are told by its names later."""
+    """Yield the inspection's findings that concern what this robot uses.
+
+    Findings on constants are left out: `_numbers` reports them later, with the robot's names.
+    """
     cameras = {camera.key: camera for camera in robot.cameras}
     for finding in inspection.findings:
         if finding.check == "constant":
@@ -98,7 +101,7 @@ def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
 
 
 def _as_stated(camera: Camera, shape: tuple[int, ...], swapped: str | None) -> Iterator[Finding]:
-    """A camera's size and colours against its YAML."""
+    """Compare a camera's size and colours with its YAML."""
     if camera.size and len(shape) == 3 and tuple(shape[:2]) != tuple(camera.size):
         said = f"camera {camera.name} is {list(shape[:2])} pixels, its YAML says {list(camera.size)}"
         yield Finding("size", "info", said, key=camera.key)
@@ -120,7 +123,7 @@ def _episodes(uri: str, robot: Embodiment, sample: int, inspection: Inspection) 
     for name in chosen:
         try:
             clip = to_clip(source.read(uri, name, robot), robot)
-            for camera in robot.cameras:  # that they can be decoded; the inspection looked at them
+            for camera in robot.cameras:  # can they be decoded? the inspection judged the pictures
                 clip.frames_at(camera.name, np.array([len(clip) - 1]))
             clips.append(clip)
         except HMAError as fault:

@@ -1,9 +1,9 @@
 """Write the YAML of a new robot from one of its recordings.
 
-What the recording states is filled in; what it cannot know stands as `TODO: question`, and
-`hma registry validate` lists those until they are answered. Which keys are taken is decided in
-`infer_choices` and, for bags, in `infer_topics`. In the YAML's text, components and cameras stand
-in braces on a line each.
+The YAML holds what the recording states. What the recording cannot know is written as `TODO: question`, and
+`hma registry validate` lists these questions until they are answered. `infer_choices` (for bags,
+`infer_topics`) decides which keys are taken. In the text of the YAML, each component and each camera is one
+line in braces.
 """
 
 import math
@@ -42,13 +42,13 @@ _BREAKS = re.compile(r"[\n\r\x85\u2028\u2029]")
 
 class _Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
-        """The parser accepts none."""
+        """Return True: write no aliases, because the parser accepts none."""
         return True
 
 
 def _text(dumper: _Dumper, value: str) -> yaml.Node:
-    """On one line, whatever it holds."""
-    value = _HALVES.sub("?", value)  # of surrogate pairs: no text
+    """Represent a text on one line, whatever it holds."""
+    value = _HALVES.sub("?", value)  # half of a surrogate pair is no text
     style = '"' if _BREAKS.search(value) else None
     return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 
@@ -57,7 +57,7 @@ _Dumper.add_representer(str, _text)
 
 
 def yaml_text(values: dict[str, Any]) -> str:
-    """Plain values as YAML, in the order given; it parses back to the same."""
+    """Return plain values as YAML, in the order given; parsing it gives the same values."""
     return "".join(_entry(name, value, "") for name, value in values.items())
 
 
@@ -84,7 +84,7 @@ def _item(value: dict[str, Any], indent: str) -> str:
 
 
 def _names(name: str, value: list[Any], indent: str) -> str:
-    """A list in brackets, broken where it is long."""
+    """Return a list in brackets, broken into lines where it is long."""
     whole = f"{indent}{_dump({name: value}, True)[1:-1]}"
     if len(whole) <= LINE:
         return whole + "\n"
@@ -113,18 +113,18 @@ def _indented(text: str, indent: str) -> str:
 
 
 HIGHEST_HZ = 100_000  # of a rate in a YAML
-MEASURED_TO = 5e-4  # of a rate; what time stamps leave open comes on top
+MEASURED_TO = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
 
 
 def infer(uri: StrPath, embodiment_id: str) -> str:
-    """The YAML of an embodiment that reads `uri`.
+    """Return the YAML of an embodiment that reads `uri`.
 
     Args:
         uri: str or path of the recording, or its URI.
         embodiment_id: of the new embodiment.
 
     Raises:
-        UsageError: not an id.
+        UsageError: `embodiment_id` is not an id.
         SourceError: the recording cannot be read, or has no camera or nothing that could be an action.
     """
     if not ID_PATTERN.fullmatch(embodiment_id) or ".." in embodiment_id:
@@ -135,7 +135,7 @@ def infer(uri: StrPath, embodiment_id: str) -> str:
 
 
 def from_inspection(found: Inspection, embodiment_id: str) -> str:
-    """See `infer`."""
+    """Return the YAML of an embodiment from an inspection; see `infer`."""
     if found.format == "hands":
         return _of_hands(found, embodiment_id)
     readable = replace(found, keys=tuple(key for key in found.keys if _is_text(key.key)))
@@ -145,7 +145,7 @@ def from_inspection(found: Inspection, embodiment_id: str) -> str:
 
 
 def _of_hands(found: Inspection, embodiment_id: str) -> str:
-    """Videos have nothing of their own that could be an action: what comes along for them is copied."""
+    """Return a copy of the embodiment `hand_video`: videos hold nothing that could be an action."""
     where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
     values = find("hand_video").to_dict() | {"id": embodiment_id}
     head = "a copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
@@ -153,15 +153,15 @@ def _of_hands(found: Inspection, embodiment_id: str) -> str:
 
 
 def _is_text(text: str) -> bool:
-    """False for bytes that no YAML can hold, as file formats let them through."""
+    """Check whether a YAML can hold a text; file formats let through bytes that it cannot hold."""
     return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 class _Draft:
-    """What is taken from one inspection.
+    """The keys taken from one inspection, and the YAML made of them.
 
     Raises:
-        SourceError: no camera, or nothing that could be an action.
+        SourceError: there is no camera, or nothing that could be an action.
     """
 
     def __init__(self, found: Inspection) -> None:
@@ -181,7 +181,7 @@ class _Draft:
             self.hz = None
 
     def _of_one_length(self, numbers: list[KeyInfo]) -> list[KeyInfo]:
-        """Rows that go with the pictures, one by one: HDF5 has also other arrays."""
+        """Return the arrays with one row per picture; HDF5 files have other arrays too."""
         lengths = [key.count for key in self.seen.keys]
         length = max(set(lengths), key=lengths.count)
         self.seen = Choice(tuple(key for key in self.seen.keys if key.count == length), self.seen.question)
@@ -202,7 +202,7 @@ class _Draft:
     # -- the YAML
 
     def values(self, embodiment_id: str) -> dict[str, Any]:
-        """Plain values in the order of the registry's YAMLs."""
+        """Return the YAML's plain values, in the order of the registry's YAMLs."""
         found = self.found
         name = found.facts.get("dataset") or found.uri.rstrip("/").rsplit("/", 1)[-1]
         values: dict[str, Any] = {
@@ -231,11 +231,11 @@ class _Draft:
         return values | ({"notes": f"recorded and not used: {unused}"} if unused else {})
 
     def _rate(self) -> float | int | None:
-        """29.97 stays; 9.97 of stamps that jitter so much that it may be 10 becomes 10."""
+        """Return the rate: 29.97 stays; 9.97 becomes 10 where the stamps jitter so much that it may be 10."""
         if self.hz is None:
             return None
         camera = self.seen.keys[0]
-        doubt = 0.0  # of the median interval of jittering stamps, relative
+        doubt = 0.0  # relative error of the median interval of jittering stamps
         if self.bag and camera.jitter_ms and camera.count:
             doubt = 2.5 * camera.jitter_ms * self.hz / 1e3 / math.sqrt(camera.count)
         whole = round(self.hz)
@@ -244,7 +244,7 @@ class _Draft:
 
     def _component(self, key: KeyInfo) -> dict[str, Any]:
         component = _named(key, key.names or names_of(key, self.found.facts))
-        switch = key.dtype == "bool" or (is_gripper(key.key) and not self.bag)  # bags: in metres, or 0 to 255
+        switch = key.dtype == "bool" or (is_gripper(key.key) and not self.bag)  # in bags: metres, or 0 to 255
         return component | ({"normalize": False} if component["dims"] == 1 and switch else {})
 
     def _cameras(self) -> list[dict[str, Any]]:
@@ -304,7 +304,7 @@ class _Draft:
         return said
 
     def _clocks(self) -> dict[str, str]:
-        """Where a bag's max_skew_ms and stamp are from."""
+        """Return the provenance of a bag's max_skew_ms and stamp."""
         topics = infer_topics.about(self._used())
         gaps = shown(f"{topic.name} {topic.gap_ms:.0f} ms" for topic in topics if topic.gap_ms)
         late = infer_topics.needs_receive_times(self._used())
@@ -339,7 +339,7 @@ def _hz(key: KeyInfo) -> str:
 
 
 def _named(key: KeyInfo, names: tuple[str, ...] | None) -> dict[str, Any]:
-    """A component; names where there is one for each value."""
+    """Return a component, with names where there is one for each value."""
     count = dims(key)
     told = names if names and len(names) == count and len(set(names)) == count else None
     return {"key": key.key, "dims": count} | ({"names": list(told)} if told else {})

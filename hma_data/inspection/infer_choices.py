@@ -1,9 +1,9 @@
 """Choose which keys of a recording are cameras, actions, states and words, by their names and shapes.
 
 The words in a key's name say whether it is a command or a measurement, a gripper or a base, or noise.
-Keys, message types or a controller's name state the action space and the names of values. A choice that
-the names do not settle carries a question, which ends as a TODO in the YAML. Bags are judged by topics,
-in `infer_topics`.
+Keys, message types or a controller's name state the action space and the names of values. Where the names
+do not decide, the choice carries a question, which becomes a TODO in the YAML. `infer_topics` chooses the
+topics of bags.
 """
 
 import re
@@ -57,33 +57,33 @@ _NEXT = re.compile(r"(^|[/.])next([_./]|$)", re.IGNORECASE)
 
 
 def words(key: str) -> list[str]:
-    """The lower-case words of a key, without digits: robot0_eefPos -> robot, eef, pos."""
+    """Return the lower-case words of a key, without digits: robot0_eefPos -> robot, eef, pos."""
     return re.findall(r"[a-z]+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", key).lower())
 
 
 def snake(key: str) -> str:
-    """Its words joined by underscores."""
+    """Return the words of a key joined by underscores."""
     return "_".join(words(key))
 
 
 def last(key: str) -> str:
-    """What follows the last separator."""
+    """Return the part of a key after the last separator."""
     return re.split(r"[/.]", key)[-1]
 
 
 def natural(text: str) -> list[tuple[int, str]]:
-    """Sort key that puts image before image_2 before image_10."""
+    """Return a sort key that puts image before image_2 before image_10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
 def shown(keys: Iterable[str], most: int = 12) -> str:
-    """Keys in one line, the first of many."""
+    """Return keys as one line of text; of more than `most`, the first ones and the number of the others."""
     listed = [" ".join(key.split())[:120] for key in keys]
     return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
 
 
 def dims(key: KeyInfo) -> int:
-    """Values a sample; 0 where it is none that a component could hold."""
+    """Return the number of values a sample; 0 where a component could not hold the key."""
     count = 1
     for side in key.shape:
         count *= max(side, 0)
@@ -91,34 +91,34 @@ def dims(key: KeyInfo) -> int:
 
 
 def is_next(key: str) -> bool:
-    """Whether it is of the step after: robomimic's next_obs, LeRobot's next.reward."""
+    """Check whether a key belongs to the following step: robomimic's next_obs, LeRobot's next.reward."""
     return bool(_NEXT.search(key))
 
 
 def is_observed(key: str) -> bool:
-    """Whether it lies under observations."""
+    """Check whether a key lies under observations."""
     return bool(_OBSERVED.search(key))
 
 
 def is_gripper(key: str) -> bool:
-    """Whether its name says that it opens and closes."""
+    """Check whether a key's name says that it is a gripper."""
     said = set(words(key))
     return bool(said & _GRIPPER or ("effector" in said and "end" not in said))
 
 
 def is_whole_state(key: str) -> bool:
-    """Whether its name says that it is all of the robot's state."""
+    """Check whether a key's name says that it is the whole state of the robot."""
     return bool(_WHOLE_STATE.fullmatch(snake(last(key))))
 
 
 def strength(said: Iterable[str]) -> int:
-    """How clearly words say that it is a command; 0 for not at all."""
+    """Return how clearly words name a command; 0 for not at all."""
     said = set(said)
     return next((rank for rank, names in _COMMANDS if said & names), 0)
 
 
 def vectors(keys: Iterable[KeyInfo]) -> list[KeyInfo]:
-    """Keys of numbers that could be part of an action or a state."""
+    """Return the keys of numbers that could be part of an action or a state."""
     numbers = [key for key in keys if key.kind == "vector" and dims(key) and not is_next(key.key)]
     return [
         key
@@ -128,7 +128,7 @@ def vectors(keys: Iterable[KeyInfo]) -> list[KeyInfo]:
 
 
 _DELTA = frozenset(("delta", "deltas", "rel", "relative"))
-_CONTROLLERS = {  # robosuite's, where they take changes; a gripper's value follows
+_CONTROLLERS = {  # of robosuite, where they take changes; the gripper's value comes after these
     "OSC_POSE": ("eef_delta", ("dx", "dy", "dz", "drx", "dry", "drz")),
     "OSC_POSITION": ("eef_delta", ("dx", "dy", "dz")),
     "IK_POSE": ("eef_delta", ("dx", "dy", "dz", "drx", "dry", "drz")),
@@ -148,7 +148,7 @@ def _controller(facts: Mapping[str, str]) -> tuple[str | None, tuple[str, ...]]:
 
 
 def names_of(key: KeyInfo, facts: Mapping[str, str]) -> tuple[str, ...] | None:
-    """Names of an action's values by the controller that takes them; None where it does not say."""
+    """Return the names of an action's values by the controller that takes them; None where it is unknown."""
     names = _controller(facts)[1]
     if not names or snake(key.key) not in ("action", "actions"):
         return None
@@ -156,7 +156,7 @@ def names_of(key: KeyInfo, facts: Mapping[str, str]) -> tuple[str, ...] | None:
 
 
 def space_of(keys: Iterable[KeyInfo], facts: Mapping[str, str]) -> str | None:
-    """The action's space where it is stated; None where it would be a guess."""
+    """Return the action's space where it is stated; None where it would be a guess."""
     keys = list(keys)
     stated = _controller(facts)[0]
     if stated and all(snake(key.key) in ("action", "actions") for key in keys):
@@ -164,7 +164,7 @@ def space_of(keys: Iterable[KeyInfo], facts: Mapping[str, str]) -> str | None:
     arms = [key for key in keys if not is_gripper(key.key)]
     moved = any(
         {"rotation", "delta"} <= set(words(key.key)) for key in keys
-    )  # a world_vector beside it is a step
+    )  # then a world_vector beside it is a change
     spaces = {
         "eef_delta" if moved and snake(key.key).endswith("world_vector") else _space(key) for key in arms
     }
@@ -193,7 +193,7 @@ def _space(key: KeyInfo) -> str | None:
 
 
 def _by_names(key: KeyInfo) -> str | None:
-    """By names such as shoulder_pan.pos and delta_x; grippers aside."""
+    """Return the space by names such as shoulder_pan.pos and delta_x; names of grippers are ignored."""
     names = [name for name in key.names or () if not is_gripper(name)]
     if names and all(re.search(r"(delta_|(^|_)d)([xyz]|roll|pitch|yaw)$", name) for name in names):
         return "eef_delta"
@@ -222,10 +222,10 @@ _INSTRUCTION = ("instruction", "instructions", "language", "task", "prompt", "go
 
 @dataclass(frozen=True)
 class Choice:
-    """Keys taken for one purpose, and what is to be asked about them.
+    """Keys taken for one purpose, and the question to ask about them.
 
     Attributes:
-        measured: whether they are no commands, but what was measured a step after each.
+        measured: True where the keys are no commands, but what was measured one step later.
     """
 
     keys: tuple[KeyInfo, ...] = ()
@@ -237,7 +237,7 @@ class Choice:
 
 
 def cameras(keys: Iterable[KeyInfo]) -> Choice:
-    """Colour cameras, third-person before wrist; grey ones, with a question, where there is no colour."""
+    """Choose the colour cameras, third-person before wrist; grey ones, with a question, without colour."""
     usable = [key for key in keys if _is_camera(key)]
     colour = _one_of_twins([key for key in usable if key.shape[2] == 3])
     grey = _one_of_twins([key for key in usable if key.shape[2] == 1])
@@ -255,7 +255,7 @@ def _is_camera(key: KeyInfo) -> bool:
 
 
 def _one_of_twins(found: list[KeyInfo]) -> list[KeyInfo]:
-    """Of a raw and a compressed topic of one camera the fuller; raw where they are about equally full."""
+    """Keep one topic of each camera: raw or compressed, whichever has more messages; raw if about equal."""
     groups: dict[str, list[KeyInfo]] = defaultdict(list)
     for key in found:
         groups[_TWIN.sub("", key.key)].append(key)
@@ -273,12 +273,12 @@ def _rank(key: str) -> int:
 
 
 def _is_telling(part: str) -> bool:
-    """Whether a part of a camera's key says more than that it is a picture."""
+    """Check whether a part of a camera's key says more than that it is a picture."""
     return any(not _PICTURE.fullmatch(word) for word in words(part))
 
 
 def camera_names(found: Iterable[KeyInfo]) -> list[str]:
-    """Short names that stay apart: the last telling part of the key, all of it, or numbers."""
+    """Return short, distinct names: from the last telling part of each key, the whole key, or a number."""
     keys = [key.key for key in found]
     wrists = [key for key in keys if _rank(key) == 2]
     for name in (_short_name, _plain):
@@ -305,7 +305,7 @@ def _plain(key: str) -> str:
 
 
 def actions(found: list[KeyInfo]) -> Choice:
-    """The action among the vectors of RLDS, HDF5 or LeRobot; empty when nothing is called so."""
+    """Choose the action among the vectors of RLDS, HDF5 or LeRobot; empty when no name says action."""
     outside = [key for key in found if not is_observed(key.key)]
     whole = [key for key in outside if last(key.key).lower() in ("action", "actions")]
     if whole:
@@ -328,7 +328,7 @@ def actions(found: list[KeyInfo]) -> Choice:
 
 
 def _is_beside(key: KeyInfo, chosen: KeyInfo) -> bool:
-    """Another action: of base or gripper beside the arm's, or another encoding in the same group."""
+    """Check whether a key is another action: of base or gripper, or another encoding in the same group."""
     said = set(words(key.key))
     if key == chosen or not said & {"action", "actions"} or "dict" in said:
         return False
@@ -338,22 +338,22 @@ def _is_beside(key: KeyInfo, chosen: KeyInfo) -> bool:
 
 
 def _called_otherwise(named: list[KeyInfo], found: list[KeyInfo]) -> Choice:
-    """Keys that are called commands in other words than action."""
+    """Choose keys that are named as commands in other words than action."""
     strongest = max(strength(words(key.key)) for key in named)
     chosen = [key for key in named if strength(words(key.key)) == strongest]
-    if all(is_gripper(key.key) for key in chosen):  # the arm is moved by something
+    if all(is_gripper(key.key) for key in chosen):  # some other key must move the arm
         chosen += [key for key in found if MOTION & set(words(key.key)) and not is_observed(key.key)]
     parts = ordered_parts(chosen)
     return Choice(parts, question(parts, [key for key in found if key not in parts]))
 
 
 def ordered_parts(parts: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
-    """Each quantity once; translations or joints, then rotations, base, and the gripper last."""
+    """Return each quantity once: translations or joints, then rotations, base, and the gripper last."""
     return tuple(sorted(_each_once(list(parts)), key=_place))
 
 
 def _each_once(parts: list[KeyInfo]) -> list[KeyInfo]:
-    """Without second encodings of one command: velocities beside positions, poses beside joints."""
+    """Remove second encodings of one command: velocities beside positions, poses beside joints."""
 
     def what(key: KeyInfo) -> frozenset[str]:
         return frozenset(words(key.key)) - PLACE - MOTION
@@ -379,7 +379,7 @@ def _asked(chosen: Iterable[KeyInfo], others: list[KeyInfo]) -> str:
 
 
 def question(chosen: Iterable[KeyInfo], others: Iterable[KeyInfo]) -> str:
-    """What `validate` reports of an action that was chosen among several."""
+    """Return the question that `validate` reports for an action chosen among several keys."""
     more = shown(key.key for key in others)
     return f"is {shown(key.key for key in chosen)} the command{f'; also recorded: {more}' if more else ''}?"
 
@@ -388,7 +388,7 @@ def question(chosen: Iterable[KeyInfo], others: Iterable[KeyInfo]) -> str:
 
 
 def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
-    """The robot's own state: one key that says it is all of it, else every position of the robot's."""
+    """Choose the robot's own state: the key of the whole state, else every position of the robot."""
     taken = list(taken)
     named = [key for key in found if key not in taken and _is_state(key)]
     named = [key for key in named if is_observed(key.key)] or named
@@ -398,7 +398,7 @@ def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...
     names = {snake(last(key.key)) for key in named}
     if "ee_states" in names:  # LIBERO repeats its parts
         named = [key for key in named if snake(last(key.key)) not in ("ee_pos", "ee_ori")]
-    own = [key for key in named if is_observed(key.key) or snake(last(key.key)) != "states"]  # a simulator's
+    own = [key for key in named if is_observed(key.key) or snake(last(key.key)) != "states"]  # of a simulator
     return tuple(sorted(own, key=_place))
 
 
@@ -413,7 +413,7 @@ def _is_state(key: KeyInfo) -> bool:
 
 
 def likely(found: list[KeyInfo]) -> Choice:
-    """What might be an action where nothing says so: the robot's own position, else any float vector."""
+    """Choose what may be an action where no name says so: the robot's own position, else any float vector."""
     own = states(found, ())
     joints = [key for key in own if JOINT & set(words(key.key))]
     chosen = tuple((joints or list(own) or [key for key in found if key.dtype.startswith("float")])[:1])
@@ -426,7 +426,7 @@ def likely(found: list[KeyInfo]) -> Choice:
 
 
 def instruction(keys: Iterable[KeyInfo]) -> str | None:
-    """The key of the language instruction."""
+    """Return the key of the language instruction; None where there is none."""
     ranked = []
     for key in keys:
         said = words(key.key)

@@ -1,4 +1,4 @@
-"""Which topics of a bag command the robot, which measure it, and how far apart their messages are."""
+"""Find which topics of a bag command the robot and which measure it, and how far apart messages are."""
 
 import re
 from collections import defaultdict
@@ -23,16 +23,16 @@ from hma_data.sources.base import KeyInfo, TopicInfo
 
 _COMMAND_TYPE = re.compile(r"(Twist|JointTrajectory|Command|Cmd|Ackermann|Joy)[A-Za-z]*$")
 _NEVER = re.compile(r"(^|/)(rosout|parameter_events|clock|diagnostics|_action)(/|$)|_service_event$")
-SLOWEST_HZ = 1.0  # a topic that ticks slower is no stream of commands or states
+SLOWEST_HZ = 1.0  # a topic with a lower rate is no stream of commands or states
 CLOCKS_APART_MS = 1000.0  # header stamps that differ so much between topics are not of one clock
-WEAK = 1  # how clearly a topic called goal, control or joy commands
-MARGIN = 1.5  # over the longest interval measured
+WEAK = 1  # strength of a topic called goal, control or joy; see `strength`
+MARGIN = 1.5  # factor on the longest interval measured
 
 Topic = tuple[KeyInfo, ...]
 
 
 def topics(found: Iterable[KeyInfo]) -> list[Topic]:
-    """The vectors of each topic that ticks."""
+    """Return the vectors of each topic that is a stream or whose rate is unknown."""
     groups: dict[str, list[KeyInfo]] = defaultdict(list)
     for key in found:
         if key.topic and not _NEVER.search(key.topic.name) and (key.hz is None or runs(key)):
@@ -41,12 +41,12 @@ def topics(found: Iterable[KeyInfo]) -> list[Topic]:
 
 
 def runs(key: KeyInfo) -> bool:
-    """Whether its topic is a stream, not a message now and then."""
+    """Check whether a key's topic is a stream, not an occasional message."""
     return key.hz is not None and key.hz >= SLOWEST_HZ
 
 
 def actions(found: list[KeyInfo]) -> Choice:
-    """The topics that command the robot; what it measures, with a question, where none does."""
+    """Choose the topics that command the robot; where there are none, what is measured, with a question."""
     ranked = [(_rank(topic), topic) for topic in topics(found)]
     commanding = sorted((pair for pair in ranked if pair[0][0] > 0), key=lambda pair: pair[0], reverse=True)
     if not commanding:
@@ -67,7 +67,7 @@ def actions(found: list[KeyInfo]) -> Choice:
 
 
 def _measured(found: list[KeyInfo]) -> Choice:
-    """The robot's own state as its action, one topic or the same of both arms."""
+    """Choose the robot's own state as its action: one topic, or the same topic of both arms."""
     own = states(found, ())
     joints = [key for key in own if JOINT & set(words(key.key))] or list(own)
     if not joints:
@@ -85,12 +85,12 @@ def _name(topic: Topic) -> str:
 
 
 def _path(key: KeyInfo) -> str:
-    """What follows the topic in a key."""
+    """Return the part of a key after the topic."""
     return key.key[len(key.topic.name) :] if key.topic else key.key
 
 
 def _rank(topic: Topic) -> tuple[int, bool, float, int]:
-    """(how clearly it commands, whether it ticks, rate, messages); the first is 0 where it does not."""
+    """Return (strength as a command, whether its rate is known, rate, messages); strength 0: no command."""
     said, first = set(words(_name(topic))), topic[0]
     inside = {word for key in topic for word in words(_path(key))}
     clear = strength(said)
@@ -104,7 +104,7 @@ def _rank(topic: Topic) -> tuple[int, bool, float, int]:
 
 
 def _other_side(topic: Topic, best: Topic) -> bool:
-    """Whether it is the same topic of the other arm."""
+    """Check whether a topic is the same as `best`, but of the other arm."""
     names = [re.findall(r"[a-z]+|\d+", _name(item).lower()) for item in (topic, best)]
     sides = [SIDES & set(name) for name in names]
     rests = [[word for word in name if word not in SIDES] for name in names]
@@ -112,19 +112,19 @@ def _other_side(topic: Topic, best: Topic) -> bool:
 
 
 def commanded_fields(topic: Topic) -> list[KeyInfo]:
-    """The fields of a topic that are the command: positions where there are any, what is desired."""
+    """Return the fields of a topic that are the command: desired values, and of these positions, if any."""
     desired = [key for key in topic if {"desired", "reference"} & set(words(_path(key)))]
     return _positions(desired or list(topic))
 
 
 def _positions(fields: list[KeyInfo]) -> list[KeyInfo]:
-    """Without velocities where the same message has positions."""
+    """Remove velocities where the same message has positions."""
     where = [key for key in fields if PLACE & set(words(_path(key)))]
     return [key for key in fields if not MOTION & set(words(_path(key)))] if where else fields
 
 
 def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
-    """What topics measure of the robot: joints and poses, not what moves them."""
+    """Return what topics measure of the robot: joints and poses, not velocities or commands."""
     used = {_name((key,)) for key in taken}
     own = [topic for topic in topics(found) if _name(topic) not in used and not _rank(topic)[0]]
     keys: list[KeyInfo] = []
@@ -139,12 +139,12 @@ def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...
 
 
 def about(keys: Iterable[KeyInfo]) -> list[TopicInfo]:
-    """The topics of those keys, once each."""
+    """Return the topics of those keys, each once."""
     return list(dict.fromkeys(key.topic for key in keys if key.topic))
 
 
 def needs_receive_times(keys: Iterable[KeyInfo]) -> str:
-    """Why header stamps cannot be the clock of all these topics; empty where they can."""
+    """Return why header stamps cannot be the clock of all these topics; empty where they can."""
     used = about(keys)
     back = [topic.name for topic in used if topic.goes_back]
     if back:
@@ -156,15 +156,15 @@ def needs_receive_times(keys: Iterable[KeyInfo]) -> str:
 
 
 def max_skew_ms(cameras: list[KeyInfo], actions: Iterable[KeyInfo], states: Iterable[KeyInfo]) -> int | None:
-    """How far values may be moved: the longest intervals measured, with a margin; None without any.
+    """Return how many ms values may be moved: the longest interval measured, with a margin; None without any.
 
-    A held command is as old as an interval, what is nearest or interpolated half as far.
+    A held command may be as old as one interval. A nearest or interpolated value is off by half of one.
     """
     held = [topic.gap_ms for topic in about(actions)]
     near = [topic.gap_ms for topic in about([*cameras, *states])]
     gaps = [gap for gap in held if gap and gap > 0] + [gap / 2 for gap in near if gap and gap > 0]
     if not gaps or not max(gaps) < 1e9:
         return None
-    wanted = max(gaps) * MARGIN - 0.01  # 40 ms by differences of large stamps is 40.0001
+    wanted = max(gaps) * MARGIN - 0.01  # differences of large stamps give 40.0001 for 40 ms
     step = 5 if wanted < 100 else 50 if wanted < 1000 else 500
     return max(int(-(-wanted // step) * step), step)

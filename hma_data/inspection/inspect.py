@@ -1,4 +1,4 @@
-"""What is in a recording, and whether an embodiment fits it."""
+"""Inspect a recording: report what is in it, and whether an embodiment fits it."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -15,18 +15,18 @@ from hma_data.sources.common.findings import SEVERITIES, Finding
 from hma_data.sources.common.survey import CHECKS
 from hma_data.storage.paths import StrPath, as_text
 
-TRIED = 20  # episodes looked at for one that can be read
+TRIED = 20  # episodes tried until one can be read
 
 
 def inspect_recording(
     uri: StrPath, embodiment: StrPath | None = None, episodes: int = SAMPLE
 ) -> dict[str, Any]:
-    """Everything `hma inspect` says, as plain values.
+    """Return the report of `hma inspect` as plain values.
 
     Args:
         uri: str or path of the recording, or its URI.
         embodiment: id, or str or path of a YAML; with it the first readable episode is aligned and checked.
-        episodes: how many are looked into, spread evenly over all.
+        episodes: number of episodes to look into, spread evenly over all.
 
     Raises:
         SourceError: the recording cannot be read at all.
@@ -49,7 +49,7 @@ def inspect_recording(
 
 
 def results(made: Iterable[str], found: Iterable[Finding]) -> dict[str, str]:
-    """Of each check: ok, the worst severity it found, or "not looked at" where it could not be made."""
+    """Return the result of each check: ok, the worst severity found, or "not looked at" where impossible."""
     told = dict.fromkeys(CHECKS, "not looked at") | dict.fromkeys(made, "ok")
     for finding in sorted(found, key=lambda one: SEVERITIES.index(one.severity)):
         told[finding.check] = finding.severity
@@ -59,7 +59,7 @@ def results(made: Iterable[str], found: Iterable[Finding]) -> dict[str, str]:
 def _fit(
     uri: str, robot: Embodiment, source: Source, inspection: Inspection, found: list[Finding]
 ) -> dict[str, str]:
-    """What the embodiment makes of the first episode it can read; why it cannot goes into `found`."""
+    """Return facts on the first episode that the embodiment can read; add the faults to `found`."""
     facts = {"embodiment": f"{robot.id}, {robot.action_dim} action dims"}
     faults: list[HMAError] = []
     names: list[str] = []
@@ -88,7 +88,7 @@ def _fit(
 
 
 def _alike(robot: Embodiment, inspection: Inspection) -> str:
-    """Recorded keys that are called nearly as those the YAML names."""
+    """Return a hint with recorded keys whose names are near to those that the YAML names."""
     known = [key.key for key in inspection.keys]
     wanted = [camera.key for camera in robot.cameras] + [part.key for part in robot.action.components]
     missing = [key for key in wanted if key not in known and not key.startswith("/")]
@@ -97,7 +97,7 @@ def _alike(robot: Embodiment, inspection: Inspection) -> str:
 
 
 def _measured(clip: Clip, robot: Embodiment, found: list[Finding]) -> dict[str, str]:
-    """Rate, skew and constant actions of the clip; another rate than the YAML's goes into `found`."""
+    """Return rate, skew and constant actions of the clip; add a rate other than the YAML's to `found`."""
     intervals = np.diff(clip.timestamps)
     measured = 1 / float(np.median(intervals)) if len(intervals) and np.median(intervals) > 0 else None
     facts = {"rate on the grid": f"{measured:.3g} Hz" if measured else "unknown"}

@@ -1,4 +1,4 @@
-"""A batch of windows, as the model takes it, and how it is put together from several embodiments.
+"""Assemble the batches that the model takes from windows of several embodiments.
 
 B batch, T frames, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
@@ -20,17 +20,17 @@ Pieces = Mapping[str, tuple[Ints, dict[str, NDArray[Any]]]]  # embodiment -> pla
 
 @dataclass
 class Batch:
-    """Windows, as the model takes them.
+    """A batch of windows, as the model takes it.
 
     Attributes:
         embodiment: B ids; may mix.
         actions: (B, T, Kmax) float32 raw; rows of narrower embodiments are zero at the end.
-        action_mask: (B, T) bool, True where the chunk is known: all of its steps are.
+        action_mask: (B, T) bool, True where all steps of the chunk are known.
         tokens: (B, T, h, w) int64, or None.
         latents: (B, T, c, H, W) float32 as stored, or None.
-        episode, frame: (B,) int64, where the window comes from.
-        camera: (B,) int64, which of the shard set's cameras saw it.
-        frame_mask: (B, T) bool, False where a short episode was padded: no loss is due there. None where
+        episode, frame: (B,) int64, the episode of the window and the frame it starts at.
+        camera: (B,) int64, index of the camera among those of the shard set.
+        frame_mask: (B, T) bool, False where a short episode was padded; such frames give no loss. None where
             episodes are not padded.
     """
 
@@ -48,11 +48,11 @@ class Batch:
         return len(self.embodiment)
 
     def to(self, device: torch.device | str) -> "Batch":
-        """The same batch elsewhere."""
+        """Return the same batch on another device."""
         return self._map(lambda value: value.to(device, non_blocking=True))
 
     def pin_memory(self) -> "Batch":
-        """Called by a DataLoader with pin_memory=True."""
+        """Return the same batch in pinned memory; a DataLoader with pin_memory=True calls this."""
         return self._map(Tensor.pin_memory)
 
     def _map(self, change: Any) -> "Batch":
@@ -61,7 +61,7 @@ class Batch:
 
 
 def assemble(sets: Mapping[str, ShardSet], names: list[str], pieces: Pieces, short: Short) -> Batch:
-    """One batch from the pieces of each embodiment."""
+    """Assemble one batch from the pieces of each embodiment."""
     size = len(names)
     width = max(windows["actions"].shape[2] for _, windows in pieces.values())
     frames = next(iter(pieces.values()))[1]["actions"].shape[1]
@@ -93,5 +93,5 @@ def assemble(sets: Mapping[str, ShardSet], names: list[str], pieces: Pieces, sho
 
 
 def as_batch(batch: Batch) -> Batch:
-    """For `collate_fn` of a DataLoader: the datasets here make whole batches."""
+    """Return the batch unchanged: a `collate_fn` for datasets that make whole batches."""
     return batch

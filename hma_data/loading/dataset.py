@@ -1,13 +1,12 @@
-"""Windows from shards into training batches.
+"""Load training batches of windows from shards.
 
 `MixtureDataset` streams: it decodes a pool of row groups of each embodiment, shuffles the windows in
-them, and goes on to the next; which embodiment a sample comes from is the mixture's draw.
+them, and goes on to the next pool. The mixture draws the embodiment of each sample.
 `WindowDataset` gives any window by number, for evaluation and small data.
 
-What comes out depends on (seed, step, rank) alone, never on the number of DataLoader workers:
-batch t of a rank is made from lane t mod `lanes`, each lane owns its share of the row groups,
-and any process can work out where a lane stands. So a run is resumed exactly from one number
-a lane and embodiment.
+The batches depend on (seed, step, rank) alone, never on the number of DataLoader workers: batch t of a rank
+is made from lane t mod `lanes`, each lane owns its share of the row groups, and any process can compute
+where a lane stands. A run can therefore be resumed exactly from one number per lane and embodiment.
 
 B batch, T frames, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
@@ -32,13 +31,13 @@ __all__ = ["Batch", "MixtureDataset", "WindowDataset", "as_batch", "open_sets"]
 
 
 def open_sets(data: Sequence[StrPath | ShardSet]) -> dict[str, ShardSet]:
-    """Shard sets by embodiment id.
+    """Open shard sets; return embodiment id -> shard set.
 
     Args:
-        data: of each set the str or path of its folder, its URI, or the set itself.
+        data: for each set, the str or path of its folder, its URI, or the set itself.
 
     Raises:
-        ShardError: none given, two of one embodiment, or sets of different tokenizers.
+        ShardError: there are none, two are of one embodiment, or their tokenizers differ.
     """
     sets: dict[str, ShardSet] = {}
     for item in data:
@@ -66,7 +65,7 @@ def open_sets(data: Sequence[StrPath | ShardSet]) -> dict[str, ShardSet]:
 
 
 class WindowDataset(Dataset[Batch]):
-    """Windows of one shard set by number.
+    """The windows of one shard set, by number.
 
     A torch DataLoader takes it with `collate_fn=as_batch`.
 
@@ -75,8 +74,8 @@ class WindowDataset(Dataset[Batch]):
         split: train or val.
         frames: T.
         stride: rows between frames; None takes the embodiment's.
-        short: episodes shorter than a window are dropped, or padded.
-        cache_mib: decoded row groups kept.
+        short: "drop" or "pad": what happens to episodes shorter than a window.
+        cache_mib: memory for decoded row groups that are kept, in MiB.
 
     Raises:
         ShardError: the set is damaged or contradicts itself.
@@ -104,13 +103,13 @@ class WindowDataset(Dataset[Batch]):
         return self.batch([window])
 
     def __getitems__(self, windows: list[int]) -> Batch:
-        return self.batch(windows)  # what a DataLoader asks of a dataset that makes whole batches
+        return self.batch(windows)  # a DataLoader calls this where a dataset makes whole batches
 
     def batch(self, windows: Sequence[int] | Ints) -> Batch:
-        """Those windows, in that order.
+        """Return those windows as one batch, in that order.
 
         Raises:
-            IndexError: no numbers, or one outside 0..len-1.
+            IndexError: there are no numbers, or one is outside 0..len-1.
             ShardError: a shard is missing or damaged.
         """
         wanted = np.asarray(windows, np.int64)
@@ -123,7 +122,7 @@ class WindowDataset(Dataset[Batch]):
         last = index.last_rows(wanted) if index.padded_episodes else None
         group = np.searchsorted(index.edges, first, side="right") - 1
         over = np.minimum(first + index.span - 1, index.last_rows(wanted)) >= index.edges[group + 1]
-        places, cuts = [], []  # a window may go on in the next row group
+        places, cuts = [], []  # a window may continue in the next row group
         for key in np.unique(2 * group + over):
             chosen = np.flatnonzero(2 * group + over == key)
             rows = self._decoder.rows(int(key // 2), whole=bool(key % 2))
@@ -145,26 +144,27 @@ class MixtureDataset(IterableDataset[Batch]):
     resumed with `state_dict` and `load_state_dict`. A torch DataLoader, or torchdata's
     StatefulDataLoader, with batch_size=None gives the same batches in the same order.
 
-    An embodiment with fewer windows than there are lanes in all ranks is seen whole by every lane;
-    all others are divided, so that lanes and ranks never share a window.
+    Every lane reads all windows of an embodiment that has fewer windows than there are lanes in all ranks.
+    The windows of other embodiments are divided, so that lanes and ranks never share a window.
 
     Args:
         data: shard sets, each of another embodiment.
         batch_size: B on this rank.
         frames: T.
-        temperature, weights, groups, caps, max_epochs, samples, draw: of the mixture, see `Mixture.of`;
-            without a temperature it is 3 for train and 4 for val.
+        temperature, weights, groups, caps, max_epochs, samples, draw: of the mixture, see `Mixture.of`; the
+            temperature is 3 for train and 4 for val by default.
         seed: of draws and shuffles.
-        rank, world: this process among those that train together; their windows are disjoint.
+        rank, world: number of this process, and of all processes that train together; their windows are
+            disjoint.
         split: train or val.
-        short: episodes shorter than a window are dropped, or padded.
+        short: "drop" or "pad": what happens to episodes shorter than a window.
         pool: row groups decoded together for an embodiment and lane; None: as `memory_mib` allows, at most 8.
-        lanes: independent streams a rank; at least the number of workers for full speed.
-        memory_mib: of decoded rows, about, in all lanes together.
+        lanes: independent streams per rank; at least the number of workers for full speed.
+        memory_mib: memory for decoded rows in all lanes together, in MiB, about.
 
-    Raises:
-        ShardError: sets that do not go together, one without a single window, or one that is damaged.
-        UsageError: values that cannot be.
+        Raises:
+            ShardError: the sets do not fit together, or one has no window or is damaged.
+            UsageError: a value is out of range.
     """
 
     def __init__(
@@ -223,7 +223,7 @@ class MixtureDataset(IterableDataset[Batch]):
         self._taken: Ints = np.zeros((lanes, len(counts)), np.int64)
 
     def __iter__(self) -> Iterator[Batch]:
-        """Batches from where `load_state_dict` left off; in a DataLoader worker, that worker's share."""
+        """Yield batches from where `load_state_dict` left off; in a DataLoader worker, the worker's share."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
         if info and self._origin is None:
@@ -241,10 +241,10 @@ class MixtureDataset(IterableDataset[Batch]):
                 yield batch
 
     def batches(self, workers: int = 0, context: str = "spawn") -> Iterator[Batch]:
-        """The same batches, decoded by `workers` processes; `state_dict` follows what was taken from here.
+        """Yield the same batches, decoded by `workers` processes; `state_dict` counts what is yielded here.
 
         Args:
-            context: how the processes are started: spawn, fork, forkserver.
+            context: how the processes start: spawn, fork, forkserver.
 
         Raises:
             ShardError: a shard is missing or damaged.
@@ -267,11 +267,11 @@ class MixtureDataset(IterableDataset[Batch]):
             yield batch
 
     def realised(self) -> list[dict[str, float | str | int]]:
-        """What this rank has taken of each embodiment, beside what was intended: `Mixture.table`."""
+        """Return what this rank has drawn of each embodiment beside what was intended: `Mixture.table`."""
         return self.mixture.table(self._taken.sum(axis=0))
 
     def _draws(self, step: int) -> Ints:
-        """(B,) embodiments of this rank's batch `step`."""
+        """Return the embodiments (B,) of this rank's batch `step`, as indices."""
         if self.mixture.draw == "per_batch":
             return self.mixture.batch(step * self.world + self.rank, self.batch_size)
         whole = self.mixture.batch(step, self.batch_size * self.world)
@@ -299,10 +299,10 @@ class MixtureDataset(IterableDataset[Batch]):
         return self._streams[lane, which]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_streams": {}, "_deals": {}}  # what a worker makes anew, pools of rows too
+        return {**self.__dict__, "_streams": {}, "_deals": {}}  # a worker makes these anew
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the stream stands, after the last batch that was taken: plain values, a few kB."""
+        """Return the position of the stream after the last batch taken, as plain values of a few kB."""
         return {
             "step": self._step,
             "rank": self.rank,
@@ -312,7 +312,7 @@ class MixtureDataset(IterableDataset[Batch]):
         }
 
     def _identity(self) -> dict[str, Any]:
-        """All that decides which windows come, but the place."""
+        """Return all values that decide which windows come, except the position."""
         index = next(iter(self._decoders.values())).index
         return {
             "names": list(self.mixture.names),
@@ -329,12 +329,13 @@ class MixtureDataset(IterableDataset[Batch]):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict`, with any number of workers.
+        """Continue from `state_dict`, with any number of workers.
 
-        The state of any rank will do. That of another costs some 20 µs a step: its draws are made again.
+        The state may come from any rank. A state of another rank costs about 20 µs a step, because the draws
+        are made again.
 
         Raises:
-            UsageError: it is of another mixture.
+            UsageError: the state is of another mixture.
         """
         for key, mine in self._identity().items():
             if state.get(key) != mine:
@@ -353,7 +354,7 @@ class MixtureDataset(IterableDataset[Batch]):
 
 
 class _Carrier(IterableDataset[Any]):
-    """A dataset whose errors come through the queue whole; torch would pass on their text alone."""
+    """A dataset that yields its errors as items: torch would pass on only their text."""
 
     def __init__(self, dataset: MixtureDataset) -> None:
         self._dataset = dataset
@@ -366,7 +367,7 @@ class _Carrier(IterableDataset[Any]):
 
 
 def _place(state: Mapping[str, Any], shape: tuple[int, ...], batch_size: int) -> tuple[int, Ints]:
-    """Step and counts of a state, which must agree."""
+    """Return the step and the counts of a state; raise UsageError where they do not agree."""
     try:
         step, taken = int(state["step"]), np.asarray(state["taken"], np.int64)
     except (KeyError, TypeError, ValueError) as fault:
@@ -387,7 +388,7 @@ def _check_frames(frames: int) -> None:
 
 
 def _check_windows(decoders: Mapping[str, Decoder], frames: int, split: str) -> None:
-    """Every set gives windows, and a first row group of it is what it should be."""
+    """Raise ShardError where a set has no window, or where its first row group with windows is damaged."""
     for decoder in decoders.values():
         index = decoder.index
         if not index.count:

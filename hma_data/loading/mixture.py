@@ -1,8 +1,8 @@
-"""How often each embodiment is drawn: the paper's inverse-exponential mixture.
+"""Draw embodiments by the paper's inverse-exponential mixture.
 
-p_i = n_i^(1/τ) / Σ_j n_j^(1/τ), n the number of training windows (paper section 3.2; the
-released code draws with τ = 3 in training, 4 in validation). τ = 1 is proportional, τ → ∞
-uniform. Draws are a pure function of (seed, step), so every rank and worker knows them all.
+p_i = n_i^(1/τ) / Σ_j n_j^(1/τ), where n is the number of training windows (paper section 3.2; the
+released code draws with τ = 3 in training, 4 in validation). τ = 1 is proportional, τ → ∞ uniform.
+Draws are a pure function of (seed, step), so every rank and worker can compute all of them.
 
 E embodiments, B samples a batch.
 """
@@ -34,18 +34,18 @@ def probabilities(
     caps: Sequence[float] | None = None,
     group_weights: Mapping[str, float] | None = None,
 ) -> Floats:
-    """The probability (E,) of each embodiment; they sum to one.
+    """Return the probability (E,) of each embodiment; the probabilities sum to one.
 
     Args:
         counts: training windows of each.
         temperature: τ above; math.inf is uniform.
-        weights: multiply the probabilities before they are normalized; within a group, where there are.
-        groups: names; each group gets an equal share, shared inside it by the rule above.
+        weights: multiply the probabilities before they are normalized; with groups, within each group.
+        groups: group of each; groups get equal shares, and the rule above divides the share of a group.
         caps: no probability exceeds its cap; what is cut goes to the others in proportion.
         group_weights: multiply the shares of groups.
 
     Raises:
-        UsageError: a value out of range, no windows at all, or caps that leave less than one.
+        UsageError: a value is out of range, there are no windows, or the caps sum to less than one.
     """
     n = np.asarray(counts, np.float64)
     if not len(n) or n.max() <= 0 or n.min() < 0:
@@ -71,7 +71,7 @@ def probabilities(
 
 
 def epoch_caps(counts: Sequence[int], max_epochs: float, samples: int) -> Floats:
-    """The largest probabilities (E,) at which `samples` draws pass over no set more than `max_epochs` times.
+    """Return the probabilities (E,) above which `samples` draws pass over a set more than `max_epochs` times.
 
     Raises:
         UsageError: so many samples cannot be drawn.
@@ -144,17 +144,17 @@ class Mixture:
         draw: Draw = "per_sample",
         seed: int = 0,
     ) -> "Mixture":
-        """The mixture over named counts; see `probabilities`.
+        """Return the mixture over named counts; see `probabilities`.
 
         Args:
             counts: embodiment -> training windows.
             weights: embodiment or group -> factor on its probability; 1 where not named.
-            groups: embodiment -> group; one that is not named is a group of its own.
+            groups: embodiment -> group; an embodiment that is not named is a group of its own.
             caps: embodiment -> its largest probability.
-            max_epochs: passes over any one embodiment at most, while `samples` are drawn in all.
+            max_epochs: most passes over any one embodiment while `samples` are drawn in all.
 
-        Raises:
-            UsageError: a name that is not there, or values that cannot be met.
+            Raises:
+                UsageError: a name is unknown, or the values cannot be met.
         """
         group = {name: (groups or {}).get(name, name) for name in counts}
         _known("groups", groups, counts)
@@ -180,7 +180,7 @@ class Mixture:
         return cls(tuple(counts), tuple(size), p, draw, seed)
 
     def batch(self, step: int, size: int) -> NDArray[np.int64]:
-        """(B,) which embodiment each sample of batch `step` comes from; the same wherever it is asked."""
+        """Return the index (B,) of each sample's embodiment in batch `step`, the same in every process."""
         rng = np.random.Generator(np.random.Philox(key=[self.seed, step]))
         edges = np.cumsum(self.p)
         edges[-1] = 1.0
@@ -188,13 +188,13 @@ class Mixture:
         return np.broadcast_to(draws, (size,)).astype(np.int64)
 
     def table(self, drawn: Sequence[int] | NDArray[np.int64]) -> list[dict[str, float | str | int]]:
-        """What was drawn beside what was intended.
+        """Return a table of what was drawn beside what was intended.
 
         Args:
             drawn: (E,) samples of each embodiment.
 
         Returns:
-            One row an embodiment: intended and realised share, samples, passes over its windows.
+            One row per embodiment: intended and realised share, samples, passes over its windows.
         """
         total = max(1, int(np.sum(drawn)))
         return [
@@ -217,7 +217,7 @@ def _known(what: str, named: Mapping[str, object] | None, known: Iterable[str]) 
 
 
 def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:
-    """Bars of the probabilities beside what proportional sampling would give; the largest set on top.
+    """Plot the probabilities as bars beside those of proportional sampling, with the largest set on top.
 
     Args:
         path: str or path of the file to write; its suffix decides the format: .png, .svg, .pdf.
@@ -251,7 +251,7 @@ def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:
 
 
 def _short(name: str) -> str:
-    """The name, its middle left out where it is long: both ends tell robots apart."""
+    """Return the name, without its middle where it is long: both ends distinguish robots."""
     if len(name) <= LONGEST_NAME:
         return name
     half = LONGEST_NAME // 2

@@ -1,9 +1,9 @@
-"""An endless, shuffled sequence of a shard set's windows for each of several readers.
+"""Give each of several readers an endless, shuffled sequence of a shard set's windows.
 
-Row groups, or parts of them where there are few, are dealt out among the readers so that each has about
-as many windows. A reader decodes a pool of row groups at a time and puts the windows of a pool in an order
-in which windows that share a row come far apart (`spread`). Everything is a pure function of (seed, set,
-reader, place in the sequence), so going on from a place costs one pool, whatever came before.
+Row groups (parts of them where there are few) are divided among the readers so that all readers have about
+the same number of windows. A reader decodes a pool of row groups at a time. It orders the windows of a pool
+so that windows that share a row are far apart (`spread`). Everything is a pure function of (seed, set,
+reader, position in the sequence), so continuing from any position costs the decoding of one pool.
 """
 
 import zlib
@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 from hma_data.loading.rows import Decoder, Rows
 from hma_data.shards.windows import Ints, WindowIndex
 
-UNITS = 8  # at least so many for a reader: the fewer, the less equal its share
+UNITS = 8  # at least so many per reader: with fewer units, shares are less equal
 LARGEST_POOL = 8  # row groups
 
 
 def pool_size(decoder: Decoder, budget: float) -> int:
-    """Row groups decoded together where `budget` bytes are to hold them: 1 to LARGEST_POOL."""
+    """Return the number of row groups to decode together within `budget` bytes: 1 to LARGEST_POOL."""
     return int(np.clip(budget // max(1, decoder.group_bytes), 1, LARGEST_POOL))
 
 
 def spread(rows: Ints, span: int, rng: np.random.Generator) -> tuple[Ints, int]:
-    """A random order of windows in which those that share a row are far apart.
+    """Return a random order of windows in which those that share a row are far apart.
 
-    The windows are laid in a table of `m` columns, m so large that all of a column are at least `span` rows
-    apart. Columns come one after another, each in random order; windows too near to the end of the column
-    before come late in theirs.
+    The windows fill a table of `m` columns, row by row; m is so large that the windows of a column are at
+    least `span` rows apart. The columns follow one another in random order, and so do the windows in each.
+    Windows that are too near to the end of the column before come late in their own column.
 
     Args:
         rows: (n,) first row of each window, ascending.
@@ -47,7 +47,7 @@ def spread(rows: Ints, span: int, rng: np.random.Generator) -> tuple[Ints, int]:
     for b in rng.permutation(m):
         column = rng.permutation(np.arange(b, count, m))
         if columns and apart:
-            near = np.zeros(lines + 2, np.bool_)  # by line, one more at either end
+            near = np.zeros(lines + 2, np.bool_)  # by row of the table, one more at either end
             line = (columns[-1][-apart:] - b) // m + 1
             near[line] = near[line + 1] = True
             late = near[column // m + 1]
@@ -58,13 +58,15 @@ def spread(rows: Ints, span: int, rng: np.random.Generator) -> tuple[Ints, int]:
 
 @dataclass(frozen=True)
 class Deal:
-    """Who reads what: units are (row group, part), the part's windows every `parts`-th of the group.
+    """The assignment of units to readers.
+
+    A unit is (row group, part); a part has every `parts`-th window of the group.
 
     Attributes:
         units: (U, 2).
-        sizes: (U,) windows of each.
-        owner: (U,) the reader.
-        parts: of a row group.
+        sizes: (U,) number of windows in each unit.
+        owner: (U,) the reader; -1: all readers.
+        parts: number of parts of a row group.
     """
 
     units: Ints
@@ -74,7 +76,7 @@ class Deal:
 
     @classmethod
     def of(cls, index: WindowIndex, readers: int) -> "Deal":
-        """Every window to one reader; all of them to each where there are fewer windows than readers."""
+        """Give every window to one reader; with fewer windows than readers, give all to every reader."""
         groups = index.units()
         if index.count < readers:
             units = np.stack([groups, np.zeros_like(groups)], axis=1)
@@ -84,26 +86,26 @@ class Deal:
         windows = np.diff(index.unit_first)[units[:, 0]]
         sizes = np.maximum(0, windows - units[:, 1] + parts - 1) // parts
         units, sizes = units[sizes > 0], sizes[sizes > 0]
-        order = np.argsort(-sizes, kind="stable")  # the largest first, to and fro: sums come out even
+        order = np.argsort(-sizes, kind="stable")  # the largest first, in alternating direction: equal sums
         turn, place = np.divmod(np.arange(len(units)), readers)
         owner = np.empty(len(units), np.int64)
         owner[order] = np.where(turn % 2, readers - 1 - place, place)
         return cls(units, sizes, owner, parts)
 
     def of_reader(self, reader: int) -> tuple[Ints, Ints]:
-        """Its units and their sizes."""
+        """Return the units of a reader and their sizes."""
         mine = (self.owner == reader) | (self.owner < 0)
         return self.units[mine], self.sizes[mine]
 
 
 class Stream:
-    """The sequence of one reader.
+    """The sequence of windows of one reader.
 
     Args:
         decoder: of the shard set.
-        deal: who reads what.
+        deal: which reader reads which units.
         seed: of the order.
-        reader: which of the deal's.
+        reader: number of this reader.
         pool: row groups decoded together.
     """
 
@@ -117,7 +119,7 @@ class Stream:
         self._rows: Rows | None = None
 
     def take(self, start: int, count: int) -> dict[str, NDArray[Any]]:
-        """Windows start to start + count of the sequence; see `Rows.cut`, and camera (n,)."""
+        """Return windows start to start + count of the sequence: those of `Rows.cut`, and camera (n,)."""
         parts = []
         while count:
             epoch, offset = divmod(start, self.length)
@@ -136,7 +138,7 @@ class Stream:
         return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
     def _rounds(self, epoch: int) -> tuple[Ints, Ints]:
-        """Order of the units in an epoch, and the number of windows up to the end of each pool."""
+        """Return the order of the units in an epoch, and the number of windows up to the end of each pool."""
         if self._epoch is None or self._epoch[0] != epoch:
             order = np.random.default_rng([*self._entropy, epoch]).permutation(len(self._units))
             firsts = np.arange(0, len(order), self._pool)
@@ -146,7 +148,7 @@ class Stream:
     def _load(self, epoch: int, number: int, order: Ints) -> Rows:
         if self._rows is not None and self._at == (epoch, number):
             return self._rows
-        self._rows = None  # the last pool goes before the next comes
+        self._rows = None  # free the last pool before the next is decoded
         index = self._decoder.index
         units = self._units[order[number * self._pool : (number + 1) * self._pool]]
         loaded, firsts, lasts, cameras, offset = [], [], [], [], 0

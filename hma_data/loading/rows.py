@@ -1,4 +1,4 @@
-"""Row groups of a shard set, decoded, checked, and cut into windows.
+"""Decode row groups of a shard set, check them, and cut them into windows.
 
 n windows, T frames, S values a frame, K = stride·A.
 """
@@ -21,17 +21,17 @@ MIB = 2**20
 
 @dataclass
 class Rows:
-    """Decoded rows; windows are cut from them."""
+    """Decoded rows, from which windows are cut."""
 
     tokens: NDArray[Any]
     actions: NDArray[np.float32]
     episode: NDArray[np.int32]
     frame: NDArray[np.int32]
-    known: NDArray[np.bool_] | None  # whether the row's action is; None where all are
+    known: NDArray[np.bool_] | None  # True where the row's action is known; None where all are
 
     @classmethod
     def join(cls, parts: "Sequence[Rows]") -> "Rows":
-        """One after the other."""
+        """Concatenate parts in their order."""
         if len(parts) == 1:
             return parts[0]
         columns = [[getattr(part, f.name) for part in parts] for f in fields(cls)]
@@ -42,20 +42,21 @@ class Rows:
         return len(self.frame)
 
     def first(self, count: int) -> "Rows":
-        """The first `count` rows."""
+        """Return the first `count` rows."""
         columns = [getattr(self, f.name) for f in fields(Rows)]
         kept: list[Any] = [None if column is None else column[:count] for column in columns]
         return Rows(*kept)
 
     def cut(self, first: Ints, last: Ints | None, index: WindowIndex) -> dict[str, NDArray[Any]]:
-        """Windows that start at rows `first` (n,).
+        """Return the windows that start at rows `first` (n,).
 
         Args:
-            last: (n,) last rows of their episodes, beyond which a window is padded; None: none is.
+            last: (n,) last rows of their episodes, beyond which windows are padded; None pads no window.
 
         Returns:
-            tokens (n, T, S), actions (n, T, K), episode (n,), frame (n,); known (n, T) where the set says
-            so or windows may be padded; inside (n, T), whether the frame is the episode's, where they may.
+            tokens (n, T, S), actions (n, T, K), episode (n,) and frame (n,). Where the set has marks or
+            windows may be padded, also known (n, T) bool. Where windows may be padded, also inside (n, T)
+            bool, True for frames of the episode.
         """
         found = {"episode": self.episode[first], "frame": self.frame[first]}
         if last is not None:
@@ -83,7 +84,7 @@ class Rows:
 
 
 def _spans(values: NDArray[Any], span: int) -> NDArray[Any]:
-    """(N, A) -> (N - span + 1, span * A): every run of rows, without a copy."""
+    """Return every run of `span` rows, without a copy: (N, A) -> (N - span + 1, span * A)."""
     rows, width = values.shape
     size = values.itemsize
     return np.ndarray(
@@ -95,12 +96,12 @@ def _spans(values: NDArray[Any], span: int) -> NDArray[Any]:
 
 
 class Decoder:
-    """Row groups of one shard set and split with the windows in them; the last used stay decoded.
+    """The row groups of one split of a shard set, and their windows; the last used row groups stay decoded.
 
     Args:
-        shards, split: where from.
+        shards, split: the shard set and its split.
         frames, stride, short: see `WindowIndex.of`.
-        cache_bytes: of decoded rows that are kept; two row groups at least.
+        cache_bytes: memory for decoded rows that are kept; at least two row groups are kept.
 
     Raises:
         ShardError: the set contradicts itself.
@@ -130,17 +131,17 @@ class Decoder:
 
     @property
     def group_bytes(self) -> int:
-        """Of a decoded row group, on average."""
+        """Return the average bytes of a decoded row group."""
         rows = self.index.edges[-1] / max(1, len(self.index.groups))
         token = np.dtype(self.shards.spec.dtype).itemsize
         width, actions = self._widths.values()
         return int(rows * (width * token + actions * 4 + 9))
 
     def rows(self, group: int, whole: bool = True) -> Rows:
-        """All rows that the windows starting in row group `group` need, its own first.
+        """Return all rows that the windows starting in row group `group` need; its own rows come first.
 
         Args:
-            whole: False leaves out those of the row groups after it.
+            whole: False leaves out the rows of the row groups after it.
 
         Raises:
             ShardError: the shard is missing or damaged, or its rows are not what the set says.
@@ -155,7 +156,7 @@ class Decoder:
         )
 
     def check(self) -> None:
-        """Decode one row group, so that what is wrong with all of them is known before the first batch."""
+        """Decode one row group, so that a fault of all row groups shows before the first batch."""
         if self.index.count:
             self.rows(int(self.index.units()[0]))
 
@@ -178,7 +179,7 @@ class Decoder:
             raise ShardError(where, fault, f"hma shards verify {self.shards.folder} tells what is damaged")
 
     def _fault(self, group: int, values: dict[str, NDArray[Any]]) -> str:
-        """What is wrong with rows that are not those that manifest and episodes.parquet promise."""
+        """Return how rows contradict the manifest or episodes.parquet; empty where they do not."""
         name, spec = self._columns[0], self.shards.spec
         tokens, actions, frame = values[name], values["action"], values["frame_index"]
         for column, width in self._widths.items():

@@ -1,8 +1,8 @@
-"""Every embodiment of the registry at once, fast enough for ten thousand of them.
+"""List every embodiment of the registry, fast enough for ten thousand of them.
 
-Each file is read and hashed; what a file of those bytes says is kept in a cache, so a YAML is parsed
-and validated once in its life. An entry is found by the bytes themselves and by the code that judged
-them, never by a time stamp: it cannot be stale.
+Each file is read and hashed. A cache keeps the facts and problems found in a file of those bytes, so each
+YAML is parsed and validated only once. The key of an entry is a hash of the bytes and of the code that
+judged them, never a time stamp; an entry cannot be out of date.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ _JUDGES = ("registry/embodiment.py", "registry/components.py", "registry/catalog
 
 
 def registry_folders(beside: StrPath | None = None) -> list[Path]:
-    """Folders searched for an id, first wins: ./registry, $HMA_REGISTRY, beside a checkpoint, shipped.
+    """Return the folders searched for an id, in order: ./registry, $HMA_REGISTRY, a checkpoint's, shipped.
 
     Args:
         beside: str or path of the checkpoint.
@@ -39,7 +39,7 @@ def registry_folders(beside: StrPath | None = None) -> list[Path]:
 
 
 def registry_files(folders: Iterable[StrPath] | None = None) -> Iterator[Path]:
-    """Every YAML of the registry (or of those folders, each a str or path), in search order."""
+    """Yield every YAML of the registry (or of those folders, each a str or path), in search order."""
     for folder in registry_folders() if folders is None else map(as_path, folders):
         found = [
             f"{root}/{name}"
@@ -51,7 +51,10 @@ def registry_files(folders: Iterable[StrPath] | None = None) -> Iterator[Path]:
 
 
 def file_id(path: Path) -> str:
-    """The id a registry file is found by; a checkpoint keeps each in a folder of its own."""
+    """Return the id by which a registry file is found.
+
+    It is the file's name, or for `embodiment.yaml`, as in a checkpoint, the name of its folder.
+    """
     return path.parent.name if path.stem == "embodiment" else path.stem
 
 
@@ -62,8 +65,8 @@ class Entry:
     Attributes:
         path: of the file.
         facts: what `hma registry list` shows of it; None where it has problems.
-        problems: as `hma_data.registry.embodiment.Problem`, plain: path, fault, value, allowed.
-        name: the id it claims, also where it has problems; None where it has none.
+        problems: the fields of `hma_data.registry.embodiment.Problem`: path, fault, value, allowed.
+        name: the id that the file states, also where it has problems; None where it states none.
     """
 
     path: Path
@@ -73,10 +76,10 @@ class Entry:
 
 
 def entries(files: Iterable[StrPath] | None = None) -> list[Entry]:
-    """Every YAML of the registry (or of those files, each a str or path), judged, in search order.
+    """Return an Entry per YAML of the registry (or of those files, each a str or path), in search order.
 
-    Problems between files are added: an id that two files of one folder tree claim, and in a registry
-    folder a file that its own id does not find.
+    Problems between files are added: two files of one folder tree with the same id, and, in a registry
+    folder, a file whose name is not its id.
     """
     judged = _Cache()
     if files is not None:
@@ -119,7 +122,7 @@ def _judge(content: bytes, path: Path) -> dict[str, Any]:
 
 
 def facts(embodiment: Any) -> dict[str, Any]:
-    """What list and show say of an embodiment, derived values included; null where the rate is unknown."""
+    """Return what list and show say of an embodiment, with derived values; None where the rate is unknown."""
     found = {
         "id": embodiment.id,
         "kind": embodiment.kind,
@@ -155,7 +158,7 @@ def _with(entry: Entry, problem: dict[str, str | None]) -> Entry:
 
 
 def _doubles(found: list[Entry]) -> list[Entry]:
-    """Two files with one id: each later one gets the problem."""
+    """Add a problem to every file whose id an earlier file has."""
     first: dict[str, Path] = {}
     result = []
     for entry in found:
@@ -167,7 +170,7 @@ def _doubles(found: list[Entry]) -> list[Entry]:
 
 
 def _misnamed(entry: Entry) -> Entry:
-    """In a registry folder an id finds the file of its name."""
+    """Add a problem to a file of a registry folder whose name is not its id."""
     if entry.facts is None or file_id(entry.path) == entry.name:
         return entry
     fault = f"does not find its file {entry.path.name}: file name and id must be the same"
@@ -175,7 +178,7 @@ def _misnamed(entry: Entry) -> Entry:
 
 
 class _Cache:
-    """Judgements by the bytes judged, in one JSON file a version of the judging code."""
+    """Facts and problems by the hash of a YAML's bytes, in one JSON file per version of the judging code."""
 
     def __init__(self) -> None:
         package = Path(__file__).parents[1]
@@ -209,7 +212,7 @@ class _Cache:
         return said
 
     def save(self) -> None:
-        """Keep the new judgements; a cache that cannot be written is only slower."""
+        """Write the new entries; where the cache cannot be written, later runs are only slower."""
         if not self._new:
             return
         room = MAX_KEPT - len(self._used)

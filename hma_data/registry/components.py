@@ -1,6 +1,6 @@
-"""The parts of a registry YAML: components of a vector, cameras, clocks, where the data is.
+"""Define the parts of a registry YAML: components of a vector, cameras, clocks, the source of the data.
 
-Frozen and validated when made; `hma_data.registry.embodiment` puts them together.
+They are frozen and validated when made; `hma_data.registry.embodiment` puts them together.
 """
 
 from typing import Annotated, Any, Literal, Self
@@ -44,7 +44,7 @@ Count = Annotated[int, BeforeValidator(_no_bool)]
 
 
 class SpecModel(BaseModel):
-    """What all of them share: unknown keys are errors, nothing changes afterwards."""
+    """The base class of all parts: unknown keys are errors, and objects are frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False, arbitrary_types_allowed=False)
 
@@ -100,11 +100,11 @@ class Vector(SpecModel):
 
     @property
     def dims(self) -> int:
-        """Width of the whole vector."""
+        """Return the width of the whole vector."""
         return sum(component.dims for component in self.components)
 
     def names(self) -> list[str]:
-        """A name for each value; made from the key where the YAML gives none."""
+        """Return a name for each value, made from the key where the YAML gives none."""
         return [
             name
             for part in self.components
@@ -113,7 +113,7 @@ class Vector(SpecModel):
 
 
 class Action(Vector):
-    """What the robot is told to do at each step."""
+    """The action vector: the command to the robot at each step."""
 
     space: Space
 
@@ -153,7 +153,7 @@ class Camera(SpecModel):
 
 
 class Sync(SpecModel):
-    """How streams of different rates meet: on the primary camera's frames, or on a fixed grid."""
+    """The grid for streams of different rates: the primary camera's frames, or a fixed rate."""
 
     primary: str | None = Field(None, description="the camera whose frames are the grid; default the first")
     rate_hz: Number | None = Field(
@@ -179,7 +179,7 @@ class Sync(SpecModel):
 class Marker(SpecModel):
     """Messages of a bag that begin or end an episode.
 
-    With `equals`, the moments at which the value becomes that one; without, every message.
+    With `equals`, only messages at which the value becomes `equals` count; without it, every message does.
     """
 
     key: str = Field(min_length=1, description="/topic, or /topic.field.path; of a service, its event topic")
@@ -195,7 +195,7 @@ class Marker(SpecModel):
 
 
 class Segments(SpecModel):
-    """Where one bag holds several episodes: what parts them. Several conditions may be given together."""
+    """The conditions that divide one bag into several episodes; several may be given together."""
 
     gap_s: Number | None = Field(
         None, gt=0, description="a longer pause of the primary camera parts episodes"
@@ -211,7 +211,7 @@ class Segments(SpecModel):
 
 
 class SourceSpec(SpecModel):
-    """Where the recordings are and how they are laid out."""
+    """The place and the layout of the recordings."""
 
     format: Format
     uri: str | None = None

@@ -1,7 +1,7 @@
-"""An embodiment: one robot as one dataset recorded it, stated by one YAML of the registry.
+"""Read embodiments: one robot as one dataset recorded it, described by one YAML of the registry.
 
-The YAML drives everything else: which keys a converter reads, the stride, the width of stem
-and head, what is published under which name. Nothing is guessed; what is unknown says so.
+The YAML decides everything else: the keys a converter reads, the stride, the width of stem and head, and
+the name under which something is published. Nothing is guessed: a YAML says what is unknown.
 
 A action dims, K = stride * A values of an action chunk.
 """
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
 TODO = "TODO"
-# What decides the content of shards. target_hz and stride act later, when windows are drawn.
+# The fields that decide the content of shards. target_hz and stride act later, when windows are drawn.
 _DECIDES: Any = {
     "id": True,
     "kind": True,
@@ -113,15 +113,15 @@ class Embodiment(SpecModel):
 
     @property
     def action_dim(self) -> int:
-        """A, the width of one action."""
+        """Return A, the width of one action."""
         return self.action.dims
 
     @property
     def rate_hz(self) -> float:
-        """Rate of the grid in Hz.
+        """Return the rate of the grid in Hz.
 
         Raises:
-            RegistryError: nobody has stated it.
+            RegistryError: the YAML does not state it.
         """
         if self.sync.rate_hz:
             return self.sync.rate_hz
@@ -138,10 +138,10 @@ class Embodiment(SpecModel):
         )
 
     def with_rate(self, hz: float) -> "Embodiment":
-        """The same with its unknown rate filled in, as a shard set made so will state it.
+        """Return a copy whose unknown rate is `hz`; a shard set made with it states that rate.
 
         Raises:
-            RegistryError: the YAML states another rate, or `hz` is none.
+            RegistryError: the YAML states another rate, or `hz` is not a valid rate.
         """
         where = f"embodiment {self.id}: frequency_hz"
         if self.frequency_hz not in ("unknown", hz):
@@ -153,28 +153,28 @@ class Embodiment(SpecModel):
 
     @property
     def stride(self) -> int:
-        """Recorded steps a frame of the model's grid: max(1, round half up of rate / target)."""
+        """Return the recorded steps per frame of the model's grid: max(1, rate / target rounded half up)."""
         if self.stride_override:
             return self.stride_override
         return max(1, math.floor(self.rate_hz / self.target_hz + 0.5))
 
     @property
     def effective_hz(self) -> float:
-        """Rate of the model's frames."""
+        """Return the rate of the model's frames in Hz."""
         return self.rate_hz / self.stride
 
     @property
     def chunk_dim(self) -> int:
-        """K = stride * A, the width of an action chunk."""
+        """Return K = stride * A, the width of an action chunk."""
         return self.stride * self.action_dim
 
     @property
     def primary_camera(self) -> Camera:
-        """The camera whose frames are the grid."""
+        """Return the camera whose frames are the grid."""
         return self.camera(self.sync.primary or self.cameras[0].name)
 
     def camera(self, name: str) -> Camera:
-        """The camera of that name.
+        """Return the camera of that name.
 
         Raises:
             RegistryError: there is none.
@@ -187,14 +187,14 @@ class Embodiment(SpecModel):
 
     @property
     def normalize_mask(self) -> "NDArray[np.bool_]":
-        """(A,) bool, True where the model normalizes the value."""
+        """Return (A,) bool, True where the model normalizes the value."""
         import numpy as np
 
         return np.array([part.normalize for part in self.action.components for _ in range(part.dims)])
 
     @cached_property
     def digest(self) -> str:
-        """Sixteen hex digits over what decides the shards' content (not texts, nor the place of the data)."""
+        """Return sixteen hex digits over the fields that decide the shards' content (no texts, no URI)."""
         content = self.model_dump(mode="json", exclude_defaults=True, include=_DECIDES)
         hashed = json.dumps(content, sort_keys=True)
         return hashlib.sha256(hashed.encode()).hexdigest()[:16]
@@ -202,34 +202,35 @@ class Embodiment(SpecModel):
     # -- YAML
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values in the YAML's form, without what was left at its default."""
+        """Return plain values in the YAML's form, without those at their defaults."""
         return self.model_dump(mode="json", by_alias=True, exclude_defaults=True)
 
     def to_yaml(self) -> str:
-        """The YAML that gives this embodiment back."""
+        """Return YAML text from which the same embodiment can be loaded."""
         return write_yaml(self.to_dict())
 
     @classmethod
     def from_yaml(cls, text: str, where: str = "embodiment.yaml") -> "Embodiment":
-        """See `load`."""
+        """Return the embodiment of a YAML text; see `load`."""
         return cls.from_values(parse_yaml(text, where), where)
 
     @classmethod
     def load(cls, path: StrPath) -> "Embodiment":
-        """The embodiment of a YAML file.
+        """Return the embodiment of a YAML file.
 
         Args:
             path: str or path of the YAML.
 
         Raises:
-            RegistryError: all the file's problems, each with YAML path, value and what is allowed.
+            RegistryError: the file has problems; the error lists them all, each with YAML path, value and
+                what is allowed.
         """
         file = as_path(path)
         return cls.from_values(read_yaml(file), str(file))
 
     @classmethod
     def from_values(cls, values: Any, where: str) -> "Embodiment":
-        """See `load`."""
+        """Return the embodiment of a YAML's plain values; see `load`."""
         found = problems(values)
         if found:
             raise RegistryError(where, "; ".join(found), "hma registry schema prints what is allowed")
@@ -238,7 +239,7 @@ class Embodiment(SpecModel):
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong with a YAML: where in it, what, the value met, and what is allowed there."""
+    """One problem of a YAML: its path in the YAML, the fault, the value found, and what is allowed there."""
 
     path: str
     fault: str
@@ -253,12 +254,12 @@ class Problem:
 
 
 def problems(values: Any) -> list[str]:
-    """Everything wrong with the plain values of a YAML, one line each; empty when it is valid."""
+    """Return all problems of a YAML's plain values, one line each; empty when it is valid."""
     return [str(problem) for problem in find_problems(values)]
 
 
 def find_problems(values: Any) -> list[Problem]:
-    """Everything wrong with the plain values of a YAML."""
+    """Return all problems of a YAML's plain values."""
     if not isinstance(values, dict):
         return [Problem("", f"must be a mapping, is {type(values).__name__}")]
     questions = todos(values)
@@ -275,7 +276,7 @@ def find_problems(values: Any) -> list[Problem]:
 
 
 def todos(values: Any, path: str = "") -> list[tuple[str, str]]:
-    """Every value that still begins with TODO: (YAML path, the question)."""
+    """Return (YAML path, question) of every value that still begins with TODO."""
     if isinstance(values, dict):
         return [
             item
@@ -290,7 +291,7 @@ def todos(values: Any, path: str = "") -> list[tuple[str, str]]:
 
 
 def _yaml_path(location: tuple[int | str, ...], values: Any, missing: bool) -> str:
-    """The place as the YAML has it; pydantic also names the branch of a union, which is no key."""
+    """Return a location as a path in the YAML; pydantic also names branches of a union, which are no keys."""
     path, here = "", values
     for i, part in enumerate(location):
         if isinstance(here, dict) and (part in here or (missing and i == len(location) - 1)):
@@ -303,7 +304,7 @@ def _yaml_path(location: tuple[int | str, ...], values: Any, missing: bool) -> s
 
 
 def _follows_from_another(item: Any) -> bool:
-    """A list whose items are all wrong is also too short, says pydantic."""
+    """Check whether an error only follows from others: pydantic calls a list of wrong items too short."""
     return item["type"] == "too_short" and bool(item["input"])
 
 
@@ -348,7 +349,7 @@ _KEYS_AT: dict[str, type[SpecModel]] = {
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema of a registry YAML, for editors."""
+    """Return the JSON Schema of a registry YAML, for editors."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **Embodiment.model_json_schema(by_alias=True),
@@ -359,14 +360,14 @@ def schema() -> dict[str, Any]:
 
 
 def find(name_or_path: StrPath, beside: StrPath | None = None) -> Embodiment:
-    """The embodiment of that id, or of that YAML file.
+    """Return the embodiment of that id, or of that YAML file.
 
     Args:
         name_or_path: id, or str or path of a YAML.
         beside: str or path of a checkpoint whose embodiments are searched too.
 
     Raises:
-        RegistryError: there is none, with the nearest ids; or its YAML is not valid.
+        RegistryError: there is none (the error names the nearest ids), or its YAML is not valid.
     """
     name_or_path = as_text(name_or_path)
     if name_or_path.endswith((".yaml", ".yml")) or os.sep in name_or_path:

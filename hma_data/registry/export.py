@@ -1,8 +1,8 @@
-"""An embodiment in the words of other projects: GR00T's modality.json, LeRobotDataset's features.
+"""Export an embodiment to the formats of other projects: GR00T's modality.json, LeRobotDataset features.
 
-Of a LeRobot recording the export speaks of its own features and the places in them. Of any other it
-speaks of the LeRobotDataset that a conversion makes: one `action`, one `observation.state`, in the
-order of our components, and `observation.images.<camera>`.
+For a LeRobot recording, the export names the recording's own features and the places in them. For any
+other recording, it names the features of the LeRobotDataset that a conversion makes: one `action` and one
+`observation.state`, in the order of the components, and `observation.images.<camera>`.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ from hma_data.registry.components import Component, Vector
 from hma_data.registry.embodiment import Embodiment
 
 DELTA_SPACES = ("eef_delta", "joint_delta")
-PICTURE = (256, 256)  # of a camera whose recorded size is not stated: what a shard decodes to
+PICTURE = (256, 256)  # where a camera's recorded size is not stated: the size to which a shard decodes
 _ROTATIONS = {
     "euler_xyz": "euler_angles_rpy",
     "quaternion_xyzw": "quaternion",
@@ -23,7 +23,7 @@ _ROTATIONS = {
 
 
 def modality(embodiment: Embodiment) -> dict[str, Any]:
-    """The content of GR00T's meta/modality.json.
+    """Return the content of GR00T's meta/modality.json.
 
     Returns:
         `state` and `action`: name -> start and end in the feature `original_key`, with rotation_type,
@@ -70,7 +70,7 @@ def _places(vector: Vector | None, feature: str, own: bool, delta: bool) -> dict
 
 
 def component_names(vector: Vector) -> list[str]:
-    """A short name for each component: what it moves where the YAML tells, else the end of its key."""
+    """Return a short name for each component: what it moves, if the YAML states it, or the end of its key."""
     plain = [_component_name(part) for part in vector.components]
     return [
         name if plain.count(name) == 1 else f"{name}_{plain[: i + 1].count(name)}"
@@ -91,7 +91,7 @@ def _component_name(part: Component) -> str:
 
 
 def lerobot_features(embodiment: Embodiment) -> dict[str, dict[str, Any]]:
-    """The `features` of a LeRobotDataset (v2.1 and v3.0) that holds this embodiment's episodes.
+    """Return the `features` of a LeRobotDataset (v2.1 and v3.0) that holds this embodiment's episodes.
 
     Returns:
         feature -> dtype, shape and names, as `LeRobotDataset.create(features=…)` takes it.

@@ -1,8 +1,8 @@
-"""Statistics of action and state vectors: float64, mergeable, in one pass.
+"""Compute statistics of action and state vectors in one pass, in float64; results can be merged.
 
-Count, mean, M2, minimum and maximum merge exactly (Chan, Golub and LeVeque 1979); quantiles come
-from a deterministic compactor sketch (the KLL family) that merges too: with k = 256 kept values a level its
-rank error is at most log2(n / 256) / 512 of n, and in practice a tenth of that.
+Count, mean, M2, minimum and maximum merge exactly (Chan, Golub and LeVeque 1979). Quantiles come from a
+deterministic compactor sketch (the KLL family), which can be merged too. With k = 256 kept values a level,
+its rank error is at most log2(n / 256) / 512 of n, and in practice a tenth of that.
 
 N rows, A values a row.
 """
@@ -22,24 +22,24 @@ LEVEL = 256
 
 @dataclass
 class QuantileSketch:
-    """Sorted samples by level: a value of level i stands for 2**i rows.
+    """Samples by level: a value of level i stands for 2**i rows.
 
     Attributes:
         levels: level -> (m, A) float32.
-        odd: level -> which of a pair the next compaction keeps; alternating keeps the error unbiased.
+        odd: level -> which of a pair the next compaction keeps; it alternates to keep the error unbiased.
     """
 
     levels: list[NDArray[np.float32]] = field(default_factory=list)
     odd: list[int] = field(default_factory=list)
 
     def add(self, values: NDArray[Any]) -> None:
-        """Take in (N, A) rows."""
+        """Add rows (N, A)."""
         for start in range(0, len(values), 4 * LEVEL):
             self._extend(0, values[start : start + 4 * LEVEL].astype(np.float32))
             self._compact()
 
     def merge(self, other: "QuantileSketch") -> None:
-        """Take in another sketch."""
+        """Add another sketch."""
         for level, values in enumerate(other.levels):
             self._extend(level, values)
         self._compact()
@@ -63,7 +63,7 @@ class QuantileSketch:
             level += 1
 
     def quantile(self, q: float) -> Array:
-        """(A,) the value below which a fraction q of the rows lies."""
+        """Return (A,) the value below which a fraction q of the rows lies."""
         values = np.concatenate(self.levels)
         weights = np.concatenate([np.full(len(v), 2.0**level) for level, v in enumerate(self.levels)])
         order = np.argsort(values, axis=0, kind="stable")
@@ -74,7 +74,7 @@ class QuantileSketch:
         return np.take_along_axis(values, np.take_along_axis(order, index[None], 0), 0)[0].astype(np.float64)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; the samples little-endian float32, zlib, base64."""
+        """Return plain values; the samples are little-endian float32, compressed by zlib, in base64."""
         width = self.levels[0].shape[1] if self.levels else 0
         packed = b"".join(np.ascontiguousarray(v, "<f4").tobytes() for v in self.levels)
         return {
@@ -86,13 +86,13 @@ class QuantileSketch:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "QuantileSketch":
-        """The sketch that `to_json` wrote."""
+        """Return the sketch that `to_json` wrote."""
         size = 4 * sum(values["rows"]) * values["width"]
         try:
             packed = zlib.decompressobj().decompress(base64.b64decode(values["values"]), size + 1)
         except zlib.error as fault:
             raise ValueError(f"a sketch cannot be unpacked: {fault}") from fault
-        if len(packed) != size:  # more is not unpacked, however much it is
+        if len(packed) != size:  # no more than size + 1 bytes are ever unpacked
             raise ValueError(f"a sketch of {values['rows']} rows holds other than {size} bytes")
         flat = np.frombuffer(packed, "<f4")
         parts = np.split(flat, np.cumsum([n * values["width"] for n in values["rows"]])[:-1])
@@ -120,12 +120,12 @@ class Stats:
 
     @classmethod
     def empty(cls, width: int) -> "Stats":
-        """Of no rows."""
+        """Return the statistics of no rows."""
         return cls(0, np.zeros(width), np.zeros(width), np.full(width, np.inf), np.full(width, -np.inf))
 
     @classmethod
     def of(cls, values: NDArray[Any]) -> "Stats":
-        """Of (N, A) rows."""
+        """Return the statistics of rows (N, A)."""
         rows = np.asarray(values, np.float64)
         if not len(rows):
             return cls.empty(rows.shape[1])
@@ -137,7 +137,7 @@ class Stats:
         return cls(len(rows), rows[0] + offset, spread, rows.min(axis=0), rows.max(axis=0), sketch)
 
     def merge(self, other: "Stats") -> "Stats":
-        """Of both together; this one is changed and returned."""
+        """Add other statistics to these, in place, and return these."""
         if not other.count:
             return self
         total = self.count + other.count
@@ -152,17 +152,17 @@ class Stats:
 
     @property
     def std(self) -> Array:
-        """(A,) population standard deviation."""
+        """Return (A,) the population standard deviation."""
         return np.sqrt(self.m2 / max(self.count, 1))
 
     def quantile(self, q: float) -> Array:
-        """(A,) see QuantileSketch."""
+        """Return (A,) the value below which a fraction q of the rows lies; see QuantileSketch."""
         return (
             np.clip(self.sketch.quantile(q), self.min, self.max) if self.count else np.zeros_like(self.mean)
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, complete: `from_json` gives the same object back."""
+        """Return plain values from which `from_json` makes the same object."""
         numbers = {name: getattr(self, name).tolist() for name in ("mean", "m2")}
         return {"count": self.count, **numbers, **self._range(), "sketch": self.sketch.to_json()}
 
@@ -173,14 +173,14 @@ class Stats:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Stats":
-        """The statistics that `to_json` wrote."""
+        """Return the statistics that `to_json` wrote."""
         if not values["count"]:
             return cls.empty(len(values["mean"]))
         numbers = {name: np.array(values[name], np.float64) for name in ("mean", "m2", "min", "max")}
         return cls(values["count"], **numbers, sketch=QuantileSketch.from_json(values["sketch"]))
 
     def summary(self) -> dict[str, Any]:
-        """What people and models read: mean, std, min, max, quantiles; all (A,) lists."""
+        """Return what people and models read: count; mean, std, min, max and quantiles as (A,) lists."""
         return {
             "count": self.count,
             "mean": self.mean.tolist(),

@@ -1,12 +1,12 @@
-"""Windows over a shard set, found by arithmetic: no list of windows, no scan of the shards.
+"""Find the windows of a shard set by arithmetic, without a list of windows or a scan of the shards.
 
 A window is T frames `stride` apart with their T action chunks, so it spans T·stride recorded
 rows of one episode and never leaves it. Rows of a split are numbered through all its shards;
-windows are numbered in row order. Memory is per episode and row group, not per window.
+windows are numbered in row order. The index takes memory per episode and row group, not per window.
 
-A shorter episode is dropped, or padded: it gives one window from its first row, whose missing frames
-repeat its last row and are masked. Attention is causal in time, so what follows the last frame changes
-no prediction before it.
+An episode shorter than a window is dropped or padded. A padded episode gives one window from its first row;
+the missing frames repeat its last row and are masked. Attention is causal in time, so frames after the last
+real frame change no prediction before them.
 """
 
 from dataclasses import dataclass
@@ -25,15 +25,15 @@ Short = Literal["drop", "pad"]
 
 @dataclass(frozen=True)
 class WindowIndex:
-    """Every window of one split.
+    """An index of the windows of one split.
 
     Attributes:
         frames: T.
         row_stride: rows from one frame to the next.
         span: rows a window covers, T · row_stride.
-        count: windows.
-        short_episodes: episodes too short for a window; they are left out, and counted here.
-        padded_episodes: short episodes that give one window all the same.
+        count: number of windows.
+        short_episodes: number of episodes left out because they are too short.
+        padded_episodes: number of short episodes that are padded and give one window.
         unit_first: (G+1,) number of windows before each row group; row group g starts windows
             unit_first[g] to unit_first[g+1].
         edges: (G+1,) first row of each row group.
@@ -50,9 +50,9 @@ class WindowIndex:
     edges: Ints
     groups: Ints
     _starts: Ints  # (N,) first row of each episode that has windows
-    _lengths: Ints  # (N,) its rows
-    _cameras: NDArray[np.int16]  # (N,) which camera saw it
-    _before: Ints  # (N+1,) windows before each
+    _lengths: Ints  # (N,) rows of each episode
+    _cameras: NDArray[np.int16]  # (N,) index of each episode's camera
+    _before: Ints  # (N+1,) number of windows before each episode
 
     @classmethod
     def of(
@@ -63,12 +63,13 @@ class WindowIndex:
         row_stride: int | None = None,
         short: Short = "drop",
     ) -> "WindowIndex":
-        """The windows of a split.
+        """Return the index of a split.
 
         Args:
             frames: T.
             row_stride: rows between frames; None takes the embodiment's.
-            short: what becomes of episodes shorter than a window; one of a single frame is always dropped.
+            short: "drop" or "pad" for episodes shorter than a window; an episode of a single frame is always
+                dropped.
 
         Raises:
             ShardError: episodes.parquet names rows that the shards do not have.
@@ -104,7 +105,7 @@ class WindowIndex:
         return index
 
     def _windows_before(self, rows: Ints) -> Ints:
-        """How many windows start before each row."""
+        """Return how many windows start before each row."""
         if not len(self._starts):
             return np.zeros(len(rows), np.int64)
         at = np.searchsorted(self._starts, rows, side="right") - 1
@@ -115,25 +116,25 @@ class WindowIndex:
         return np.searchsorted(self._before, windows, side="right") - 1
 
     def first_rows(self, windows: Ints) -> Ints:
-        """First row of each window."""
+        """Return the first row of each window."""
         at = self._episodes(windows)
         return self._starts[at] + (windows - self._before[at])
 
     def last_rows(self, windows: Ints) -> Ints:
-        """Last row of each window's episode; beyond it the window is padded."""
+        """Return the last row of each window's episode; beyond it the window is padded."""
         at = self._episodes(windows)
         return self._starts[at] + self._lengths[at] - 1
 
     def cameras(self, windows: Ints) -> Ints:
-        """Which of the set's cameras saw each window."""
+        """Return the index of each window's camera among those of the set."""
         return self._cameras[self._episodes(windows)].astype(np.int64)
 
     def units(self) -> Ints:
-        """Row groups in which at least one window starts."""
+        """Return the row groups in which at least one window starts."""
         return np.flatnonzero(np.diff(self.unit_first) > 0)
 
     def reach(self, group: int) -> int:
-        """Last row group needed for the windows that start in `group`: its own unless an episode goes on."""
+        """Return the last row group that windows from `group` need: `group` unless an episode goes on."""
         after = self.unit_first[group + 1]
         if after == self.unit_first[group]:
             return group
@@ -142,13 +143,13 @@ class WindowIndex:
         return int(np.searchsorted(self.edges, row, side="right")) - 1
 
     def episode_starts(self, group: int) -> Ints:
-        """Rows of a row group, counted from its first, at which an episode with windows begins."""
+        """Return the rows of a row group, counted from its first, at which an episode with windows begins."""
         first, after = np.searchsorted(self._starts, self.edges[group : group + 2])
         return self._starts[first:after] - self.edges[group]
 
 
 def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
-    """First rows (G+1,) and places (G, 2) of all row groups of a split."""
+    """Return the first rows (G+1,) and the places (G, 2) of all row groups of a split."""
     sizes = np.array([rows for groups in per_shard for rows in groups], np.int64)
     edges = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     counts = np.array([len(groups) for groups in per_shard], np.int64)
@@ -158,7 +159,7 @@ def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
 
 
 def _first_rows(shards: ShardSet, split: str, episodes: EpisodeIndex) -> Ints:
-    """First row of each episode, counted through all shards of the split."""
+    """Return the first row of each episode, counted through all shards of the split."""
     sizes = np.array([sum(groups) for groups in shards.row_groups(split)], np.int64)
     if not len(episodes.shard):
         return np.zeros(0, np.int64)

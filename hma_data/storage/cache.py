@@ -1,7 +1,8 @@
-"""Whole shards of remote sets, kept on this machine by their sha256, so that later epochs are local.
+"""Keep whole shards of remote sets on this machine, by their sha256, so that later epochs read them locally.
 
-They lie in `$HMA_CACHE/shards` and take `$HMA_CACHE_GB` at most (default 20; 0 keeps none). Those not
-used for longest make room, but none of the last hour: a set that does not fit is read by ranges.
+They are files of `$HMA_CACHE/shards` and take at most `$HMA_CACHE_GB` gigabytes (default 20; 0 keeps none).
+The shards unused for longest are deleted to make room, but none that was used in the last hour. A shard that
+does not fit is read by ranges.
 """
 
 import fcntl
@@ -19,11 +20,11 @@ from hma_data.storage.remote import AHEAD, RangeFile, RemotePath
 
 LIMIT, DEFAULT_GB = "HMA_CACHE_GB", 20.0
 IN_USE_S = 3600.0
-SPARE, SPARE_BYTES = 0.1, 5 * 10**9  # a tenth of the disk is left free, of a large one so much
+SPARE, SPARE_BYTES = 0.1, 5 * 10**9  # free space to leave: a tenth of the disk, but at most 5 GB
 
 
 def limit_bytes() -> int:
-    """How much may be kept.
+    """Return how many bytes of shards may be kept.
 
     Raises:
         UsageError: $HMA_CACHE_GB is not a number of gigabytes.
@@ -39,7 +40,9 @@ def limit_bytes() -> int:
 
 
 def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
-    """A shard's copy on this machine, downloaded where there is none; None where it would not fit.
+    """Return a shard's copy on this machine; download it if there is none.
+
+    The result is None where the copy does not fit or the cache cannot be written.
 
     Args:
         sha256, size: as its manifest states.
@@ -60,12 +63,12 @@ def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
             if not _make_room(folder, size):
                 return None
             return _download(path, sha256, size, final)
-    except OSError:  # a cache that cannot be written is none
+    except OSError:  # the cache cannot be written
         return None
 
 
 def _is_there(final: Path, size: int) -> bool:
-    """Whether it is kept; if so it counts as used now."""
+    """Check whether a shard is kept; if so, mark it as used now."""
     with suppress(OSError):
         if final.stat().st_size == size:
             os.utime(final)
@@ -92,7 +95,7 @@ def _download(path: RemotePath, sha256: str, size: int, final: Path) -> Path:
 
 
 def _make_room(folder: Path, size: int) -> bool:
-    """Delete what was not used for longest until `size` more bytes fit; False where that does not do."""
+    """Delete the shards unused for longest until `size` more bytes fit; return False if they cannot."""
     found = []
     for path in folder.iterdir():
         with suppress(OSError):
@@ -118,7 +121,7 @@ def _usable_bytes(folder: Path) -> int:
 
 @contextmanager
 def _one_at_a_time(lock: Path) -> Iterator[None]:
-    """Of several processes that want one shard, one downloads it."""
+    """Let only one of several processes that want a shard download it."""
     with lock.open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
         try:

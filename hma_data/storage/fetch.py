@@ -1,7 +1,7 @@
-"""Bytes of files wherever fsspec finds them: a range at a time, tried again when the network stumbles.
+"""Read bytes of files wherever fsspec finds them: by ranges, again when the network fails.
 
-A file system raises what it likes; here that becomes one SourceError that names the file. What may
-pass by itself (a lost connection, a server that is busy) is tried again, what will not is not.
+File systems raise many kinds of exceptions; this module turns them into one SourceError that names the
+file. Faults that may pass by themselves (a lost connection, a busy server) are tried again; others are not.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import fsspec
 from hma_data.errors import HMAError, MissingDependencyError, SourceError, StorageAwayError
 from hma_data.storage.retry import ABSENT, address_hint, may_pass, retried, said
 
-CONNECT_S = 3.0  # seconds until a server that does not answer is given up on
+CONNECT_S = 3.0  # seconds to wait for a server to answer
 WAITS_S = (0.2, 0.6, 1.8)  # before the second, third and fourth try
 PACKAGES = {
     "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",
@@ -25,7 +25,7 @@ NO_LISTING = ("http", "https")
 def file_system(uri: str) -> tuple[Any, str]:
     """Return the fsspec file system of a URI, and the path on it.
 
-    Its driver soon gives up on an address where nobody answers, and leaves the further tries to us.
+    Its driver soon gives up on an address where nobody answers; `attempt` makes the further tries.
 
     Raises:
         MissingDependencyError: the file system's package is not installed.
@@ -53,32 +53,33 @@ def _client_options(scheme: str) -> dict[str, Any]:
 
 
 def protocol(files: Any) -> str:
-    """The first name of a file system: file, memory, s3, gs, https."""
+    """Return the first name of a file system: file, memory, s3, gs, https."""
     name: str = files.protocol if isinstance(files.protocol, str) else files.protocol[0]
     return name
 
 
 def is_local(files: Any) -> bool:
-    """Whether its paths are this machine's."""
+    """Check whether a file system's paths are on this machine."""
     return "file" in files.protocol
 
 
 def is_listless(files: Any) -> bool:
-    """Whether its folders cannot be listed."""
+    """Check whether a file system's folders cannot be listed."""
     return protocol(files) in NO_LISTING
 
 
 def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
-    """What `action` returns, tried again when a remote file system fails in a way that may pass.
+    """Return what `action` returns; try again when a remote file system fails in a way that may pass.
 
     Raises:
         SourceError: it fails for good.
+        StorageAwayError: it fails in a way that may pass, at every try.
     """
     try:
         return retried(action, path, () if is_local(files) else WAITS_S)
     except HMAError:
         raise
-    except Exception as fault:  # file systems raise what they like
+    except Exception as fault:  # file systems raise exceptions of any kind
         text = f"cannot be read: {said(fault)}"
         if may_pass(fault):
             remedy = "the network failed again and again; run it again later, it continues where it was"
@@ -87,10 +88,10 @@ def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
 
 
 def info(files: Any, path: str) -> dict[str, Any]:
-    """What the file system says of a file; at least `size`.
+    """Return what the file system says of a file; at least `size`.
 
     Raises:
-        SourceError: nothing is there, or it cannot be told how long it is.
+        SourceError: nothing is there, or its length is unknown.
     """
     found: dict[str, Any] = attempt(files, path, lambda: files.info(path))
     if found.get("size") is None:
@@ -101,12 +102,12 @@ def info(files: Any, path: str) -> dict[str, Any]:
 
 
 def mark(found: dict[str, Any]) -> str:
-    """Changes when a file does, by what `info` found."""
+    """Return a text that changes when the file does, made from what `info` found."""
     return " ".join(f"{key}={found[key]}" for key in ("size", *MARKS) if found.get(key) is not None)
 
 
 def fetch(files: Any, path: str, start: int, end: int) -> bytes:
-    """The bytes from `start` up to `end`; fewer where the file ends before.
+    """Return the bytes from `start` up to `end`; fewer where the file ends before.
 
     Raises:
         SourceError: they cannot be read, or the server answers with something else.
@@ -122,7 +123,7 @@ def fetch(files: Any, path: str, start: int, end: int) -> bytes:
 
 
 def fetch_whole(files: Any, path: str, limit: int) -> bytes | None:
-    """All bytes of a small file; None when there is none.
+    """Return all bytes of a small file; None when there is no such file.
 
     Raises:
         SourceError: it cannot be read, or is longer than `limit` bytes.

@@ -1,4 +1,7 @@
-"""Files that are whole or absent: written beside, flushed, renamed; for a store, written here, then put."""
+"""Write files so that they are whole or absent: write beside the final name, flush, rename.
+
+Files of a store are written on this machine and then uploaded.
+"""
 
 import hashlib
 import os
@@ -10,14 +13,14 @@ from pathlib import Path
 from hma_data.errors import OutputError
 from hma_data.storage.remote import RemotePath, put_bytes, put_file
 
-PART = ".part"  # ends the name of whatever is not finished
+PART = ".part"  # ends the name of every unfinished file
 
 
 @contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
-    """A path beside `final` to write to; it becomes `final` when the block ends without an error.
+    """Give a path beside `final` to write to; it becomes `final` when the block ends without an error.
 
-    For a file of a store it is a path of this machine, and uploaded when the block ends.
+    For a file of a store, the path is on this machine, and the file is uploaded when the block ends.
 
     Raises:
         OutputError: the folder cannot be written, or the disk is full.
@@ -68,7 +71,7 @@ def upload_folder(folder: RemotePath) -> Path:
 
 
 def write_atomic(final: Path, content: str | bytes) -> None:
-    """A whole small file; see `atomic_path`."""
+    """Write a small file, whole or not at all; see `atomic_path`."""
     if isinstance(final, RemotePath):
         put_bytes(content.encode() if isinstance(content, str) else content, final)
         return
@@ -86,7 +89,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def cache_folder() -> Path:
-    """Where what can be made again is kept: $HMA_CACHE, or `hma` in the user's cache folder."""
+    """Return the folder for files that can be made again: $HMA_CACHE, or `hma` in the user's cache folder."""
     stated = os.environ.get("HMA_CACHE")
     if stated:
         return Path(stated)
@@ -95,13 +98,13 @@ def cache_folder() -> Path:
 
 
 def file_sha256(path: Path) -> str:
-    """Hex digest of a file's bytes."""
+    """Return the SHA-256 hex digest of a file's bytes."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def remove_parts(folder: Path) -> None:
-    """Delete what a killed run left unfinished in a folder and the folders right below it."""
+    """Delete the unfinished files of a killed run in a folder and in the folders directly below it."""
     if isinstance(folder, RemotePath):
         for place in (folder, folder / "train", folder / "val"):
             for part in upload_folder(place).glob(f".*{PART}"):  # another job may be writing the same set
@@ -112,7 +115,7 @@ def remove_parts(folder: Path) -> None:
 
 
 def is_running(pid: int) -> bool:
-    """Check whether this machine has a process of that number."""
+    """Check whether this machine has a process with that number."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):

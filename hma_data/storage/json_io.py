@@ -1,4 +1,4 @@
-"""JSON as we accept it in files that strangers may have written: no key is given twice."""
+"""Parse JSON of files that strangers may have written; refuse an object that gives a key twice."""
 
 import json
 from collections import Counter
@@ -6,10 +6,10 @@ from typing import Any
 
 
 def parse_json(content: bytes | str) -> Any:
-    """The plain values of a JSON text.
+    """Return the plain values of a JSON text.
 
-    Readers differ in which of two values of one key they take, so that a text with both means one thing here
-    and another elsewhere.
+    A key may not be given twice: readers differ in which of the two values they take, so the same text would
+    mean one thing here and another elsewhere.
 
     Raises:
         ValueError: it is not JSON, or an object gives a key twice.

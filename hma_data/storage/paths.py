@@ -1,8 +1,8 @@
 """Take paths as callers give them: text, a `Path` or any other path object.
 
-A public function takes `StrPath` and turns it, once, into what it works with: `as_text` where a URI or a
-name may be meant, `as_path` for a file or folder of this machine, `as_address` for a hub.
-`hma_data.storage.remote.place` does the same where the path may be of a store.
+A public function takes a `StrPath` and converts it once: with `as_text` where it may be a URI or a name,
+with `as_path` for a file or folder of this machine, with `as_address` for a hub, and with
+`hma_data.storage.remote.place` where it may be a path of a store.
 """
 
 import os
@@ -18,11 +18,11 @@ _CUT = re.compile(r"([a-z][a-z0-9+.-]+):/+(?=.)")
 def as_text(path: StrPath) -> str:
     """Return a path or URI as text.
 
-    `Path("s3://bucket/set")` is `s3:/bucket/set`: a URI in a path object gets back the slashes it lost.
+    `Path("s3://bucket/set")` is `s3:/bucket/set`; a URI that lost slashes in a path object gets them back.
 
     Raises:
-        UsageError: it is bytes.
-        TypeError: it is no path.
+        UsageError: the path is bytes.
+        TypeError: the value is no path.
     """
     if isinstance(path, str):
         return path
@@ -33,7 +33,10 @@ def as_text(path: StrPath) -> str:
 
 
 def as_path(path: StrPath) -> Path:
-    """Return a file or folder of this machine as a `Path`; a `Path` stays as it is. Errors as `as_text`."""
+    """Return a file or folder of this machine as a `Path`; raise the errors of `as_text`.
+
+    A `Path` is returned unchanged.
+    """
     return path if isinstance(path, Path) else Path(as_text(path))
 
 
@@ -41,7 +44,7 @@ def as_address(path: StrPath) -> str | Path:
     """Return the address of a hub: text and URIs as text, any other path object as a `Path`.
 
     Only text can name a repository: `org/name` may be one, `Path("org/name")` is always a folder.
-    Errors as `as_text`.
+    The errors are those of `as_text`.
     """
     text = as_text(path)
     return text if isinstance(path, str) or "://" in text else Path(text)

@@ -1,8 +1,8 @@
-"""Folders and files of object stores, used like paths: `s3://bucket/set`, `gs://`, `hf://`, `memory://`.
+"""Use folders and files of object stores like paths: `s3://bucket/set`, `gs://`, `hf://`, `memory://`.
 
-`place` makes a path of what a user wrote. A `RemotePath` can be joined, listed, read by ranges and
-deleted; whole files get there by `put_file` and `put_bytes`. A store raises what it likes: what may
-pass by itself is tried again, the rest becomes FileNotFoundError, or one StorageError that names the URI.
+`place` makes a path of what a user wrote. A `RemotePath` can be joined, listed, read by ranges and deleted;
+`put_file` and `put_bytes` upload whole files. Stores raise many kinds of exceptions. A fault that may pass by
+itself is tried again; any other becomes FileNotFoundError, or a StorageError that names the URI.
 """
 
 import errno
@@ -23,20 +23,20 @@ from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.retry import ABSENT, address_hint, may_pass, retried, said
 
 WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
-TAIL, AHEAD = 256 << 10, 8 << 20  # bytes: read at once from the end of a file; ahead of who reads on
+TAIL, AHEAD = 256 << 10, 8 << 20  # bytes read at once: at the end of a file; ahead of a sequential reader
 WHOLE_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "memory"}  # an object appears whole or not at all
 _SCHEME = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.DOTALL)
 
 
 def place(where: StrPath) -> Path:
-    """The path a user named: of this machine, or a RemotePath where it begins with a store's scheme.
+    """Return the path a user named: a RemotePath where it begins with a store's scheme, else a local path.
 
     Args:
-        where: str or path; also what became of a URI in `Path("s3://bucket/set")`, `s3:/bucket/set`.
+        where: str or path; also `s3:/bucket/set`, which is what `Path("s3://bucket/set")` makes of a URI.
 
     Raises:
-        StorageError: no store is known by that scheme, or it names nothing in it.
-        MissingDependencyError: its package is not installed.
+        StorageError: no store is known by that scheme, or the URI names no bucket or repository.
+        MissingDependencyError: the package of the store is not installed.
     """
     if isinstance(where, RemotePath):
         return where
@@ -49,24 +49,24 @@ def place(where: StrPath) -> Path:
     if found[1] in ("file", "local"):
         return Path("/" + found[2])
     path = RemotePath(text)
-    _ = path.files  # whether there is a driver
+    _ = path.files  # raises where there is no driver
     return path
 
 
 def is_remote(path: Path) -> bool:
-    """Whether a path is in a store rather than on this machine."""
+    """Check whether a path is in a store rather than on this machine."""
     return isinstance(path, RemotePath)
 
 
 def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
-    """What `action` returns, tried again where the store failed in a way that may pass.
+    """Return what `action` returns; try again where the store fails in a way that may pass.
 
     Args:
         doing: for the error, such as "written".
 
     Raises:
         FileNotFoundError: there is no such file.
-        StorageAwayError: it failed in such a way every time.
+        StorageAwayError: it failed in such a way at every try.
         StorageError: it fails for good.
     """
     try:
@@ -75,7 +75,7 @@ def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
         raise
     except ABSENT as fault:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(where)) from fault
-    except Exception as fault:  # stores raise what they like
+    except Exception as fault:  # stores raise exceptions of any kind
         text = f"cannot be {doing}: {said(fault)}"
         if may_pass(fault):
             remedy = address_hint(fault) + "everything finished is kept: run the same command again"
@@ -92,10 +92,10 @@ def _remedy(fault: BaseException) -> str:
 
 
 class RemotePath(PosixPath):
-    """A file or folder of a store. What a path of this machine can and this cannot raises an error."""
+    """A file or folder of a store; operations that only a path of this machine supports raise an error."""
 
     def with_segments(self, *segments: Any) -> Any:
-        """A path of the same kind; one that is relative to a remote path is of no machine."""
+        """Return a RemotePath, or a PurePosixPath where the result is relative to a remote path."""
         pure = PurePosixPath(*segments)
         return RemotePath(pure) if pure.parts and pure.parts[0] == self.parts[0] else pure
 
@@ -113,31 +113,31 @@ class RemotePath(PosixPath):
 
     @property
     def scheme(self) -> str:
-        """s3, gs, hf, memory, …"""
+        """Return the scheme: s3, gs, hf, memory, …"""
         return self.parts[0].removesuffix(":")
 
     @property
     def files(self) -> Any:
-        """The store's file system; fsspec keeps one for each process.
+        """Return the store's file system; fsspec keeps one for each process.
 
         Raises:
             StorageError: no store is known by that scheme.
-            MissingDependencyError: its package is not installed.
+            MissingDependencyError: the package of the store is not installed.
         """
         return _files(str(self))
 
     @property
     def key(self) -> str:
-        """The path as the store's file system names it."""
+        """Return the path as the store's file system names it."""
         return str(self.files._strip_protocol(str(self)))
 
     # -- what is there
 
     def info(self) -> dict[str, Any]:
-        """What the store says of a file or folder: type, size and more.
+        """Return what the store says of a file or folder: type, size and more.
 
         Raises:
-            FileNotFoundError: there is nothing.
+            FileNotFoundError: there is neither a file nor a folder.
         """
 
         def ask() -> dict[str, Any]:
@@ -147,7 +147,7 @@ class RemotePath(PosixPath):
         return attempt(self, "read", ask)
 
     def listing(self) -> dict[str, int]:
-        """Name below this folder -> bytes, of every file, by name; empty where there is none."""
+        """Return name below this folder -> bytes of every file, sorted by name; empty where there is none."""
 
         def ask() -> dict[str, Any]:
             self.files.invalidate_cache()
@@ -181,13 +181,16 @@ class RemotePath(PosixPath):
             return False
 
     def stat(self, **_: Any) -> os.stat_result:
-        """Size and kind; a store tells no more in common."""
+        """Return size and kind; stores have no more facts in common."""
         found = self.info()
         mode = stat.S_IFREG if found["type"] == "file" else stat.S_IFDIR
         return os.stat_result((mode | 0o644, 0, 0, 0, 0, 0, int(found["size"] or 0), 0, 0, 0))
 
     def iterdir(self) -> Generator["RemotePath"]:
-        """What is right below; nothing where there is nothing, as stores keep no empty folders."""
+        """Yield the files and folders directly below.
+
+        A folder that does not exist yields nothing, because stores keep no empty folders.
+        """
 
         def ask() -> list[str]:
             self.files.invalidate_cache()
@@ -203,7 +206,7 @@ class RemotePath(PosixPath):
                 yield self / last
 
     def glob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
-        """Files below whose path matches, part by part; folders are not told."""
+        """Yield the files below whose path matches the pattern, part by part; folders are not listed."""
         wanted = pattern.split("/")
         for name in self.listing():
             parts = name.split("/")
@@ -211,7 +214,7 @@ class RemotePath(PosixPath):
                 yield self / name
 
     def rglob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
-        """Files anywhere below whose name matches."""
+        """Yield the files at any depth below whose name matches."""
         for name in self.listing():
             if fnmatchcase(name.rsplit("/", 1)[-1], pattern):
                 yield self / name
@@ -225,7 +228,7 @@ class RemotePath(PosixPath):
     # -- reading and deleting
 
     def open(self, mode: str = "r", *_: Any, **options: Any) -> Any:
-        """The file, to read."""
+        """Open the file to read it; any other mode raises StorageError."""
         if mode not in ("r", "rb", "rt"):
             raise StorageError(self, f"cannot be opened for {mode!r}", "files of a store are put as a whole")
         data = io.BufferedReader(RangeFile(self), 1 << 20)
@@ -254,10 +257,10 @@ class RemotePath(PosixPath):
                 raise
 
     def mkdir(self, *_: Any, **__: Any) -> None:
-        """Nothing: folders are there when something is in them."""
+        """Do nothing: a folder of a store exists when a file is in it."""
 
     def delete_tree(self, keep: Callable[[str], bool] = lambda name: False) -> None:
-        """Delete every file below, but those whose name below this folder is to be kept."""
+        """Delete every file below, except where `keep` returns True for its name below this folder."""
         for name in self.listing():
             if not keep(name):
                 (self / name).unlink(missing_ok=True)
@@ -275,7 +278,7 @@ def _files(uri: str) -> Any:
 
 
 def put_file(local: Path, to: RemotePath) -> None:
-    """Upload a file; it appears under its name when it is whole.
+    """Upload a file; it appears under its name only when it is whole.
 
     Raises:
         StorageError: the store refuses it; StorageAwayError: it does not answer.
@@ -290,9 +293,9 @@ def put_bytes(content: bytes, to: RemotePath) -> None:
 
 
 def create_bytes(content: bytes, to: RemotePath) -> bool:
-    """Upload a small file if there is none of that name, as one step; False where there is one.
+    """Upload a small file unless there is one of that name, in one step; return False where there is one.
 
-    A store that knows no such condition is written to as by `put_bytes`.
+    A store that does not support this condition is written as by `put_bytes`.
 
     Raises:
         StorageError: the store refuses it; StorageAwayError: it does not answer.
@@ -305,7 +308,7 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
     def once() -> bool:
         try:
             files.pipe_file(to.key, content, mode="create")
-        except Exception:  # each driver says in its own way that there is one
+        except Exception:  # each driver has its own error for an existing file
             files.invalidate_cache()
             if files.exists(to.key):
                 return False
@@ -316,7 +319,7 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
         return attempt(to, "written", once)
     except StorageAwayError:
         raise
-    except (FileNotFoundError, StorageError):  # refused: the condition, or any writing
+    except (FileNotFoundError, StorageError):  # the store refused the condition, or refuses any write
         put_bytes(content, to)
         return True
 
@@ -345,7 +348,10 @@ def _put(to: RemotePath, upload: Callable[[str], Any], size: int) -> None:
 
 
 class RangeFile(io.RawIOBase):
-    """A remote file as a seekable one: its end at once, the rest as asked for, ahead of who reads on."""
+    """A remote file that can be read at any position.
+
+    The end of the file is read at once and the rest on request; a sequential reader is read ahead of.
+    """
 
     def __init__(self, path: RemotePath, size: int | None = None) -> None:
         self._path, self._at, self._last = path, 0, -1
@@ -363,7 +369,7 @@ class RangeFile(io.RawIOBase):
         return self._at
 
     def size(self) -> int:
-        """Bytes in all."""
+        """Return the bytes of the whole file."""
         return self._size
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
@@ -377,7 +383,7 @@ class RangeFile(io.RawIOBase):
         return len(data)
 
     def read(self, size: int | None = -1) -> bytes:
-        """Exactly `size` bytes where there are so many."""
+        """Return exactly `size` bytes, or fewer at the end of the file."""
         return bytes(self._bytes(self._size if size is None or size < 0 else size))
 
     def _bytes(self, count: int) -> memoryview:
@@ -405,12 +411,12 @@ class RangeFile(io.RawIOBase):
 
 
 def parquet_input(path: Path) -> Any:
-    """What pyarrow reads a parquet file from: the path, or a file of ranges."""
+    """Return what pyarrow can read a parquet file from: the local path, or a RangeFile."""
     return RangeFile(path) if isinstance(path, RemotePath) else path
 
 
 def parquet_file(path: Path, **options: Any) -> Any:
-    """A pyarrow ParquetFile wherever it is; of a remote one, a row group's bytes come in few requests."""
+    """Open a local or remote pyarrow ParquetFile; a remote row group is read in few requests."""
     import pyarrow.parquet as pq
 
     remote = is_remote(path)

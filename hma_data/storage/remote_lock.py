@@ -1,9 +1,9 @@
-"""A lock in an object store: an object that says who holds it, and is written again while they live.
+"""Lock a place in an object store by an object that names the holder.
 
-Stores have no locks of their own. The holder writes its name every half minute; one not heard of for
-three minutes, by the store's own clock, is gone, and so is one whose process has ended on this machine.
-Of two that come at once, the store lets one write where it can (S3, GCS); in any case the one whose name
-is read back after a short wait has it.
+Stores have no locks of their own. The holder writes its name again every half minute. A holder counts as gone
+when its object is older than three minutes by the store's own clock, or when its process on this machine has
+ended. Where two jobs come at once, a store that can (S3, GCS) lets only one of them write; in any case, the
+job whose name is read back after a short wait holds the lock.
 """
 
 import json
@@ -24,20 +24,20 @@ from hma_data.storage.files import is_running
 from hma_data.storage.remote import RemotePath, create_bytes, put_bytes
 
 REFRESH_S, STALE_S, SETTLE_S = 30.0, 180.0, 2.0
-PROBE = ".lock-clock-"  # begins the names of objects that only tell the store's time
+PROBE = ".lock-clock-"  # begins the names of objects that only show the store's time
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a lock.
+    """The holder of a lock.
 
     Attributes:
-        job: an id of its own for each time a lock is taken.
-        host, pid: where it runs.
-        machine: tells machines (and containers) of one name apart.
-        since, time: Unix seconds, when it was taken and last written.
+        job: an id, new each time a lock is taken.
+        host, pid: the machine and the process.
+        machine: distinguishes machines (and containers) of one name.
+        since, time: when the lock was taken and when it was last written, in Unix seconds.
     """
 
     job: str
@@ -49,7 +49,7 @@ class Holder:
 
     @classmethod
     def me(cls) -> "Holder":
-        """This process, now."""
+        """Return a holder for this process, with the time now."""
         now = time.time()
         return cls(uuid.uuid4().hex, platform.node(), os.getpid(), _machine(), now, now)
 
@@ -59,7 +59,7 @@ class Holder:
 
 
 class RemoteLock:
-    """Context manager: takes the lock, keeps it, gives it back.
+    """A context manager that takes the lock, renews it, and releases it.
 
     Raises:
         OutputError: another job holds it.
@@ -77,7 +77,7 @@ class RemoteLock:
         held = living_holder(self._path)
         if held:
             raise held_by(self._path, held, self._what)
-        if not create_bytes(self._content(), self._path):  # one came in between, or a dead one's is left
+        if not create_bytes(self._content(), self._path):  # another job came first, or a dead job's is left
             held = living_holder(self._path)
             if held and held.job != self._me.job:
                 raise held_by(self._path, held, self._what)
@@ -95,8 +95,8 @@ class RemoteLock:
     ) -> None:
         self._ended.set()
         self._thread.join()
-        with suppress(Exception):  # what was done stays done; the lock is forgotten by itself
-            if isinstance(fault, StorageAwayError):  # one try: it was waited for long enough
+        with suppress(Exception):  # the work is done; the lock expires by itself
+            if isinstance(fault, StorageAwayError):  # one try only: the store has been waited for long enough
                 if not self._taken and time.monotonic() - self._written < STALE_S:
                     self._path.files.rm_file(self._path.key)
                 return
@@ -122,18 +122,18 @@ class RemoteLock:
         while not self._ended.wait(REFRESH_S) and not self._taken:
             try:
                 self._renew()
-            except (HMAError, OSError) as fault:  # the next turn may do better; `check` looks at the time
+            except (HMAError, OSError) as fault:  # the next turn may succeed
                 log.info("%s: not refreshed: %s", self._path, fault)
 
 
 def held_by(path: RemotePath, holder: Holder, what: str = "it") -> OutputError:
-    """The error of a lock that another job holds."""
+    """Return the error for a lock that another job holds."""
     remedy = f"wait for it, or choose another --out; a killed job is forgotten after {STALE_S / 60:g} min"
     return OutputError(path.parent, f"another job is writing {what}: {holder}", remedy)
 
 
 def living_holder(path: RemotePath) -> Holder | None:
-    """Who holds a lock; None when there is none, or its holder is gone."""
+    """Return the holder of a lock; None where there is no lock, or its holder is gone."""
     holder = _read(path)
     if holder is None:
         return None
@@ -157,7 +157,7 @@ def _read(path: RemotePath) -> Holder | None:
 
 
 def _age(path: RemotePath, holder: Holder) -> float | None:
-    """Seconds since a lock was written, by the store's clock where it tells; None when it is gone."""
+    """Return the seconds since a lock was written, by the store's clock if it has one; None if it is gone."""
     probe = path.with_name(f"{PROBE}{uuid.uuid4().hex}")
     try:
         put_bytes(b"", probe)
@@ -165,14 +165,14 @@ def _age(path: RemotePath, holder: Holder) -> float | None:
         return float((now - then).total_seconds())
     except FileNotFoundError:
         return None
-    except (NotImplementedError, TypeError, AttributeError, KeyError):  # a store that tells no times
+    except (NotImplementedError, TypeError, AttributeError, KeyError):  # a store without times
         return time.time() - holder.time
     finally:
         probe.unlink(missing_ok=True)
 
 
 def _machine() -> str:
-    """The same for processes that can see one another, as far as that can be told."""
+    """Return a text that is equal for processes that can see one another; empty where that is unknown."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot} {Path('/proc/self/ns/pid').readlink()}"

@@ -1,4 +1,4 @@
-"""Faults of storage that may go away: told apart from faults of the data, and waited for."""
+"""Recognise faults of storage that may pass, and try again; faults of the data are not tried again."""
 
 import errno
 import logging
@@ -62,7 +62,7 @@ def retried[T](action: Callable[[], T], where: object, waits_s: Sequence[float])
             return action()
         except HMAError:
             raise
-        except Exception as fault:  # file systems raise what they like
+        except Exception as fault:  # file systems raise exceptions of any kind
             if not may_pass(fault):
                 raise
             log.info("%s: %s; trying again", where, said(fault))
@@ -82,14 +82,14 @@ def may_pass(fault: BaseException) -> bool:
 
 
 def address_hint(fault: BaseException) -> str:
-    """Return the begin of a remedy where a server's address may be wrong, else nothing."""
+    """Return the first part of a remedy where a server's address may be wrong; else an empty text."""
     if _kinds(fault) & _UNREACHABLE:
         return "check the network, and the address (AWS_ENDPOINT_URL for s3); "
     return ""
 
 
 def said(fault: BaseException) -> str:
-    """Return an exception in one line."""
+    """Return an exception as one line of text."""
     text = " ".join(str(fault).split())
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
@@ -109,7 +109,7 @@ def _status(fault: BaseException) -> int:
 
 
 def causes(fault: BaseException | None) -> Iterator[BaseException]:
-    """A fault and what it was raised from, all the way."""
+    """Yield a fault, the fault it was raised from, and so on to the first."""
     seen: set[int] = set()
     while fault is not None and id(fault) not in seen:
         seen.add(id(fault))
@@ -118,7 +118,7 @@ def causes(fault: BaseException | None) -> Iterator[BaseException]:
 
 
 def storage_is_away(fault: BaseException) -> bool:
-    """Whether storage did not answer, which says nothing about the episode that was being read."""
+    """Check whether storage did not answer; such a fault is not the episode's."""
     return any(
         isinstance(item, ConnectionError | TimeoutError | StorageAwayError)
         or (isinstance(item, OSError) and item.errno in _ANSWERS_LATER)
@@ -127,12 +127,12 @@ def storage_is_away(fault: BaseException) -> bool:
 
 
 def worth_another_try(fault: BaseException) -> bool:
-    """Whether reading the same again may succeed: storage did not answer, or the disk failed to read."""
+    """Check whether reading again may succeed: storage did not answer, or the disk failed to read."""
     return storage_is_away(fault) or any(
         isinstance(item, OSError) and item.errno in _OF_THE_DISK for item in causes(fault)
     )
 
 
 def disk_is_full(fault: BaseException) -> bool:
-    """Whether it is for want of space, here rather than in the recording."""
+    """Check whether a disk of this machine has no space; such a fault is not the recording's."""
     return any(isinstance(item, OSError) and item.errno in _FULL for item in causes(fault))

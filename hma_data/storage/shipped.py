@@ -1,4 +1,4 @@
-"""Where the files that come with the package are: registry, recipes.
+"""Find the files that come with the package: registry, recipes.
 
 In a checkout they lie at its top level; in a wheel they are inside `hma_data/shipped/`.
 """
@@ -9,6 +9,6 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped(name: str) -> Path:
-    """The folder `registry` or `recipes` that this installation brought along."""
+    """Return the folder `registry` or `recipes` of this installation."""
     packed = _PACKAGE / "shipped" / name
     return packed if packed.is_dir() else _PACKAGE.parent / name

@@ -1,8 +1,8 @@
-"""YAML as we accept it: plain values only, no surprises.
+"""Read and write YAML of plain values only.
 
-No tags, no anchors, aliases or merges (nothing that can grow), no duplicate keys, no tabs, at most
-1 MB. Every refusal names the file and the line. libyaml scans where PyYAML was built with it (seven
-times as fast); what is accepted is decided here either way.
+Tags, anchors, aliases, merges, duplicate keys, tabs and files of more than 1 MB are refused. A refusal names
+the file and, for a fault in the text, the line. libyaml scans the text where PyYAML was built with it (seven
+times as fast); the rules for what is accepted are the same either way.
 """
 
 import os
@@ -15,7 +15,7 @@ import yaml
 from hma_data.errors import HMAError, RegistryError
 
 try:
-    from yaml._yaml import CParser as _Events  # its own composer would build aliases: only events are used
+    from yaml._yaml import CParser as _Events  # only its events: its own composer would build aliases
 except ImportError:  # a PyYAML without libyaml
     from yaml.loader import SafeLoader as _Events  # type: ignore[assignment]
 
@@ -24,7 +24,7 @@ MAX_DEPTH = 32
 
 
 class _PlainLoader(yaml.composer.Composer, _Events, yaml.constructor.SafeConstructor, yaml.resolver.Resolver):
-    """Builds plain values; refuses aliases, tags, duplicate keys and deep nesting."""
+    """A loader that builds plain values and refuses aliases, tags, duplicate keys and deep nesting."""
 
     depth = 0
 
@@ -66,10 +66,10 @@ def _refused(fault: str, at: Any) -> yaml.MarkedYAMLError:
 
 
 def parse_yaml(text: str, where: str, error: type[HMAError] = RegistryError) -> Any:
-    """The plain values of a YAML text.
+    """Return the plain values of a YAML text.
 
     Raises:
-        error: the text is not YAML as we accept it; the message carries line and column.
+        error: the text is not YAML that this module accepts; the message states line and column.
     """
     try:
         loader = _PlainLoader(text)
@@ -87,15 +87,15 @@ def parse_yaml(text: str, where: str, error: type[HMAError] = RegistryError) -> 
 
 
 def read_yaml(path: Path, error: type[HMAError] = RegistryError) -> Any:
-    """The plain values of a YAML file; see `parse_yaml`."""
+    """Return the plain values of a YAML file; see `parse_yaml`."""
     return parse_yaml(decode_yaml(read_bytes(path, error), path, error), str(path), error)
 
 
 def read_bytes(path: Path, error: type[HMAError] = RegistryError) -> bytes:
-    """The bytes of a YAML file.
+    """Return the bytes of a YAML file.
 
     Raises:
-        error: there is none, it is no regular file, or it is larger than a YAML of ours can be.
+        error: there is none, it is no regular file, or it is larger than MAX_BYTES.
     """
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in the folder must not block
@@ -115,7 +115,7 @@ def read_bytes(path: Path, error: type[HMAError] = RegistryError) -> bytes:
 
 
 def decode_yaml(content: bytes, path: Path, error: type[HMAError] = RegistryError) -> str:
-    """The text of a YAML file.
+    """Return the text of a YAML file.
 
     Raises:
         error: it is not UTF-8.
@@ -127,5 +127,5 @@ def decode_yaml(content: bytes, path: Path, error: type[HMAError] = RegistryErro
 
 
 def write_yaml(values: Any) -> str:
-    """Plain values as YAML in the order given."""
+    """Return plain values as YAML in the order given."""
     return yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=100)
