@@ -163,7 +163,7 @@ def registry_validate(
 
 
 def _line(problem: dict[str, str | None]) -> str:
-    """Return a problem as text, as hma_data.registry.embodiment.Problem does, without importing that module."""
+    """Return a problem as text, as `Problem` of the registry does, without importing it."""
     text = f"{problem['path']}: {problem['fault']}" if problem["path"] else str(problem["fault"])
     if problem["value"] is not None:
         text += f" (is {problem['value']})"

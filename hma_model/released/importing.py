@@ -40,7 +40,7 @@ def import_released(
     embodiments: Iterable[str] | None = None,
     grid: tuple[int, int] | None = None,
     tokenizer: str | None = None,
-    origin: str | Path | None = None,
+    origin: StrPath | None = None,
 ) -> Checkpoint:
     """Convert a released checkpoint of this machine to our layout.
 

@@ -250,7 +250,7 @@ def test_a_full_disk_is_one_error_and_what_was_made_is_kept(
 COMMAND = """
 import os, signal, sys, time
 from pathlib import Path
-from hma_data import shard_work
+from hma_data.conversion import worker as shard_work
 from hma_data.conversion.job import convert
 from hma_data.registry.embodiment import Embodiment
 from hma_data.conversion.engines.base import Limits

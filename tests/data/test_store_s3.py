@@ -324,7 +324,7 @@ def test_a_shard_cut_short_is_an_error_and_no_hang(toy_arm, toy_recording, out, 
 COMMAND = f"""
 import sys, time
 from pathlib import Path
-from hma_data import shard_work
+from hma_data.conversion import worker as shard_work
 import hma_data.conversion.job
 from hma_data.registry.embodiment import Embodiment
 from hma_data.conversion.plan import Settings
