@@ -1,9 +1,9 @@
 """Bound the time that threads of a matrix product spin while they wait for one another.
 
 GCC's OpenMP, which torch brings, lets a thread that has done its share spin in a loop before it sleeps.
-Sleeping at once (OMP_WAIT_POLICY=PASSIVE) costs one wake-up per product, which slows small products. Spinning long
-takes the core from the thread that is waited for, where other processes use the machine too. So the loop is
-short. `hma bench waiting` compares the choices; figures are in docs/results.md.
+Sleeping at once (OMP_WAIT_POLICY=PASSIVE) costs one wake-up per product, which slows small products.
+Spinning long takes the core from the thread that is waited for, where other processes use the machine too. So
+the loop is short. `hma bench waiting` compares the choices; figures are in docs/results.md.
 """
 
 import os

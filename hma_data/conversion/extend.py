@@ -41,8 +41,8 @@ def extended(
         plan: of the recordings as they are now, made as for an empty folder.
         shard_frames: frames a shard, about.
         content: returns the hash of an episode as it is recorded now; see
-            `hma_data.conversion.episode_hash`. It is called where the fingerprint differs, for example because
-            a file has grown.
+            `hma_data.conversion.episode_hash`. It is called where the fingerprint differs, as when a
+            file has grown.
 
     Returns:
         a plan whose units are the new shards alone; where there are none, its facts are those of `base`.

@@ -75,7 +75,7 @@ def import_released(
         out,
         embodiment_yaml={name: _yaml(domain, spaces[name]) for domain, name in names.items()},
         stats={name: _stats(space) for name, space in spaces.items()},
-        cards={name: _card(domain, origin or address) for domain, name in names.items()},
+        cards={name: _card(domain, as_address(origin or source)) for domain, name in names.items()},
         tokenizer=config.tokenizer,
     )
 
