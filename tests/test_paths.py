@@ -51,7 +51,7 @@ from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import Checkpoint, resolve, training_checkpoints
 from hma_model.demo.run import demo
 from hma_model.evaluation.evaluate import evaluate, unconditional_baseline, windows
-from hma_model.evaluation.rollout_video import Film, write_film
+from hma_model.evaluation.rollout_video import RolloutVideo, write_video
 from hma_model.hub import datasets as hub_data
 from hma_model.hub import listing as hub_list
 from hma_model.hub import publish as hub
@@ -262,7 +262,7 @@ def recorded(made: Made, given: Given, out: Path) -> Any:
 
 
 def drawn(made: Made, given: Given, out: Path) -> Any:
-    write_film(given(out / "film.webp"), Film(np.zeros((2, 16, 16, 3), np.uint8), 5.0, 1))
+    write_video(given(out / "film.webp"), RolloutVideo(np.zeros((2, 16, 16, 3), np.uint8), 5.0, 1))
     return content(out)
 
 

@@ -181,10 +181,10 @@ def generate(
     """
     from hma_data.shards.preview import tokenizer_of
     from hma_data.shards.reader import ShardSet
-    from hma_model.evaluation.rollout_video import rollout_film, write_film
+    from hma_model.evaluation.rollout_video import rollout_video, write_video
 
     shards = ShardSet(data)
-    film = rollout_film(
+    film = rollout_video(
         _model(checkpoint, shards.embodiment.id),
         tokenizer_of(shards),
         shards,
@@ -197,7 +197,7 @@ def generate(
         temperature=temperature,
         seed=seed,
     )
-    write_film(out, film)
+    write_video(out, film)
     print(
         f"wrote {out}: {len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
     )

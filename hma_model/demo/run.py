@@ -35,7 +35,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_data.threads import usable_cores
 
 if TYPE_CHECKING:
-    from hma_model.evaluation.rollout_video import Film
+    from hma_model.evaluation.rollout_video import RolloutVideo
 
 ROBOTS = ("pusht_fast", "pusht_slow")
 TOKENIZER = "fsq-8"
@@ -70,7 +70,7 @@ class Demo:
     published: Path | None = None
     pulled: dict[str, Path] = field(default_factory=dict)
     figures: dict[str, dict[str, Any]] = field(default_factory=dict)
-    films: dict[str, "Film"] = field(default_factory=dict)
+    films: dict[str, "RolloutVideo"] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     sizes: dict[str, int] = field(default_factory=dict)
 
@@ -281,10 +281,10 @@ def write_results(made: Demo) -> None:
     write_atomic(made.out / RESULTS, json.dumps(results, indent=1))
 
 
-def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "Film"]:
+def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:
     from hma_data.shards.preview import tokenizer_of
     from hma_model.evaluation.evaluate import default_prompt, evaluate
-    from hma_model.evaluation.rollout_video import rollout_film
+    from hma_model.evaluation.rollout_video import rollout_video
     from hma_model.network.model import HMA
 
     shards = made.sets[robot]
@@ -294,7 +294,7 @@ def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "Film"]:
     lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
     prompt = max(2, default_prompt(model.config.frames))
     frames = min(LONGEST, max(lengths) // shards.row_stride) - prompt
-    return found, rollout_film(model, tokenizer, shards, frames=frames, prompt=prompt)
+    return found, rollout_video(model, tokenizer, shards, frames=frames, prompt=prompt)
 
 
 def _refuse_foreign(out: Path) -> None:

@@ -23,7 +23,7 @@ SMALLEST = 192  # minimum width in pixels at which a picture is shown
 
 
 @dataclass(frozen=True)
-class Film:
+class RolloutVideo:
     """Frames (T, H, W, 3) uint8 at `fps`; the first `prompt` of them are true frames, not predictions."""
 
     frames: NDArray[np.uint8]
@@ -31,7 +31,7 @@ class Film:
     prompt: int
 
 
-def rollout_film(
+def rollout_video(
     model: "HMA",
     tokenizer: "Tokenizer",
     shards: ShardSet,
@@ -44,7 +44,7 @@ def rollout_film(
     temperature: float = 0.0,
     sample_steps: int | None = None,
     seed: int = 0,
-) -> Film:
+) -> RolloutVideo:
     """Roll out from one window of a shard set, with its own actions and with those of another window.
 
     Args:
@@ -84,7 +84,7 @@ def rollout_film(
         "true actions": with_actions(true.predicted[0], own, low, high),
         "other actions": with_actions(changed.predicted[0], foreign, low, high),
     }
-    return Film(_side_by_side(panels, prompt), shards.embodiment.effective_hz, prompt)
+    return RolloutVideo(_side_by_side(panels, prompt), shards.embodiment.effective_hz, prompt)
 
 
 def _side_by_side(panels: dict[str, NDArray[np.uint8]], prompt: int) -> NDArray[np.uint8]:
@@ -101,7 +101,7 @@ def _side_by_side(panels: dict[str, NDArray[np.uint8]], prompt: int) -> NDArray[
     return film
 
 
-def write_film(path: StrPath, film: Film) -> None:
+def write_video(path: StrPath, film: RolloutVideo) -> None:
     """Write an .mp4 or an animated .webp to a str or path, atomically.
 
     Raises:

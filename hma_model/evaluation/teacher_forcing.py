@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hma_model.evaluation.metrics import token_hits, token_nats
-from hma_model.network.conditioning import Groups, Slots, align, condition
+from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
 from hma_model.network.trunk import Clock, rotary_angles
 
 if TYPE_CHECKING:
@@ -55,8 +55,8 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     assert batch.tokens is not None
     config, frames = model.config, batch.tokens.flatten(2)
     count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
-    slots = align(config, batch.actions, batch.action_mask, count)
-    both = Slots(*(torch.cat([x, x[:, 1:]], dim=1) for x in (slots.chunks, slots.known)))
+    given = align(config, batch.actions, batch.action_mask, count)
+    both = ActionConditioning(*(torch.cat([x, x[:, 1:]], dim=1) for x in (given.chunks, given.known)))
     clock = _clock(config, count, frames.device)
     masked = torch.full_like(frames[:, 1:], config.vocab_size)
     x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)))

@@ -18,7 +18,7 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.generation.cache import Cache
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame
-from hma_model.network.conditioning import Groups, Slots, condition
+from hma_model.network.conditioning import ActionConditioning, Groups, condition
 from hma_model.network.embed import patchify, unpatchify
 from hma_model.network.masking import masked_after
 from hma_model.network.model import HMA
@@ -84,7 +84,7 @@ class Rollout:
             values = patchify(frames.float() * self.config.latent_scale, self.config.patch)
         count = frames.shape[1]
         self.frames = self.groups.sort(values.to(self.model.device))
-        self.slots = self._slots_of(actions, count)
+        self.given = self._condition_on(actions, count)
         self.passive = actions is None
         self.begun, self.cache = False, None
         self._keep(self.config.frames)
@@ -161,31 +161,31 @@ class Rollout:
 
     def _condition(self, frames: int) -> Conditioning:
         """Return the conditioning of the last frames, the new one included; it is the same in every pass."""
-        start = self.slots.known.shape[1] - frames
-        slots = Slots(self.slots.chunks[:, start:], self.slots.known[:, start:])
+        start = self.given.known.shape[1] - frames
+        given = ActionConditioning(self.given.chunks[:, start:], self.given.known[:, start:])
         positions = torch.arange(self.time + 1 - frames, self.time + 1, device=self.model.device)
-        return condition(self.model, None if self._skips() else slots, self.sorted, positions)
+        return condition(self.model, None if self._skips() else given, self.sorted, positions)
 
     def _skips(self) -> bool:
         return self.passive and self.config.absent_action != "embedding"
 
-    def _slots_of(self, actions: Tensor | None, frames: int) -> Slots:
+    def _condition_on(self, actions: Tensor | None, frames: int) -> ActionConditioning:
         """Return the chunk at each known frame; with `current` alignment `step` adds the last chunk."""
         shape, device = (self.batch, frames), self.model.device
-        slots = Slots(
+        given = ActionConditioning(
             torch.zeros(*shape, self.width, device=device),
             torch.zeros(shape, dtype=torch.bool, device=device),
         )
         if actions is None or frames == 1:
-            return slots
+            return given
         if actions.shape[1] < frames - 1 or actions.shape[2] < self.width:
             fault = f"actions of shape {tuple(actions.shape)} for a prompt of {frames} frames"
             raise HMAError("prompt", fault, f"give (batch, {frames - 1} or more, {self.width})")
         late = int(self.config.action_alignment == "previous")
         place = slice(late, frames - 1 + late)
-        slots.chunks[:, place] = self.groups.sort(actions.to(device))[:, : frames - 1, : self.width].float()
-        slots.known[:, place] = True
-        return slots
+        given.chunks[:, place] = self.groups.sort(actions.to(device))[:, : frames - 1, : self.width].float()
+        given.known[:, place] = True
+        return given
 
     def _take(self, chunk: Tensor | None, following: Tensor | None) -> None:
         """Store the chunk at the frame that it conditions, and add a slot for the new frame."""
@@ -193,15 +193,16 @@ class Rollout:
             raise HMAError("step", "actions came or went during a rollout", "give them always or never")
         self.passive = self.passive and chunk is None
         self.begun = True
-        new = self._slots_of(None, 1)
+        new = self._condition_on(None, 1)
         if chunk is not None:
             values = self._chunk(chunk)
             if self.config.action_alignment == "current":
-                self.slots.chunks[:, -1], self.slots.known[:, -1] = values, True
+                self.given.chunks[:, -1], self.given.known[:, -1] = values, True
                 values = values if following is None else self._chunk(following)
             new.chunks[:, 0], new.known[:, 0] = values, True
-        self.slots = Slots(
-            torch.cat([self.slots.chunks, new.chunks], 1), torch.cat([self.slots.known, new.known], 1)
+        self.given = ActionConditioning(
+            torch.cat([self.given.chunks, new.chunks], 1),
+            torch.cat([self.given.known, new.known], 1),
         )
 
     def _chunk(self, chunk: Tensor) -> Tensor:
@@ -226,10 +227,12 @@ class Rollout:
                 self.cache.clear()
 
     def _keep(self, frames: int, ahead: int = 0) -> None:
-        """Drop all but the last frames, and all slots but theirs and the `ahead` slots after them."""
+        """Drop all but the last frames, and all chunks but theirs and the `ahead` chunks after them."""
         self.frames = self.frames[:, max(self.frames.shape[1] - frames, 0) :]
-        start = max(self.slots.known.shape[1] - frames - ahead, 0)
-        self.slots = Slots(self.slots.chunks[:, start:].clone(), self.slots.known[:, start:].clone())
+        start = max(self.given.known.shape[1] - frames - ahead, 0)
+        self.given = ActionConditioning(
+            self.given.chunks[:, start:].clone(), self.given.known[:, start:].clone()
+        )
 
     # -- in and out ---------------------------------------------------------------------------------------
 

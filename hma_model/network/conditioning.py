@@ -71,7 +71,7 @@ class Groups:
 
 
 @dataclass
-class Slots:
+class ActionConditioning:
     """The chunk in force at each frame.
 
     Attributes:
@@ -83,7 +83,7 @@ class Slots:
     known: Tensor
 
 
-def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int) -> Slots:
+def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int) -> ActionConditioning:
     """Assign chunks (B, >= T-1, K), of which some are known (B, >= T-1), to the frames they condition."""
     late = config.action_alignment == "previous"
     if actions.shape[1] < frames - late:
@@ -92,39 +92,43 @@ def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int)
     if known is None:
         known = torch.ones(actions.shape[:2], dtype=torch.bool, device=actions.device)
     if not late:
-        return Slots(actions[:, :frames], known[:, :frames])
-    return Slots(F.pad(actions[:, : frames - 1], (0, 0, 1, 0)), F.pad(known[:, : frames - 1], (1, 0)))
+        return ActionConditioning(actions[:, :frames], known[:, :frames])
+    return ActionConditioning(
+        F.pad(actions[:, : frames - 1], (0, 0, 1, 0)), F.pad(known[:, : frames - 1], (1, 0))
+    )
 
 
-def unknown(model: "HMA", groups: Groups, frames: int) -> Slots:
-    """Return slots without any known chunk, which condition on the absence of actions."""
+def unknown(model: "HMA", groups: Groups, frames: int) -> ActionConditioning:
+    """Return a conditioning without any known chunk: on the absence of actions."""
     batch = sum(size for _, size in groups.parts)
     widest = max(model.stem(name).input.in_features for name, _ in groups.parts)
     shape = (batch, frames)
-    return Slots(
+    return ActionConditioning(
         torch.zeros(*shape, widest, device=model.device),
         torch.zeros(shape, dtype=torch.bool, device=model.device),
     )
 
 
-def condition(model: "HMA", slots: Slots | None, groups: Groups, positions: Tensor) -> Conditioning:
+def condition(
+    model: "HMA", given: ActionConditioning | None, groups: Groups, positions: Tensor
+) -> Conditioning:
     """Return the trunk's conditioning for the samples, in the order of `groups`.
 
     Args:
         model: the model, whose stems and modulation are used once per embodiment.
-        slots: in the batch's order; None for no actions at all.
+        given: in the batch's order; None for no actions at all.
         groups: the batch's embodiments.
         positions: (T,) int64, the times of the frames.
     """
     config, absent = model.config, rows_at(model.trunk.absent, positions)
-    if slots is None and config.absent_action == "skip":
+    if given is None and config.absent_action == "skip":
         return Conditioning()
-    if slots is None and config.absent_action == "tokens":
+    if given is None and config.absent_action == "tokens":
         batch = sum(size for _, size in groups.parts)
         return Conditioning(tokens=absent.expand(batch, len(positions), -1))
-    if slots is None:
-        slots = unknown(model, groups, len(positions))
-    chunks, known = groups.sort(slots.chunks), groups.sort(slots.known).unsqueeze(-1)
+    if given is None:
+        given = unknown(model, groups, len(positions))
+    chunks, known = groups.sort(given.chunks), groups.sort(given.known).unsqueeze(-1)
     shown = torch.ones_like(known) if config.absent_action == "tokens" else known
     embeddings, modulations, outs = [], [], []
     for name, span in groups.spans():

@@ -267,10 +267,10 @@ class HMA(nn.Module):
         """
         groups, count = Groups.of(embodiment, len(frames)), frames.shape[1]
         clock = self.clock(count)
-        slots = None if self.config.absent_action == "tokens" else unknown(self, groups, count)
+        given = None if self.config.absent_action == "tokens" else unknown(self, groups, count)
         if actions is not None:
-            slots = align(self.config, actions, action_mask, count)
-        conditioning = condition(self, slots, groups, clock.positions)
+            given = align(self.config, actions, action_mask, count)
+        conditioning = condition(self, given, groups, clock.positions)
         if frames.is_floating_point():
             patches = patchify(frames.float() * self.config.latent_scale, self.config.patch)
             x = self.embed_patches(groups.sort(patches), torch.zeros_like(patches[..., :1], dtype=torch.bool))
@@ -290,8 +290,8 @@ class HMA(nn.Module):
     ) -> Conditioning:
         if actions is None:
             return condition(self, None, groups, clock.positions)
-        slots = align(self.config, actions, known, len(clock.positions))
-        return condition(self, slots, groups, clock.positions)
+        given = align(self.config, actions, known, len(clock.positions))
+        return condition(self, given, groups, clock.positions)
 
     def _predict(
         self, pooled: Tensor, embodiment: str, readout: str, generator: torch.Generator | None

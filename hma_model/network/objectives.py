@@ -79,10 +79,10 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     elif objective == "inverse":  # no frame follows the last chunk, so it stays
         dropped[:, :-1] = drop_chunks(batch.action_mask[:, :-1], generator)
 
-    slots = None
+    given = None
     if objective != "passive":
-        slots = align(config, batch.actions, batch.action_mask & ~dropped, count)
-    conditioning = condition(model, slots, groups, clock.positions)
+        given = align(config, batch.actions, batch.action_mask & ~dropped, count)
+    conditioning = condition(model, given, groups, clock.positions)
     x = _embed(model, seen, video, groups, generator)
     features = model.trunk(x, conditioning, clock)
 

@@ -59,7 +59,7 @@ def _workers_alive() -> Iterator[None]:
         ) from fault
 
 
-class Feed:
+class TrainData:
     """The batches of this rank.
 
     Args:

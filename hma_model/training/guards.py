@@ -24,7 +24,7 @@ SETTLED = 20  # steps before a norm can be a spike
 
 
 @dataclass
-class Pulse:
+class GradientSpikeDetector:
     """The running mean of gradient norms.
 
     Attributes:

@@ -145,21 +145,21 @@ def _loop(
         stopped = _agreed(run.world, stop)
         last = run.step == recipe.steps
         if (last or _due(run.step, recipe.eval_every)) and run.held_out:
-            log.evaluation({**run.evaluate(), "mixture": run.feed.realised()})
+            log.evaluation({**run.evaluate(), "mixture": run.train_data.realised()})
             log.pictures(run.out, run.step)
             if complaint := run.complaint():
                 log.note(complaint)
         if last or stopped or _due(run.step, recipe.checkpoint_every):
             log.sync()
             run.save()
-    if run.world.main and any(row["samples"] for row in run.feed.realised()):
+    if run.world.main and any(row["samples"] for row in run.train_data.realised()):
         log.note(f"drawn: {_shares(run)}")
     if stopped:
         log.note(f"stopped by a signal and saved at step {run.step}; the same command goes on")
 
 
 def _shares(run: Run) -> str:
-    rows = sorted(run.feed.realised(), key=lambda row: -row["intended"])
+    rows = sorted(run.train_data.realised(), key=lambda row: -row["intended"])
     return ", ".join(f"{r['embodiment']} {r['realised']:.1%} ({r['intended']:.1%} intended)" for r in rows)
 
 

@@ -173,7 +173,7 @@ class _DDP(nn.parallel.DistributedDataParallel):
         del group
 
 
-class Spread:
+class ParallelModel:
     """A network that is distributed over the ranks of a run.
 
     Args:

@@ -50,7 +50,7 @@ class State:
         step: number of finished steps.
         recipe: `Recipe.identity` of the run.
         data: embodiment id -> digest of its shards.
-        sampler: `Feed.state`.
+        sampler: `TrainData.state`.
         skipped: number of steps skipped because of a bad loss or gradient.
         seconds: time spent in steps so far.
         evaluation: the figures of the last evaluation.
@@ -143,7 +143,7 @@ def require_version(path: Path) -> None:
 
 
 @dataclass(frozen=True)
-class Kept:
+class OptimizerState:
     """The content of a checkpoint for a run, read completely before the model changes.
 
     Attributes:
@@ -187,7 +187,7 @@ def _prefixes(embodiments: Iterable[str]) -> tuple[str, ...]:
     return tuple(f"{part}.{module_key(name)}." for name in embodiments for part in ("stems", "heads"))
 
 
-def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) -> Kept:
+def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) -> OptimizerState:
     """Read the content of a checkpoint for a run; embodiments that the checkpoint lacks are left out.
 
     Raises:
@@ -199,7 +199,7 @@ def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) 
         shown[name] = tuple(read_tensors(checkpoint.path(name, part)) for part in (STEM, HEAD))
     weights = _own_file(checkpoint, WEIGHTS) if WEIGHTS in _files(checkpoint) else {}
     moments = _own_file(checkpoint, OPTIMIZER)
-    return Kept(state, shown, weights, moments)
+    return OptimizerState(state, shown, weights, moments)
 
 
 def _files(checkpoint: Checkpoint) -> dict[str, str]:

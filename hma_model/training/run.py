@@ -25,15 +25,15 @@ from hma_model.config import ActionSpace, HMAConfig
 from hma_model.evaluation.evaluate import Means, digit_frequencies, unconditional_baseline, windows
 from hma_model.evaluation.sample_images import newest_pictures, sample_pictures
 from hma_model.network.model import HMA
-from hma_model.training.data import Feed
+from hma_model.training.data import TrainData
 from hma_model.training.ema import Average
-from hma_model.training.guards import Pulse, culprits, listed, suspects
+from hma_model.training.guards import GradientSpikeDetector, culprits, listed, suspects
 from hma_model.training.init_from import Start
 from hma_model.training.optim import load_optimizer_state, lr_scale, make_optimizer, optimizer_state, set_lr
-from hma_model.training.parallel import Spread, World, gathered
+from hma_model.training.parallel import ParallelModel, World, gathered
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
-    Kept,
+    OptimizerState,
     OtherVersionError,
     State,
     data_digests,
@@ -46,7 +46,7 @@ from hma_model.training.resume import (
 )
 from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require_memory
 from hma_model.training.scheduled_sampling import forwarded, share_at
-from hma_model.training.step_metrics import Tally, peak_memory_mib
+from hma_model.training.step_metrics import StepMetrics, peak_memory_mib
 from hma_model.training.validation import main_objective, validate
 
 
@@ -76,7 +76,7 @@ class Run:
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
         self.recipe = recipe
-        self.feed = Feed(recipe, self.sets, self.world)
+        self.train_data = TrainData(recipe, self.sets, self.world)
         self.digests = data_digests(self.sets)
         if self.start:
             self.digests["the checkpoint it starts from"] = self.start.checkpoint.trunk_sha256[:16]
@@ -92,7 +92,7 @@ class Run:
             name: s for name, s in self.sets.items() if len(WindowDataset(s, "val", recipe.frames))
         }
         self.step, self.skipped, self.seconds = 0, 0, 0.0
-        self.pulse = Pulse(recipe.spike)
+        self.spike_detector = GradientSpikeDetector(recipe.spike)
         self.evaluation: dict[str, Any] = {}
         self._baseline: Means | None = None
         self._twin: HMA | None = None
@@ -139,7 +139,7 @@ class Run:
         if self.start and not self.step:
             notes += self.start.remarks(self.sets)
         if self.world.size > 1:
-            passes = f"{self.feed.passes} passes a step over {self.world.size} ranks"
+            passes = f"{self.train_data.passes} passes a step over {self.world.size} ranks"
             notes.append(f"{passes}, {self.recipe.parallel}")
         return notes
 
@@ -151,13 +151,13 @@ class Run:
             return
         shares = [
             [p * digit for digit in digit_frequencies(shards)]
-            for p, shards in zip(self.feed.mixture.p, self.sets.values())
+            for p, shards in zip(self.train_data.mixture.p, self.sets.values())
         ]
         bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
 
-    def prepare(self, kept: Kept | None) -> None:
+    def prepare(self, kept: OptimizerState | None) -> None:
         """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given.
 
         Raises:
@@ -166,7 +166,7 @@ class Run:
         if self.recipe.compile:
             for block in self.model.trunk.blocks:
                 block.compile()
-        self.spread = Spread(self.model, self.world, self.recipe.parallel)
+        self.parallel_model = ParallelModel(self.model, self.world, self.recipe.parallel)
         self.optimizer = make_optimizer(self.model, self.recipe)
         self.average = Average(self.model, self.recipe.ema) if self.recipe.ema else None
         if kept is None:
@@ -184,25 +184,25 @@ class Run:
         recipe, begun = self.recipe, time.monotonic()
         lr = set_lr(self.optimizer, lr_scale(self.step, recipe))
         self.optimizer.zero_grad(set_to_none=True)
-        tally, seen, waited = Tally(list(self.sets), self.device), [], 0.0
-        batches = self.feed.step()
-        for _ in self.feed.own:
+        step_metrics, seen, waited = StepMetrics(list(self.sets), self.device), [], 0.0
+        batches = self.train_data.step()
+        for _ in self.train_data.own:
             asked = time.monotonic()
             number, batch = next(batches)
             waited += time.monotonic() - asked
-            output = self._pass(number, batch.to(self.device), number == self.feed.own[-1])
-            tally.add(batch.embodiment, output)
+            output = self._pass(number, batch.to(self.device), number == self.train_data.own[-1])
+            step_metrics.add(batch.embodiment, output)
             seen.append((batch, output.per_sample))
-        self.spread.average()
-        norm = self.spread.clip(recipe.clip)
-        loss, by_embodiment, objectives = tally.whole(self.world, self.feed.passes)
+        self.parallel_model.average()
+        norm = self.parallel_model.clip(recipe.clip)
+        loss, by_embodiment, objectives = step_metrics.whole(self.world, self.train_data.passes)
         self.step += 1
-        fault = self.pulse.fault(loss, norm)
+        fault = self.spike_detector.fault(loss, norm)
         if fault:
             self._refuse(fault, seen)
         else:
             self.optimizer.step()
-            self.pulse.take(norm)
+            self.spike_detector.take(norm)
             if self.average:
                 self.average.update(self.step)
         spent = time.monotonic() - begun
@@ -225,14 +225,14 @@ class Run:
         """Run a forward and backward pass; the loss of a step is the mean over the passes of all ranks."""
         torch.manual_seed(seed_for(self.recipe.seed, "dropout", self.step, number))
         generator = torch.Generator().manual_seed(seed_for(self.recipe.seed, "masks", self.step, number))
-        with self.spread.passing(last):
+        with self.parallel_model.passing(last):
             with self._autocast():
                 batch = self._past(number, batch)
-                output = self.spread(batch, generator=generator)
+                output = self.parallel_model(batch, generator=generator)
             if not output.loss.requires_grad:
                 fault = f"nothing that may learn takes part in the objective {output.objective}"
                 raise RecipeError("recipe: freeze", fault, "use freeze=nothing, or another objective")
-            (output.loss / len(self.feed.own)).backward()
+            (output.loss / len(self.train_data.own)).backward()
         return output
 
     def _past(self, number: int, batch: Batch) -> Batch:
@@ -264,7 +264,7 @@ class Run:
 
     def shown(self) -> HMA:
         """Return the model to evaluate and save, unsharded on rank 0; every rank must call it."""
-        if not self.average and not self.spread.sharded:
+        if not self.average and not self.parallel_model.sharded:
             return self.model
         state = self.average.state() if self.average else gathered(self.model.state_dict().items())
         if self.world.main:
@@ -320,7 +320,7 @@ class Run:
 
     def save(self) -> Path:
         """Write checkpoints/step-N, and delete all but the last few; every rank must call it."""
-        model, sampler = self.shown(), self.feed.state(self.world)
+        model, sampler = self.shown(), self.train_data.state(self.world)
         moments = optimizer_state(self.optimizer)
         weights = gathered(self.model.state_dict().items()) if self.average else {}
         state = State(
@@ -331,7 +331,7 @@ class Run:
             skipped=self.skipped,
             seconds=self.seconds,
             evaluation=self.evaluation,
-            norms=[self.pulse.mean, float(self.pulse.count)],
+            norms=[self.spike_detector.mean, float(self.spike_detector.count)],
         )
 
         def write() -> Path:
@@ -370,7 +370,7 @@ class Run:
             training["trunk"] = "frozen" if self.start.frozen else "tuned"
         return {"data": data, "metrics": metrics, "training": training}
 
-    def resume(self, force: bool) -> tuple[Kept | None, list[str]]:
+    def resume(self, force: bool) -> tuple[OptimizerState | None, list[str]]:
         """Load the weights and the state of the newest readable checkpoint.
 
         Returns:
@@ -443,12 +443,12 @@ class Run:
         self.step, self.skipped, self.seconds = state.step, state.skipped, state.seconds
         self.evaluation = state.evaluation
         if state.norms:
-            self.pulse.mean, self.pulse.count = state.norms[0], int(state.norms[1])
+            self.spike_detector.mean, self.spike_detector.count = state.norms[0], int(state.norms[1])
         notes = [f"going on from step {state.step}"]
         try:
-            self.feed.load_state(state.sampler)
+            self.train_data.load_state(state.sampler)
         except UsageError as fault:
-            if not force and not self.feed.shared_otherwise(state.sampler):
+            if not force and not self.train_data.shared_otherwise(state.sampler):
                 raise
             notes.append(f"the sampler begins anew: {fault}")
         return notes

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from hma_model.network.objectives import Output
 
 
-class Tally:
+class StepMetrics:
     """Sums of losses, kept on the device of the losses, so that a step needs only one transfer.
 
     Args:

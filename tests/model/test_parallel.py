@@ -18,7 +18,7 @@ from hma_data.errors import HMAError, ShardError, TrainingError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from hma_model.training.parallel import Spread, World, join
+from hma_model.training.parallel import ParallelModel, World, join
 from hma_model.training.rank_errors import read_error, report_once, write_error
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import ROOT, errors, run_ranks
@@ -227,7 +227,7 @@ def free_the_error_last(rank: int) -> None:
         with join(torch.device("cpu")) as world:
             if rank == 0:
                 fail_under_ddp(world)
-            network = Spread(Network(), world, "ddp")
+            network = ParallelModel(Network(), world, "ddp")
             store.wait(["freeing"])
             await_sleep(int(store.get("freeing")))
             world.sum(torch.ones(1))
@@ -246,7 +246,7 @@ class Network(torch.nn.Linear):
 
 
 def fail_under_ddp(world: World) -> None:
-    network = Spread(Network(), world, "ddp")
+    network = ParallelModel(Network(), world, "ddp")
     dist.all_reduce(torch.ones(1), async_op=True)
     raise TrainingError(str(network), "fails")
 

@@ -7,9 +7,9 @@ import torch
 from hma_data.errors import RecipeError, TrainingError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.network.model import HMA
-from hma_model.training.data import Feed, share
+from hma_model.training.data import TrainData, share
 from hma_model.training.ema import Average
-from hma_model.training.guards import SETTLED, Pulse, listed
+from hma_model.training.guards import SETTLED, GradientSpikeDetector, listed
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.parallel import World
@@ -46,9 +46,9 @@ def gradients(recipe, out, batches) -> dict[str, torch.Tensor]:
     out.mkdir()
     run = Run(recipe, out, torch.device("cpu"))
     run.prepare(None)
-    assert run.feed.passes == len(batches)
-    run.feed.step = lambda: iter(enumerate(batches))
-    run.spread.clip = lambda limit: 1.0
+    assert run.train_data.passes == len(batches)
+    run.train_data.step = lambda: iter(enumerate(batches))
+    run.parallel_model.clip = lambda limit: 1.0
     run.optimizer.step = lambda: None
     run.advance()
     return {n: p.grad.clone() for n, p in run.model.named_parameters() if p.grad is not None}
@@ -63,7 +63,7 @@ def part(batch, rows: slice):
 def test_accumulated_passes_have_the_gradient_of_the_whole_batch(recipe, tmp_path):
     model = {**TINY["model"], "mask_ratio_min": 1.0, "corrupt_max": 0.0, "history_probability": 0.0}
     whole = recipe(batch_size=8, model=model)
-    _, batch = next(Feed(whole, Run(whole, tmp_path, torch.device("cpu")).sets, World()).step())
+    _, batch = next(TrainData(whole, Run(whole, tmp_path, torch.device("cpu")).sets, World()).step())
     one = gradients(whole, tmp_path / "one", [batch])
     halves = [part(batch, slice(0, 4)), part(batch, slice(4, 8))]
     two = gradients(recipe(batch_size=4, accumulate=2, model=model), tmp_path / "two", halves)
@@ -170,18 +170,18 @@ def test_what_is_trained_is_what_is_evaluated(recipe, tmp_path, objective):
 
 
 def test_a_norm_far_above_its_running_mean_is_a_spike():
-    pulse = Pulse(limit=3.0)
-    assert pulse.fault(1.0, 1e9) == ""
+    detector = GradientSpikeDetector(limit=3.0)
+    assert detector.fault(1.0, 1e9) == ""
     for _ in range(SETTLED):
-        pulse.take(2.0)
-    assert pulse.fault(1.0, 5.9) == ""
-    assert "3.5 times its running mean 2" in pulse.fault(1.0, 7.0)
-    assert Pulse().fault(1.0, 1e30) == ""
+        detector.take(2.0)
+    assert detector.fault(1.0, 5.9) == ""
+    assert "3.5 times its running mean 2" in detector.fault(1.0, 7.0)
+    assert GradientSpikeDetector().fault(1.0, 1e30) == ""
 
 
 @pytest.mark.parametrize(("loss", "norm"), [(float("nan"), 1.0), (1.0, float("inf"))])
 def test_what_is_no_number_is_always_a_fault(loss, norm):
-    assert "the loss is" in Pulse().fault(loss, norm)
+    assert "the loss is" in GradientSpikeDetector().fault(loss, norm)
 
 
 @pytest.fixture
@@ -240,8 +240,8 @@ def test_windows_that_cannot_be_shared_are_refused(recipe):
 def test_ranks_see_what_one_would_see_and_each_window_once(recipe, data, tmp_path):
     given = recipe(batch_size=4, accumulate=2)
     sets = Run(given, tmp_path, torch.device("cpu")).sets
-    alone = Feed(given, sets, World())
-    pair = [Feed(given, sets, World(rank, 2)) for rank in range(2)]
+    alone = TrainData(given, sets, World())
+    pair = [TrainData(given, sets, World(rank, 2)) for rank in range(2)]
     for _ in range(5):
         single = dict(alone.step())
         shared = {number: batch for feed in pair for number, batch in feed.step()}
@@ -256,7 +256,7 @@ def test_ranks_draw_disjoint_windows_within_an_epoch(recipe, data, tmp_path):
     sets = Run(given, tmp_path, torch.device("cpu")).sets
     seen = []
     for rank in range(2):
-        feed = Feed(given, sets, World(rank, 2))
+        feed = TrainData(given, sets, World(rank, 2))
         places = set()
         for _ in range(6):
             for _, batch in feed.step():
