@@ -9,6 +9,7 @@ killed pushes.
 import hashlib
 import os
 import random
+import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -374,6 +375,8 @@ def _local_sizes(root: Path) -> dict[str, int]:
     sizes = {}
     for folder, _, names in os.walk(root):
         for path in (Path(folder, name) for name in names):
-            if path.is_file():
-                sizes[path.relative_to(root).as_posix()] = path.stat().st_size
+            with suppress(FileNotFoundError):  # another push has renamed it since the folder was listed
+                found = path.stat()
+                if stat.S_ISREG(found.st_mode):
+                    sizes[path.relative_to(root).as_posix()] = found.st_size
     return sizes

@@ -20,6 +20,7 @@ from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import PARTS
 from hma_model.hub import publish as hub
 from hma_model.hub import swap as hub_swap
+from hma_model.hub.folder import FolderStore
 from tests.hub_server import Hub
 from tests.hub_state import EVERY, REPO, sha256
 from tests.model.robots import make_model, save
@@ -399,6 +400,12 @@ def test_pushes_of_one_embodiment_at_once_leave_the_whole_of_one(folder, source,
         pushed = [pool.submit(hub.push, other, folder) for other in others]
         assert [future.result(60) for future in pushed] == [str(folder)] * 3
     assert list(checkpoint.load(folder).embodiments) == ["arm"]
+
+
+def test_a_file_that_another_push_renames_during_the_listing_is_left_out(tmp_path, monkeypatch):
+    (tmp_path / "here").write_bytes(b"12")
+    monkeypatch.setattr(os, "walk", lambda root: [(str(root), [], ["gone", "here"])])
+    assert FolderStore(tmp_path).files() == {"here": 2}
 
 
 @pytest.mark.parametrize("step", ["link", "exchange", "rmtree"])
