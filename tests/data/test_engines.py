@@ -20,7 +20,7 @@ from hma_data.conversion.engines.base import Attempt, Ledger, Limits, Report, Re
 from hma_data.conversion.engines.local import run, serve
 from hma_data.errors import HMAError, TokenizerError
 
-FAST = Limits(quiet_s=1.5, kills=3)
+FAST = Limits(quiet_s=6, kills=3)  # no innocent step takes that long, however busy the machine
 
 
 @dataclass(frozen=True)
@@ -145,13 +145,13 @@ def print_nothing(number: int, event: Any) -> None:
     pass
 
 
-@pytest.mark.parametrize("kind", ["SIGSEGV", "SIGABRT", "hang"])
+@pytest.mark.parametrize("kind", ["SIGSEGV", "SIGABRT", pytest.param("hang", marks=pytest.mark.slow)])
 def test_a_step_that_crashes_or_hangs_is_refused_and_the_others_kept(kind: str, tmp_path: Path) -> None:
     results, events = do([Unit("bad", ("a", "b", "c"), "b", kind), PLAIN[0]], tmp_path)
     assert results == {"bad": ["a", "c"], "u0": ["a", "b"]}
     reasons = [event.reason for _, event in events if isinstance(event, Retry)]
     assert len(reasons) == 2
-    assert all(("no progress for 1.5 s" if kind == "hang" else kind) in reason for reason in reasons)
+    assert all(("no progress for 6 s" if kind == "hang" else kind) in reason for reason in reasons)
 
 
 def test_an_error_that_is_not_the_datas_ends_the_run_as_it_is(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def test_a_worker_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
     parent.kill()
     parent.wait()
-    for _ in range(100):
+    for _ in range(600):
         alive = [child for child in children if _runs(int(child))]
         if not alive:
             break

@@ -80,7 +80,7 @@ def opened(tmp_path: Path, request: pytest.FixtureRequest) -> Worker:
 
 
 def made(request: pytest.FixtureRequest, make_work: Callable[[int], Work], answer_s: float = 0.2) -> Worker:
-    worker = Worker(make_work, 1, 1.5, answer_s)
+    worker = Worker(make_work, 1, 6, answer_s)
     request.addfinalizer(lambda: worker._process and worker._end())
     return worker
 
@@ -111,7 +111,7 @@ def test_a_units_events_and_result_are_told_in_order(opened: Worker) -> None:
         ("SIGSEGV", "crashed", "ended the process by SIGSEGV"),
         ("SIGKILL", "killed", "ended by SIGKILL"),
         ("memory", "killed", "ran out of memory"),
-        ("hang", "hung", "made no progress for 1.5 s"),
+        pytest.param("hang", "hung", "made no progress for 6 s", marks=pytest.mark.slow),
     ],
 )
 def test_how_a_process_was_lost_is_told_with_its_step_and_the_next_unit_is_done(
