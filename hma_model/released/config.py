@@ -28,8 +28,8 @@ _LAYOUT: dict[str, Any] = {
     "final_norm": False,
     "add_at": "layers",
 }
-# Our objective by their (jointly_predict_actions, jointly_predict_states). Without the first, the second has
-# no effect: the released code then always predicts video.
+# Our objective by their (jointly_predict_actions, jointly_predict_states). Without the first, the second is
+# ignored: video is predicted.
 _OBJECTIVE = {
     (False, False): "forward",
     (False, True): "forward",
