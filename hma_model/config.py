@@ -14,9 +14,9 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from hma_data.errors import RecipeError
+from hma_model.objective import OBJECTIVES as OBJECTIVES
 
 CONDITIONINGS = ("modulation", "concat", "add", "cross_attention")
-OBJECTIVES = ("forward", "passive", "policy", "full", "inverse")
 _CHOICES = {
     "kind": ("discrete", "continuous"),
     "time_position": ("rotary", "learned"),

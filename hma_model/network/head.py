@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.diffusion import DiffusionHead
 from hma_model.network.trunk import rows_at
+from hma_model.objective import Readout
 
 
 class TokenReadout(nn.Module):
@@ -86,13 +87,13 @@ class ActionHead(nn.Module):
             nn.init.normal_(linear.weight, std=config.width**-0.5 if self.diffusion else 0.02)
             nn.init.zeros_(linear.bias)
 
-    def forward(self, features: Tensor, readout: str) -> Tensor:
+    def forward(self, features: Tensor, readout: Readout) -> Tensor:
         """Map features (M, D) to chunks (M, K), or to the conditions (M, D) of a diffusion head."""
-        linear = self.inverse if readout == "inverse" else self.policy
+        linear: nn.Linear = getattr(self, readout.name)
         return linear(features * self.multiplier if self.multiplier != 1 else features)
 
     def loss(
-        self, features: Tensor, target: Tensor, readout: str, generator: torch.Generator | None = None
+        self, features: Tensor, target: Tensor, readout: Readout, generator: torch.Generator | None = None
     ) -> Tensor:
         """Return the loss (M,) float32 of features (M, D) and target chunks (M, K)."""
         predicted = self(features, readout)
@@ -100,7 +101,7 @@ class ActionHead(nn.Module):
             return self.diffusion.loss(target, predicted, generator)
         return F.mse_loss(predicted.float(), target.float(), reduction="none").mean(-1)
 
-    def predict(self, features: Tensor, readout: str, generator: torch.Generator | None = None) -> Tensor:
+    def predict(self, features: Tensor, readout: Readout, generator: torch.Generator | None = None) -> Tensor:
         """Predict chunks (M, K) float32 from features (M, D)."""
         predicted = self(features, readout)
         return (

@@ -24,6 +24,7 @@ from hma_model.network.head import ActionHead, LatentReadout, TokenReadout
 from hma_model.network.state import check_fit, module_key, space_of_stem
 from hma_model.network.stem import Stem
 from hma_model.network.trunk import Clock, Conditioning, Trunk, window_clock
+from hma_model.objective import POLICY, READOUTS, Readout
 
 if TYPE_CHECKING:
     from hma_model.network.objectives import Output, Windows
@@ -264,7 +265,12 @@ class HMA(nn.Module):
 
         Returns:
             (B, T, K) float32 raw; narrower embodiments of a mixed batch are padded with zeros.
+
+        Raises:
+            HMAError: the readout is unknown.
         """
+        if readout not in READOUTS:
+            raise HMAError("readout", f"{readout!r} is unknown", "give one of " + ", ".join(READOUTS))
         groups, count = Groups.of(embodiment, len(frames)), frames.shape[1]
         clock = self.clock(count)
         given = None if self.config.absent_action == "tokens" else unknown(self, groups, count)
@@ -278,7 +284,7 @@ class HMA(nn.Module):
             x = self.embed_tokens(groups.sort(frames.flatten(2)))
         pooled = self.action_features(self.trunk(x, conditioning, clock))
         chunks = [
-            self._predict(part, name, readout, generator)
+            self._predict(part, name, READOUTS[readout], generator)
             for part, (name, _) in zip(pooled.split([size for _, size in groups.parts]), groups.parts)
         ]
         widest = max(chunk.shape[-1] for chunk in chunks)
@@ -294,13 +300,13 @@ class HMA(nn.Module):
         return condition(self, given, groups, clock.positions)
 
     def _predict(
-        self, pooled: Tensor, embodiment: str, readout: str, generator: torch.Generator | None
+        self, pooled: Tensor, embodiment: str, readout: Readout, generator: torch.Generator | None
     ) -> Tensor:
         head = self.head(embodiment)
-        chunks = head.predict(pooled.flatten(0, 1), "policy", generator).unflatten(0, pooled.shape[:2])
-        if readout == "inverse":
-            after = head.predict(pooled[:, 1:].flatten(0, 1), "inverse", generator)
-            chunks = torch.cat([after.unflatten(0, (len(pooled), -1)), chunks[:, -1:]], dim=1)
+        chunks = head.predict(pooled.flatten(0, 1), POLICY, generator).unflatten(0, pooled.shape[:2])
+        if lag := readout.lag:
+            after = head.predict(pooled[:, lag:].flatten(0, 1), readout, generator)
+            chunks = torch.cat([after.unflatten(0, (len(pooled), -1)), chunks[:, -lag:]], dim=1)
         return chunks if self.config.action_target == "raw" else self.stem(embodiment).normalizer.undo(chunks)
 
     @torch.no_grad()

@@ -1,8 +1,6 @@
 """Compute the losses of the training objectives (paper section 3).
 
-forward: predict masked video from past video and actions. passive: the same without actions. policy: predict
-the chunk to command from each frame on. inverse: predict the chunk that led from one frame to the next. full:
-video and policy together.
+`hma_model.objective.OBJECTIVES` states what each objective predicts, sees and hides.
 
 B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = stride * action dim.
 """
@@ -14,10 +12,11 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.config import OBJECTIVES, HMAConfig
+from hma_model.config import HMAConfig
 from hma_model.network.conditioning import Groups, align, condition
 from hma_model.network.embed import patchify, to_digits
 from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks, uniform
+from hma_model.objective import OBJECTIVES, Readout
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -59,9 +58,10 @@ class Output:
 def compute(model: "HMA", batch: Windows, objective: str | None, generator: torch.Generator | None) -> Output:
     """Compute the losses of one batch; `HMA.forward` explains the arguments."""
     config = model.config
-    objective = objective or draw_objective(config, generator)
-    if objective not in OBJECTIVES:
-        raise HMAError("objective", f"{objective!r} is unknown", "give one of " + ", ".join(OBJECTIVES))
+    name = objective or draw_objective(config, generator)
+    if name not in OBJECTIVES:
+        raise HMAError("objective", f"{name!r} is unknown", "give one of " + ", ".join(OBJECTIVES))
+    chosen = OBJECTIVES[name]
     frames, count, size = _frames(model, batch), batch.actions.shape[1], len(batch.actions)
     groups, clock = Groups.of(batch.embodiment, size), model.clock(count)
 
@@ -71,16 +71,15 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     inside = getattr(batch, "frame_mask", None)
     if inside is not None:  # padding of a short episode has no loss
         video.masked &= inside.to(video.masked.device).unsqueeze(-1)
-    if objective in ("policy", "inverse"):
+    if not chosen.predicts_video:
         video.masked = torch.zeros_like(video.masked)
     dropped = torch.zeros_like(batch.action_mask)
-    if objective in ("policy", "full"):
-        dropped = drop_chunks(batch.action_mask, generator)
-    elif objective == "inverse":  # no frame follows the last chunk, so it stays
-        dropped[:, :-1] = drop_chunks(batch.action_mask[:, :-1], generator)
+    if chosen.readout is not None:
+        read = count - chosen.readout.lag  # the chunks after these have no frame to be read from
+        dropped[:, :read] = drop_chunks(batch.action_mask[:, :read], generator)
 
     given = None
-    if objective != "passive":
+    if chosen.sees_actions:
         given = align(config, batch.actions, batch.action_mask & ~dropped, count)
     conditioning = condition(model, given, groups, clock.positions)
     x = _embed(model, seen, video, groups, generator)
@@ -88,9 +87,11 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
 
     video_loss = action_loss = logits = None
     per_sample = torch.zeros(size, device=features.device)
-    if objective in ("policy", "inverse", "full"):
-        action_loss, per_sample = _action_loss(model, features, batch, dropped, objective, groups, generator)
-    if objective in ("forward", "passive", "full"):
+    if chosen.readout is not None:
+        action_loss, per_sample = _action_loss(
+            model, features, batch, dropped, chosen.readout, groups, generator
+        )
+    if chosen.predicts_video:
         own = model.video_features(features)
         predictors = own if config.kind == "discrete" else model.latent_readout(own, clock.positions)
         video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
@@ -103,7 +104,7 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     if action_loss is not None:
         loss = loss + config.action_loss_weight * action_loss
     masked = video.masked.to(features.device).unflatten(2, config.token_grid)
-    return Output(loss, video_loss, action_loss, per_sample.detach(), masked, objective, logits)
+    return Output(loss, video_loss, action_loss, per_sample.detach(), masked, name, logits)
 
 
 def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
@@ -169,18 +170,16 @@ def _action_loss(
     features: Tensor,
     batch: Windows,
     dropped: Tensor,
-    objective: str,
+    readout: Readout,
     groups: Groups,
     generator: torch.Generator | None,
 ) -> tuple[Tensor, Tensor]:
     """Return the mean loss over predicted chunks, and each sample's (B,), in the batch's order."""
-    readout = "inverse" if objective == "inverse" else "policy"
     wanted = batch.action_mask.clone()
-    if readout == "inverse" or model.config.action_alignment == "current":
+    if readout.lag or model.config.action_alignment == "current":
         wanted &= dropped  # a chunk that the model saw is not predicted
-    pooled = model.action_features(features)
-    if readout == "inverse":
-        pooled, wanted = pooled[:, 1:], wanted[:, :-1]
+    pooled = model.action_features(features)[:, readout.lag :]
+    wanted = wanted[:, : pooled.shape[1]]
     actions, wanted = groups.sort(batch.actions)[:, : wanted.shape[1]], groups.sort(wanted)
     losses, samples = [], []
     for name, span in groups.spans():

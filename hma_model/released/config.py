@@ -15,6 +15,7 @@ from typing import Any
 
 from hma_data.errors import CheckpointError, RecipeError
 from hma_model.config import HMAConfig
+from hma_model.objective import INVERSE, OBJECTIVES, POLICY
 
 LATENT_SCALE = 0.18215  # the factor by which the released loader multiplies stored latents
 _WHERE = "config.json"
@@ -26,6 +27,14 @@ _LAYOUT: dict[str, Any] = {
     "temporal_norm": False,
     "final_norm": False,
     "add_at": "layers",
+}
+# Our objective by their (jointly_predict_actions, jointly_predict_states). Without the first, the second is
+# ignored: video is predicted.
+_OBJECTIVE = {
+    (False, False): "forward",
+    (False, True): "forward",
+    (True, False): "policy",
+    (True, True): "full",
 }
 # The values of fields that a released file does not state.
 _DEFAULTS: dict[str, Any] = {
@@ -113,7 +122,7 @@ def _shared(values: Mapping[str, Any], continuous: bool) -> dict[str, Any]:
         fault = f"is continuous with use_mup and width {values['d_model']}"
         raise CheckpointError(_WHERE, fault, "the released code makes such a model only at width 256")
     conditioning = _conditioning(str(values["action_network"]))
-    objective = "forward" if not joint else "full" if values["jointly_predict_states"] else "policy"
+    objective = _OBJECTIVE[joint, bool(values["jointly_predict_states"])]
     return {
         "layers": values["num_layers"],
         "width": values["d_model"],
@@ -229,7 +238,7 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
         "num_prompt_frames": config.history_frames,
         "action_network": f"{concat}{inside}".strip("+"),
         "jointly_predict_actions": joint,
-        "jointly_predict_states": set(config.objectives) != {"policy"},
+        "jointly_predict_states": any(OBJECTIVES[name].predicts_video for name in config.objectives),
         "action_token_size": config.action_tokens,
         "action_loss_weight": config.action_loss_weight,
         "qkv_bias": config.qkv_bias,
@@ -268,9 +277,8 @@ def _inexpressible(config: HMAConfig) -> list[str]:
     if math.isqrt(math.prod(config.grid)) ** 2 != math.prod(config.grid):
         faults.append(f"a frame of {math.prod(config.grid)} tokens, which is no square")
     trained = {name for name, weight in config.objectives.items() if weight > 0}
-    if "inverse" in trained:
-        faults.append("objective inverse")
-    if trained & {"policy", "full"} and config.absent_action != "tokens":
+    faults += [f"objective {name}" for name in sorted(trained) if OBJECTIVES[name].readout == INVERSE]
+    if any(OBJECTIVES[name].readout == POLICY for name in trained) and config.absent_action != "tokens":
         faults.append(f"objectives {', '.join(sorted(trained))} with absent_action {config.absent_action!r}")
     if config.mup and config.base_width != 256:
         faults.append(f"base_width {config.base_width}")

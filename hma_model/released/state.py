@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hma_data.errors import CheckpointError
 from hma_model.config import HMAConfig
+from hma_model.objective import READOUTS
 
 State = dict[str, Tensor]
 Parts = dict[str, tuple[State, State]]
@@ -309,7 +310,7 @@ def _head(source: State, domain: str, config: HMAConfig) -> State:
     else:
         weight, bias = (source[f"action_out_projectors.{domain}.{name}"] for name in ("weight", "bias"))
         head = {}
-    for readout in ("policy", "inverse"):
+    for readout in READOUTS:
         head |= {f"{readout}.weight": weight.clone(), f"{readout}.bias": bias.clone()}
     return head
 

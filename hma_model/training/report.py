@@ -13,6 +13,7 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.html import Page
 from hma_model.evaluation.sample_images import FOLDER
+from hma_model.objective import OBJECTIVES
 from hma_model.training.logging import read_metrics
 from hma_model.training.runtime import ENVIRONMENT, RECIPE
 
@@ -140,7 +141,8 @@ def _course(page: Page, steps: list[dict[str, Any]]) -> None:
 
 
 def _unit(recipe: dict[str, Any], evaluations: list[dict[str, Any]]) -> str:
-    video = {"forward", "passive", "full"} & set(recipe.get("objectives") or ())
+    names = recipe.get("objectives") or ()
+    video = any(objective.predicts_video for name, objective in OBJECTIVES.items() if name in names)
     discrete = any("perplexity" in line for line in evaluations)
     return "loss, nats a token" if video and discrete else "loss"
 

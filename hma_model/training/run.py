@@ -124,7 +124,7 @@ class Run:
     @property
     def nats(self) -> bool:
         """Check whether the losses are nats a token."""
-        video = main_objective(self.recipe.objectives) in ("forward", "passive", "full")
+        video = main_objective(self.recipe.objectives).predicts_video
         return self.model.config.kind == "discrete" and video
 
     def remarks(self) -> list[str]:

@@ -18,6 +18,7 @@ from torch import Tensor
 from hma_data.loading.dataset import Batch
 from hma_model.network.embed import from_digits, unpatchify
 from hma_model.network.masking import uniform
+from hma_model.objective import OBJECTIVES
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -95,7 +96,7 @@ def _predicted(
     """Predict frame `at` (n,) of each window, wholly masked, from the frames before it."""
     config, rows = model.config, torch.arange(len(at), device=at.device)
     actions = None
-    if any(weight for name, weight in config.objectives.items() if name != "passive"):
+    if any(weight and OBJECTIVES[name].sees_actions for name, weight in config.objectives.items()):
         actions = batch.actions[chosen]
     known = None if actions is None else batch.action_mask[chosen]
     if config.kind == "discrete":

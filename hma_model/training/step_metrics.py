@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from hma_model.config import OBJECTIVES
+from hma_model.objective import OBJECTIVES
 from hma_model.training.parallel import World
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class StepMetrics:
         losses = output.per_sample.to(self._sums)
         self._loss += output.loss.detach().to(self._loss)
         self._sums.index_add_(1, index, torch.stack([losses, torch.ones_like(losses)]))
-        self._objectives[OBJECTIVES.index(output.objective)] += 1
+        self._objectives[list(OBJECTIVES).index(output.objective)] += 1
 
     def whole(self, world: World, passes: int) -> tuple[float, dict[str, float], list[str]]:
         """Return the mean loss over all ranks, the mean by embodiment, and the objectives of the step."""

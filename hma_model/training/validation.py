@@ -13,15 +13,16 @@ import torch
 
 from hma_model.evaluation.evaluate import Means, validation_losses
 from hma_model.evaluation.metrics import perplexity
+from hma_model.objective import OBJECTIVES, Objective
 
 if TYPE_CHECKING:
     from hma_data.loading.dataset import Batch
     from hma_model.network.model import HMA
 
 
-def main_objective(weights: Mapping[str, float]) -> str:
+def main_objective(weights: Mapping[str, float]) -> Objective:
     """Return the objective that is drawn most often."""
-    return max(weights, key=lambda name: weights[name])
+    return OBJECTIVES[max(weights, key=lambda name: weights[name])]
 
 
 def validate(
@@ -41,15 +42,15 @@ def validate(
         step: number of finished steps.
     """
     begun, objective = time.monotonic(), main_objective(model.config.objectives)
-    video = objective in ("forward", "full")
+    video = objective.predicts_video and objective.sees_actions
     accuracy = Means()
     if video:
         losses, accuracy = validation_losses(model, held_out(), seed)
     else:
-        losses = _losses_of(model, held_out(), objective, seed)
+        losses = _losses_of(model, held_out(), objective.name, seed)
     facts: dict[str, Any] = {
         "step": step,
-        "objective": objective,
+        "objective": objective.name,
         "loss": losses.mean(),
         "loss_by_embodiment": losses.by_embodiment(),
         "windows": sum(losses.counts.values()),
