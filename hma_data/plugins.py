@@ -7,10 +7,12 @@ only by `Plugin.load`.
 import sys
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import HMAError, PluginError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 SOURCE_GROUP = "hma_data.sources"
 TOKENIZER_GROUP = "hma_data.tokenizers"
@@ -28,7 +30,7 @@ class Plugin:
 
     name: str
     packages: tuple[str, ...]
-    entry_point: EntryPoint
+    entry_point: "EntryPoint"
 
     def load(self) -> Any:
         """Import the object of the entry point.
@@ -61,6 +63,8 @@ def installed(group: str) -> dict[str, Plugin]:
 
 @cache
 def _installed(group: str, path: tuple[str, ...]) -> dict[str, Plugin]:
+    from importlib.metadata import entry_points
+
     found: dict[str, Plugin] = {}
     for entry in entry_points(group=group):
         package = f"{entry.dist.name} {entry.dist.version}" if entry.dist else "a package"
