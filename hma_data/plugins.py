@@ -5,6 +5,7 @@ only by `Plugin.load`.
 """
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -40,13 +41,20 @@ class Plugin:
         """
         if len(self.packages) > 1:
             raise self.broken("two packages add this name", "uninstall one of them")
+        return self.call(f"importing {self.entry_point.value}", self.entry_point.load)
+
+    def call(self, doing: str, function: Callable[..., Any], *args: Any, **keywords: Any) -> Any:
+        """Return what a function of the package returns.
+
+        Raises:
+            PluginError: it raised what is no HMAError.
+        """
         try:
-            return self.entry_point.load()
+            return function(*args, **keywords)
         except HMAError:
             raise
         except Exception as fault:
-            said = f"{self.entry_point.value} cannot be imported: {type(fault).__name__}: {fault}"
-            raise self.broken(said) from fault
+            raise self.broken(f"{doing} failed: {type(fault).__name__}: {fault}") from fault
 
     def broken(self, fault: str, remedy: str = "") -> PluginError:
         """Return the error that names the package at fault."""

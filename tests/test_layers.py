@@ -9,8 +9,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = (
     "hma_data.errors", "hma_data.plugins", "hma_data.console", "hma_data.priority", "hma_data.threads",
-    "hma_data.storage", "hma_data.hub", "hma_data.registry", "hma_data.episodes", "hma_data.sources",
-    "hma_data.tokenizers", "hma_data.shards", "hma_data.tokenizers.training", "hma_data.inspection", "hma_data.conversion",
+    "hma_data.storage",
+    "hma_data.hub", "hma_data.registry", "hma_data.episodes", "hma_data.sources", "hma_data.tokenizers",
+    "hma_data.shards", "hma_data.tokenizers.training", "hma_data.inspection", "hma_data.conversion",
     "hma_data.loading", "hma_data.loader", "hma_data.lab", "hma_data.bench", "hma_data.cli", "hma_data",
     "hma_model.config", "hma_model.network", "hma_model.checkpoint", "hma_model.generation",
     "hma_model.evaluation", "hma_model.released", "hma_model.hub", "hma_model.training", "hma_model.demo",

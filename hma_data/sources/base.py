@@ -222,7 +222,7 @@ def open_source(name: str) -> Source:
     module = plugin.load()
     if not callable(getattr(module, "open", None)):
         raise plugin.broken(f"{plugin.entry_point.value} has no open()")
-    opened = module.open()
+    opened = plugin.call("open()", module.open)
     if not isinstance(opened, Source):
         raise plugin.broken(f"open() gave {type(opened).__name__}, which is no hma_data.sources.base.Source")
     return opened

@@ -113,11 +113,11 @@ def _of_package(entry: Entry, weights: str | None, device: str) -> Tokenizer:
         PluginError: its module cannot be imported, or what it loads is no tokenizer of that name.
     """
     plugin = installed(TOKENIZER_GROUP)[entry.name]
-    try:
-        load = import_module(entry.module).load
-    except (ImportError, AttributeError) as fault:
-        raise plugin.broken(f"load of {entry.module} cannot be imported: {fault}") from fault
-    tokenizer = load(entry.name, weights=weights, device=device, **entry.arguments)
+    module = plugin.call(f"importing {entry.module}", import_module, entry.module)
+    if not callable(getattr(module, "load", None)):
+        raise plugin.broken(f"{entry.module} has no load()")
+    keywords = {"weights": weights, "device": device, **entry.arguments}
+    tokenizer = plugin.call("load()", module.load, entry.name, **keywords)
     if not isinstance(tokenizer, Tokenizer) or not isinstance(tokenizer.spec, TokenizerSpec):
         kind = type(tokenizer).__name__
         raise plugin.broken(f"load() gave {kind}, which is no hma_data.tokenizers.base.Tokenizer")

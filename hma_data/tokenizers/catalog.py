@@ -287,10 +287,7 @@ def _entry_of(plugin: Plugin) -> Entry:
     """Return the entry that a package's object is, or gives when it is called."""
     entry = plugin.load()
     if callable(entry):
-        try:
-            entry = entry()
-        except Exception as fault:
-            raise plugin.broken(f"giving its Entry failed: {type(fault).__name__}: {fault}") from fault
+        entry = plugin.call(f"{plugin.entry_point.value}()", entry)
     if not isinstance(entry, Entry):
         kind = type(entry).__name__
         raise plugin.broken(f"gives a {kind}, not an Entry of hma_data.tokenizers.catalog")
