@@ -1,6 +1,7 @@
 """The rooms in the order of the road: a module imports only from its own room and from those before it."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,6 +63,12 @@ def test_a_module_imports_only_from_rooms_before_its_own(module: str) -> None:
         name for name in imports(module) if ROOMS.index(room(name)) > here and (module, name) not in DOORS
     ]
     assert not wrong
+
+
+def test_the_architecture_page_lists_the_rooms_in_their_order() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    rooms = [name for name in ROOMS if MODULES[name].name == "__init__.py" and "." in name]
+    assert re.findall(r"^\| `(hma_[\w.]+)` \|", page, re.MULTILINE) == rooms
 
 
 def test_a_room_says_what_it_is_for() -> None:
