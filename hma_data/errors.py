@@ -42,6 +42,10 @@ class SourceError(HMAError):
     """A recording cannot be read at all."""
 
 
+class PluginError(HMAError):
+    """A package that adds a source or a tokenizer is broken; `where` names the package."""
+
+
 class StorageAwayError(SourceError):
     """Storage did not answer after several tries; this is no fault of the recording."""
 

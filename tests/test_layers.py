@@ -1,6 +1,7 @@
 """The rooms in the order of the road: a module imports only from its own room and from those before it."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,7 +9,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = (
-    "hma_data.errors", "hma_data.console", "hma_data.priority", "hma_data.threads", "hma_data.storage",
+    "hma_data.errors", "hma_data.plugins", "hma_data.console", "hma_data.priority", "hma_data.threads",
+    "hma_data.storage",
     "hma_data.hub", "hma_data.registry", "hma_data.episodes", "hma_data.sources", "hma_data.tokenizers",
     "hma_data.shards", "hma_data.tokenizers.training", "hma_data.inspection", "hma_data.conversion",
     "hma_data.loading", "hma_data.loader", "hma_data.lab", "hma_data.bench", "hma_data.cli", "hma_data",
@@ -62,6 +64,12 @@ def test_a_module_imports_only_from_rooms_before_its_own(module: str) -> None:
         name for name in imports(module) if ROOMS.index(room(name)) > here and (module, name) not in DOORS
     ]
     assert not wrong
+
+
+def test_the_architecture_page_lists_the_rooms_in_their_order() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    rooms = [name for name in ROOMS if MODULES[name].name == "__init__.py" and "." in name]
+    assert re.findall(r"^\| `(hma_[\w.]+)` \|", page, re.MULTILINE) == rooms
 
 
 def test_a_room_says_what_it_is_for() -> None:

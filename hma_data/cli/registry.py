@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from hma_data.console import print_json, print_table
+from hma_data.registry.formats import FORMATS
 
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -44,7 +45,7 @@ def registry_list(
     ] = None,
     kind: Annotated[Kind | None, typer.Option("--kind", help="Only this kind.")] = None,
     source: Annotated[
-        str | None, typer.Option("--source", help="Only this format: rlds, hdf5, rosbag, lerobot, hands.")
+        str | None, typer.Option("--source", help=f"Only this format: {', '.join(FORMATS)}, or a package's.")
     ] = None,
     space: Annotated[str | None, typer.Option("--space", help="Only this action space.")] = None,
     dims: Annotated[int | None, typer.Option("--dims", help="Only this many action dims.")] = None,

@@ -17,11 +17,19 @@ def tokenizer_list(json: Json = False) -> None:
 
     Example: hma tokenizer list
     """
-    from hma_data.tokenizers.catalog import CATALOG
+    from hma_data.tokenizers.catalog import all_entries
 
+    found, broken = all_entries()
     if json:
-        print_json([entry.to_json() for entry in CATALOG.values()])
-        return
+        print_json([entry.to_json() for entry in found])
+    else:
+        _print_list(found)
+    for fault in broken:
+        typer.echo(f"not listed: {fault}", err=True)
+    raise typer.Exit(1 if broken else 0)
+
+
+def _print_list(entries: list[Any]) -> None:
     rows = [
         [
             entry.name,
@@ -33,7 +41,7 @@ def tokenizer_list(json: Json = False) -> None:
             entry.licence,
             entry.description,
         ]
-        for entry in CATALOG.values()
+        for entry in entries
     ]
     print_table(["name", "kind", "picture", "grid", "here", "weights", "licence", "what it is"], rows)
 

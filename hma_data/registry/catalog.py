@@ -15,13 +15,17 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HMAError, RegistryError
+from hma_data.registry.formats import FORMATS
 from hma_data.storage.files import cache_folder, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.shipped import shipped
 from hma_data.storage.yaml_io import decode_yaml, parse_yaml, read_bytes
 
 MAX_KEPT = 100_000  # judgements kept in the cache
-_JUDGES = ("registry/embodiment.py", "registry/components.py", "registry/catalog.py", "storage/yaml_io.py")
+_JUDGES = (
+    "registry/embodiment.py", "registry/components.py", "registry/formats.py", "registry/catalog.py",
+    "storage/yaml_io.py",
+)  # fmt: skip
 
 
 def registry_folders(beside: StrPath | None = None) -> list[Path]:
@@ -177,6 +181,13 @@ def _misnamed(entry: Entry) -> Entry:
     return _with(entry, _plain("id", fault, repr(entry.name)))
 
 
+def _asked_packages(said: dict[str, Any]) -> bool:
+    """Check whether a judgement was of a format that is not built in: installing a package changes it."""
+    if said["facts"]:
+        return said["facts"]["format"] not in FORMATS
+    return any(problem["path"] == "source.format" for problem in said["problems"])
+
+
 class _Cache:
     """Facts and problems by the hash of a YAML's bytes, in one JSON file per version of the judging code."""
 
@@ -207,8 +218,9 @@ class _Cache:
         return said
 
     def put(self, content: bytes, said: dict[str, Any]) -> dict[str, Any]:
-        self._used[hashlib.sha256(content).hexdigest()] = said
-        self._new = True
+        if not _asked_packages(said):
+            self._used[hashlib.sha256(content).hexdigest()] = said
+            self._new = True
         return said
 
     def save(self) -> None:

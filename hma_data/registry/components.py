@@ -14,6 +14,9 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
+
+from hma_data.registry.formats import MORE, is_known, known_formats
 
 Space = Literal[
     "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",
@@ -24,7 +27,6 @@ Representation = Literal[
 ]
 Gripper = Literal["open_is_high", "open_is_low", "opening_is_high", "closing_is_high"]
 Method = Literal["nearest", "hold", "interpolate"]
-Format = Literal["rlds", "hdf5", "rosbag", "lerobot", "hands"]
 
 
 def _no_bool(value: Any) -> Any:
@@ -41,6 +43,20 @@ Number = Annotated[
     float, BeforeValidator(_no_bool), Field(allow_inf_nan=False), AfterValidator(_no_minus_zero)
 ]
 Count = Annotated[int, BeforeValidator(_no_bool)]
+
+
+def _known_format(value: Any) -> Any:
+    if not isinstance(value, str) or not is_known(value):
+        allowed = f"{', '.join(map(repr, known_formats()))}; {MORE}"
+        raise PydanticCustomError("literal_error", "must be a known format", {"expected": allowed})
+    return value
+
+
+def _list_formats(schema: dict[str, Any]) -> None:
+    schema["enum"] = known_formats()
+
+
+Format = Annotated[str, BeforeValidator(_known_format), Field(json_schema_extra=_list_formats)]
 
 
 class SpecModel(BaseModel):

@@ -2,43 +2,34 @@
 
 A source must be cheap to make, because every worker makes its own. Between calls it keeps no file open
 that would not survive a fork. `open_source` finds a source by the name of its format; `detect` finds the
-format of the files at a path.
+format of the files at a path. Formats are listed in `hma_data.registry.formats`; installed packages may
+add some.
 
 T frames of an episode, A values of a vector.
 """
 
 import hashlib
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from fnmatch import fnmatchcase
 from importlib import import_module
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode
-from hma_data.errors import EpisodeError, SourceError
+from hma_data.errors import EpisodeError, PluginError, SourceError
+from hma_data.plugins import SOURCE_GROUP, installed
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.formats import FORMATS, MORE, known_formats
 from hma_data.sources.common.findings import Finding
 from hma_data.sources.common.links import nothing_there
 from hma_data.storage.paths import StrPath, as_text
 
-FORMATS = {
-    "rlds": "hma_data.sources.rlds.source",
-    "hdf5": "hma_data.sources.hdf5.source",
-    "rosbag": "hma_data.sources.bags.source",
-    "lerobot": "hma_data.sources.lerobot.source",
-    "hands": "hma_data.sources.hands.source",
-}
 SAMPLE = 20  # episodes that inspect looks into
-VIDEO_SUFFIXES = (
-    ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".ogv", ".flv", ".gif",
-)  # fmt: skip
-
-ENDINGS = dict.fromkeys((".h5", ".hdf5", ".hdf"), "hdf5") | dict.fromkeys((".bag", ".mcap", ".db3"), "rosbag")
 PACKED = {  # the command that unpacks a file, by the end of its name
     ".tar": "tar xf", ".tar.gz": "tar xf", ".tgz": "tar xf", ".tar.bz2": "tar xf", ".tar.xz": "tar xf",
     ".tar.zst": "tar xf", ".zip": "unzip", ".7z": "7z x", ".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz",
@@ -131,7 +122,7 @@ class Inspection:
     """What a recording holds, found without an embodiment.
 
     Attributes:
-        format: rlds, hdf5, rosbag, lerobot or hands.
+        format: as `open_source` takes it.
         episodes: how many.
         frames: of all episodes together; None when counting them would need a full read.
         lengths: of the first episodes (at most 1,000).
@@ -166,6 +157,7 @@ class Inspection:
         return asdict(self) | {"problems": list(self.problems)}
 
 
+@runtime_checkable
 class Source(Protocol):
     """One recording format. `uri` is the path (str or path object) or the URI of a recording."""
 
@@ -186,56 +178,143 @@ class Source(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Recognition:
+    """By what a format's recordings are recognised; the format's package states it as `RECOGNITION`.
+
+    `detect` asks every format by its first attribute, then every format by the next. What is left empty
+    recognises nothing.
+
+    Attributes:
+        label: what such a recording is, for the error that lists what is known.
+        uri: whether a name or URI is of this format, before anything is opened.
+        layout: files inside the recording's folder, such as "meta/info.json".
+        names: patterns of file names anywhere in the folder, such as "*.tfrecord*".
+        endings: of file names, such as ".h5"; of a store's URI too.
+        magic: what files begin with, at most 32 bytes.
+        weak_endings: of file names in lower case, that count only where nothing else does.
+    """
+
+    label: str
+    uri: Callable[[str], bool] = lambda uri: False
+    layout: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    endings: tuple[str, ...] = ()
+    magic: tuple[bytes, ...] = ()
+    weak_endings: tuple[str, ...] = ()
+
+
+Recognitions = Mapping[str, Recognition]
+
+
 def open_source(name: str) -> Source:
     """Return the source of a format, e.g. "rlds".
 
     Raises:
         SourceError: no such format.
+        PluginError: the package that adds it is broken.
     """
-    if name not in FORMATS:
-        raise SourceError(name, "is not a source format", f"known: {', '.join(FORMATS)}")
-    source: Source = import_module(FORMATS[name]).open()
-    return source
+    if name in FORMATS:
+        source: Source = import_module(f"{FORMATS[name]}.source").open()
+        return source
+    plugin = installed(SOURCE_GROUP).get(name)
+    if plugin is None:
+        raise SourceError(name, "is not a source format", f"known: {', '.join(known_formats())}; {MORE}")
+    module = plugin.load()
+    if not callable(getattr(module, "open", None)):
+        raise plugin.broken(f"{plugin.entry_point.value} has no open()")
+    opened = plugin.call("open()", module.open)
+    if not isinstance(opened, Source):
+        raise plugin.broken(f"open() gave {type(opened).__name__}, which is no hma_data.sources.base.Source")
+    return opened
 
 
 def detect(uri: StrPath) -> str:
     """Return the format of the recording at `uri`, found by the names and first bytes of its files.
+
+    Formats of installed packages are asked after the built-in ones.
 
     Args:
         uri: str or path of the recording, or its URI.
 
     Raises:
         SourceError: nothing is there, or its format is unknown.
+        PluginError: the format is unknown, and a package that might know it is broken.
     """
     uri = as_text(uri)
     if not uri:
         raise SourceError("", "the recording's path is empty", "name a file, a folder or a URI")
-    if "://" in uri and not uri.startswith("file://"):
-        return "lerobot" if uri.startswith("hf://") else ENDINGS.get(PurePosixPath(uri).suffix, "rlds")
-    if _names_a_dataset(uri):
-        return "lerobot"
+    ours = {name: import_module(package).RECOGNITION for name, package in FORMATS.items()}
+    if found := _by_uri(uri, ours):
+        return found
+    if _is_away(uri):
+        return _by_uri(uri, _of_packages()[0]) or "rlds"
     path = local_path(uri)
     files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())[:2000]
-    names = {item.name for item in files}
-    if path.is_dir() and (path / "meta" / "info.json").is_file():
-        return "lerobot"
-    if "features.json" in names or any(".tfrecord" in name or ".array_record" in name for name in names):
-        return "rlds"
-    for item in files:
-        if _is_bag(item):
-            return "rosbag"
-        if ENDINGS.get(item.suffix) == "hdf5" or first_bytes(item, 8) == b"\x89HDF\r\n\x1a\n":
-            return "hdf5"
-    if any(item.suffix.lower() in VIDEO_SUFFIXES for item in files):
-        return "hands"
+    if found := _by_files(path, files, ours):
+        return found
+    theirs, broken = _of_packages()
+    if found := _by_uri(uri, theirs) or _by_files(path, files, theirs):
+        return found
+    if broken:
+        raise broken[0]
+    known = [recognition.label for recognition in (*ours.values(), *theirs.values())]
     raise nothing_there(
         uri,
         path,
         "is not a recording of a known format" if files else "holds no files",
-        _unpack_first(files)
-        or "expected RLDS (features.json, *.tfrecord*), HDF5, a ROS bag or MCAP, "
-        "a LeRobotDataset (meta/info.json), or videos of hands",
+        _unpack_first(files) or f"expected {', '.join(known[:-1])}, or {known[-1]}",
     )
+
+
+def _of_packages() -> tuple[Recognitions, list[PluginError]]:
+    """How the formats of installed packages are recognised, and the errors of packages that are broken."""
+    found: dict[str, Recognition] = {}
+    broken: list[PluginError] = []
+    for name, plugin in installed(SOURCE_GROUP).items():
+        if name in FORMATS:
+            continue
+        try:
+            recognition = getattr(plugin.load(), "RECOGNITION", None)
+            if not isinstance(recognition, Recognition | None):
+                raise plugin.broken(f"its RECOGNITION is a {type(recognition).__name__}")
+        except PluginError as fault:
+            broken.append(fault)
+            continue
+        if recognition:
+            found[name] = recognition
+    return found, broken
+
+
+def _is_away(uri: str) -> bool:
+    return "://" in uri and not uri.startswith("file://")
+
+
+def _by_uri(uri: str, known: Recognitions) -> str | None:
+    """The format that a name or URI alone tells."""
+    suffix = PurePosixPath(uri).suffix if _is_away(uri) else ""
+    by_name = (name for name, recognition in known.items() if recognition.uri(uri))
+    by_ending = (name for name, recognition in known.items() if suffix in recognition.endings)
+    return next(by_name, None) or next(by_ending, None)
+
+
+def _by_files(path: Path, files: Sequence[Path], known: Recognitions) -> str | None:
+    """The format that the files of a recording on this machine tell."""
+    for name, recognition in known.items():
+        if any((path / place).is_file() for place in recognition.layout):
+            return name
+    for name, recognition in known.items():
+        if any(fnmatchcase(file.name, pattern) for file in files for pattern in recognition.names):
+            return name
+    for file in files:
+        head = first_bytes(file, 32)
+        for name, recognition in known.items():
+            if file.name.endswith(recognition.endings) or head.startswith(recognition.magic):
+                return name
+    for name, recognition in known.items():
+        if any(file.suffix.lower() in recognition.weak_endings for file in files):
+            return name
+    return None
 
 
 def of_another_format(uri: str, name: str, fault: SourceError) -> SourceError:
@@ -262,20 +341,6 @@ def _unpack_first(files: Sequence[Path]) -> str:
             if file.name.lower().endswith(suffix):
                 return f"{file.name} is packed: unpack it first, as with `{tool} {file.name}`"
     return ""
-
-
-def _names_a_dataset(uri: str) -> bool:
-    """Check whether a URI reads NAME/DATASET[@REVISION] of the Hub, and names no path on this machine."""
-    path = Path(uri).expanduser()
-    found = re.fullmatch(r"\w[\w.-]*/\w[\w-]*(\.\d[\w.-]*)?(@[\w./-]+)?", uri)
-    return bool(found) and not path.exists() and not path.parent.exists()
-
-
-def _is_bag(path: Path) -> bool:
-    magic = first_bytes(path, 28)
-    known = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3", b"rosbag2_bagfile_information:")
-    endings = (".bag", ".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-    return path.name.endswith(endings) or magic.startswith(known)
 
 
 def local_path(uri: str) -> Path:

@@ -14,13 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import TokenizerError
+from hma_data.plugins import TOKENIZER_GROUP, installed
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.tokenizers.catalog import CATALOG
-
-# name -> (module, keyword arguments of its `load`)
-TOKENIZERS: dict[str, tuple[str, dict[str, Any]]] = {
-    name: (entry.module, dict(entry.arguments)) for name, entry in CATALOG.items()
-}
+from hma_data.tokenizers.catalog import CATALOG, Entry, find_entry
 
 
 @dataclass(frozen=True)
@@ -95,19 +91,42 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
     """Return the tokenizer of that name, ready to use.
 
     Args:
-        name_or_path: a name of `TOKENIZERS`.
+        name_or_path: a name of `hma tokenizer list`.
         weights: str or path of a file (or folder) to take the weights from instead of the usual place, or
             `hf://[datasets/]ORGANISATION/NAME[@REVISION]/FILE`.
         device: device that runs the network: cpu, cuda, mps.
 
     Raises:
         TokenizerError: there is no such tokenizer, or its weights cannot be used.
+        PluginError: the package that adds it is broken.
     """
     name, given = as_text(name_or_path), None if weights is None else as_text(weights)
-    if name not in TOKENIZERS:
-        raise TokenizerError(name, "is not a tokenizer", f"known: {', '.join(sorted(TOKENIZERS))}")
-    module, arguments = TOKENIZERS[name]
-    tokenizer: Tokenizer = import_module(module).load(name, weights=given, device=device, **arguments)
+    entry = find_entry(name)
+    if name not in CATALOG:
+        return _of_package(entry, given, device)
+    tokenizer: Tokenizer = import_module(entry.module).load(
+        name, weights=given, device=device, **entry.arguments
+    )
+    return tokenizer
+
+
+def _of_package(entry: Entry, weights: str | None, device: str) -> Tokenizer:
+    """The tokenizer that an installed package adds.
+
+    Raises:
+        PluginError: its module cannot be imported, or what it loads is no tokenizer of that name.
+    """
+    plugin = installed(TOKENIZER_GROUP)[entry.name]
+    module = plugin.call(f"importing {entry.module}", import_module, entry.module)
+    if not callable(getattr(module, "load", None)):
+        raise plugin.broken(f"{entry.module} has no load()")
+    keywords = {"weights": weights, "device": device, **entry.arguments}
+    tokenizer = plugin.call("load()", module.load, entry.name, **keywords)
+    if not isinstance(tokenizer, Tokenizer) or not isinstance(tokenizer.spec, TokenizerSpec):
+        kind = type(tokenizer).__name__
+        raise plugin.broken(f"load() gave {kind}, which is no hma_data.tokenizers.base.Tokenizer")
+    if tokenizer.spec.name != entry.name:
+        raise plugin.broken(f"its spec is named {tokenizer.spec.name!r}, not {entry.name!r}")
     return tokenizer
 
 

@@ -1,7 +1,8 @@
 """List the tokenizers: what each is, where its weights come from, and what it needs on this machine.
 
-To add a tokenizer, add a row to `CATALOG` and a module with `load(name, *, weights, device, **arguments)`.
-This module imports neither torch nor a tokenizer's module.
+To add a tokenizer, add a row to `CATALOG`, or have an installed package add an `Entry` (CONTRIBUTING.md), and
+a module with `load(name, *, weights, device, **arguments)`. This module imports neither torch nor a built-in
+tokenizer's module.
 """
 
 from collections.abc import Mapping
@@ -9,6 +10,9 @@ from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
+
+from hma_data.errors import PluginError, TokenizerError
+from hma_data.plugins import TOKENIZER_GROUP, Plugin, installed
 
 EMBEDDED = Path(__file__).parent / "weights"
 
@@ -244,3 +248,49 @@ _ROWS = (
 )
 
 CATALOG: dict[str, Entry] = {entry.name: entry for entry in _ROWS}
+
+
+def find_entry(name: str) -> Entry:
+    """Return the tokenizer of that name: built in, or of an installed package.
+
+    Raises:
+        TokenizerError: there is none.
+        PluginError: the package that adds it is broken.
+    """
+    if name in CATALOG:
+        return CATALOG[name]
+    plugin = installed(TOKENIZER_GROUP).get(name)
+    if plugin is None:
+        more = f"an installed package may add tokenizers by entry points of {TOKENIZER_GROUP}"
+        raise TokenizerError(name, "is not a tokenizer", f"known: {', '.join(known_names())}; {more}")
+    return _entry_of(plugin)
+
+
+def known_names() -> list[str]:
+    """Return the names of all tokenizers, sorted."""
+    return sorted({*CATALOG, *installed(TOKENIZER_GROUP)})
+
+
+def all_entries() -> tuple[list[Entry], list[PluginError]]:
+    """Return every tokenizer, and the errors of packages that are broken."""
+    found, broken = list(CATALOG.values()), list[PluginError]()
+    for name, plugin in installed(TOKENIZER_GROUP).items():
+        if name not in CATALOG:
+            try:
+                found.append(_entry_of(plugin))
+            except PluginError as fault:
+                broken.append(fault)
+    return found, broken
+
+
+def _entry_of(plugin: Plugin) -> Entry:
+    """Return the entry that a package's object is, or gives when it is called."""
+    entry = plugin.load()
+    if callable(entry):
+        entry = plugin.call(f"{plugin.entry_point.value}()", entry)
+    if not isinstance(entry, Entry):
+        kind = type(entry).__name__
+        raise plugin.broken(f"gives a {kind}, not an Entry of hma_data.tokenizers.catalog")
+    if entry.name != plugin.name:
+        raise plugin.broken(f"its Entry is named {entry.name!r}, not {plugin.name!r}")
+    return entry

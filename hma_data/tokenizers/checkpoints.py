@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from hma_data.errors import TokenizerError
 from hma_data.storage.files import file_sha256
-from hma_data.tokenizers.catalog import CATALOG, Entry
+from hma_data.tokenizers.catalog import Entry, find_entry
 
 FOLDER = "HMA_WEIGHTS"  # environment variable: a folder of weights, named after the tokenizers
 SUFFIXES = (".safetensors", ".ckpt", ".pt", ".pth")
@@ -39,7 +39,7 @@ def find_weights(name: str, weights: str | None) -> Path:
     """Return the file or folder that holds a tokenizer's weights.
 
     Args:
-        name: name of the tokenizer, a key of `CATALOG`.
+        name: name of the tokenizer, as `get_tokenizer` takes it.
         weights: a path, or `hf://[datasets/]ORGANISATION/NAME[@REVISION]/FILE`; None takes the usual place.
 
     Raises:
@@ -59,7 +59,7 @@ def find_weights(name: str, weights: str | None) -> Path:
         for path in (*files, home / name):
             if path.exists():
                 return path
-    entry = CATALOG[name]
+    entry = find_entry(name)
     if not entry.repo:
         raise TokenizerError(
             name, "has no weights in the package and no pinned download", "give --weights PATH (weights=PATH)"

@@ -6,7 +6,7 @@ A folder may hold one checkpoint, or many in separate folders. Only JSON files a
 from collections.abc import Mapping
 from typing import Any
 
-from hma_data.errors import HMAError, HubError
+from hma_data.errors import HMAError, HubError, PluginError, TokenizerError
 from hma_data.storage.folders import parse_json
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint import migrate
@@ -159,11 +159,14 @@ def _card_problems(card: Mapping[str, Any], config: Mapping[str, Any]) -> list[s
 
 def _tokenizer_problems(tokenizer: Any) -> list[str]:
     """Return the problems that prevent decoding the model's predictions here."""
-    from hma_data.tokenizers.catalog import CATALOG
+    from hma_data.tokenizers.catalog import find_entry
 
     name = _of(tokenizer, "name")
-    entry = CATALOG.get(name) if isinstance(name, str) else None
-    if entry is None:
+    try:
+        entry = find_entry(str(name))
+    except PluginError as fault:
+        return [str(fault)]
+    except TokenizerError:
         return [f"tokenizer {str(name)[:60]!r} is not one of this release: pictures need it"]
     missing = entry.missing()
     return [f"tokenizer {name} needs {', '.join(missing)}: {entry.extra}"] if missing else []

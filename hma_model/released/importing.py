@@ -21,7 +21,7 @@ from hma_data.registry.embodiment import Embodiment, find
 from hma_data.storage.folders import read_json, read_tensors
 from hma_data.storage.paths import StrPath, as_address
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_data.tokenizers.catalog import CATALOG
+from hma_data.tokenizers.catalog import find_entry
 from hma_model.checkpoint.io import LIBRARY, Checkpoint, save
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA
@@ -253,9 +253,7 @@ def _tokenizer_spec(config: HMAConfig, name: str | None, folder: Path) -> Tokeni
     """Return the tokenizer's spec, without the hash of its weights, which the release does not state."""
     discrete = config.kind == "discrete"
     paper = config.vocab_size == 2**18 if discrete else config.channels == 4
-    known = CATALOG.get(name) if name else None
-    if name and known is None:
-        raise CheckpointError(folder, f"{name!r} is not a tokenizer", f"known: {', '.join(sorted(CATALOG))}")
+    known = find_entry(name) if name else None
     if known and (known.kind, known.grid) != (config.kind, config.grid):
         theirs = f"{name} gives {known.kind} ones of {known.grid}"
         fault = f"was trained on {config.kind} tokens of a grid {config.grid}, {theirs}"

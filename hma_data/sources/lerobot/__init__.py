@@ -1,1 +1,18 @@
 """Read LeRobotDataset versions 2.0, 2.1 and 3.0 with pyarrow and PyAV."""
+
+import re
+from pathlib import Path
+
+from hma_data.sources.base import Recognition
+
+
+def _is_of_the_hub(uri: str) -> bool:
+    """Check for hf://, or for NAME/DATASET[@REVISION] where nothing of this machine is meant by it."""
+    path = Path(uri).expanduser()
+    found = re.fullmatch(r"\w[\w.-]*/\w[\w-]*(\.\d[\w.-]*)?(@[\w./-]+)?", uri)
+    return uri.startswith("hf://") or (bool(found) and not path.exists() and not path.parent.exists())
+
+
+RECOGNITION = Recognition(
+    label="a LeRobotDataset (meta/info.json)", uri=_is_of_the_hub, layout=("meta/info.json",)
+)
