@@ -96,7 +96,7 @@ def trouble(kind: str) -> None:
     if kind == "hang":
         time.sleep(600)
     elif kind == "nap":
-        time.sleep(1.5)
+        time.sleep(3)
     elif kind == "memory":
         raise MemoryError
     elif kind == "error":

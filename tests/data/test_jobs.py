@@ -319,6 +319,7 @@ def shards_in(out: Path) -> int:
 def test_a_killed_job_is_continued_to_the_same_bytes(
     script: Path, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
 ) -> None:
+    (tmp_path / "trouble" / "demo_11").write_text("hang")  # so that it cannot end before it is killed
     process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble")
     while process.poll() is None and not shards_in(tmp_path / "out"):
         time.sleep(0.01)

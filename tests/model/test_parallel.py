@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from unittest import mock
@@ -252,12 +253,13 @@ def fail_under_ddp(world: World) -> None:
 
 
 def await_sleep(pid: int) -> None:
-    """Wait until a process waits for something itself, ten times in a row."""
+    """Wait until a process waits for something itself, ten times in a row, or has ended."""
     asleep = 0
-    while asleep < 10 and alive(pid):
-        time.sleep(0.01)
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        asleep = asleep + 1 if state == "S" else 0
+    with suppress(OSError):  # it may end between two looks
+        while asleep < 10 and alive(pid):
+            time.sleep(0.01)
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+            asleep = asleep + 1 if state == "S" else 0
 
 
 def test_one_process_is_a_world_of_one():
