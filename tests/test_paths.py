@@ -43,8 +43,8 @@ from hma_data.storage.paths import StrPath, as_address, as_path, as_text
 from hma_data.storage.remote import RemotePath, place
 from hma_data.tokenizers import get_tokenizer
 from hma_data.tokenizers.catalog import EMBEDDED
+from hma_data.tokenizers.training import eval as tokenizer_report
 from hma_data.tokenizers.training import recipe as tokenizer_recipe
-from hma_data.tokenizers.training import report as tokenizer_report
 from hma_data.tokenizers.training import train as tokenizer_train
 from hma_data.tokenizers.training.frames import frames_of, read_frames, recording_frames
 from hma_model.checkpoint import io as checkpoint
@@ -396,7 +396,7 @@ PUBLIC = (
     "hma_data.sources.hands.scan", "hma_data.sources.hands.source", "hma_data.sources.hdf5.source",
     "hma_data.sources.lerobot.source", "hma_data.sources.rlds.source", "hma_data.tokenizers.base",
     "hma_data.tokenizers.training.frames", "hma_data.tokenizers.training.recipe",
-    "hma_data.tokenizers.training.report", "hma_data.tokenizers.training.train",
+    "hma_data.tokenizers.training.eval", "hma_data.tokenizers.training.train",
     "hma_model.checkpoint.folder", "hma_model.checkpoint.io", "hma_model.demo.run",
     "hma_model.evaluation.evaluate", "hma_model.evaluation.rollout_video", "hma_model.hub.datasets",
     "hma_model.hub.listing", "hma_model.hub.publish", "hma_model.hub.sample", "hma_model.network.model",
@@ -419,7 +419,7 @@ INNER = {  # take what a public function has made of a path already
     "hma_data.shards.verify": {"check_rows", "check_shard"},
     "hma_data.sources.base": {"of_another_format", "local_path", "leaves", "first_bytes", "file_fingerprint"},
     "hma_data.sources.hands.scan": {"scan_cached"},
-    "hma_data.tokenizers.training.frames": {"read_pictures"},
+    "hma_data.tokenizers.training.frames": {"read_pictures", "load_pools"},
     "hma_data.tokenizers.training.train": {"Run"},
     "hma_model.checkpoint.folder": {"inside"},
     "hma_model.hub.publish": {"Store", "embodiment_ids"},

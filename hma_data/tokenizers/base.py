@@ -13,10 +13,12 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import TokenizerError
+from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.plugins import TOKENIZER_GROUP, installed
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.catalog import CATALOG, Entry, find_entry
+
+OTHER = "name the weights of this tokenizer"  # remedy where a file holds something else
 
 
 @dataclass(frozen=True)
@@ -98,29 +100,26 @@ def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, devi
 
     Raises:
         TokenizerError: there is no such tokenizer, or its weights cannot be used.
+        MissingDependencyError: a package that it needs is not installed.
         PluginError: the package that adds it is broken.
     """
     name, given = as_text(name_or_path), None if weights is None else as_text(weights)
     entry = find_entry(name)
+    if missing := entry.missing():
+        raise MissingDependencyError(name, f"needs {', '.join(missing)}", entry.extra)
+    keywords = {"weights": given, "device": device, **entry.arguments}
     if name not in CATALOG:
-        return _of_package(entry, given, device)
-    tokenizer: Tokenizer = import_module(entry.module).load(
-        name, weights=given, device=device, **entry.arguments
-    )
+        return _of_package(entry, keywords)
+    tokenizer: Tokenizer = import_module(entry.module).load(name, **keywords)
     return tokenizer
 
 
-def _of_package(entry: Entry, weights: str | None, device: str) -> Tokenizer:
-    """The tokenizer that an installed package adds.
-
-    Raises:
-        PluginError: its module cannot be imported, or what it loads is no tokenizer of that name.
-    """
+def _of_package(entry: Entry, keywords: dict[str, Any]) -> Tokenizer:
+    """Return the tokenizer that an installed package adds; raise PluginError if the package is broken."""
     plugin = installed(TOKENIZER_GROUP)[entry.name]
     module = plugin.call(f"importing {entry.module}", import_module, entry.module)
     if not callable(getattr(module, "load", None)):
         raise plugin.broken(f"{entry.module} has no load()")
-    keywords = {"weights": weights, "device": device, **entry.arguments}
     tokenizer = plugin.call("load()", module.load, entry.name, **keywords)
     if not isinstance(tokenizer, Tokenizer) or not isinstance(tokenizer.spec, TokenizerSpec):
         kind = type(tokenizer).__name__
@@ -143,16 +142,11 @@ def check_frames(frames: NDArray[Any], spec: TokenizerSpec) -> None:
 
 def check_tokens(tokens: NDArray[Any], spec: TokenizerSpec) -> None:
     """Raise TokenizerError unless tokens have the grid of `spec` and lie in its vocabulary."""
-    if spec.kind == "discrete":
-        shape: tuple[int, ...] = spec.grid
-        fits = tokens.ndim == 3 and tokens.shape[1:] == shape and np.issubdtype(tokens.dtype, np.integer)
-    else:
-        shape = (spec.channels or 0, *spec.grid)
-        fits = tokens.ndim == 4 and tokens.shape[1:] == shape
-    if not fits:
-        raise TokenizerError(
-            spec.name, f"decodes (N, {', '.join(map(str, shape))}), was given {tokens.dtype} {tokens.shape}"
-        )
+    discrete = spec.kind == "discrete"
+    cells = spec.grid if discrete else (spec.channels or 0, *spec.grid)
+    if tokens.shape[1:] != cells or (discrete and not np.issubdtype(tokens.dtype, np.integer)):
+        form = f"(N, {', '.join(map(str, cells))})"
+        raise TokenizerError(spec.name, f"decodes {form}, was given {tokens.dtype} {tokens.shape}")
     if spec.vocab_size and tokens.size and (int(tokens.max()) >= spec.vocab_size or int(tokens.min()) < 0):
         raise TokenizerError(
             spec.name, f"ids must lie in 0..{spec.vocab_size - 1}, met {tokens.min()}..{tokens.max()}"

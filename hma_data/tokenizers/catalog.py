@@ -6,7 +6,7 @@ tokenizer's module.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -103,149 +103,74 @@ class Entry:
         }
 
 
+_MAGVIT2 = Entry(
+    "magvit2", "discrete", 256, (16, 16),
+    "the paper's: Open-MAGVIT2 as 1X tuned it to robot video, 18 bits a token",
+    "download", "hma_data.tokenizers.magvit2", {"averaged": True},
+    repo="1x-technologies/worldmodel", repo_type="dataset", file="magvit2.ckpt", bytes=1_150_000_000,
+    revision="94b418de3ad6efe100495a45ce82d5d870df6265",
+)  # fmt: skip
 _ROWS = (
     Entry(
-        "fsq-16",
-        "discrete",
-        256,
-        (16, 16),
+        "fsq-16", "discrete", 256, (16, 16),
         "the default: finite scalar quantisation, 18 bits a token, fast on a CPU",
-        "embedded",
-        "hma_data.tokenizers.fsq",
-        {"image_size": 256},
-        file="fsq.safetensors",
+        "embedded", "hma_data.tokenizers.fsq", {"image_size": 256}, file="fsq.safetensors",
     ),
     Entry(
-        "fsq-8",
-        "discrete",
-        128,
-        (8, 8),
+        "fsq-8", "discrete", 128, (8, 8),
         "the same network on small pictures, four times cheaper to train on",
-        "embedded",
-        "hma_data.tokenizers.fsq",
-        {"image_size": 128},
-        file="fsq.safetensors",
+        "embedded", "hma_data.tokenizers.fsq", {"image_size": 128}, file="fsq.safetensors",
     ),
     Entry(
-        "vae-8",
-        "continuous",
-        256,
-        (32, 32),
+        "vae-8", "continuous", 256, (32, 32),
         "continuous without a download: 4 channels at 1/8 of the side, fast on a CPU",
-        "embedded",
-        "hma_data.tokenizers.vae",
-        {"image_size": 256},
-        file="vae.safetensors",
+        "embedded", "hma_data.tokenizers.vae", {"image_size": 256}, file="vae.safetensors",
+    ),
+    _MAGVIT2,
+    replace(
+        _MAGVIT2, name="magvit2-plain", arguments={"averaged": False},
+        description="the same checkpoint without averaging: the ids that the paper's own code makes of it",
     ),
     Entry(
-        "magvit2",
-        "discrete",
-        256,
-        (16, 16),
-        "the paper's: Open-MAGVIT2 as 1X tuned it to robot video, 18 bits a token",
-        "download",
-        "hma_data.tokenizers.magvit2",
-        {"averaged": True},
-        repo="1x-technologies/worldmodel",
-        repo_type="dataset",
-        file="magvit2.ckpt",
-        revision="94b418de3ad6efe100495a45ce82d5d870df6265",
-        bytes=1_150_000_000,
-    ),
-    Entry(
-        "magvit2-plain",
-        "discrete",
-        256,
-        (16, 16),
-        "the same checkpoint without averaging: the ids that the paper's own code makes of it",
-        "download",
-        "hma_data.tokenizers.magvit2",
-        {"averaged": False},
-        repo="1x-technologies/worldmodel",
-        repo_type="dataset",
-        file="magvit2.ckpt",
-        revision="94b418de3ad6efe100495a45ce82d5d870df6265",
-        bytes=1_150_000_000,
-    ),
-    Entry(
-        "svd-vae",
-        "continuous",
-        256,
-        (32, 32),
+        "svd-vae", "continuous", 256, (32, 32),
         "the paper's continuous one: Stable Video Diffusion's autoencoder, 4 channels",
-        "download",
-        "hma_data.tokenizers.svd_vae",
-        licence="Stability AI Community License",
-        repo="stabilityai/stable-video-diffusion-img2vid",
-        file="vae/diffusion_pytorch_model.safetensors",
-        bytes=391_000_000,
-        revision="9cf024d5bfa8f56622af86c884f26a52f6676f2e",
-        imports=("torch", "diffusers"),
-        extra="pip install diffusers",
+        "download", "hma_data.tokenizers.svd_vae", licence="Stability AI Community License",
+        repo="stabilityai/stable-video-diffusion-img2vid", bytes=391_000_000,
+        file="vae/diffusion_pytorch_model.safetensors", revision="9cf024d5bfa8f56622af86c884f26a52f6676f2e",
+        imports=("torch", "diffusers"), extra="pip install diffusers",
     ),
     Entry(
-        "taesd",
-        "continuous",
-        256,
-        (32, 32),
+        "taesd", "continuous", 256, (32, 32),
         "the latents of Stable Diffusion 1 and 2 by a tiny network, 4 channels",
-        "download",
-        "hma_data.tokenizers.taesd",
-        {"channels": 4},
-        licence="MIT",
-        repo="madebyollin/taesd",
-        file="diffusion_pytorch_model.safetensors",
-        bytes=9_793_292,
+        "download", "hma_data.tokenizers.taesd", {"channels": 4}, licence="MIT",
+        repo="madebyollin/taesd", file="diffusion_pytorch_model.safetensors", bytes=9_793_292,
         revision="614f76814bbe30edbe2e627ace1c2234c81a2c0e",
         sha256="db169d69145ec4ff064e49d99c95fa05d3eb04ee453de35824a6d0f325513549",
     ),
     Entry(
-        "taef2",
-        "continuous",
-        256,
-        (32, 32),
+        "taef2", "continuous", 256, (32, 32),
         "the latents of FLUX.2 by a tiny network, 32 channels: finer pictures, eight times the data",
-        "download",
-        "hma_data.tokenizers.taesd",
-        {"channels": 32},
-        licence="MIT",
-        repo="madebyollin/taef2",
-        file="taef2.safetensors",
-        bytes=10_000_000,
+        "download", "hma_data.tokenizers.taesd", {"channels": 32}, licence="MIT",
+        repo="madebyollin/taef2", file="taef2.safetensors", bytes=10_000_000,
         revision="bd244ebfe4398c84fbf312a2f1c868c676b500e3",
         sha256="701d31c0ecbef3b609fe236e2e3a65ffb17f3a94237acdd771e8ea3194df557a",
     ),
     Entry(
-        "cosmos-di16",
-        "discrete",
-        256,
-        (16, 16),
+        "cosmos-di16", "discrete", 256, (16, 16),
         "NVIDIA Cosmos, discrete: 64,000 ids; TorchScript files that the user trusts and names",
-        "path",
-        "hma_data.tokenizers.cosmos",
-        licence="NVIDIA Open Model License",
+        "path", "hma_data.tokenizers.cosmos", licence="NVIDIA Open Model License",
     ),
     Entry(
-        "cosmos-ci16",
-        "continuous",
-        256,
-        (16, 16),
+        "cosmos-ci16", "continuous", 256, (16, 16),
         "NVIDIA Cosmos, continuous: 16 channels; TorchScript files that the user trusts and names",
-        "path",
-        "hma_data.tokenizers.cosmos",
-        licence="NVIDIA Open Model License",
+        "path", "hma_data.tokenizers.cosmos", licence="NVIDIA Open Model License",
     ),
     Entry(
-        "raw",
-        "continuous",
-        256,
-        (256, 256),
+        "raw", "continuous", 256, (256, 256),
         "pixels as they are, for baselines and for models with a tokenizer of their own",
-        "none",
-        "hma_data.tokenizers.raw",
-        imports=(),
+        "none", "hma_data.tokenizers.raw", imports=(),
     ),
-)
+)  # fmt: skip
 
 CATALOG: dict[str, Entry] = {entry.name: entry for entry in _ROWS}
 
@@ -261,14 +186,10 @@ def find_entry(name: str) -> Entry:
         return CATALOG[name]
     plugin = installed(TOKENIZER_GROUP).get(name)
     if plugin is None:
+        known = ", ".join(sorted({*CATALOG, *installed(TOKENIZER_GROUP)}))
         more = f"an installed package may add tokenizers by entry points of {TOKENIZER_GROUP}"
-        raise TokenizerError(name, "is not a tokenizer", f"known: {', '.join(known_names())}; {more}")
+        raise TokenizerError(name, "is not a tokenizer", f"known: {known}; {more}")
     return _entry_of(plugin)
-
-
-def known_names() -> list[str]:
-    """Return the names of all tokenizers, sorted."""
-    return sorted({*CATALOG, *installed(TOKENIZER_GROUP)})
 
 
 def all_entries() -> tuple[list[Entry], list[PluginError]]:

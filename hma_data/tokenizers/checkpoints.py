@@ -1,9 +1,12 @@
-"""Find, check and read the weights of the tokenizers that are not in the package.
+"""Find, read and write the weights of tokenizers.
 
-Weights are looked for in three places, in this order: the path that was named; a file or folder of the
-tokenizer's name in $HMA_WEIGHTS; the Hugging Face Hub, at the revision that `catalog` pins. Reading runs
-no code from the files: safetensors holds no code, and of a torch checkpoint only tensors and plain values
-are unpickled (`weights_only`). A network takes all its weights or none.
+Weights that are not in the package are looked for in three places, in this order: the path that was
+named; a file or folder of the tokenizer's name in $HMA_WEIGHTS; the Hugging Face Hub, at the revision that
+`catalog` pins. Reading runs no code from the files: safetensors holds no code, and of a torch checkpoint
+only tensors and plain values are unpickled (`weights_only`). A network takes all its weights or none.
+
+The weights' file of an embedded tokenizer is safetensors of float16 parameters; its metadata holds the
+format, the network's shape and the facts of the training.
 """
 
 import hashlib
@@ -16,23 +19,25 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import BaseModel
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from hma_data.errors import TokenizerError
-from hma_data.storage.files import file_sha256
+from hma_data.storage.files import file_sha256, write_atomic
+from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import Entry, find_entry
 
 FOLDER = "HMA_WEIGHTS"  # environment variable: a folder of weights, named after the tokenizers
 SUFFIXES = (".safetensors", ".ckpt", ".pt", ".pth")
 NESTED = ("state_dict", "model_state_dict", "model")  # where trainers keep the weights in a checkpoint
 HALVES = ("encoder", "decoder")  # in the names of files that come in pairs
-MAX_JSON_BYTES = 1 << 20
 
 Tensors = dict[str, Tensor]
 
 
-# -- where
+# -- find
 
 
 def find_weights(name: str, weights: str | None) -> Path:
@@ -68,74 +73,52 @@ def find_weights(name: str, weights: str | None) -> Path:
 
 
 def _parse_uri(uri: str) -> Entry:
+    """Return an entry of which only the fields that name the file matter."""
     form = r"hf://(datasets/)?([\w.-]+/[\w.-]+?)(?:@([\w.-]+))?/([\w./-]+)"
     found = re.fullmatch(form, uri)
     if not found or ".." in uri:
         raise TokenizerError(uri, "is no file on the hub", "write hf://ORGANISATION/NAME@REVISION/FILE")
     dataset, repo, revision, file = found.groups()
-    kind = "dataset" if dataset else "model"
-    # Only the fields that name the file matter here.
-    return Entry(
-        uri,
-        "discrete",
-        0,
-        (0, 0),
-        "",
-        "download",
-        "",
-        repo=repo,
-        file=file,
-        revision=revision or "main",
-        repo_type=kind,  # type: ignore[arg-type]
-    )
+    place: dict[str, Any] = {"repo": repo, "file": file, "revision": revision or "main"}
+    place["repo_type"] = "dataset" if dataset else "model"
+    return Entry(uri, "discrete", 0, (0, 0), "", "download", "", **place)
 
 
 def _from_hub(name: str, entry: Entry) -> Path:
-    """Return the path of a pinned file in the hub's cache; download it if it is not there."""
+    """Return the path of a file in the hub's cache; download the file if it is not there."""
     import httpx
-    from huggingface_hub import errors
+    from huggingface_hub.errors import GatedRepoError, HFValidationError
 
-    size = f", {entry.bytes / 1e6:.0f} MB" if entry.bytes else ""
-    wanted = f"{entry.file} of {entry.repo} at {entry.revision[:12]}{size}"
-    remedy = "get the file elsewhere and give its path: --weights PATH (weights=PATH)"
     try:
-        path = _cached(entry) or _download(entry)
-    except errors.GatedRepoError as fault:
-        gated = f"accept its licence on the repository's page and log in, or {remedy}"
-        raise TokenizerError(name, f"needs {wanted}, which is gated", gated) from fault
-    except (errors.HfHubHTTPError, errors.HFValidationError) as fault:
-        if isinstance(fault, errors.LocalEntryNotFoundError):
-            raise _unreachable(name, wanted, fault, remedy) from fault
-        text = _one_line(fault)
-        raise TokenizerError(name, f"needs {wanted}, which the hub did not give: {text}", remedy) from fault
-    except (httpx.HTTPError, OSError) as fault:
-        raise _unreachable(name, wanted, fault, remedy) from fault
-    if entry.sha256 and file_sha256(Path(path)) != entry.sha256:
+        path = Path(_download(entry))
+    except (httpx.HTTPError, HFValidationError, OSError) as fault:
+        size = f", {entry.bytes / 1e6:.0f} MB" if entry.bytes else ""
+        wanted = f"needs {entry.file} of {entry.repo} at {entry.revision[:12]}{size}"
+        remedy = "get the file elsewhere and give its path: --weights PATH (weights=PATH)"
+        if isinstance(fault, GatedRepoError):
+            remedy = f"accept its licence on the repository's page and log in, or {remedy}"
+        text = f"{wanted}, which could not be downloaded: {type(fault).__name__}: {_one_line(fault)}"
+        raise TokenizerError(name, text, remedy) from fault
+    if entry.sha256 and file_sha256(path) != entry.sha256:
         raise TokenizerError(
             path, f"is not the file that was pinned for {name} (SHA-256 {entry.sha256[:12]}…)", "delete it"
         )
-    return Path(path)
-
-
-def _unreachable(name: str, wanted: str, fault: Exception, remedy: str) -> TokenizerError:
-    reason = type(fault).__name__
-    return TokenizerError(name, f"needs {wanted} from the hub, which is out of reach ({reason})", remedy)
-
-
-def _cached(entry: Entry) -> str | None:
-    """Return the file in the hub's cache if the revision is a commit; a branch or tag can move."""
-    from huggingface_hub import try_to_load_from_cache
-
-    if not re.fullmatch(r"[0-9a-f]{40}", entry.revision):
-        return None
-    found = try_to_load_from_cache(entry.repo, entry.file, revision=entry.revision, repo_type=entry.repo_type)
-    return found if isinstance(found, str) else None
+    return path
 
 
 def _download(entry: Entry) -> str:
-    from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
+    from huggingface_hub import (
+        get_hf_file_metadata,
+        hf_hub_download,
+        hf_hub_url,
+        try_to_load_from_cache,
+    )
 
     kind, revision = entry.repo_type, entry.revision
+    if re.fullmatch(r"[0-9a-f]{40}", revision):  # a branch or a tag can move, a commit cannot
+        cached = try_to_load_from_cache(entry.repo, entry.file, revision=revision, repo_type=kind)
+        if isinstance(cached, str):
+            return cached
     # Ask once first: without a connection, the download would retry for half a minute and log each try.
     get_hf_file_metadata(hf_hub_url(entry.repo, entry.file, repo_type=kind, revision=revision))
     return hf_hub_download(entry.repo, entry.file, revision=revision, repo_type=kind)
@@ -147,12 +130,9 @@ def one_file(path: Path, names: Iterable[str], what: str) -> Path:
     Raises:
         TokenizerError: none of them is there.
     """
-    if path.is_file():
-        return path
-    names = tuple(names)
-    for name in names:
-        if (path / name).is_file():
-            return path / name
+    for file in (path, *(path / name for name in names)):
+        if file.is_file():
+            return file
     raise TokenizerError(path, f"holds none of {', '.join(names)}", f"name the file of {what}")
 
 
@@ -179,7 +159,7 @@ def digest_of(paths: Iterable[Path]) -> str:
     return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
-# -- what
+# -- read
 
 
 def read_tensors(path: Path) -> Tensors:
@@ -188,83 +168,63 @@ def read_tensors(path: Path) -> Tensors:
     Raises:
         TokenizerError: it is not such a file, is truncated, or holds values that only code could make.
     """
-    try:
-        with path.open("rb") as file:
-            start = file.read(9)
-    except OSError as fault:
-        raise TokenizerError(path, f"weights cannot be read: {fault.strerror or fault}") from fault
-    if start[8:] == b"{":
-        return _read_safetensors(path)
-    if start.startswith((b"PK", b"\x80")):
-        return _read_torch(path)
-    raise TokenizerError(
-        path, "is neither safetensors nor a torch checkpoint", "name the file that holds the weights"
-    )
-
-
-def _read_safetensors(path: Path) -> Tensors:
-    try:
-        with safe_open(path, "pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as fault:
-        raise TokenizerError(
-            path, f"is no whole safetensors file: {_one_line(fault)}", "fetch it again"
-        ) from fault
-
-
-def _read_torch(path: Path) -> Tensors:
     import pickle
 
     try:
-        try:
-            values = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-        except RuntimeError:  # a file written before torch 1.6 cannot be mapped
-            values = torch.load(path, map_location="cpu", weights_only=True)
+        with path.open("rb") as file:
+            start = file.read(9)
+        if start[8:] == b"{":
+            return _read_safetensors(path)[0]
+        # Only a zip archive can be memory-mapped; torch wrote others before version 1.6.
+        values = torch.load(path, map_location="cpu", weights_only=True, mmap=start.startswith(b"PK"))
     except pickle.UnpicklingError as fault:
         raise TokenizerError(
             path,
-            f"holds more than tensors and plain values, and was not unpickled: {_refused(fault)}",
+            "is no torch checkpoint, or holds more than tensors and plain values; it was not unpickled",
             "save its state_dict as safetensors where it can be trusted",
         ) from fault
-    except Exception as fault:  # a damaged file can raise anything
-        text = f"{type(fault).__name__}: {_one_line(fault)}"
-        raise TokenizerError(path, f"is no whole torch checkpoint ({text})", "fetch it again") from fault
+    except TokenizerError:
+        raise
+    except Exception as fault:  # torch raises many kinds of errors on a damaged file
+        text = f"is no whole safetensors file or torch checkpoint: {type(fault).__name__}: {_one_line(fault)}"
+        raise TokenizerError(path, text, "fetch it again") from fault
     for key in NESTED:
         if isinstance(values, Mapping) and isinstance(values.get(key), Mapping):
             values = values[key]
-    tensors = (
-        {str(k): v for k, v in values.items() if isinstance(v, Tensor)} if isinstance(values, Mapping) else {}
-    )
+    named = values.items() if isinstance(values, Mapping) else ()
+    tensors = {str(name): value for name, value in named if isinstance(value, Tensor)}
     if not tensors:
-        raise TokenizerError(path, f"holds no weights by name, but a {type(values).__name__}")
+        raise TokenizerError(path, f"holds no weights by name, but a {type(values).__name__}", OTHER)
     return tensors
 
 
-def _refused(fault: Exception) -> str:
-    """Return the name that the unpickler refused, taken from its long message."""
-    text = _one_line(fault, 4000)
-    found = re.search(r"GLOBAL ([\w.]+)", text) or re.search(r"WeightsUnpickler error: ([^.]{1,120})", text)
-    return found.group(1) if found else text[:120]
+def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
+    """Return the tensors and the metadata of a safetensors file."""
+    try:
+        with safe_open(path, "pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except (SafetensorError, OSError) as fault:
+        raise TokenizerError(path, f"is no whole safetensors file: {_one_line(fault)}", OTHER) from fault
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    """Return the `config.json` of a folder; empty if there is none.
+def stated_scale(folder: Path, default: float) -> float:
+    """Return the `scaling_factor` that a folder's `config.json` states; `default` if it states none.
 
     Raises:
-        TokenizerError: it is not a JSON object.
+        TokenizerError: the file is not a JSON object, or the factor is not a positive number.
     """
     path = folder / "config.json"
-    if not path.is_file():
-        return {}
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise ValueError(f"larger than {MAX_JSON_BYTES} bytes")
-        values = json.loads(path.read_text("utf-8"))
-        if not isinstance(values, dict):
-            raise ValueError("not an object")
-    except (OSError, ValueError, RecursionError) as fault:
-        raise TokenizerError(path, f"is no JSON object: {_one_line(fault)}", "remove or repair it") from fault
-    return values
+        scale = float(json.loads(path.read_text("utf-8")).get("scaling_factor", default))
+        if not 0 < scale < 1e6:
+            raise ValueError(f"scaling_factor is {scale}")
+    except FileNotFoundError:
+        return default
+    except (OSError, ValueError, TypeError, AttributeError) as fault:
+        raise TokenizerError(
+            path, f"states no usable scaling_factor: {_one_line(fault)}", "repair it"
+        ) from fault
+    return scale
 
 
 def fill(network: nn.Module, tensors: Mapping[str, Tensor], where: object) -> None:
@@ -273,36 +233,24 @@ def fill(network: nn.Module, tensors: Mapping[str, Tensor], where: object) -> No
     Raises:
         TokenizerError: a weight is missing, unexpected, of another shape, or not finite.
     """
-    expected = {name: tuple(p.shape) for name, p in network.state_dict().items()}
-    remedy = "these are the weights of another network"
-    if missing := sorted(expected.keys() - tensors.keys()):
-        raise TokenizerError(where, f"lacks {_some(missing)}", remedy)
-    if unexpected := sorted(tensors.keys() - expected.keys()):
-        raise TokenizerError(where, f"has {_some(unexpected)}, unknown to the network", remedy)
-    for name, shape in expected.items():
-        if tuple(tensors[name].shape) != shape:
-            fault = f"{name} has shape {tuple(tensors[name].shape)}, the network takes {shape}"
-            raise TokenizerError(where, fault, remedy)
     state = {name: tensor.to(torch.float32, copy=True).contiguous() for name, tensor in tensors.items()}
     for name, tensor in state.items():
         if not torch.isfinite(tensor).all():
             raise TokenizerError(where, f"{name} holds values that are not finite", "fetch it again")
-    network.load_state_dict(state, assign=True)
+    try:
+        network.load_state_dict(state, assign=True)
+    except RuntimeError as fault:
+        raise TokenizerError(where, f"does not fit the network: {_one_line(fault, 300)}", OTHER) from fault
 
 
 @contextmanager
 def shapes_of(where: object, what: str) -> Iterator[None]:
-    """Turn a missing or unsuitable tensor, met while sizes are derived, into one TokenizerError."""
+    """Turn a missing or unsuitable tensor, met while a network is derived, into one TokenizerError."""
     try:
         yield
-    except KeyError as fault:
-        raise TokenizerError(
-            where, f"lacks {fault.args[0]}: not the weights of {what}", "name other weights"
-        ) from fault
-    except (ValueError, IndexError, TypeError, RuntimeError, ZeroDivisionError) as fault:
-        raise TokenizerError(
-            where, f"describes no {what}: {_one_line(fault)}", "these are the weights of another network"
-        ) from fault
+    except (KeyError, IndexError, ValueError, TypeError, RuntimeError, ZeroDivisionError) as fault:
+        text = f"lacks {fault.args[0]}" if isinstance(fault, KeyError) else _one_line(fault)
+        raise TokenizerError(where, f"does not hold the weights of {what}: {text}", OTHER) from fault
 
 
 def numbers(names: Iterable[str], prefix: str) -> list[int]:
@@ -311,10 +259,41 @@ def numbers(names: Iterable[str], prefix: str) -> list[int]:
     return sorted(int(number) for number in found if number.isdecimal())
 
 
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more
-
-
 def _one_line(fault: object, length: int = 160) -> str:
     return " ".join(str(fault).split())[:length]
+
+
+# -- the embedded tokenizers' files
+
+
+def save_weights(
+    path: Path, form: str, config: BaseModel, tensors: dict[str, Tensor], facts: dict[str, Any]
+) -> None:
+    """Write parameters as float16 with the network's shape and `facts` in the metadata, atomically."""
+    halves = {name: tensor.detach().half().contiguous() for name, tensor in sorted(tensors.items())}
+    metadata = {"format": form, "config": json.dumps(config.model_dump()), "training": json.dumps(facts)}
+    content = save(halves, metadata)
+    # The library writes the header in an order that varies; sort it, so that equal weights are equal files.
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    write_atomic(path, len(header).to_bytes(8, "little") + header + content[end:])
+
+
+def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C, Tensors, str]:
+    """Read a weights' file; return the network's shape, its parameters (float16) and the file's SHA-256.
+
+    Raises:
+        TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
+    """
+    tensors, metadata = _read_safetensors(path)
+    remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
+    if metadata.get("format") != form:
+        raise TokenizerError(path, f"holds no {form} weights (format {metadata.get('format')!r})", remedy)
+    try:
+        shape = config.model_validate_json(metadata.get("config", ""))
+    except ValueError as fault:
+        raise TokenizerError(
+            path, f"its metadata describes no network: {_one_line(fault)}", remedy
+        ) from fault
+    return shape, tensors, file_sha256(path)

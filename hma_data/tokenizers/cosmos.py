@@ -9,7 +9,6 @@ Both take 256×256 pictures to a 16×16 grid. `di16`: 64,000 ids, finite scalar 
 (8, 8, 8, 5, 5, 5), the first lowest, so two digits of 512 and 125. `ci16`: latents of 16 channels.
 """
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -39,58 +38,38 @@ class CosmosNetwork(nn.Module):
         self.encoder, self.decoder = encoder, decoder
 
 
-def find_files(path: Path) -> list[Path]:
-    """Return the encoder's and the decoder's file, given the folder or one of the two files.
-
-    Raises:
-        TokenizerError: one of them is not there.
-    """
-    files = pair_of(path / "encoder.jit" if path.is_dir() else path)
-    if not files:
-        raise TokenizerError(path, "is named after neither encoder nor decoder", REMEDY)
-    return files
-
-
 def read_program(path: Path) -> torch.jit.ScriptModule:
     """Load a TorchScript file. Loading trusts the file: see the module's docstring.
 
     Raises:
-        TokenizerError: the file is not a TorchScript archive, or is truncated.
+        TokenizerError: the file is not a TorchScript program, or is truncated.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            scripted = any("/code/" in name for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError) as fault:
-        raise TokenizerError(path, f"is no whole TorchScript file: {fault}", "fetch it again") from fault
-    if not scripted:
-        raise TokenizerError(path, "is a torch checkpoint, not a TorchScript program", REMEDY)
     try:
         program: torch.jit.ScriptModule = torch.jit.load(str(path), map_location="cpu")
     except (RuntimeError, ValueError, EOFError) as fault:
         text = " ".join(str(fault).split())[:160]
-        raise TokenizerError(path, f"cannot be loaded as TorchScript: {text}", "fetch it again") from fault
+        raise TokenizerError(path, f"cannot be loaded as TorchScript: {text}", REMEDY) from fault
     return program
 
 
-def _first(made: object) -> Tensor:
-    """Return the first output of a program: the ids, latents or pixels; the rest are codes and losses."""
+def _output(made: object, shape: tuple[int, ...]) -> Tensor:
+    """Return the first output of a program, the ids, latents or pixels; the others are codes and losses."""
     value = made[0] if isinstance(made, tuple | list) and made else made
-    if not isinstance(value, Tensor):
-        raise TypeError(f"it gives a {type(value).__name__}")
+    if not isinstance(value, Tensor) or tuple(value.shape[1:]) != shape:
+        raise ValueError(f"it does not give values of shape {shape}")
     return value
 
 
 def _try(tokenizer: NetworkTokenizer, files: list[Path]) -> None:
     """Encode and decode one grey picture, so that programs of other tokenizers are refused at once."""
-    grey: NDArray[Any] = np.full((1, IMAGE_SIZE, IMAGE_SIZE, 3), 127, np.uint8)
+    values: NDArray[Any] = np.full((1, IMAGE_SIZE, IMAGE_SIZE, 3), 127, np.uint8)
     for file, half in zip(files, (tokenizer.encode, tokenizer.decode), strict=True):
         try:
-            grey = half(grey)
-        except (RuntimeError, ValueError, TypeError, IndexError) as fault:
+            values = half(values)
+        except (RuntimeError, ValueError) as fault:
             text = " ".join(str(fault).split())[-160:]
-            raise TokenizerError(
-                file, f"does not do what {tokenizer.spec.name} does: {text}", REMEDY
-            ) from fault
+            fault_text = f"does not do what {tokenizer.spec.name} does: {text}"
+            raise TokenizerError(file, fault_text, REMEDY) from fault
 
 
 def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
@@ -104,7 +83,10 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
         TokenizerError: the files cannot be used, or there is no such device.
     """
     place = open_device(name, device)
-    files = find_files(find_weights(name, weights))
+    path = find_weights(name, weights)
+    files = pair_of(path / "encoder.jit" if path.is_dir() else path)
+    if not files:
+        raise TokenizerError(path, "is named after neither encoder nor decoder", REMEDY)
     encoder, decoder = (read_program(file) for file in files)
     discrete = name == "cosmos-di16"
     spec = TokenizerSpec(
@@ -124,16 +106,10 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
     def encode(pixels: Tensor) -> Tensor:
         # The optimiser rewrites a program after its first runs, which may change the last bits.
         with torch.jit.optimized_execution(place.type != "cpu"):
-            made = _first(encoder(pixels))
-        if tuple(made.shape[1:]) != cells or made.is_floating_point() == discrete:
-            raise ValueError(f"it gives {made.dtype} {tuple(made.shape[1:])}, not {cells}")
-        return made
+            return _output(encoder(pixels), cells)
 
     def decode(tokens: Tensor) -> Tensor:
-        made = _first(decoder(tokens))
-        if tuple(made.shape[1:]) != (3, IMAGE_SIZE, IMAGE_SIZE):
-            raise ValueError(f"it gives {tuple(made.shape[1:])}")
-        return made
+        return _output(decoder(tokens), (3, IMAGE_SIZE, IMAGE_SIZE))
 
     tokenizer = NetworkTokenizer(spec, CosmosNetwork(encoder, decoder), place, encode, decode)
     _try(tokenizer, files)

@@ -6,16 +6,25 @@ Both take 256×256 pictures and give 16×16 ids of 18 bits, two digits of 512. T
 hold averaged weights (`model_ema.*`) beside the plain ones: `magvit2` uses the averaged weights. The
 paper's own loader overwrites the averaged weights with the plain ones: `magvit2-plain` gives that
 loader's ids.
+
+The network is a convolutional autoencoder whose latents are reduced to their signs (lookup-free
+quantisation, Yu et al. 2024). Parameter names are those of the released checkpoints. The first
+checkpoints (1X's among them) have a plain decoder. In later ones (`adaptive`), each stage of the decoder
+has a group norm whose scale and shift come from the code.
+
+B pictures, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
+from torch import Tensor, nn
+from torch.nn import functional
 
 from hma_data.errors import TokenizerError
-from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers.base import OTHER, TokenizerSpec
 from hma_data.tokenizers.checkpoints import (
     Tensors,
     digest_of,
@@ -23,12 +32,10 @@ from hma_data.tokenizers.checkpoints import (
     find_weights,
     numbers,
     one_file,
-    read_config,
     read_tensors,
     shapes_of,
 )
-from hma_data.tokenizers.magvit2_network import Magvit2, Magvit2Config
-from hma_data.tokenizers.network import NetworkTokenizer, grid_of, open_device
+from hma_data.tokenizers.network import NetworkTokenizer, open_device
 
 VERSION = 1
 IMAGE_SIZE = 256
@@ -38,9 +45,194 @@ FIRST = "encoder.conv_in.weight"
 AVERAGED = "model_ema."
 # Projections around a learned codebook; a network that has them is a VQGAN or IBQ, not Open-MAGVIT2.
 FOREIGN = ("quant_conv.", "post_quant_conv.", "quantize.embedding")
+GROUPS, EPS = 32, 1e-6
 
 
-def choose_weights(tensors: Mapping[str, torch.Tensor], where: object, *, averaged: bool = True) -> Tensors:
+@dataclass(frozen=True)
+class Magvit2Config:
+    """The network's shape.
+
+    Attributes:
+        base: channels at the picture's own size.
+        z: channels of the code, which is the number of bits of a token.
+        mult: channels of each level as multiples of `base`; each level except the last halves the side.
+        res_blocks: residual blocks a level.
+        adaptive: whether the decoder has adaptive group norms.
+    """
+
+    base: int = 128
+    z: int = 18
+    mult: tuple[int, ...] = (1, 1, 2, 2, 4)
+    res_blocks: int = 2
+    adaptive: bool = False
+
+    @property
+    def stride(self) -> int:
+        """Return the number of pixels a token covers along each side."""
+        return 2 ** (len(self.mult) - 1)
+
+    @property
+    def factored(self) -> tuple[int, ...]:
+        """Return the sizes of two digits, low digit first, as equal as z allows; one digit if z is 1."""
+        return (2 ** (self.z - self.z // 2), 2 ** (self.z // 2)) if self.z > 1 else (2,)
+
+
+class ResBlock(nn.Module):
+    """A residual block: x + conv2(silu(norm2(conv1(silu(norm1(x)))))), 3×3 and without bias.
+
+    If the widths differ, a 1×1 convolution of x replaces x in the sum.
+    """
+
+    def __init__(self, before: int, after: int) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = nn.GroupNorm(GROUPS, before, eps=EPS), nn.GroupNorm(GROUPS, after, eps=EPS)
+        self.conv1 = nn.Conv2d(before, after, 3, padding=1, bias=False)
+        self.conv2 = nn.Conv2d(after, after, 3, padding=1, bias=False)
+        self.nin_shortcut = None if before == after else nn.Conv2d(before, after, 1, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.conv1(functional.silu(self.norm1(x)))
+        h = self.conv2(functional.silu(self.norm2(h)))
+        return h + (x if self.nin_shortcut is None else self.nin_shortcut(x))
+
+
+def _blocks(before: int, after: int, count: int) -> nn.ModuleList:
+    return nn.ModuleList(ResBlock(before if i == 0 else after, after) for i in range(count))
+
+
+def _run(blocks: Iterable[nn.Module], x: Tensor) -> Tensor:
+    for block in blocks:
+        x = block(x)
+    return x
+
+
+class DownLevel(nn.Module):
+    """Residual blocks, then a strided convolution that halves the side, except on the last level."""
+
+    def __init__(self, before: int, after: int, count: int, last: bool) -> None:
+        super().__init__()
+        self.block = _blocks(before, after, count)
+        self.downsample = None if last else nn.Conv2d(after, after, 3, stride=2, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = _run(self.block, x)
+        return x if self.downsample is None else self.downsample(x)
+
+
+class Upsample(nn.Module):
+    """An upsampling by 2: a 3×3 convolution makes four times the channels, which become 2×2 pixels.
+
+    Of the output channels of the convolution, the picture channel varies fastest.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(width, 4 * width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        batch, width, height, side = x.shape
+        cells = self.conv1(x).view(batch, 2, 2, width, height, side)
+        return cells.permute(0, 3, 4, 1, 5, 2).reshape(batch, width, 2 * height, 2 * side)
+
+
+class UpLevel(nn.Module):
+    """Residual blocks, then an upsampling that doubles the side, except on the finest level."""
+
+    def __init__(self, before: int, after: int, count: int, finest: bool) -> None:
+        super().__init__()
+        self.block = _blocks(before, after, count)
+        self.upsample = None if finest else Upsample(after)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = _run(self.block, x)
+        return x if self.upsample is None else self.upsample(x)
+
+
+class AdaptiveNorm(nn.Module):
+    """A group norm whose scale comes from the code's spread over the picture, and its shift from the mean."""
+
+    def __init__(self, z: int, width: int) -> None:
+        super().__init__()
+        self.gamma, self.beta = nn.Linear(z, width), nn.Linear(z, width)
+
+    def forward(self, x: Tensor, codes: Tensor) -> Tensor:
+        flat = codes.flatten(2)
+        scale = self.gamma((flat.var(dim=2) + EPS).sqrt())
+        shift = self.beta(flat.mean(dim=2))
+        return functional.group_norm(x, GROUPS, eps=EPS) * scale[:, :, None, None] + shift[:, :, None, None]
+
+
+class Encoder(nn.Module):
+    """The encoder: (B, 3, S, S) pixels -> (B, z, h, h), whose signs are the code."""
+
+    def __init__(self, config: Magvit2Config) -> None:
+        super().__init__()
+        widths = [config.base * m for m in (1, *config.mult)]
+        last = len(config.mult) - 1
+        self.conv_in = nn.Conv2d(3, config.base, 3, padding=1, bias=False)
+        self.down = nn.ModuleList(
+            DownLevel(widths[i], widths[i + 1], config.res_blocks, i == last) for i in range(last + 1)
+        )
+        self.mid_block = _blocks(widths[-1], widths[-1], config.res_blocks)
+        self.norm_out = nn.GroupNorm(GROUPS, widths[-1], eps=EPS)
+        self.conv_out = nn.Conv2d(widths[-1], config.z, 1)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        x = _run(self.mid_block, _run(self.down, self.conv_in(pixels)))
+        return self.conv_out(functional.silu(self.norm_out(x)))
+
+
+class Decoder(nn.Module):
+    """The decoder: (B, z, h, h) codes of -1 and 1 -> (B, 3, S, S) pixels, about [-1, 1]."""
+
+    def __init__(self, config: Magvit2Config) -> None:
+        super().__init__()
+        after = [config.base * m for m in config.mult]
+        before = [*after[1:], after[-1]]  # input widths; a level takes the output of the coarser one
+        levels = range(len(after))
+        self.conv_in = nn.Conv2d(config.z, after[-1], 3, padding=1)
+        self.mid_block = _blocks(after[-1], after[-1], config.res_blocks)
+        self.up = nn.ModuleList(UpLevel(before[i], after[i], config.res_blocks, i == 0) for i in levels)
+        norms = (AdaptiveNorm(config.z, before[i]) for i in levels if config.adaptive)
+        self.adaptive = nn.ModuleList(norms)
+        self.norm_out = nn.GroupNorm(GROUPS, after[0], eps=EPS)
+        self.conv_out = nn.Conv2d(after[0], 3, 3, padding=1)
+
+    def forward(self, codes: Tensor) -> Tensor:
+        x = _run(self.mid_block, self.conv_in(codes))
+        for i in reversed(range(len(self.up))):
+            if self.adaptive:
+                x = self.adaptive[i](x, codes)
+            x = self.up[i](x)
+        return self.conv_out(functional.silu(self.norm_out(x)))
+
+
+class Magvit2(nn.Module):
+    """An autoencoder of `encoder` and `decoder`, with a quantiser between them that has no parameters.
+
+    A channel above zero is a 1. Bit c of an id is channel c, the lowest first. The paper's release
+    stores ids in this order (its `flip`); upstream's order is the reverse.
+    """
+
+    def __init__(self, config: Magvit2Config) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = Encoder(config)
+        self.decoder = Decoder(config)
+
+    def to_ids(self, latents: Tensor) -> Tensor:
+        """Return the ids of latents: (B, z, h, w) -> (B, h, w) int64."""
+        bits = (latents > 0).to(torch.int64)
+        weights = 2 ** torch.arange(self.config.z, device=latents.device)
+        return (bits * weights.view(1, -1, 1, 1)).sum(1)
+
+    def from_ids(self, ids: Tensor) -> Tensor:
+        """Return the codes of ids: (B, h, w) int64 -> (B, z, h, w) float32 of -1 and 1."""
+        shifts = torch.arange(self.config.z, device=ids.device).view(1, -1, 1, 1)
+        return ((ids.unsqueeze(1) >> shifts) & 1).float() * 2 - 1
+
+
+def choose_weights(tensors: Mapping[str, Tensor], where: object, *, averaged: bool = True) -> Tensors:
     """Return the parameters of encoder and decoder in a checkpoint, under their plain names.
 
     The trainer's prefix is removed, and parameters of the loss (the discriminator) are left out.
@@ -51,62 +243,29 @@ def choose_weights(tensors: Mapping[str, torch.Tensor], where: object, *, averag
     Raises:
         TokenizerError: the checkpoint holds no such network, or averages only a part of it.
     """
-    prefixes = [name.removesuffix(FIRST) for name in tensors if name.endswith(FIRST)]
-    if not prefixes:
-        raise TokenizerError(where, f"lacks {FIRST}: not the weights of {WHAT}", "name other weights")
-    prefix = min(prefixes, key=len)
+    prefix = min((name.removesuffix(FIRST) for name in tensors if name.endswith(FIRST)), key=len, default="")
     named = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
-    foreign = [name for name in named if name.startswith(FOREIGN)]
-    if foreign:
-        raise TokenizerError(where, f"has {foreign[0]}: not the weights of {WHAT}", "name other weights")
+    if foreign := [name for name in named if name.startswith(FOREIGN)]:
+        raise TokenizerError(where, f"does not hold the weights of {WHAT}: has {foreign[0]}", OTHER)
     plain = {name: t for name, t in named.items() if name.startswith(("encoder.", "decoder."))}
     if not averaged or not any(name.startswith(AVERAGED) for name in named):
         return plain
-    keys = {name: AVERAGED + name.replace(".", "") for name in plain}
-    missing = [key for key in keys.values() if key not in named]
-    if missing:
-        raise TokenizerError(
-            where, f"its averaged weights lack {missing[0]} ({len(missing)} in all)", "fetch it again"
-        )
-    return {name: named[key] for name, key in keys.items()}
-
-
-def derive_config(tensors: Mapping[str, torch.Tensor], where: object) -> Magvit2Config:
-    """Derive the network's shape from the shapes of its weights.
-
-    Raises:
-        TokenizerError: the weights are not those of such a network.
-    """
     with shapes_of(where, WHAT):
-        base, colours = tensors[FIRST].shape[:2]
-        if colours != 3:
-            raise ValueError(f"it takes {colours} channels of pixels")
-        levels = len(numbers(tensors, "encoder.down."))
-        widths = [tensors[f"encoder.down.{i}.block.0.conv1.weight"].shape[0] for i in range(levels)]
-        if any(width % base for width in widths):
-            raise ValueError(f"widths {widths} are no multiples of {base}")
-        return Magvit2Config(
-            base=base,
-            z=tensors["encoder.conv_out.weight"].shape[0],
-            mult=tuple(width // base for width in widths),
-            res_blocks=len(numbers(tensors, "encoder.down.0.block.")),
-            adaptive=any(name.startswith("decoder.adaptive.") for name in tensors),
-        )
+        return {name: named[AVERAGED + name.replace(".", "")] for name in plain}
 
 
-def check_config(config: Magvit2Config, stated: Mapping[str, Any], where: object) -> None:
-    """Raise TokenizerError if a `config.json` beside the weights contradicts them."""
-    derived = {
-        "base_channels": config.base,
-        "z_channels": config.z,
-        "ch_mult": list(config.mult),
-        "num_res_blocks": config.res_blocks,
-    }
-    for key, value in derived.items():
-        if key in stated and stated[key] != value:
-            raise TokenizerError(
-                where, f"the config.json beside it says {key} {stated[key]!r}, its weights say {value!r}"
-            )
+def derive_config(tensors: Mapping[str, Tensor]) -> Magvit2Config:
+    """Return the network's shape, derived from the shapes of its weights."""
+    base = tensors[FIRST].shape[0]
+    levels = len(numbers(tensors, "encoder.down."))
+    widths = [tensors[f"encoder.down.{i}.block.0.conv1.weight"].shape[0] for i in range(levels)]
+    return Magvit2Config(
+        base=base,
+        z=tensors["encoder.conv_out.weight"].shape[0],
+        mult=tuple(width // base for width in widths),
+        res_blocks=len(numbers(tensors, "encoder.down.0.block.")),
+        adaptive=any(name.startswith("decoder.adaptive.") for name in tensors),
+    )
 
 
 def read_network(path: Path, *, averaged: bool = True) -> Magvit2:
@@ -116,10 +275,8 @@ def read_network(path: Path, *, averaged: bool = True) -> Magvit2:
         TokenizerError: the file cannot be read, or holds another network.
     """
     tensors = choose_weights(read_tensors(path), path, averaged=averaged)
-    config = derive_config(tensors, path)
-    check_config(config, read_config(path.parent), path)
-    with torch.device("meta"):
-        network = Magvit2(config)
+    with shapes_of(path, WHAT), torch.device("meta"):
+        network = Magvit2(derive_config(tensors))
     fill(network, tensors, path)
     return network
 
@@ -138,22 +295,23 @@ def load(name: str, *, weights: str | None, device: str, averaged: bool) -> Netw
     path = one_file(find_weights(name, weights), FILES, name)
     network = read_network(path, averaged=averaged)
     config = network.config
+    side = IMAGE_SIZE // config.stride
     spec = TokenizerSpec(
         name=name,
         version=VERSION,
         kind="discrete",
         image_size=IMAGE_SIZE,
-        grid=grid_of(IMAGE_SIZE, config.stride, path),
+        grid=(side, side),
         vocab_size=2**config.z,
         factored=config.factored,
         dtype="uint32",
         weights_sha256=digest_of([path]),
     )
 
-    def encode(pixels: torch.Tensor) -> torch.Tensor:
+    def encode(pixels: Tensor) -> Tensor:
         return network.to_ids(network.encoder(pixels))
 
-    def decode(ids: torch.Tensor) -> torch.Tensor:
+    def decode(ids: Tensor) -> Tensor:
         codes = network.from_ids(ids)
         return network.decoder(codes.to(network.decoder.conv_in.weight.dtype))
 

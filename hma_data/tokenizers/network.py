@@ -12,7 +12,7 @@ B pictures of a batch, S side, c channels, h·w grid. Pixels inside are (B, 3, S
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hma_data.errors import TokenizerError
-from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
+from hma_data.tokenizers.base import OTHER, TokenizerSpec, check_frames, check_tokens
 
 Step = Callable[[Tensor], Tensor]
 
@@ -49,7 +49,6 @@ class NetworkTokenizer:
         """Move the network to the device and set it to evaluation mode.
 
         Args:
-            network: moved to `device`.
             encode: pixels (B, 3, S, S) -> int64 ids (B, h, w), or latents (B, c, h, w).
             decode: ids or latents, as `encode` returns them, -> pixels (B, 3, S, S).
             light: whether it is a network of plain convolutions, small enough for float32 and channels-last
@@ -107,16 +106,12 @@ class NetworkTokenizer:
 
         With `alone`, on a CPU, several batches are computed at the same time, each on one thread.
         """
-        parts = [items[start : start + self.batch] for start in range(0, len(items), self.batch)]
-        if alone and parts and self.device.type == "cpu":
-            with single_threads(len(parts)) as pool:
-                self._store(out, pool.map(step, parts))
-        else:
-            self._store(out, map(step, parts))
-
-    def _store(self, out: NDArray[Any], batches: Iterator[NDArray[Any]]) -> None:
-        for index, made in enumerate(batches):
-            out[index * self.batch : (index + 1) * self.batch] = made
+        starts = range(0, len(items), self.batch)
+        parts = [items[start : start + self.batch] for start in starts]
+        several = alone and parts and self.device.type == "cpu"
+        with single_threads(len(parts)) if several else nullcontext() as pool:
+            for start, made in zip(starts, pool.map(step, parts) if pool else map(step, parts), strict=True):
+                out[start : start + self.batch] = made
 
     @torch.inference_mode()
     def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
@@ -141,13 +136,11 @@ class NetworkTokenizer:
             ids = made.cpu().numpy()
             if ids.size and (ids.min() < 0 or ids.max() >= (self.spec.vocab_size or 0)):
                 fault = f"its network made id {ids.max()}, the vocabulary ends at {self.spec.vocab_size}"
-                raise TokenizerError(self.spec.name, fault, "name the weights of this tokenizer")
+                raise TokenizerError(self.spec.name, fault, OTHER)
             return ids
         latents = made.float().cpu().numpy()
         if not np.abs(latents).max(initial=0) <= np.finfo(np.float16).max:
-            raise TokenizerError(
-                self.spec.name, "its network made latents that float16 cannot hold", "name other weights"
-            )
+            raise TokenizerError(self.spec.name, "its network made latents that float16 cannot hold", OTHER)
         return latents
 
     def _padded(self, part: NDArray[Any]) -> Tensor:
@@ -182,14 +175,3 @@ def open_device(name: str, device: str) -> torch.device:
         reason = str(fault).splitlines()[0]
         raise TokenizerError(name, f"cannot run on device {device!r}: {reason}", "use cpu") from fault
     return place
-
-
-def grid_of(size: int, stride: int, where: object) -> tuple[int, int]:
-    """Return (h, w) of a square picture cut into cells of `stride` pixels.
-
-    Raises:
-        TokenizerError: the cells do not tile the picture.
-    """
-    if stride < 1 or size % stride:
-        raise TokenizerError(where, f"makes cells of {stride} pixels, which do not tile {size}")
-    return size // stride, size // stride

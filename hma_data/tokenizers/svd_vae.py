@@ -6,13 +6,11 @@ which works on videos, gets videos of one frame. The network is diffusers' `Auto
 """
 
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor, nn
 
-from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.checkpoints import (
     digest_of,
@@ -20,11 +18,11 @@ from hma_data.tokenizers.checkpoints import (
     find_weights,
     numbers,
     one_file,
-    read_config,
     read_tensors,
     shapes_of,
+    stated_scale,
 )
-from hma_data.tokenizers.network import NetworkTokenizer, grid_of, open_device
+from hma_data.tokenizers.network import NetworkTokenizer, open_device
 
 VERSION = 1
 IMAGE_SIZE = 256
@@ -39,57 +37,31 @@ FILES = (
 )
 
 
-def derive_config(tensors: Mapping[str, Tensor], where: object) -> dict[str, Any]:
-    """Return the arguments of diffusers' class, derived from the shapes of the weights.
-
-    Raises:
-        TokenizerError: the weights are not those of such a network.
-    """
-    with shapes_of(where, WHAT):
-        levels = numbers(tensors, "encoder.down_blocks.")
-        widths = [tensors[f"encoder.down_blocks.{i}.resnets.0.conv1.weight"].shape[0] for i in levels]
-        if not widths or any(width < 1 or width % 32 for width in widths):
-            raise ValueError(f"widths {widths} are no multiples of 32")
-        if "decoder.time_conv_out.weight" not in tensors:
-            raise KeyError("decoder.time_conv_out.weight")
-        return {
-            "down_block_types": ("DownEncoderBlock2D",) * len(widths),
-            "block_out_channels": tuple(widths),
-            "layers_per_block": len(numbers(tensors, "encoder.down_blocks.0.resnets.")),
-            "latent_channels": tensors["quant_conv.weight"].shape[0] // 2,
-        }
-
-
-def _diffusers() -> Any:
-    try:
-        return import_module("diffusers")
-    except ImportError as fault:
-        raise MissingDependencyError(
-            "svd-vae", f"needs diffusers: {fault}", "pip install diffusers"
-        ) from fault
+def derive_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Return the arguments of diffusers' class, derived from the shapes of the weights."""
+    levels = numbers(tensors, "encoder.down_blocks.")
+    widths = [tensors[f"encoder.down_blocks.{i}.resnets.0.conv1.weight"].shape[0] for i in levels]
+    return {
+        "down_block_types": ("DownEncoderBlock2D",) * len(widths),
+        "block_out_channels": tuple(widths),
+        "layers_per_block": len(numbers(tensors, "encoder.down_blocks.0.resnets.")),
+        "latent_channels": tensors["quant_conv.weight"].shape[0] // 2,
+    }
 
 
 def read_network(path: Path) -> nn.Module:
     """Read the network from a weights' file.
 
     Raises:
-        MissingDependencyError: diffusers is not installed.
         TokenizerError: the file cannot be read, or holds another network.
     """
-    diffusers = _diffusers()
+    from diffusers import AutoencoderKLTemporalDecoder
+
     tensors = read_tensors(path)
-    arguments = derive_config(tensors, path)
     with shapes_of(path, WHAT):
-        network: nn.Module = diffusers.AutoencoderKLTemporalDecoder(**arguments)
+        network: nn.Module = AutoencoderKLTemporalDecoder(**derive_config(tensors))
     fill(network, tensors, path)
     return network
-
-
-def _scale(stated: Mapping[str, Any], where: object) -> float:
-    scale = stated.get("scaling_factor", LATENT_SCALE)
-    if not isinstance(scale, int | float) or not 0 < scale < 1e6:
-        raise TokenizerError(where, f"its config.json says scaling_factor {scale!r}, which is no scale")
-    return float(scale)
 
 
 def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
@@ -99,22 +71,20 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
         weights: a file, a folder as diffusers writes it, or `hf://…`; None takes them from the hub.
 
     Raises:
-        MissingDependencyError: diffusers is not installed.
-            TokenizerError: the weights cannot be obtained or used, or there is no such device.
+        TokenizerError: the weights cannot be obtained or used, or there is no such device.
     """
     place = open_device(name, device)
-    _diffusers()  # before anything is downloaded
     path = one_file(find_weights(name, weights), FILES, name)
     network: Any = read_network(path)
-    channels = network.config.latent_channels
+    side = IMAGE_SIZE // 2 ** (len(network.config.block_out_channels) - 1)
     spec = TokenizerSpec(
         name=name,
         version=VERSION,
         kind="continuous",
         image_size=IMAGE_SIZE,
-        grid=grid_of(IMAGE_SIZE, 2 ** (len(network.config.block_out_channels) - 1), path),
-        channels=channels,
-        latent_scale=_scale(read_config(path.parent), path.parent),
+        grid=(side, side),
+        channels=network.config.latent_channels,
+        latent_scale=stated_scale(path.parent, LATENT_SCALE),
         dtype="float16",
         weights_sha256=digest_of([path]),
     )

@@ -5,17 +5,21 @@ Latents are stored as the encoder makes them; both encoders are distilled to lat
 (`latent_scale` 1). Two layouts of weights are read. Diffusers writes an `AutoencoderTiny` as one file of
 `encoder.layers.N.*` and `decoder.layers.N.*`. The author writes two files, one for the encoder and one
 for the decoder, of `N.*`. Neither diffusers nor the author's code is needed.
+
+The network consists of 3×3 convolutions, ReLUs and residual blocks in sequence, so its layers are derived
+from the weights: a convolution without a bias halves (encoder) or doubles (decoder) the side. Sizes and
+order follow Ollin Boer Bohan's TAESD. Pixels are in [-1, 1] at the interface; the weights expect [0, 1].
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional
 
 from hma_data.errors import TokenizerError
-from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers.base import OTHER, TokenizerSpec
 from hma_data.tokenizers.checkpoints import (
     HALVES,
     SUFFIXES,
@@ -25,19 +29,115 @@ from hma_data.tokenizers.checkpoints import (
     find_weights,
     numbers,
     pair_of,
-    read_config,
     read_tensors,
     shapes_of,
+    stated_scale,
 )
-from hma_data.tokenizers.network import NetworkTokenizer, grid_of, open_device
-from hma_data.tokenizers.taesd_network import Layer, TinyAutoencoder, TinyConfig
+from hma_data.tokenizers.network import NetworkTokenizer, open_device
 
 VERSION = 1
 IMAGE_SIZE = 256
 WHAT = "a TAESD tokenizer"
 WHOLE = ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.bin")
-# Values that an AutoencoderTiny's config.json must have if it states them; the network supports no others.
-KNOWN = {"act_fn": "relu", "upsample_fn": "nearest", "upsampling_scaling_factor": 2, "shift_factor": 0.0}
+LIMIT = 3.0  # the decoder squeezes latents into (-LIMIT, LIMIT)
+POOL_GROUPS = 4
+
+
+class Block(nn.Module):
+    """A residual block: relu(x + three convolutions of x).
+
+    With `pooled` channels, a normalised 1×1 branch is first added to x.
+    """
+
+    def __init__(self, before: int, after: int, pooled: int) -> None:
+        super().__init__()
+        self.conv = nn.Sequential(
+            nn.Conv2d(before, after, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(after, after, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(after, after, 3, padding=1),
+        )
+        self.skip = nn.Identity() if before == after else nn.Conv2d(before, after, 1, bias=False)
+        self.pool: nn.Module | None = None
+        if pooled:
+            self.pool = nn.Sequential(
+                nn.Conv2d(before, pooled, 1, bias=False),
+                nn.GroupNorm(POOL_GROUPS, pooled),
+                nn.ReLU(),
+                nn.Conv2d(pooled, before, 1, bias=False),
+            )
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.pool is not None:
+            x = x + self.pool(x)
+        return functional.relu(self.conv(x) + self.skip(x))
+
+
+def _scales(layer: nn.Module) -> bool:
+    """Check whether a layer halves or doubles the side."""
+    return isinstance(layer, nn.Conv2d) and layer.bias is None
+
+
+class Encoder(nn.Module):
+    """The encoder: (B, 3, S, S) pixels -> (B, c, h, h) latents."""
+
+    def __init__(self, layers: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(layers)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        x = pixels.add(1).div(2)
+        for layer in self.layers:
+            x = layer(x)
+        return x
+
+
+class Decoder(nn.Module):
+    """The decoder: (B, c, h, h) latents -> (B, 3, S, S) pixels, about [-1, 1]."""
+
+    def __init__(self, layers: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(layers)
+
+    def forward(self, latents: Tensor) -> Tensor:
+        first, *others = self.layers
+        x = functional.relu(first(torch.tanh(latents / LIMIT) * LIMIT))
+        for layer in others:
+            x = layer(functional.interpolate(x, scale_factor=2) if _scales(layer) else x)
+        return x.mul(2).sub(1)
+
+
+class TinyAutoencoder(nn.Module):
+    """An autoencoder of `encoder` and `decoder`, built from the names and shapes that `in_order` returned.
+
+    Attributes:
+        channels: number of latent channels.
+        stride: number of pixels a latent covers along each side.
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        halves = [
+            [
+                _layer(tensors, f"{half}.layers.{place}", stride)
+                for place in numbers(tensors, f"{half}.layers.")
+            ]
+            for half, stride in zip(HALVES, (2, 1), strict=True)
+        ]
+        self.encoder, self.decoder = Encoder(halves[0]), Decoder(halves[1])
+        self.channels = tensors[f"encoder.layers.{len(halves[0]) - 1}.weight"].shape[0]
+        self.stride = 2 ** sum(map(_scales, halves[0]))
+
+
+def _layer(tensors: Mapping[str, Tensor], prefix: str, stride: int) -> nn.Module:
+    if f"{prefix}.conv.0.weight" in tensors:
+        after, before = tensors[f"{prefix}.conv.0.weight"].shape[:2]
+        pool = tensors.get(f"{prefix}.pool.0.weight")
+        return Block(before, after, 0 if pool is None else pool.shape[0])
+    after, before = tensors[f"{prefix}.weight"].shape[:2]
+    keeps = f"{prefix}.bias" in tensors
+    return nn.Conv2d(before, after, 3, stride=1 if keeps else stride, padding=1, bias=keeps)
 
 
 def find_files(name: str, path: Path) -> list[Path]:
@@ -73,9 +173,8 @@ def read_halves(files: list[Path]) -> Tensors:
             for key, tensor in read_tensors(file).items()
         }
     tensors = {key.replace(".layers.", ".", 1): t for key, t in read_tensors(files[0]).items()}
-    foreign = [key for key in tensors if not key.startswith(("encoder.", "decoder."))]
-    if foreign:
-        raise TokenizerError(files[0], f"has {foreign[0]}: not the weights of {WHAT}", "name other weights")
+    if foreign := [key for key in tensors if not key.startswith(("encoder.", "decoder."))]:
+        raise TokenizerError(files[0], f"does not hold the weights of {WHAT}: has {foreign[0]}", OTHER)
     return tensors
 
 
@@ -93,57 +192,18 @@ def in_order(tensors: Mapping[str, Tensor]) -> Tensors:
     return named
 
 
-def derive_config(tensors: Mapping[str, Tensor], where: object) -> TinyConfig:
-    """Derive the layers from the names and shapes that `in_order` returned.
-
-    Raises:
-        TokenizerError: the weights are not those of such a network.
-    """
-    with shapes_of(where, WHAT):
-        halves = [
-            tuple(_layer(tensors, f"{half}.layers.{place}") for place in numbers(tensors, f"{half}.layers."))
-            for half in HALVES
-        ]
-        return TinyConfig(*halves)
-
-
-def _layer(tensors: Mapping[str, Tensor], prefix: str) -> Layer:
-    if f"{prefix}.conv.0.weight" not in tensors:
-        after, before = tensors[f"{prefix}.weight"].shape[:2]
-        return Layer("conv" if f"{prefix}.bias" in tensors else "scale", before, after)
-    after, before = tensors[f"{prefix}.conv.0.weight"].shape[:2]
-    pool = tensors.get(f"{prefix}.pool.0.weight")
-    return Layer("block", before, after, 0 if pool is None else pool.shape[0])
-
-
-def _check_config(stated: Mapping[str, Any], where: object) -> float:
-    """Return the scale of the latents that a config.json states; raise TokenizerError for another network."""
-    for key, value in KNOWN.items():
-        if stated.get(key, value) != value:
-            raise TokenizerError(where, f"its config.json asks for {key} {stated[key]!r}, known is {value!r}")
-    scale = stated.get("scaling_factor", 1.0)
-    if not isinstance(scale, int | float) or not 0 < scale < 1e6:
-        raise TokenizerError(where, f"its config.json says scaling_factor {scale!r}, which is no scale")
-    return float(scale)
-
-
 def read_network(files: list[Path]) -> TinyAutoencoder:
     """Read the network from one file or from a pair.
 
     Raises:
         TokenizerError: the files cannot be read, or hold another network.
     """
-    where = _names(files)
+    where = " and ".join(map(str, files))
     tensors = in_order(read_halves(files))
-    config = derive_config(tensors, where)
-    with torch.device("meta"):
-        network = TinyAutoencoder(config)
+    with shapes_of(where, WHAT), torch.device("meta"):
+        network = TinyAutoencoder(tensors)
     fill(network, tensors, where)
     return network
-
-
-def _names(files: Iterable[Path]) -> str:
-    return " and ".join(map(str, files))
 
 
 def load(name: str, *, weights: str | None, device: str, channels: int) -> NetworkTokenizer:
@@ -159,19 +219,19 @@ def load(name: str, *, weights: str | None, device: str, channels: int) -> Netwo
     place = open_device(name, device)
     files = find_files(name, find_weights(name, weights))
     network = read_network(files)
-    if network.config.channels != channels:
-        fault = f"has latents of {network.config.channels} channels, {name} has {channels}"
-        raise TokenizerError(_names(files), fault, "name the weights of this tokenizer")
-    # A config.json beside a pair of files belongs to other weights.
-    stated = read_config(files[0].parent) if files[0].name in WHOLE else {}
+    if network.channels != channels:
+        fault = f"has latents of {network.channels} channels, {name} has {channels}"
+        raise TokenizerError(files[0], fault, OTHER)
+    side = IMAGE_SIZE // network.stride
     spec = TokenizerSpec(
         name=name,
         version=VERSION,
         kind="continuous",
         image_size=IMAGE_SIZE,
-        grid=grid_of(IMAGE_SIZE, network.config.stride, files[0]),
+        grid=(side, side),
         channels=channels,
-        latent_scale=_check_config(stated, files[0].parent),
+        # A config.json beside a pair of files belongs to other weights.
+        latent_scale=stated_scale(files[0].parent, 1.0) if files[0].name in WHOLE else 1.0,
         dtype="float16",
         weights_sha256=digest_of(files),
     )

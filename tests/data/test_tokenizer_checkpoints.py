@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from hma_data.errors import TokenizerError
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG
-from hma_data.tokenizers.checkpoints import digest_of, find_weights, read_config, read_tensors
+from hma_data.tokenizers.checkpoints import digest_of, find_weights, read_tensors, stated_scale
 from tests.data.tokenizer_files import frames, magvit2_state, write_magvit2, write_tiny_pair, write_tiny_whole
 
 # -- files that mean harm or are damaged
@@ -35,7 +35,7 @@ def test_a_hostile_checkpoint_is_refused_and_does_not_run(tmp_path, name, zipped
     mark, path = tmp_path / "ran", tmp_path / "evil.ckpt"
     state = {"state_dict": magvit2_state(), "hyper_parameters": Evil(mark)}
     torch.save(state, path, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(TokenizerError, match=r"evil\.ckpt: holds more than tensors.*system"):
+    with pytest.raises(TokenizerError, match=r"evil\.ckpt: .*holds more than tensors"):
         get_tokenizer(name, weights=str(path))
     assert not mark.exists()
 
@@ -94,11 +94,11 @@ def test_checkpoints_of_all_layouts_give_the_same_tensors(tmp_path, nest, zipped
         )
 
 
-@pytest.mark.parametrize("text", ["", "[1]", "{", '{"a": NaN'])
+@pytest.mark.parametrize("text", ["", "[1]", "{", '{"scaling_factor": NaN}'])
 def test_a_config_that_is_no_object_is_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(TokenizerError, match=r"config\.json"):
-        read_config(tmp_path)
+        stated_scale(tmp_path, 1.0)
 
 
 # -- where they are found
@@ -200,9 +200,9 @@ def test_what_was_downloaded_is_used_without_a_network(hub, tmp_path):
 @pytest.mark.parametrize(
     ("failure", "named"),
     [
-        (errors.GatedRepoError, "gated.*accept its licence"),
-        (errors.RepositoryNotFoundError, "the hub did not give: no such thing"),
-        (errors.RemoteEntryNotFoundError, "the hub did not give: no such thing"),
+        (errors.GatedRepoError, "GatedRepoError.*accept its licence"),
+        (errors.RepositoryNotFoundError, "could not be downloaded: .*no such thing"),
+        (errors.RemoteEntryNotFoundError, "could not be downloaded: .*no such thing"),
     ],
 )
 def test_what_the_hub_refuses_is_told(hub, failure, named):

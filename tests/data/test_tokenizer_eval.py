@@ -21,11 +21,8 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED, Entry
-from hma_data.tokenizers.training import perceptual
-from hma_data.tokenizers.training.eval import LatentMoments, evaluate
+from hma_data.tokenizers.training.eval import LatentMoments, evaluate, open_lpips, to_markdown, write_report
 from hma_data.tokenizers.training.frames import frames_of, read_frames
-from hma_data.tokenizers.training.perceptual import open_lpips
-from hma_data.tokenizers.training.report import to_markdown, write_report
 from tests.conftest import ARM_YAML, write_toy
 from tests.data.tokenizer_files import draw_scene
 
@@ -99,7 +96,7 @@ def test_a_film_without_pictures_is_refused(tmp_path):
         frame.sample_rate = 8000
         container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    with pytest.raises(TokenizerError, match="no video stream"):
+    with pytest.raises(TokenizerError, match="is no video that can be decoded"):
         list(read_frames(tmp_path / "sound.mp4", 64))
 
 
@@ -174,7 +171,7 @@ def test_lpips_is_not_downloaded_unasked(lpips):
     with pytest.raises(MissingDependencyError, match="--lpips downloads"):
         open_lpips(download=False)
     lpips.mkdir()
-    (lpips / perceptual.BACKBONE).touch()
+    (lpips / BACKBONE).touch()
     assert callable(open_lpips(download=False))
 
 

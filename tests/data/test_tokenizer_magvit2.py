@@ -1,7 +1,5 @@
 """`magvit2`: the released tokenizer's ids and pictures, from any checkpoint of its kind."""
 
-import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +17,7 @@ from hma_data.shards.preview import preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
-from hma_data.tokenizers.magvit2 import derive_config, read_network
-from hma_data.tokenizers.magvit2_network import Magvit2, Magvit2Config
+from hma_data.tokenizers.magvit2 import Magvit2, Magvit2Config, derive_config, read_network
 from tests.conftest import write_toy
 from tests.data.tokenizer_files import TINY_MAGVIT2, frames, magvit2_state, randomized, write_magvit2
 
@@ -51,17 +48,6 @@ def test_ids_and_pictures_are_those_of_the_released_code(real_data):
     certain = (np.abs(known["pre_quant"]) > 1e-4).all(axis=1)
     assert certain.any() and np.array_equal(ids[certain], known["indices"][certain])
     assert np.abs(decoded - known["decoded"]).max() < 1e-4
-
-
-@pytest.mark.real
-def test_a_config_beside_the_weights_must_agree_with_them(real_data, tmp_path):
-    for name in ("config.json", "model.safetensors"):
-        shutil.copy(real_data / "parity" / "magvit2" / name, tmp_path)
-    path = tmp_path / "config.json"
-    path.chmod(0o644)
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"num_res_blocks": 4}))
-    with pytest.raises(TokenizerError, match="num_res_blocks 4, its weights say 2"):
-        get_tokenizer("magvit2", weights=str(tmp_path))
 
 
 # -- against other statements
@@ -182,7 +168,7 @@ def test_sizes_are_read_off_the_weights(adaptive):
     config = Magvit2Config(base=64, z=14, mult=(1, 3, 2), res_blocks=3, adaptive=adaptive)
     with torch.device("meta"):
         state = dict(Magvit2(config).named_parameters())
-    assert derive_config(state, "x") == config
+    assert derive_config(state) == config
 
 
 def test_names_are_those_of_the_release():
@@ -314,17 +300,22 @@ def altered(**changes: Tensor | None) -> dict[str, Tensor]:
     ("state", "named"),
     [
         ({"conv.weight": torch.zeros(3, 3)}, r"lacks encoder\.conv_in\.weight"),
-        (altered(decoder__conv_in__bias=None), r"lacks decoder\.conv_in\.bias"),
+        (altered(decoder__conv_in__bias=None), r"Missing key.*decoder\.conv_in\.bias"),
         (altered(encoder__conv_out__weight=None), r"lacks encoder\.conv_out\.weight"),
         (altered(encoder__mid__attn_1__q__weight=torch.zeros(2)), r"encoder\.mid\.attn_1\.q\.weight"),
         (altered(quant_conv__weight=torch.zeros(2)), r"quant_conv\.weight"),
-        (altered(decoder__conv_in__weight=torch.zeros(32, 4, 3, 3)), r"takes \(32, 18, 3, 3\)"),
-        (altered(encoder__conv_in__weight=torch.zeros(24, 3, 3, 3)), "multiple"),
-        (altered(encoder__conv_in__weight=torch.zeros(32, 1, 3, 3)), "1 channels of pixels"),
-        (altered(encoder__conv_in__weight=torch.zeros(0, 3, 3, 3)), "describes no"),
-        (altered(encoder__conv_in__weight=torch.zeros(3)), "describes no"),
+        (
+            altered(decoder__conv_in__weight=torch.zeros(32, 4, 3, 3)),
+            r"size mismatch for decoder\.conv_in\.weight",
+        ),
+        (altered(encoder__conv_in__weight=torch.zeros(24, 3, 3, 3)), "divisible"),
+        (
+            altered(encoder__conv_in__weight=torch.zeros(32, 1, 3, 3)),
+            r"size mismatch for encoder\.conv_in\.weight",
+        ),
+        (altered(encoder__conv_in__weight=torch.zeros(0, 3, 3, 3)), "does not hold the weights"),
+        (altered(encoder__conv_in__weight=torch.zeros(3)), "does not fit the network"),
         (altered(decoder__conv_in__bias=torch.full((32,), torch.nan)), "not finite"),
-        (altered(encoder__conv_out__weight=torch.zeros(40, 32, 1, 1)), "1 to 31 channels"),
     ],
 )
 def test_weights_of_another_network_are_refused_by_name(tmp_path, state, named):

@@ -46,7 +46,7 @@ def test_without_diffusers_the_command_that_installs_it_is_named(tmp_path, monke
 
 
 def test_sizes_are_read_off_the_weights(folder, theirs):
-    derived = derive_config(load_file(folder / NAME), "x")
+    derived = derive_config(load_file(folder / NAME))
     assert all(tuple(np.atleast_1d(theirs.config[k])) == tuple(np.atleast_1d(v)) for k, v in derived.items())
 
 
@@ -89,10 +89,13 @@ def test_another_scale_in_the_config_is_kept(folder, tmp_path):
     ("changes", "named"),
     [
         ({"decoder.time_conv_out.weight": None}, r"decoder\.time_conv_out\.weight"),
-        ({"encoder.conv_in.bias": None}, r"lacks encoder\.conv_in\.bias"),
+        ({"encoder.conv_in.bias": None}, r"Missing key.*encoder\.conv_in\.bias"),
         ({"post_quant_conv.weight": torch.ones(1)}, r"post_quant_conv\.weight"),
-        ({"quant_conv.weight": torch.ones(1, 8)}, "describes no|the network takes|lacks"),
-        ({"encoder.down_blocks.0.resnets.0.conv1.weight": torch.ones(30, 3, 3, 3)}, "multiples of 32"),
+        ({"quant_conv.weight": torch.ones(1, 8)}, "the weights of an AutoencoderKL|does not fit the network"),
+        (
+            {"encoder.down_blocks.0.resnets.0.conv1.weight": torch.ones(30, 3, 3, 3)},
+            "the weights of an AutoencoderKL",
+        ),
     ],
 )
 def test_weights_of_another_network_are_refused_by_name(folder, tmp_path, changes, named):

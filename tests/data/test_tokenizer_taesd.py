@@ -201,8 +201,8 @@ def test_the_scale_of_a_config_beside_diffusers_weights_is_kept(tmp_path):
 # -- bad input
 
 
-@pytest.mark.parametrize("stated", [{"act_fn": "gelu"}, {"scaling_factor": 0}, {"scaling_factor": "one"}])
-def test_a_config_of_another_network_is_refused(tmp_path, stated):
+@pytest.mark.parametrize("stated", [{"scaling_factor": 0}, {"scaling_factor": "one"}])
+def test_a_config_without_a_usable_scale_is_refused(tmp_path, stated):
     write_tiny_whole(tmp_path / "diffusion_pytorch_model.safetensors")
     (tmp_path / "config.json").write_text(json.dumps(stated))
     with pytest.raises(TokenizerError, match=next(iter(stated))):
@@ -227,15 +227,15 @@ def test_half_a_pair_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"encoder.layers.1.conv.2.weight": None}, r"lacks encoder\.layers\.1\.conv\.2\.weight"),
+        ({"encoder.layers.1.conv.2.weight": None}, r"Missing key.*encoder\.layers\.1\.conv\.2\.weight"),
         ({"encoder.layers.1.attention.weight": torch.zeros(2)}, r"attention\.weight"),
         ({"quant_conv.weight": torch.zeros(2)}, r"quant_conv\.weight"),
-        ({"encoder.layers.2.bias": torch.zeros(8)}, "shrinks by 4, but grows by 8"),
-        ({"encoder.layers.0.weight": torch.zeros(8, 4, 3, 3)}, "no RGB"),
-        ({"encoder.layers.0.weight": torch.zeros(8)}, "describes no"),
-        ({"encoder.layers.8.weight": torch.zeros(4, 9, 3, 3)}, "widths"),
+        ({"encoder.layers.0.weight": torch.zeros(8)}, "does not hold the weights"),
         ({"encoder.layers.1.conv.2.bias": torch.full((8,), torch.inf)}, "not finite"),
-        ({"decoder.layers.11.conv.2.weight": torch.zeros(8, 8, 1, 1)}, r"the network takes"),
+        (
+            {"decoder.layers.11.conv.2.weight": torch.zeros(8, 8, 1, 1)},
+            r"size mismatch for decoder\.layers\.11",
+        ),
     ],
 )
 def test_weights_of_another_network_are_refused_by_name(tmp_path, weights, changes, named):

@@ -13,14 +13,12 @@ from safetensors.torch import load_file
 from hma_data.errors import RecipeError, TokenizerError
 from hma_data.storage.shipped import shipped
 from hma_data.tokenizers.base import get_tokenizer
-from hma_data.tokenizers.embedded import read_weights
-from hma_data.tokenizers.fsq import WEIGHTS
-from hma_data.tokenizers.fsq_network import FORMAT, FsqConfig
-from hma_data.tokenizers.training.crops import draw_batch, load_pools
+from hma_data.tokenizers.checkpoints import read_weights
+from hma_data.tokenizers.fsq import FORMAT, WEIGHTS, FsqConfig
 from hma_data.tokenizers.training.eval import psnr_db
-from hma_data.tokenizers.training.muon import Muon, orthogonal
+from hma_data.tokenizers.training.frames import draw_batch, load_pools
 from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
-from hma_data.tokenizers.training.train import train
+from hma_data.tokenizers.training.train import Muon, orthogonal, train
 from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
@@ -40,7 +38,7 @@ def write_recipe(folder: Path, **training: object) -> Path:
         "name": "small",
         "seed": 1,
         "corpus": str(folder),
-        "network": SMALL.to_json(),
+        "network": SMALL.model_dump(),
         "training": {
             "steps": 6,
             "batch": 4,
@@ -150,7 +148,7 @@ def test_crops_depend_on_seed_and_step_alone(tmp_path):
 
 def test_the_shipped_recipe_is_valid_and_makes_the_shipped_network():
     config, _, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
-    assert load_recipe(RECIPE).network.config() == config
+    assert load_recipe(RECIPE).network == config
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,12 @@ import torch
 from hma_data.errors import TokenizerError
 from hma_data.storage.shipped import shipped
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
-from hma_data.tokenizers.embedded import read_weights, save_weights
+from hma_data.tokenizers.checkpoints import read_weights, save_weights
 from hma_data.tokenizers.fsq import WEIGHTS as FSQ_WEIGHTS
 from hma_data.tokenizers.training.eval import evaluate, psnr_db
 from hma_data.tokenizers.training.recipe import load_recipe
 from hma_data.tokenizers.training.train import train
-from hma_data.tokenizers.vae import WEIGHTS
-from hma_data.tokenizers.vae_network import FORMAT, VaeAutoencoder, VaeConfig
+from hma_data.tokenizers.vae import FORMAT, WEIGHTS, VaeAutoencoder, VaeConfig
 from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "vae.yaml"
@@ -70,15 +69,15 @@ def test_weights_whose_config_lies_are_refused(tmp_path, change):
 
     config, tensors, _ = read_weights(WEIGHTS, FORMAT, VaeConfig)
     path = tmp_path / "lying.safetensors"
-    save_file(tensors, path, {"format": FORMAT, "config": json.dumps(config.to_json() | change)})
-    with pytest.raises(TokenizerError, match=r"the network takes|describes no network"):
+    save_file(tensors, path, {"format": FORMAT, "config": json.dumps(config.model_dump() | change)})
+    with pytest.raises(TokenizerError, match="does not fit the network|describes no network"):
         get_tokenizer("vae-8", weights=str(path))
 
 
 def test_the_scale_belongs_to_the_spec(tmp_path):
     digests = set()
     for scale in (1.0, 0.5):
-        config = VaeConfig(**{**SMALL.to_json(), "decoder_blocks": (1, 1), "latent_scale": scale})
+        config = VaeConfig(**{**SMALL.model_dump(), "decoder_blocks": (1, 1), "latent_scale": scale})
         torch.manual_seed(0)
         path = tmp_path / f"{scale}.safetensors"
         save_weights(path, FORMAT, config, dict(VaeAutoencoder(config).named_parameters()), {})
@@ -89,7 +88,7 @@ def test_the_scale_belongs_to_the_spec(tmp_path):
 
 
 def _recipe(folder: Path) -> Path:
-    network = {key: value for key, value in SMALL.to_json().items() if key != "latent_scale"}
+    network = {key: value for key, value in SMALL.model_dump().items() if key != "latent_scale"}
     values = {
         "job": "tokenizer",
         "name": "small",

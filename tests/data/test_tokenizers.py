@@ -12,13 +12,11 @@ from hma_data.errors import TokenizerError
 from hma_data.storage.shipped import shipped
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG
-from hma_data.tokenizers.embedded import read_weights, save_weights
-from hma_data.tokenizers.fsq import WEIGHTS
-from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig, Quantizer
-from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ssim
+from hma_data.tokenizers.checkpoints import read_weights, save_weights
+from hma_data.tokenizers.fsq import FORMAT, WEIGHTS, FsqAutoencoder, FsqConfig, Quantizer
+from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ssim, to_markdown
 from hma_data.tokenizers.training.frames import read_frames
 from hma_data.tokenizers.training.recipe import load_recipe
-from hma_data.tokenizers.training.report import to_markdown
 from tests.data.tokenizer_files import draw_scene
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
@@ -287,9 +285,9 @@ def test_weights_of_another_architecture_are_refused(tmp_path):
 def test_weights_whose_config_lies_are_refused(tmp_path, change):
     path = tmp_path / "lying.safetensors"
     config, tensors, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
-    values = json.dumps(config.to_json() | change)
+    values = json.dumps(config.model_dump() | change)
     save_file(tensors, path, {"format": "hma-fsq-1", "config": values})
-    with pytest.raises(TokenizerError, match=r"the network takes|describes no network"):
+    with pytest.raises(TokenizerError, match="does not fit the network|describes no network"):
         get_tokenizer("fsq-8", weights=str(path))
 
 

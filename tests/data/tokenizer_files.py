@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from hma_data.tokenizers.magvit2_network import Magvit2, Magvit2Config
+from hma_data.tokenizers.magvit2 import Magvit2, Magvit2Config
 
 DRAW = runpy.run_path(str(Path(__file__).parents[2] / "recipes/tokenizer/draw.py"))
 draw_scene, write_pictures = DRAW["draw_scene"], DRAW["write_pictures"]

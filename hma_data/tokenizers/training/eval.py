@@ -3,14 +3,18 @@
     evaluate(get_tokenizer("fsq-16"), hma_data.tokenizers.training.frames.read_frames(Path("video.mp4"), 256))
 
 N frames, S side, h·w grid, D digits. PSNR and SSIM (Wang et al. 2004: grey, Gaussian of 11 taps,
-sigma 1.5) are means over frames of pixels in [0, 1].
+sigma 1.5) are means over frames of pixels in [0, 1]. LPIPS (Zhang et al. 2018) needs its package and the
+weights of its backbone. `write_report` writes what `hma tokenizer eval --out` leaves behind.
 """
 
 import heapq
+import json
 import math
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,13 +22,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hma_data.errors import TokenizerError
+from hma_data.episodes.sheets import grid, write_png
+from hma_data.errors import MissingDependencyError, TokenizerError
+from hma_data.storage.files import write_atomic
+from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
-from hma_data.tokenizers.training.perceptual import Perceptual
 
 Frames = NDArray[np.uint8]
+Perceptual = Callable[[Frames, Frames], NDArray[np.float64]]
+Results = dict[str, dict[str, Any]]
 BATCH = 32
 GREY = (0.299, 0.587, 0.114)
+BACKBONE = "alexnet-owt-7be5be79.pth"  # torchvision's file of AlexNet, 233 MB
+
+
+# -- errors of a round trip
 
 
 def _window(size: int, like: Tensor) -> Tensor:
@@ -35,16 +47,12 @@ def _window(size: int, like: Tensor) -> Tensor:
     return taps / taps.sum(dim=1, keepdim=True)
 
 
-def _smooth(x: Tensor) -> Tensor:
-    return _window(x.shape[2], x) @ x @ _window(x.shape[3], x).T
-
-
 def ssim_map(first: Tensor, second: Tensor) -> Tensor:
     """Return the structural similarity of (N, C, S, S) pictures in [0, 1] per pixel, (N, C, S-10, S-10)."""
     c1, c2 = 0.01**2, 0.03**2
-    count = first.shape[1]
     both = torch.cat([first, second, first * first, second * second, first * second], dim=1)
-    mean1, mean2, square1, square2, product = _smooth(both).split(count, dim=1)
+    smooth = _window(both.shape[2], both) @ both @ _window(both.shape[3], both).T
+    mean1, mean2, square1, square2, product = smooth.split(first.shape[1], dim=1)
     var1, var2 = square1 - mean1 * mean1, square2 - mean2 * mean2
     covariance = product - mean1 * mean2
     return ((2 * mean1 * mean2 + c1) * (2 * covariance + c2)) / (
@@ -69,6 +77,47 @@ def ssim(true: Frames, made: Frames) -> NDArray[np.float64]:
     return ssim_map(grey[0][:, None], grey[1][:, None]).mean(dim=(1, 2, 3)).numpy()
 
 
+def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
+    """Return a function that measures LPIPS: (N, S, S, 3) uint8 true and made -> (N,); lower is nearer.
+
+    Args:
+        download: whether the backbone may be downloaded.
+
+    Raises:
+        MissingDependencyError: the package or the backbone is missing; the remedy says how to get it.
+    """
+    try:
+        lpips = import_module("lpips")
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "LPIPS", "the package lpips is not installed", "pip install lpips"
+        ) from fault
+    cached = Path(torch.hub.get_dir()) / "checkpoints" / BACKBONE
+    if not download and not cached.is_file():
+        raise MissingDependencyError(
+            "LPIPS", "AlexNet's weights (233 MB) are not on this machine", "--lpips downloads them"
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it uses torchvision's old arguments
+            network = lpips.LPIPS(net="alex", verbose=False).to(device).eval()
+    except OSError as fault:
+        text = f"AlexNet's weights could not be downloaded: {fault}"
+        raise MissingDependencyError("LPIPS", text, f"put {BACKBONE} into {cached.parent}") from fault
+
+    def pixels(frames: Frames) -> Tensor:
+        return torch.from_numpy(frames).to(device).permute(0, 3, 1, 2).float().mul(2 / 255).sub(1)
+
+    @torch.inference_mode()
+    def measure(true: Frames, made: Frames) -> NDArray[np.float64]:
+        return np.asarray(network(pixels(true), pixels(made)).flatten().cpu().numpy(), np.float64)
+
+    return measure
+
+
+# -- use of ids and latents
+
+
 class CodebookUse:
     """Counts of the ids that occur."""
 
@@ -87,10 +136,8 @@ class CodebookUse:
         """
         # Low digit first: in C order of the reversed sizes it is the last axis.
         table = self.joint.reshape(self.sizes[::-1])
-        digits = [
-            table.sum(axis=tuple(i for i in range(table.ndim) if i != axis)) for axis in range(table.ndim)
-        ]
-        digits = digits[::-1]
+        axes = range(table.ndim)
+        digits = [table.sum(axis=tuple(other for other in axes if other != axis)) for axis in reversed(axes)]
         entropy = _entropy_bits(self.joint)
         return {
             "digit_use": [round(float((counts > 0).mean()), 4) for counts in digits],
@@ -104,14 +151,6 @@ class CodebookUse:
 def _entropy_bits(counts: NDArray[np.int64]) -> float:
     share = counts[counts > 0] / max(1, counts.sum())
     return float(-(share * np.log2(share)).sum())
-
-
-def bits_per_frame(spec: TokenizerSpec) -> float:
-    """Return the number of bits of a frame's tokens or latents before any entropy coding."""
-    cells = spec.grid[0] * spec.grid[1]
-    if spec.kind == "discrete":
-        return cells * math.log2(spec.vocab_size or 1)
-    return cells * (spec.channels or 1) * np.dtype(spec.dtype).itemsize * 8.0
 
 
 class LatentMoments:
@@ -134,15 +173,15 @@ class LatentMoments:
         return {"latent_mean_scaled": round(mean, 4), "latent_std_scaled": round(deviation, 4)}
 
 
-@dataclass
-class _Totals:
-    use: CodebookUse | LatentMoments
-    psnr: list[float] = field(default_factory=list)
-    ssim: list[float] = field(default_factory=list)
-    lpips: list[float] = field(default_factory=list)
-    encode_s: float = 0.0
-    decode_s: float = 0.0
-    worst: list[tuple[float, int, Frames, Frames]] = field(default_factory=list)
+def bits_per_frame(spec: TokenizerSpec) -> float:
+    """Return the number of bits of a frame's tokens or latents before any entropy coding."""
+    cells = spec.grid[0] * spec.grid[1]
+    if spec.kind == "discrete":
+        return cells * math.log2(spec.vocab_size or 1)
+    return cells * (spec.channels or 1) * np.dtype(spec.dtype).itemsize * 8.0
+
+
+# -- everything together
 
 
 def evaluate(
@@ -158,7 +197,7 @@ def evaluate(
         tokenizer: the tokenizer to measure.
         frames_iter: frames (S, S, 3), or batches of them (n, S, S, 3), uint8.
         worst: how many of the frames with the lowest PSNR to return as `worst_frames`.
-        perceptual: measures LPIPS, see `hma_data.tokenizers.training.perceptual`.
+        perceptual: measures LPIPS, see `open_lpips`.
 
     Returns:
         frames, psnr_db (mean over frames, lossless frames counted as 99), psnr_db_min, ssim, bits_per_frame,
@@ -169,37 +208,47 @@ def evaluate(
     Raises:
         TokenizerError: there is no frame, or the frames do not fit.
     """
-    discrete = tokenizer.spec.kind == "discrete"
-    totals = _Totals(CodebookUse(tokenizer.spec) if discrete else LatentMoments(tokenizer.spec))
+    spec = tokenizer.spec
+    use = CodebookUse(spec) if spec.kind == "discrete" else LatentMoments(spec)
+    psnr, similarity, distance = list[float](), list[float](), list[float]()
+    lowest = list[tuple[float, int, Frames, Frames]]()
+    encode_s = decode_s = 0.0
     for batch in _batches(frames_iter):
-        if not totals.psnr:
+        if not psnr:
             tokenizer.decode(tokenizer.encode(batch[:1]))  # the first pass prepares kernels
-        _measure(tokenizer, batch, totals, worst, perceptual)
-    if not totals.psnr:
-        raise TokenizerError(tokenizer.spec.name, "was given no frame to measure")
-    count = len(totals.psnr)
+        started = time.perf_counter()
+        tokens = tokenizer.encode(batch)
+        between = time.perf_counter()
+        made = tokenizer.decode(tokens)
+        decode_s += time.perf_counter() - between
+        encode_s += between - started
+        use.add(tokens)
+        values = np.minimum(psnr_db(batch, made), 99.0).tolist()
+        found = zip(values, range(len(psnr), len(psnr) + len(batch)), batch, made, strict=True)
+        lowest = heapq.nsmallest(worst, [*lowest, *found], key=lambda entry: entry[:2])
+        psnr += values
+        similarity += ssim(batch, made).tolist()
+        if perceptual is not None:
+            distance += perceptual(batch, made).tolist()
+    if not psnr:
+        raise TokenizerError(spec.name, "was given no frame to measure")
     result: dict[str, Any] = {
-        "tokenizer": tokenizer.spec.name,
-        "weights_sha256": tokenizer.spec.weights_sha256,
-        "frames": count,
-        "psnr_db": round(float(np.mean(totals.psnr)), 3),
-        "psnr_db_min": round(min(totals.psnr), 3),
-        "ssim": round(float(np.mean(totals.ssim)), 4),
-        "bits_per_frame": bits_per_frame(tokenizer.spec),
-        "encode_frames_per_second": round(count / totals.encode_s, 1),
-        "decode_frames_per_second": round(count / totals.decode_s, 1),
+        "tokenizer": spec.name,
+        "weights_sha256": spec.weights_sha256,
+        "frames": len(psnr),
+        "psnr_db": round(float(np.mean(psnr)), 3),
+        "psnr_db_min": round(min(psnr), 3),
+        "ssim": round(float(np.mean(similarity)), 4),
+        "bits_per_frame": bits_per_frame(spec),
+        "encode_frames_per_second": round(len(psnr) / encode_s, 1),
+        "decode_frames_per_second": round(len(psnr) / decode_s, 1),
+        **use.result(),
     }
-    result |= totals.use.result()
-    if totals.lpips:
-        result["lpips"] = round(float(np.mean(totals.lpips)), 4)
+    if distance:
+        result["lpips"] = round(float(np.mean(distance)), 4)
     if worst:
-        lowest_first = sorted(totals.worst, key=_order, reverse=True)
-        result["worst_frames"] = [(-value, index, true, made) for value, index, true, made in lowest_first]
+        result["worst_frames"] = lowest
     return result
-
-
-def _order(entry: tuple[float, int, Frames, Frames]) -> tuple[float, int]:
-    return entry[0], entry[1]
 
 
 def _batches(frames_iter: Iterable[Frames]) -> Iterator[Frames]:
@@ -214,24 +263,72 @@ def _batches(frames_iter: Iterable[Frames]) -> Iterator[Frames]:
         yield np.stack(waiting)
 
 
-def _measure(
-    tokenizer: Tokenizer, batch: Frames, totals: _Totals, worst: int, perceptual: Perceptual | None
-) -> None:
-    started = time.perf_counter()
-    tokens = tokenizer.encode(batch)
-    between = time.perf_counter()
-    made = tokenizer.decode(tokens)
-    totals.encode_s += between - started
-    totals.decode_s += time.perf_counter() - between
-    totals.use.add(tokens)
-    psnr = np.minimum(psnr_db(batch, made), 99.0)
-    for i, value in enumerate(psnr):
-        if worst:
-            # A heap of the highest -PSNR; the index breaks ties before pictures are compared.
-            heapq.heappush(totals.worst, (-float(value), len(totals.psnr) + i, batch[i], made[i]))
-            if len(totals.worst) > worst:
-                heapq.heappop(totals.worst)
-    totals.psnr.extend(psnr.tolist())
-    totals.ssim.extend(ssim(batch, made).tolist())
-    if perceptual is not None:
-        totals.lpips.extend(perceptual(batch, made).tolist())
+# -- report
+
+
+def _percent(shares: list[float]) -> str:
+    return ", ".join(f"{100 * share:.0f} %" for share in shares)
+
+
+# column -> (key in a result, function that formats its value)
+COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "frames": ("frames", str),
+    "PSNR dB": ("psnr_db", "{:.2f}".format),
+    "lowest dB": ("psnr_db_min", "{:.2f}".format),
+    "SSIM": ("ssim", "{:.3f}".format),
+    "LPIPS": ("lpips", "{:.3f}".format),
+    "digits used": ("digit_use", _percent),
+    "entropy bits/token": ("entropy_bits_per_token", "{:.2f}".format),
+    "latents' std × scale": ("latent_std_scaled", "{:.2f}".format),
+    "bits/frame": ("bits_per_frame", "{:.0f}".format),
+    "encode frames/s": ("encode_frames_per_second", "{:.0f}".format),
+    "decode frames/s": ("decode_frames_per_second", "{:.0f}".format),
+}
+
+
+def to_markdown(results: Results) -> str:
+    """Return a table with one row per set of frames; leave out columns that no result has.
+
+    Args:
+        results: name -> what `evaluate` returned.
+    """
+    columns = {
+        name: column for name, column in COLUMNS.items() if any(column[0] in r for r in results.values())
+    }
+    lines = ["| of | " + " | ".join(columns) + " |", "|" + " --- |" * (len(columns) + 1)]
+    for name, result in results.items():
+        cells = [show(result[key]) if key in result else "–" for key, show in columns.values()]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def write_report(folder: StrPath, title: str, results: Results, notes: list[str]) -> list[Path]:
+    """Write `eval.md`, `eval.json` and, where results hold worst frames, `worst.png` to a folder.
+
+    Args:
+        folder: str or path of the folder.
+        results: as for `to_markdown`; their `worst_frames` go into the picture.
+        notes: lines to print below the table.
+    """
+    folder = as_path(folder)
+    plain = {name: without_frames(result) for name, result in results.items()}
+    text = f"# {title}\n\n{to_markdown(plain)}" + "".join(f"\n{note}\n" for note in notes)
+    paths = [folder / "eval.json", folder / "eval.md"]
+    rows, labels = [], []
+    for name, result in results.items():
+        if worst := result.get("worst_frames"):
+            rows += [[true for _, _, true, _ in worst], [made for _, _, _, made in worst]]
+            levels = ", ".join(f"{value:.1f}" for value, _, _, _ in worst)
+            labels += [f"{name}: the frames of lowest PSNR", f"decoded: {levels} dB"]
+    if rows:
+        paths.append(folder / "worst.png")
+        write_png(paths[-1], grid(rows, labels))
+        text += "\n![Frames of lowest PSNR, original above decoded](worst.png)\n"
+    write_atomic(paths[0], json.dumps(plain, indent=1, ensure_ascii=False) + "\n")
+    write_atomic(paths[1], text)
+    return paths
+
+
+def without_frames(result: dict[str, Any]) -> dict[str, Any]:
+    """Return the result without its `worst_frames`, so that it holds plain values only."""
+    return {key: value for key, value in result.items() if key != "worst_frames"}

@@ -1,165 +1,43 @@
-"""Read the frames to measure a tokenizer on, from pictures, videos, recordings or a shard set's source.
+"""Read the pictures that tokenizers are measured on, and draw the crops that they are trained on.
 
-S side of the square that the tokenizer takes. All frames are uint8 RGB (S, S, 3).
+Frames to measure on come from pictures, videos, recordings or a shard set's source. Training crops come
+from the pictures and videos that a recipe lists: these are held in memory at a few sizes, and a crop is a
+part of one picture, scaled, rotated, mirrored and recoloured. It depends only on (seed, step, index in the
+batch).
+
+N crops, S side of a crop or of the square that the tokenizer takes. All pictures are uint8 RGB.
 """
 
-from collections.abc import Callable, Iterator
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Episode
 from hma_data.episodes.images import Filter, prepare, resize
-from hma_data.errors import EpisodeError, SourceError, TokenizerError
+from hma_data.errors import EpisodeError, RecipeError, SourceError, TokenizerError
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers.training.recipe import DrawnSource, FileSource
 
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
 Frame = NDArray[np.uint8]
+Skip = Callable[[str], object]  # is told why a file or an episode is left out
 VIDEOS = {".mp4", ".avi", ".mkv", ".webm", ".gif"}
 PICTURES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
 EPISODES = 16  # number of episodes taken from a recording, evenly spaced
+LARGEST, SMALLEST = 768, 48  # short side of the training pictures that are kept, pixels
+SHARES, SHARE_ODDS = ((0.42, 0.6), (0.3, 1.0), (1.0, 1.0)), (0.45, 0.35, 0.2)  # of a picture's short side
 
 
-def _ignore(text: str) -> None:
-    """Do nothing; the default for callers that do not ask what was skipped."""
-
-
-def read_frames(
-    path: StrPath,
-    size: int,
-    *,
-    frames: int = 64,
-    resize_filter: Filter = "area",
-    on_skip: Callable[[str], None] = _ignore,
-) -> Iterator[Frame]:
-    """Yield frames of a picture, a video, or every picture and video below a folder.
-
-    Args:
-        path: str or path of the file or folder.
-        frames: number of frames taken from each video, evenly spaced.
-        on_skip: called with the reason for each file in a folder that cannot be decoded.
-
-    Raises:
-        TokenizerError: the path does not exist, holds no picture and no video, or none can be decoded.
-    """
-    path = as_path(path)
-    if not path.exists():
-        raise TokenizerError(path, "no such file or folder")
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    found, skipped = False, ""
-    for file in files:
-        if file.suffix.lower() not in VIDEOS | PICTURES:
-            continue
-        try:
-            for picture in _pictures(file, frames):
-                found = True
-                yield resize(picture[None], size, "short_side_crop", resize_filter)[0]
-        except TokenizerError as fault:
-            if file == path:
-                raise
-            skipped = str(fault)
-            on_skip(skipped)
-    if not found:
-        raise TokenizerError(
-            path,
-            "holds no picture and no video" + (f" that can be decoded: {skipped}" if skipped else ""),
-            "name a file or folder of png, jpg, mp4; a recording needs --embodiment",
-        )
-
-
-def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
-    """Yield the picture in a file, or `frames` evenly spaced frames of a video.
-
-    Yield nothing if the file is neither.
-    """
-    import cv2
-
-    if path.suffix.lower() in VIDEOS:
-        yield from _read_video(path, frames)
-        return
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is not None:
-        yield np.ascontiguousarray(picture[:, :, ::-1])
-
-
-def _read_video(path: Path, frames: int) -> Iterator[Frame]:
-    import av
-
-    with av.open(str(path)) as container:
-        count = sum(1 for _ in container.decode(video=0))
-    wanted = set(np.linspace(0, count - 1, min(frames, count)).astype(int).tolist())
-    with av.open(str(path)) as container:
-        for index, frame in enumerate(container.decode(video=0)):
-            if index in wanted:
-                yield frame.to_ndarray(format="rgb24")
-
-
-def _pictures(file: Path, frames: int) -> Iterator[Frame]:
-    from av.error import FFmpegError
-
-    count = 0
-    try:
-        for picture in read_pictures(file, frames):
-            count += 1
-            yield picture
-    except (FFmpegError, IndexError) as fault:  # a container without video has no stream 0
-        reason = getattr(fault, "strerror", None) or "it holds no video stream"
-        raise TokenizerError(file, f"is no video that can be decoded: {reason}") from fault
-    if not count:
-        raise TokenizerError(file, "is no picture that can be decoded")
-
-
-def recording_frames(
-    embodiment: "Embodiment",
-    uri: StrPath,
-    spec: TokenizerSpec,
-    *,
-    frames: int = 64,
-    on_skip: Callable[[str], None] = _ignore,
-) -> Iterator[Frame]:
-    """Yield frames of a recording as a conversion would tokenize them: every camera, by the robot's YAML.
-
-    Args:
-        uri: str or path of the recording, or its URI.
-        frames: number of frames taken from each of up to 16 episodes, evenly spaced.
-        on_skip: called with the reason for each episode that cannot be read; another episode replaces it.
-
-    Raises:
-        SourceError: the recording cannot be read, or none of its episodes can be read.
-    """
-    from hma_data.sources.base import open_source
-
-    source = open_source(embodiment.source.format)
-    ids = [ref.id for ref in source.index(uri, embodiment)]
-    spread = np.unique(np.linspace(0, len(ids) - 1, min(EPISODES, len(ids))).astype(int)).tolist()
-    others = [index for index in range(len(ids)) if index not in set(spread)]
-    read, fault = 0, "it holds no episode"
-    for index in spread + others:
-        if read == EPISODES:
-            return
-        try:
-            yield from _episode_frames(source.read(uri, ids[index], embodiment), embodiment, spec, frames)
-            read += 1
-        except (EpisodeError, SourceError) as problem:
-            fault = str(problem)
-            on_skip(fault)
-    if not read:
-        raise SourceError(as_text(uri), f"gave no frame: {fault}")
-
-
-def _episode_frames(
-    episode: Episode, embodiment: "Embodiment", spec: TokenizerSpec, frames: int
-) -> Iterator[Frame]:
-    for camera in embodiment.cameras:
-        stream = episode.streams[camera.name]
-        count = len(stream.timestamps)
-        for at in np.unique(np.linspace(0, count - 1, min(frames, count)).astype(int)):
-            yield prepare(stream.frames([at]), camera, spec.image_size, spec.resize_filter)[0]
+# -- frames to measure on
 
 
 def frames_of(
@@ -168,7 +46,7 @@ def frames_of(
     *,
     embodiment: "Embodiment | None" = None,
     frames: int = 64,
-    on_skip: Callable[[str], None] = _ignore,
+    on_skip: Skip = str,
 ) -> Iterator[Frame]:
     """Return an iterator over the frames of a recording, a shard set's source, pictures or videos.
 
@@ -192,3 +70,254 @@ def frames_of(
         return recording_frames(embodiment, uri, spec, frames=frames, on_skip=on_skip)
     size, resize_filter = spec.image_size, spec.resize_filter
     return read_frames(path, size, frames=frames, resize_filter=resize_filter, on_skip=on_skip)
+
+
+def read_frames(
+    path: StrPath,
+    size: int,
+    *,
+    frames: int = 64,
+    resize_filter: Filter = "area",
+    on_skip: Skip = str,
+) -> Iterator[Frame]:
+    """Yield frames of a picture, a video, or every picture and video below a folder.
+
+    Args:
+        path: str or path of the file or folder.
+        frames: number of frames taken from each video, evenly spaced.
+        on_skip: called with the reason for each file that cannot be decoded.
+
+    Raises:
+        TokenizerError: the path does not exist, holds no picture and no video, or none can be decoded.
+    """
+    path = as_path(path)
+    if not path.exists():
+        raise TokenizerError(path, "no such file or folder")
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    found, skipped = False, ""
+    for file in files:
+        if file.suffix.lower() not in VIDEOS | PICTURES:
+            continue
+        try:
+            for picture in read_pictures(file, frames):
+                found = True
+                yield resize(picture[None], size, "short_side_crop", resize_filter)[0]
+        except TokenizerError as fault:
+            skipped = f": {fault}"
+            on_skip(str(fault))
+    if not found:
+        remedy = "name a file or folder of png, jpg, mp4; a recording needs --embodiment"
+        raise TokenizerError(path, f"holds no picture and no video that can be decoded{skipped}", remedy)
+
+
+def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
+    """Yield the picture in a file, or `frames` evenly spaced frames of a video.
+
+    Raises:
+        TokenizerError: the file cannot be decoded.
+    """
+    import av
+    import cv2
+
+    if path.suffix.lower() not in VIDEOS:
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise TokenizerError(path, "is no picture that can be decoded")
+        yield np.ascontiguousarray(picture[:, :, ::-1])
+        return
+    try:
+        with av.open(str(path)) as container:
+            count = sum(1 for _ in container.decode(video=0))
+        wanted = set(_evenly(count, frames))
+        with av.open(str(path)) as container:
+            for index, frame in enumerate(container.decode(video=0)):
+                if index in wanted:
+                    yield frame.to_ndarray(format="rgb24")
+    except (av.FFmpegError, IndexError) as fault:  # a container without video has no stream 0
+        raise TokenizerError(path, f"is no video that can be decoded: {fault}") from fault
+
+
+def recording_frames(
+    embodiment: "Embodiment",
+    uri: StrPath,
+    spec: TokenizerSpec,
+    *,
+    frames: int = 64,
+    on_skip: Skip = str,
+) -> Iterator[Frame]:
+    """Yield frames of a recording as a conversion would tokenize them: every camera, by the robot's YAML.
+
+    Args:
+        uri: str or path of the recording, or its URI.
+        frames: number of frames taken from each of up to 16 episodes, evenly spaced.
+        on_skip: called with the reason for each episode that cannot be read; another episode replaces it.
+
+    Raises:
+        SourceError: the recording cannot be read, or none of its episodes can be read.
+    """
+    from hma_data.sources.base import open_source
+
+    source = open_source(embodiment.source.format)
+    ids = [ref.id for ref in source.index(uri, embodiment)]
+    spread = _evenly(len(ids), EPISODES)
+    others = [index for index in range(len(ids)) if index not in set(spread)]
+    read, fault = 0, "it holds no episode"
+    for index in spread + others:
+        if read == EPISODES:
+            return
+        try:
+            episode = source.read(uri, ids[index], embodiment)
+            for camera in embodiment.cameras:
+                stream = episode.streams[camera.name]
+                for at in _evenly(len(stream.timestamps), frames):
+                    yield prepare(stream.frames([at]), camera, spec.image_size, spec.resize_filter)[0]
+            read += 1
+        except (EpisodeError, SourceError) as problem:
+            fault = str(problem)
+            on_skip(fault)
+    if not read:
+        raise SourceError(as_text(uri), f"gave no frame: {fault}")
+
+
+def _evenly(count: int, wanted: int) -> list[int]:
+    """Return at most `wanted` different indices below `count`, evenly spaced."""
+    return np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(int)).tolist()
+
+
+# -- crops to train on
+
+
+@dataclass
+class Pool:
+    """The pictures of one source, each at several sizes, largest first."""
+
+    name: str
+    weight: float
+    pictures: list[list[Frame]]
+
+
+def shrink(picture: Frame, short_side: int) -> Frame:
+    """Return the picture shrunk by area averaging to at most that short side."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    scale = short_side / min(height, width)
+    if scale >= 1:
+        return picture
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _levels(picture: Frame) -> list[Frame]:
+    levels = [shrink(picture, LARGEST)]
+    while min(levels[-1].shape[:2]) > 160:
+        levels.append(shrink(levels[-1], min(levels[-1].shape[:2]) // 2))
+    return levels
+
+
+def _source_files(source: FileSource | DrawnSource, corpus: Path) -> list[Path]:
+    if isinstance(source, DrawnSource):
+        files = sorted((corpus / source.kind).glob("*.png"))
+        if len(files) != source.pictures:
+            fault = f"holds {len(files)} pictures, the recipe says {source.pictures}"
+            raise RecipeError(corpus / source.kind, fault, f"recipes/tokenizer/draw.py {corpus} makes them")
+        return files
+    folder = corpus / source.path
+    files = sorted({path for glob in source.glob for path in folder.glob(glob)})
+    if not files:
+        fault = f"no file matches {', '.join(source.glob)}"
+        raise RecipeError(folder, fault, f"unpack {source.origin} there")
+    return files
+
+
+def load_pools(sources: Sequence[FileSource | DrawnSource], corpus: Path) -> tuple[list[Pool], str]:
+    """Read all pictures of the sources into memory; return them and a SHA-256 of their pixels.
+
+    Raises:
+        RecipeError: a source has no picture.
+    """
+    digest = hashlib.sha256()
+    pools = []
+    for source in sources:
+        pictures = []
+        name, frames = (source.kind, 1) if isinstance(source, DrawnSource) else (source.path, source.frames)
+        for file in _source_files(source, corpus):
+            with suppress(TokenizerError):  # a glob may match a file that is no picture
+                for picture in read_pictures(file, frames):
+                    if min(picture.shape[:2]) >= SMALLEST:
+                        pictures.append(_levels(picture))
+                        digest.update(pictures[-1][-1].tobytes())
+        if not pictures:
+            raise RecipeError(corpus / name, "holds no picture that can be decoded and is large enough")
+        pools.append(Pool(name, source.weight, pictures))
+    return pools, digest.hexdigest()
+
+
+def draw_batch(pools: list[Pool], side: int, count: int, seed: int, step: int) -> NDArray[np.float32]:
+    """Return the crops of a training step, (N, S, S, 3) float32 in [-1, 1].
+
+    The same arguments always give the same crops.
+    """
+    weights = np.array([pool.weight for pool in pools])
+    crops = np.empty((count, side, side, 3), np.float32)
+    for index in range(count):
+        rng = np.random.default_rng([seed, step, index])
+        pool = pools[int(rng.choice(len(pools), p=weights / weights.sum()))]
+        crop = _crop(pool.pictures[int(rng.integers(len(pool.pictures)))], side, rng)
+        crops[index] = _recolour(crop, rng)
+    return np.clip(crops, -1, 1, out=crops)
+
+
+def _crop(levels: list[Frame], side: int, rng: np.random.Generator) -> Frame:
+    """Cut a square out of the picture, rotate and mirror it, and scale it to `side`."""
+    import cv2
+
+    short = min(levels[0].shape[:2])
+    # A crop of 128 covers half the side of a frame at 256², and the whole side of a frame at 128².
+    low, high = SHARES[int(rng.choice(len(SHARES), p=SHARE_ODDS))]
+    share = math.exp(rng.uniform(math.log(low), math.log(high)))
+    wanted = max(short * share, side / 3)
+    level = max((n for n, p in enumerate(levels) if min(p.shape[:2]) * share >= side), default=0)
+    picture = levels[level]
+    height, width = picture.shape[:2]
+    scale = min(height, width) / short
+    span = min(wanted * scale, min(height, width))
+    angle = rng.normal(0, 0.12) + (math.pi / 2) * rng.integers(0, 4) * (rng.random() < 0.3)
+    x = rng.uniform(span / 2, width - span / 2) if width > span else width / 2
+    y = rng.uniform(span / 2, height - span / 2) if height > span else height / 2
+    stretch = math.exp(rng.normal(0, 0.08))
+    flip = -1.0 if rng.random() < 0.5 else 1.0
+    zoom = span / side
+    cos, sin = math.cos(angle) * zoom, math.sin(angle) * zoom
+    back = np.array([[cos * flip * stretch, -sin / stretch], [sin * flip * stretch, cos / stretch]])
+    centre = np.array([x, y]) - back @ np.array([(side - 1) / 2, (side - 1) / 2])
+    matrix = np.hstack([back, centre[:, None]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    crop = cv2.warpAffine(picture, matrix, (side, side), flags=flags, borderMode=cv2.BORDER_REFLECT_101)
+    return np.asarray(crop, np.uint8)
+
+
+def _recolour(crop: Frame, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Change brightness, contrast, gamma, saturation and colour cast, and add blur and noise.
+
+    Returns:
+        float32 in [-1, 1].
+    """
+    import cv2
+
+    x = crop.astype(np.float32) / 255.0
+    if rng.random() < 0.15:
+        x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.4))
+    if rng.random() < 0.5:
+        x = x ** np.float32(math.exp(rng.normal(0, 0.2)))
+        grey = x.mean(axis=2, keepdims=True)
+        x = grey + (x - grey) * np.float32(math.exp(rng.normal(-0.1, 0.3)))
+        cast = np.exp(rng.normal(0, 0.06, 3)).astype(np.float32)
+        x = (x - 0.5) * np.float32(math.exp(rng.normal(0, 0.15))) * cast + np.float32(
+            0.5 + rng.normal(0, 0.06)
+        )
+    if rng.random() < 0.06:
+        x = x[:, :, rng.permutation(3)]
+    if rng.random() < 0.05:
+        x = x + rng.normal(0, rng.uniform(0.004, 0.02), x.shape).astype(np.float32)
+    return np.clip(x, 0, 1) * np.float32(2) - np.float32(1)

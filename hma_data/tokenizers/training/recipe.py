@@ -5,61 +5,22 @@ Every value is checked before any data is read or any step is trained; unknown k
 
 import hashlib
 import json
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError, model_validator
 
 from hma_data.errors import RecipeError
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.yaml_io import read_yaml
-from hma_data.tokenizers.fsq_network import STRIDE, FsqConfig
-from hma_data.tokenizers.vae_network import VaeConfig
+from hma_data.tokenizers.fsq import STRIDE, FsqConfig
+from hma_data.tokenizers.vae import VaeConfig
+
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class FsqRecipe(_Strict):
-    """The values of `FsqConfig` that a recipe states."""
-
-    levels: list[list[int]]
-    width: tuple[int, int]
-    hidden: int
-    encoder_blocks: tuple[int, int]
-    decoder_blocks: tuple[int, int, int]
-    fine_width: int
-
-    @model_validator(mode="after")
-    def _is_a_network(self) -> "FsqRecipe":
-        self.config()
-        return self
-
-    def config(self) -> FsqConfig:
-        """Return the network's shape."""
-        return FsqConfig.from_json(self.model_dump())
-
-
-class VaeRecipe(_Strict):
-    """The values of `VaeConfig` that a recipe states; the scale of the latents is measured instead."""
-
-    channels: int
-    width: int
-    hidden: int
-    encoder_blocks: int
-    decoder_blocks: tuple[int, int]
-    fine_width: int
-    noise: float
-
-    @model_validator(mode="after")
-    def _is_a_network(self) -> "VaeRecipe":
-        self.config()
-        return self
-
-    def config(self) -> VaeConfig:
-        """Return the network's shape."""
-        return VaeConfig.from_json(self.model_dump())
 
 
 class TrainingRecipe(_Strict):
@@ -87,19 +48,17 @@ class TrainingRecipe(_Strict):
     adam_learning_rate: float = Field(gt=0)
     weight_decay: float = Field(ge=0, default=0.0)
     warmup_steps: int = Field(ge=0, default=100)
-    fall: list[tuple[int, float]] = Field(default_factory=list)
+    fall: list[tuple[NonNegativeInt, Share]] = Field(default_factory=list)
     ema: float = Field(ge=0, lt=1, default=0.998)
     threads: int = Field(gt=0, default=1)
 
     @model_validator(mode="after")
     def _falls_to_the_end(self) -> "TrainingRecipe":
         steps = [step for step, _ in self.fall]
-        if not self.fall:
-            return self
-        if sorted(set(steps)) != steps or min(steps) < 0 or self.fall[0][1] != 1:
-            raise ValueError("fall must begin with share 1, at ascending steps")
-        if self.fall[-1] != (self.steps, 0) or not all(0 <= share <= 1 for _, share in self.fall):
-            raise ValueError(f"fall must end with [{self.steps}, 0], shares within 0..1")
+        if self.fall and (sorted(set(steps)) != steps or self.fall[0][1] != 1):
+            raise ValueError("fall must begin with share 1 and list ascending steps")
+        if self.fall and self.fall[-1] != (self.steps, 0):
+            raise ValueError(f"fall must end with [{self.steps}, 0]")
         return self
 
     def rate(self, step: int) -> float:
@@ -146,21 +105,6 @@ class DrawnSource(_Strict):
     pictures: int = Field(gt=0, default=200)
     weight: float = Field(gt=0, default=1.0)
 
-    @property
-    def path(self) -> str:
-        """Return the folder below the recipe's `corpus`."""
-        return self.kind
-
-    @property
-    def glob(self) -> list[str]:
-        """Return the patterns of the files to take."""
-        return ["*.png"]
-
-    @property
-    def frames(self) -> int:
-        """Return the number of frames taken from each file."""
-        return 1
-
 
 class TokenizerRecipe(_Strict):
     """A whole training, described well enough to repeat it."""
@@ -169,25 +113,28 @@ class TokenizerRecipe(_Strict):
     name: str
     seed: int = Field(ge=0)
     corpus: str
-    network: FsqRecipe | VaeRecipe
+    network: FsqConfig | VaeConfig
     training: TrainingRecipe
     loss: LossRecipe
     sources: list[FileSource | DrawnSource] = Field(min_length=1)
 
     def digest(self) -> str:
-        """Return the SHA-256 of all values except the corpus's location."""
-        return _digest(self.model_dump(mode="json", exclude={"corpus"}))
+        """Return the SHA-256 of all values except the corpus's location and what training measures."""
+        return _digest(self._values())
 
     def course(self) -> str:
         """Return the SHA-256 of the values that must not change when a run is resumed.
 
-        It covers all values except the corpus's location, `steps`, `fall` and `threads`. A run can be
-        resumed if this digest and the rates of its past steps are the same.
+        It covers the values of `digest` except `steps`, `fall` and `threads`. A run can be resumed if this
+        digest and the rates of its past steps are the same.
         """
-        values = self.model_dump(mode="json", exclude={"corpus"})
+        values = self._values()
         for key in ("steps", "fall", "threads"):
             values["training"].pop(key)
         return _digest(values)
+
+    def _values(self) -> dict[str, Any]:
+        return self.model_dump(mode="json", exclude={"corpus": True, "network": {"latent_scale"}})
 
 
 def _digest(values: dict[str, Any]) -> str:

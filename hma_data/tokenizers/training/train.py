@@ -15,9 +15,8 @@ import math
 import platform
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -31,17 +30,18 @@ from torch.nn import functional
 from hma_data.errors import RecipeError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.tokenizers.embedded import save_weights
-from hma_data.tokenizers.fsq_network import FORMAT, FsqAutoencoder, FsqConfig
+from hma_data.tokenizers.checkpoints import save_weights
+from hma_data.tokenizers.fsq import FORMAT, FsqAutoencoder, FsqConfig
 from hma_data.tokenizers.network import open_device
-from hma_data.tokenizers.training.crops import Pool, draw_batch, load_pools
-from hma_data.tokenizers.training.eval import ssim_map
-from hma_data.tokenizers.training.muon import Muon
+from hma_data.tokenizers.training.eval import GREY, ssim_map
+from hma_data.tokenizers.training.frames import Pool, draw_batch, load_pools
 from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
-from hma_data.tokenizers.vae_network import FORMAT as VAE_FORMAT
-from hma_data.tokenizers.vae_network import VaeAutoencoder, VaeConfig
+from hma_data.tokenizers.vae import FORMAT as VAE_FORMAT
+from hma_data.tokenizers.vae import VaeAutoencoder, VaeConfig
 
 START, END = 2**32 - 1, 2**32 - 2  # step numbers of the batches that initialise and measure a network
+ROUNDS = 5  # of the Newton–Schulz iteration; they bring the singular values near 1
+_A, _B, _C = 3.4445, -4.7750, 2.0315  # largest slope at zero that keeps values in (0, 1] near 1
 Autoencoder = FsqAutoencoder | VaeAutoencoder
 
 
@@ -60,7 +60,7 @@ def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tupl
 
 
 def _grey(pictures: Tensor) -> Tensor:
-    weights = pictures.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
+    weights = pictures.new_tensor(GREY).view(1, 3, 1, 1)
     return (pictures * weights).sum(1, keepdim=True)
 
 
@@ -100,18 +100,14 @@ def start_linear(network: Autoencoder, crops: Tensor) -> None:
         decoder.head.weight.mul_(0.1)
 
 
-def _autoencoder(recipe: TokenizerRecipe) -> Autoencoder:
-    config = recipe.network.config()
-    return FsqAutoencoder(config) if isinstance(config, FsqConfig) else VaeAutoencoder(config)
-
-
 class Run:
     """A training in progress: network, averaged weights, optimizers, and the step it has reached."""
 
     def __init__(self, recipe: TokenizerRecipe, pools: list[Pool], device: torch.device) -> None:
         self.recipe, self.pools, self.step, self.seconds = recipe, pools, 0, 0.0
         torch.manual_seed(recipe.seed)
-        network = _autoencoder(recipe)
+        config = recipe.network
+        network = FsqAutoencoder(config) if isinstance(config, FsqConfig) else VaeAutoencoder(config)
         start_linear(network, self.batch(START, 256))
         self.device = device
         self.network: Autoencoder = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -146,11 +142,11 @@ class Run:
 
     def write_weights(self, path: Path, facts: dict[str, Any]) -> None:
         """Write the averaged weights as a tokenizer's file, with the facts of the training."""
-        config = self.recipe.network.config()
+        config = self.recipe.network
         if isinstance(config, FsqConfig):
             save_weights(path, FORMAT, config, self.average, facts)
         else:
-            scaled = replace(config, latent_scale=self._latent_scale(config))
+            scaled = config.model_copy(update={"latent_scale": self._latent_scale(config)})
             save_weights(path, VAE_FORMAT, scaled, self.average, facts)
 
     @torch.no_grad()
@@ -162,20 +158,18 @@ class Run:
 
     def save(self, path: Path) -> None:
         """Write what `resume` needs, atomically."""
-        metadata = {"course": self.recipe.course(), "step": str(self.step)}
-        metadata["rates"] = self._past_rates(self.step)
-        metadata["seconds"] = str(round(self.seconds, 3))
-        tensors = {name: tensor.contiguous() for name, tensor in self._state().items()}
-        write_atomic(path, save(tensors, metadata))
-
-    def _state(self) -> dict[str, Tensor]:
-        """Return copies of the parameters, the averages and the optimizers' moments, by name."""
-        state = {f"network.{name}": p.detach().clone() for name, p in self.network.named_parameters()}
-        state |= {f"average.{name}": tensor.clone() for name, tensor in self.average.items()}
+        metadata = {
+            "course": self.recipe.course(),
+            "step": str(self.step),
+            "rates": self._past_rates(self.step),
+            "seconds": str(round(self.seconds, 3)),
+        }
+        state = {f"network.{name}": parameter.detach() for name, parameter in self.network.named_parameters()}
+        state |= {f"average.{name}": tensor for name, tensor in self.average.items()}
         for number, optimizer in enumerate(self.optimizers):
             for index, moments in optimizer.state_dict()["state"].items():
-                state |= {f"moment.{number}.{index}.{key}": m.clone() for key, m in moments.items()}
-        return state
+                state |= {f"moment.{number}.{index}.{key}": moment for key, moment in moments.items()}
+        write_atomic(path, save({name: tensor.contiguous() for name, tensor in state.items()}, metadata))
 
     def resume(self, path: Path) -> None:
         """Resume from a state that `save` wrote.
@@ -183,18 +177,18 @@ class Run:
         Raises:
             RecipeError: the file is not such a state, or is of a training with other settings.
         """
-        remedy = f"remove {path.name} to start anew"
+        remedy = f"delete {path.name} to start again"
         try:
             with safe_open(path, "pt") as file:
                 metadata = file.metadata() or {}
                 state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            step = int(metadata.get("step", -1))
-            same = metadata.get("course") == self.recipe.course()
-            if step < 0 or not same or metadata.get("rates") != self._past_rates(step):
-                raise RecipeError(path, "is the state of a training with other settings", remedy)
-            self._restore(state)
-        except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as fault:
+        except (SafetensorError, OSError) as fault:
             raise RecipeError(path, f"is no state of a training: {fault!s:.120}", remedy) from fault
+        step = int(metadata.get("step", 0))
+        past = (metadata.get("course"), metadata.get("rates"))
+        if past != (self.recipe.course(), self._past_rates(step)):
+            raise RecipeError(path, "is the state of a training with other settings", remedy)
+        self._restore(state)
         self.step, self.seconds = step, float(metadata.get("seconds", 0))
 
     def _restore(self, state: dict[str, Tensor]) -> None:
@@ -227,6 +221,52 @@ def _optimizers(network: Autoencoder, recipe: TrainingRecipe) -> list[torch.opti
         Muon(matrices, lr=recipe.learning_rate, decay=recipe.weight_decay),
         torch.optim.Adam(others, lr=recipe.adam_learning_rate, betas=(0.9, 0.99)),
     ]
+
+
+def orthogonal(matrix: Tensor) -> Tensor:
+    """Return approximately the nearest matrix whose singular values are 1; (R, C) -> (R, C)."""
+    x = matrix / (matrix.norm() + 1e-7)
+    tall = x.shape[0] > x.shape[1]
+    x = x.T if tall else x
+    for _ in range(ROUNDS):
+        square = x @ x.T
+        x = _A * x + (_B * square + _C * square @ square) @ x
+    return x.T if tall else x
+
+
+class Muon(torch.optim.Optimizer):
+    """The Muon optimizer (Jordan et al. 2024): momentum made orthogonal before each step.
+
+    A convolution's weight (out, in, k, k) is treated as a matrix (out, in·k·k).
+
+    `lr` is the spectral norm of a step, multiplied by √(rows/columns) for tall matrices. Each step shrinks
+    the weights by lr·decay, which bounds their norm by 1/decay. Without `decay`, nothing bounds the norm of
+    the weights in a network that has no normalisation.
+    """
+
+    def __init__(
+        self, params: Iterable[Tensor], lr: float, momentum: float = 0.95, decay: float = 0.0
+    ) -> None:
+        super().__init__(params, {"lr": lr, "momentum": momentum, "decay": decay})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
+        """Take one step; `closure` is not called."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._step_one(parameter, parameter.grad, group)
+
+    def _step_one(self, parameter: Tensor, grad: Tensor, group: dict[str, Any]) -> None:
+        state = self.state[parameter]
+        if "momentum" not in state:
+            state["momentum"] = torch.zeros_like(grad)
+        state["momentum"].lerp_(grad, 1 - group["momentum"])
+        ahead = grad.lerp(state["momentum"], group["momentum"])
+        flat = ahead.reshape(len(ahead), -1)
+        update = orthogonal(flat) * max(1.0, flat.shape[0] / flat.shape[1]) ** 0.5
+        parameter.mul_(1 - group["lr"] * group["decay"])
+        parameter.add_(update.view(parameter.shape), alpha=-group["lr"])
 
 
 def _latent_penalty(latents: Tensor) -> Tensor:
@@ -278,13 +318,15 @@ def train(
     run, state = Run(recipe, pools, place), out.with_name(out.name + ".state")
     if state.exists():
         run.resume(state)
-        report(f"going on from step {run.step}")
+        report(f"resuming from step {run.step}")
+    threads = recipe.training.threads
+    processor = torch.cuda.get_device_name(place) if place.type == "cuda" else f"{threads} thread"
     facts: dict[str, Any] = {
         "recipe": recipe.name,
         "recipe_sha256": recipe.digest(),
         "corpus_sha256": corpus_sha256,
         "seed": recipe.seed,
-        "machine": _machine(place, recipe.training.threads),
+        "machine": f"{platform.machine()}, {processor}, torch {torch.__version__}",
     }
     # Far below zero the slope of silu is a denormal number; denormal numbers make a step seven times slower.
     torch.set_flush_denormal(True)
@@ -294,11 +336,6 @@ def train(
         torch.set_flush_denormal(False)
     state.unlink(missing_ok=True)
     return facts
-
-
-def _machine(device: torch.device, threads: int) -> str:
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{threads} thread"
-    return f"{platform.machine()}, {name}, torch {torch.__version__}"
 
 
 def _crops(run: Run, workers: int) -> Iterator[Tensor]:
