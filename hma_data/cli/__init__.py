@@ -1,1 +1,65 @@
-"""Offer the data verbs of `hma`, one module a verb. Each imports what it needs when it runs."""
+"""Offer the data verbs of `hma`, one module a verb or a group of verbs.
+
+Only light modules are imported here. Each verb imports what it needs when it runs.
+"""
+
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from hma_data.cli.convert import convert
+from hma_data.cli.inspect import doctor, inspect
+from hma_data.cli.mixture import mixture
+from hma_data.cli.registry import registry_app
+from hma_data.cli.shards import shards_app
+from hma_data.cli.tokenizer import tokenizer_app
+from hma_data.console import print_json, print_table
+
+Json = Annotated[bool, Option("--json", help="Print JSON.")]
+
+
+def mount(app: typer.Typer) -> None:
+    """Add every data verb to the command."""
+    app.add_typer(registry_app, name="registry")
+    app.command("inspect")(inspect)
+    app.command("doctor")(doctor)
+    app.command("convert")(convert)
+    app.add_typer(shards_app, name="shards")
+    app.command("mixture")(mixture)
+    app.add_typer(tokenizer_app, name="tokenizer")
+    app.command("bench")(bench)
+
+
+def bench(
+    name: Annotated[str | None, Argument(help="Which one; all are listed without it.")] = None,
+    settings: Annotated[list[str] | None, Argument(metavar="[KEY=VALUE]...", help="Its settings.")] = None,
+    json: Json = False,
+) -> None:
+    """Run a benchmark on generated data; nothing is downloaded.
+
+    Example: hma bench loader frames=1000000 --json
+    """
+    from hma_data.bench import BENCHES, load, machine, report, settings_of
+
+    if name is None:
+        modules = {known: load(known) for known in sorted(BENCHES)}
+        if json:
+            print_json({known: {"about": m.ABOUT, "settings": m.DEFAULTS} for known, m in modules.items()})
+            return
+        rows = [
+            [known, module.ABOUT, " ".join(f"{key}={value}" for key, value in module.DEFAULTS.items())]
+            for known, module in modules.items()
+        ]
+        print_table(["bench", "about", "settings"], rows)
+        return
+    module = load(name)
+    chosen = settings_of(module, name, settings or [])
+    results = module.run(chosen)
+    if json:
+        print_json(report(name, chosen, results))
+        return
+    columns = list(dict.fromkeys(key for result in results for key in result))
+    print_table(columns, [[result.get(key) for key in columns] for result in results], title=module.ABOUT)
+    facts = machine()
+    print(f"{facts['processor']}, {facts['cores']} cores, load {facts['load_average']}, {facts['date']}")

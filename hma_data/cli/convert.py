@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Option
 
 from hma_data.console import human_bytes, human_seconds, print_json, print_table, progress
 from hma_data.errors import HMAError, UsageError
@@ -17,74 +17,48 @@ if TYPE_CHECKING:
     from hma_data.conversion.recipe import ConversionJob
 
 SHOWN = 20  # reasons of quarantine that are printed
-Option = typer.Option
 
-
-class Frames(StrEnum):
-    all = "all"
-    strided = "strided"
-
-
-class Engine(StrEnum):
-    local = "local"
-    ray = "ray"
+Text = str | None
 
 
 def convert(
-    embodiment: Annotated[
-        str | None, Option("--embodiment", "-e", help="Registry id, or a YAML file.")
-    ] = None,
-    out: Annotated[Path | None, Option("--out", help="Folder of the shard set.")] = None,
-    source: Annotated[
-        str | None, Option("--source", help="Recording; default: source.uri of the YAML.")
-    ] = None,
-    recipe: Annotated[
-        Path | None, Option("--recipe", help="Several conversions: a YAML as in recipes/convert.")
-    ] = None,
-    tokenizer: Annotated[str, Option("--tokenizer", help="Name of the tokenizer.")] = "fsq-16",
-    weights: Annotated[
-        str | None, Option("--weights", help="The tokenizer's weights, if not the usual.")
-    ] = None,
-    device: Annotated[str, Option("--device", help="Where the tokenizer runs: cpu, cuda, mps.")] = "cpu",
-    workers: Annotated[
-        int, Option("--workers", min=0, help="Processes; 0 works in this one and survives no crash.")
-    ] = 1,
-    engine: Annotated[Engine, Option("--engine", help="What runs the workers.")] = Engine.local,
-    limit: Annotated[int | None, Option("--limit", min=1, help="Only the first episodes.")] = None,
-    frames: Annotated[Frames, Option("--frames", help="All rows, or the model's grid only.")] = Frames.all,
+    embodiment: Annotated[Text, Option("--embodiment", "-e", help="Registry id, or a YAML file.")] = None,
+    out: Annotated[Path | None, Option(help="Folder of the shard set.")] = None,
+    source: Annotated[Text, Option(help="Recording; default: source.uri of the YAML.")] = None,
+    recipe: Annotated[Path | None, Option(help="Several conversions: a YAML as in recipes/convert.")] = None,
+    tokenizer: Annotated[str, Option(help="Name of the tokenizer; see hma tokenizer list.")] = "fsq-16",
+    weights: Annotated[Text, Option(help="The tokenizer's weights, if not the usual ones.")] = None,
+    device: Annotated[str, Option(help="Where the tokenizer runs: cpu, cuda, mps.")] = "cpu",
+    workers: Annotated[int, Option(min=0, help="Processes; 0 works in this one and survives no crash.")] = 1,
+    engine: Annotated[Literal["local", "ray"], Option(help="What runs the workers.")] = "local",
+    limit: Annotated[int | None, Option(min=1, help="Convert only the first episodes.")] = None,
+    frames: Annotated[
+        Literal["all", "strided"], Option(help="Keep all rows, or only those of the model's grid.")
+    ] = "all",
     frequency_hz: Annotated[
-        float | None, Option("--frequency-hz", help="The recording's rate, where the YAML's is unknown.")
+        float | None, Option(help="Rate of the recording, where the YAML does not know it.")
     ] = None,
-    camera: Annotated[list[str] | None, Option("--camera", help="Camera to keep; repeat for more.")] = None,
-    shard_frames: Annotated[
-        int | None, Option("--shard-frames", min=1, help="About so many a shard.")
-    ] = None,
-    val_fraction: Annotated[float, Option("--val-fraction", help="Share of episodes for validation.")] = 0.05,
-    seed: Annotated[int, Option("--seed", help="Of the split.")] = 0,
+    camera: Annotated[list[str] | None, Option(help="Camera to keep; repeat it for more.")] = None,
+    shard_frames: Annotated[int | None, Option(min=1, help="Frames in a shard, about.")] = None,
+    val_fraction: Annotated[float, Option(help="Share of episodes for validation.")] = 0.05,
+    seed: Annotated[int, Option(help="Seed of the split.")] = 0,
     max_quarantine: Annotated[
-        float, Option("--max-quarantine", min=0, max=1, help="Share of bad episodes allowed.")
+        float, Option(min=0, max=1, help="Share of episodes that may be refused.")
     ] = 0.01,
     episode_timeout: Annotated[
-        float,
-        Option(
-            "--episode-timeout",
-            min=0,
-            help="Seconds without progress, then the episode is refused; 0: never.",
-        ),
+        float, Option(min=0, help="Refuse an episode after this many seconds without progress; 0: never.")
     ] = 300.0,
     extend: Annotated[
         bool, Option("--extend", help="Add the episodes that the set in --out does not have yet.")
     ] = False,
-    overwrite: Annotated[bool, Option("--overwrite", help="Throw away the shard set in --out.")] = False,
+    overwrite: Annotated[bool, Option("--overwrite", help="Delete the shard set in --out first.")] = False,
     shard_index: Annotated[
-        int | None, Option("--shard-index", min=0, help="This job's share of the shards, of --shard-count.")
+        int | None, Option(min=0, help="Which share of the shards this job makes, of --shard-count.")
     ] = None,
     shard_count: Annotated[
-        int | None, Option("--shard-count", min=1, help="Jobs that share the work, e.g. a Slurm array.")
+        int | None, Option(min=1, help="Number of jobs that share the work, for example a Slurm array.")
     ] = None,
-    dry_run: Annotated[
-        bool, Option("--dry-run", help="Print the plan, its size and time, and stop.")
-    ] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Only print the plan, its size and time.")] = False,
     json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Convert recordings to tokenized shards; run it again to continue.
@@ -95,52 +69,48 @@ def convert(
     from hma_data.conversion.recipe import job_of_options, load_jobs
 
     if extend and overwrite:
-        raise UsageError("hma convert", "--extend keeps what --overwrite throws away", "give one of them")
+        raise UsageError("hma convert", "--extend keeps what --overwrite deletes", "give one of them")
     if recipe:
         if embodiment or out or source:
             raise UsageError("--recipe", "states embodiment, source and out itself", "leave the options out")
         jobs = load_jobs(recipe)
+    elif embodiment is None or out is None:
+        raise UsageError("hma convert", "needs --embodiment and --out, or --recipe", "see hma convert --help")
     else:
-        if embodiment is None or out is None:
-            raise UsageError(
-                "hma convert", "needs --embodiment and --out, or --recipe", "see hma convert --help"
-            )
-        jobs = [
-            job_of_options(
-                embodiment=embodiment,
-                out=out,
-                source=source,
-                tokenizer=tokenizer,
-                weights=weights,
-                device=device,
-                workers=workers,
-                engine=engine.value,
-                limit=limit,
-                frames=frames.value,
-                frequency_hz=frequency_hz,
-                cameras=tuple(camera or ()),
-                shard_frames=shard_frames,
-                val_fraction=_fraction(val_fraction),
-                seed=seed,
-                max_quarantine=max_quarantine,
-                episode_timeout=episode_timeout,
-            )
-        ]
-    if (shard_index is None) != (shard_count is None):
-        raise UsageError("hma convert", "--shard-index and --shard-count belong together")
-    share = None if shard_index is None or shard_count is None else Share(shard_index, shard_count)
-    if share and share.index >= share.count:
-        raise UsageError("--shard-index", f"must be below --shard-count {share.count}, is {share.index}")
-    if share and (overwrite or engine is Engine.ray):
-        raise UsageError("--shard-index", "goes with neither --overwrite nor --engine ray")
-    run = _planned if dry_run else _shared if share else _converted
-    _run_all(jobs, lambda job: run(job, json, extend=extend, overwrite=overwrite, share=share))
+        job = job_of_options(
+            embodiment=embodiment,
+            out=out,
+            source=source,
+            tokenizer=tokenizer,
+            weights=weights,
+            device=device,
+            workers=workers,
+            engine=engine,
+            limit=limit,
+            frames=frames,
+            frequency_hz=frequency_hz,
+            cameras=tuple(camera or ()),
+            shard_frames=shard_frames,
+            val_fraction=val_fraction,
+            seed=seed,
+            max_quarantine=max_quarantine,
+            episode_timeout=episode_timeout,
+        )
+        jobs = [job]
+    share = None
+    if shard_index is not None and shard_count is not None:
+        share = Share(shard_index, shard_count)
+        if shard_index >= shard_count:
+            raise UsageError("--shard-index", f"must be below --shard-count {shard_count}, is {shard_index}")
+        if overwrite or engine == "ray":
+            raise UsageError("--shard-index", "cannot be combined with --overwrite or --engine ray")
+    elif shard_index is not None or shard_count is not None:
+        raise UsageError("hma convert", "--shard-index and --shard-count belong together", "give both")
 
+    def run(job: "ConversionJob") -> bool:
+        return _plan(job, json) if dry_run else _convert(job, json, extend, overwrite, share)
 
-def _fraction(value: float) -> float:
-    if not 0 <= value < 1:
-        raise UsageError("--val-fraction", f"must lie in 0..1, is {value}")
-    return value
+    _run_all(jobs, run)
 
 
 def _run_all(jobs: "list[ConversionJob]", run: "Callable[[ConversionJob], bool]") -> None:
@@ -159,65 +129,36 @@ def _run_all(jobs: "list[ConversionJob]", run: "Callable[[ConversionJob], bool]"
     raise typer.Exit(1 if failed else 0)
 
 
-# -- kinds of runs
-
-
-def _converted(
-    job: "ConversionJob", json: bool, *, extend: bool, overwrite: bool, share: "Share | None"
-) -> bool:
+def _convert(job: "ConversionJob", json: bool, extend: bool, overwrite: bool, share: "Share | None") -> bool:
+    """Run a conversion, or a share of it; return False if too many episodes are in quarantine."""
     from hma_data.conversion.engines.base import Limits
     from hma_data.conversion.job import convert as run
+    from hma_data.conversion.job import convert_share
 
+    what = (_robot(job), job.source, job.tokenizer, job.out)
     with _shown(job) as on_progress:
-        summary = run(
-            _robot(job),
-            job.source,
-            job.tokenizer,
-            job.out,
-            settings=job.settings,
-            workers=job.workers,
-            engine=job.engine,
-            weights=job.weights,
-            device=job.device,
-            limits=Limits(quiet_s=job.episode_timeout or None),
-            max_quarantine=job.max_quarantine,
-            overwrite=overwrite,
-            extend=extend,
-            on_progress=on_progress,
-        )
+        options: dict[str, Any] = {
+            "settings": job.settings,
+            "workers": job.workers,
+            "weights": job.weights,
+            "device": job.device,
+            "limits": Limits(quiet_s=job.episode_timeout or None),
+            "extend": extend,
+            "on_progress": on_progress,
+        }
+        if share:
+            done = convert_share(*what, share, **options)
+        else:
+            options |= {"engine": job.engine, "max_quarantine": job.max_quarantine}
+            summary = run(*what, overwrite=overwrite, **options)
+    if share:
+        _report_share(done, share, json)
+        return True
     _report(summary, job.max_quarantine, json)
     return not summary.too_many
 
 
-def _shared(
-    job: "ConversionJob", json: bool, *, extend: bool, overwrite: bool, share: "Share | None"
-) -> bool:
-    from hma_data.conversion.engines.base import Limits
-    from hma_data.conversion.job import convert_share
-
-    assert share is not None
-    with _shown(job) as on_progress:
-        done = convert_share(
-            _robot(job),
-            job.source,
-            job.tokenizer,
-            job.out,
-            share,
-            settings=job.settings,
-            workers=job.workers,
-            weights=job.weights,
-            device=job.device,
-            limits=Limits(quiet_s=job.episode_timeout or None),
-            extend=extend,
-            on_progress=on_progress,
-        )
-    _report_share(done, share, json)
-    return True
-
-
-def _planned(
-    job: "ConversionJob", json: bool, *, extend: bool, overwrite: bool, share: "Share | None"
-) -> bool:
+def _plan(job: "ConversionJob", json: bool) -> bool:
     from hma_data.conversion.estimate import estimate
     from hma_data.conversion.job import plan_conversion
     from hma_data.storage.remote import place
@@ -230,31 +171,32 @@ def _planned(
     units = [
         {"shard": unit.name, "episodes": len(unit.episodes), "frames": unit.frames} for unit in plan.units
     ]
-    facts = {
-        "source": uri,
-        "out": str(place(job.out)),
-        "episodes": plan.episodes,
-        "frames": plan.frames,
-        "bytes": cost.bytes,
-        "frames_per_second": cost.frames_per_second,
-        "seconds": cost.seconds,
-        "shards": units,
-    }
     if json:
-        print_json(facts)
+        print_json(
+            {
+                "source": uri,
+                "out": str(place(job.out)),
+                "episodes": plan.episodes,
+                "frames": plan.frames,
+                "bytes": cost.bytes,
+                "frames_per_second": cost.frames_per_second,
+                "seconds": cost.seconds,
+                "shards": units,
+            }
+        )
         return True
     print_table(["shard", "episodes", "frames, about"], [list(unit.values()) for unit in units])
     print(
         f"{uri}: {plan.episodes:,} episodes, about {plan.frames:,} frames into {len(units)} shards, "
         f"about {human_bytes(cost.bytes)}"
     )
-    if cost.seconds is not None:
+    if cost.seconds is None:
+        print(f"time unknown, no episode could be read: {cost.fault}")
+    else:
         print(
-            f"about {human_seconds(cost.seconds)} with --workers {job.workers}: one does "
+            f"about {human_seconds(cost.seconds)} with --workers {job.workers}: one worker converts "
             f"{cost.frames_per_second:,.0f} frames/s, measured on one episode"
         )
-    else:
-        print(f"time unknown, no episode could be read: {cost.fault}")
     return True
 
 
@@ -263,9 +205,6 @@ def _robot(job: "ConversionJob") -> Any:
 
     robot = find(job.embodiment)
     return robot if job.frequency_hz is None else robot.with_rate(job.frequency_hz)
-
-
-# -- what is shown
 
 
 @contextmanager
@@ -288,21 +227,13 @@ def _shown(job: "ConversionJob") -> "Iterator[Callable[[Progress], None]]":
 
 def _report_share(done: "Shared", share: "Share", json: bool) -> None:
     if json:
-        print_json(
-            {
-                "out": str(done.out),
-                "shards_made": done.made_shards,
-                "shards_kept": done.kept_shards,
-                "shards_missing": done.missing,
-                "seconds": done.seconds,
-            }
-        )
+        facts = {"shards_made": done.made_shards, "shards_kept": done.kept_shards}
+        facts |= {"shards_missing": done.missing}
+        print_json({"out": str(done.out), **facts, "seconds": done.seconds})
         return
-    said = (
-        f"{done.missing} shards are left to the other shares; the last of them writes the manifest"
-        if done.missing
-        else "all shards are there, the manifest is written"
-    )
+    said = "all shards are there, the manifest is written"
+    if done.missing:
+        said = f"{done.missing} shards are left to the other shares; the last of them writes the manifest"
     print(
         f"{done.out}: share {share.name} made {done.made_shards} shards "
         f"({done.kept_shards} were there already), {human_seconds(done.seconds)}; {said}"
@@ -310,6 +241,8 @@ def _report_share(done: "Shared", share: "Share", json: bool) -> None:
 
 
 def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
+    from hma_data.cli.shards import totals_line
+
     manifest = summary.manifest
     totals = manifest.to_json()["totals"]
     if json:
@@ -327,13 +260,8 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
             }
         )
     else:
-        splits = ", ".join(f"{name} {split['episodes']:,}" for name, split in manifest.splits.items())
         kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
-        print(
-            f"{summary.out}: {totals['episodes']:,} episodes ({splits}), {totals['frames']:,} frames, "
-            f"{human_bytes(totals['bytes'])} in "
-            f"{len(manifest.shards)} shards{kept}, {human_seconds(summary.seconds)}"
-        )
+        print(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
         if summary.flags:
             counts = [f"{count:,} {name.replace('_', ' ')}" for name, count in summary.flags.items()]
             print(f"flags: {', '.join(counts)}")

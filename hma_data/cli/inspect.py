@@ -1,22 +1,22 @@
 """Run `hma inspect` (what is in a recording) and `hma doctor` (what in it will hurt training)."""
 
-from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
 from hma_data.console import human_number, print_json, print_lines, print_table
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Episodes = Annotated[int, typer.Option("--episodes", min=1, help="How many are looked into.")]
+Json = Annotated[bool, Option("--json", help="Print JSON.")]
+Episodes = Annotated[int, Option("--episodes", min=1, help="Number of episodes to look into.")]
 COLUMNS = ["key", "shape", "dtype", "Hz", "jitter ms", "skew ms", "count", "values"]
 NO_JITTER_MS = 0.001  # a smaller jitter comes from rounded stamps
 
 
 def inspect(
-    uri: Annotated[str, typer.Argument(help="A recording: file, folder or URI.")],
+    uri: Annotated[str, Argument(help="A recording: file, folder or URI.")],
     embodiment: Annotated[
-        str | None, typer.Option("--embodiment", "-e", help="Check against this embodiment.")
+        str | None, Option("--embodiment", "-e", help="Check against this embodiment.")
     ] = None,
     episodes: Episodes = 20,
     json: Json = False,
@@ -37,14 +37,10 @@ def inspect(
 
 def _print_inspection(report: dict[str, Any]) -> None:
     episodes = f"{report['episodes']:,} episode{'s' if report['episodes'] != 1 else ''}"
-    facts = [f"{report['format']}", episodes]
-    if report["frames"]:
-        facts.append(f"{report['frames']:,} frames")
-    if report["hz"]:
-        facts.append(f"{report['hz']:.4g} Hz")
-    if report["robot"]:
-        facts.append(report["robot"])
-    print(f"{report['uri']}: " + ", ".join(facts))
+    frames = f"{report['frames']:,} frames" if report["frames"] else None
+    rate = f"{report['hz']:.4g} Hz" if report["hz"] else None
+    facts = [report["format"], episodes, frames, rate, report["robot"]]
+    print(f"{report['uri']}: " + ", ".join(fact for fact in facts if fact))
     lengths = sorted(report["lengths"])
     if lengths:
         told = "" if len(lengths) == report["episodes"] else f" of the {len(lengths):,} counted"
@@ -94,22 +90,16 @@ def _print_checks(report: dict[str, Any]) -> None:
     )
 
 
-class Limit(StrEnum):
-    info = "info"
-    warn = "warn"
-    error = "error"
-    never = "never"
-
-
 def doctor(
-    target: Annotated[str, typer.Argument(help="A recording, or the folder of a shard set.")],
+    target: Annotated[str, Argument(help="A recording, or the folder of a shard set.")],
     embodiment: Annotated[
-        str | None, typer.Option("--embodiment", "-e", help="Look into the episodes as this robot's.")
+        str | None, Option("--embodiment", "-e", help="Look into the episodes as this robot's.")
     ] = None,
     episodes: Episodes = 20,
     fail_on: Annotated[
-        Limit, typer.Option("--fail-on", help="Exit with 1 from this severity on.")
-    ] = Limit.error,
+        Literal["info", "warn", "error", "never"],
+        Option("--fail-on", help="Exit with 1 if there is a finding of this severity or worse."),
+    ] = "error",
     json: Json = False,
 ) -> None:
     """Check the health of a recording or shard set: report what in it will hurt training.
@@ -127,5 +117,5 @@ def doctor(
         counts = [f"{sum(one.severity == level for one in found)} {level}" for level in reversed(SEVERITIES)]
         print(f"{target}: {', '.join(counts)}" if found else f"{target}: sound")
     worst = max((SEVERITIES.index(finding.severity) for finding in found), default=-1)
-    failed = fail_on is not Limit.never and worst >= SEVERITIES.index(fail_on.value)
+    failed = fail_on != "never" and worst >= SEVERITIES.index(fail_on)
     raise typer.Exit(1 if failed else 0)

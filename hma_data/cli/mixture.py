@@ -1,9 +1,9 @@
 """Run `hma mixture`: show how often each embodiment is drawn, as a table and a plot."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 
 from hma_data.console import print_json, print_table
 
@@ -11,33 +11,27 @@ if TYPE_CHECKING:
     from hma_data.loading.mixture import Mixture
     from hma_data.shards.windows import WindowIndex
 
+
 Pairs = list[str] | None
 
 
 def mixture(
-    folders: Annotated[list[str], typer.Argument(help="Shard sets.")],
+    folders: Annotated[list[str], Argument(help="Shard sets.")],
     temperature: Annotated[
-        float | None,
-        typer.Option("--temperature", help="τ: 1 proportional, large uniform; default 3, for val 4."),
+        float | None, Option(help="τ: 1 is proportional, a large one uniform; default 3, for val 4.")
     ] = None,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="T of a window.")] = 12,
-    split: Annotated[str, typer.Option("--split", help="train or val.")] = "train",
-    short: Annotated[str, typer.Option("--short", help="Short episodes: drop or pad.")] = "drop",
-    weight: Annotated[
-        Pairs, typer.Option("--weight", metavar="NAME=FACTOR", help="Of an embodiment or group.")
-    ] = None,
-    group: Annotated[
-        Pairs, typer.Option("--group", metavar="ID=GROUP", help="Groups get equal shares.")
-    ] = None,
-    cap: Annotated[Pairs, typer.Option("--cap", metavar="ID=SHARE", help="Largest probability.")] = None,
-    max_epochs: Annotated[
-        float | None, typer.Option("--max-epochs", help="Passes over one set at most.")
-    ] = None,
+    frames: Annotated[int, Option(min=1, help="Frames T of a window.")] = 12,
+    split: Annotated[Literal["train", "val"], Option(help="Split to draw from.")] = "train",
+    short: Annotated[Literal["drop", "pad"], Option(help="What to do with short episodes.")] = "drop",
+    weight: Annotated[Pairs, Option(metavar="NAME=FACTOR", help="Of an embodiment or group.")] = None,
+    group: Annotated[Pairs, Option(metavar="ID=GROUP", help="Groups get equal shares.")] = None,
+    cap: Annotated[Pairs, Option(metavar="ID=SHARE", help="Largest probability.")] = None,
+    max_epochs: Annotated[float | None, Option(help="Largest number of passes over one set.")] = None,
     samples: Annotated[
-        int | None, typer.Option("--samples", min=1, help="Planned draws; default: as many as windows.")
+        int | None, Option(min=1, help="Planned draws; default: the number of windows.")
     ] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="PNG, SVG or PDF to draw.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    plot: Annotated[Path | None, Option(help="PNG, SVG or PDF to draw.")] = None,
+    json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Show how often each embodiment is drawn.
 
@@ -46,21 +40,13 @@ def mixture(
     from hma_data.errors import UsageError
     from hma_data.loading.dataset import open_sets
     from hma_data.loading.mixture import TEMPERATURES, Mixture, plot_mixture
-    from hma_data.shards.manifest import SPLITS
     from hma_data.shards.windows import WindowIndex
 
-    if split not in SPLITS:
-        raise UsageError("--split", f"must be train or val, is {split!r}")
-    if short not in ("drop", "pad"):
-        raise UsageError("--short", f"must be drop or pad, is {short!r}")
     if plot and plot.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise UsageError("--plot", f"must end in .png, .svg or .pdf, is {plot}")
     tau = TEMPERATURES[split] if temperature is None else temperature
     sets = open_sets(folders)
-    indexes = {
-        name: WindowIndex.of(shards, split, frames, short="pad" if short == "pad" else "drop")
-        for name, shards in sets.items()
-    }
+    indexes = {name: WindowIndex.of(shards, split, frames, short=short) for name, shards in sets.items()}
     counts = {name: index.count for name, index in indexes.items()}
     planned = samples or max(1, sum(counts.values()))
     mix = Mixture.of(
@@ -77,9 +63,8 @@ def mixture(
     if plot:
         plot_mixture(mix, tau, plot)
     if json:
-        said = tau if tau != float("inf") else "inf"
-        facts = {"temperature": said, "frames": frames, "split": split, "samples": planned}
-        print_json({**facts, "embodiments": rows})
+        facts = {"temperature": "inf" if tau == float("inf") else tau, "frames": frames, "split": split}
+        print_json({**facts, "samples": planned, "embodiments": rows})
         return
     columns = ["windows", "episodes", "too short", "frames", "proportional", f"p at τ = {tau:g}"]
     print_table(["embodiment", *columns, "p uniform", "epochs"], [list(row.values()) for row in rows])

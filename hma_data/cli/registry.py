@@ -1,18 +1,19 @@
 """Run `hma registry`: list and show embodiments, check their YAML, write a new robot's YAML, export it."""
 
 import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
 from hma_data.console import print_json, print_table
 from hma_data.registry.formats import FORMATS
 
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Id = Annotated[str, typer.Argument(help="Registry id, or a YAML file.")]
+Json = Annotated[bool, Option("--json", help="Print JSON.")]
+Id = Annotated[str, Argument(help="Registry id, or a YAML file.")]
+Out = Annotated[Path | None, Option(help="File to write; default: print.")]
 SCHEMA = "embodiment.schema.json"  # the first line of a YAML names it for editors
 LISTED = {  # column -> fact
     "id": "id",
@@ -27,29 +28,18 @@ LISTED = {  # column -> fact
 }
 
 
-class Kind(StrEnum):
-    real = "real"
-    simulation = "simulation"
-    human = "human"
-
-
-class Convention(StrEnum):
-    modality = "modality.json"
-    lerobot = "lerobot-features"
-
-
 @registry_app.command("list")
 def registry_list(
     words: Annotated[
-        list[str] | None, typer.Argument(help="Only those with all these words in id, robot or description.")
+        list[str] | None, Argument(help="Only those with all these words in id, robot or description.")
     ] = None,
-    kind: Annotated[Kind | None, typer.Option("--kind", help="Only this kind.")] = None,
+    kind: Annotated[Literal["real", "simulation", "human"] | None, Option(help="Only this kind.")] = None,
     source: Annotated[
-        str | None, typer.Option("--source", help=f"Only this format: {', '.join(FORMATS)}, or a package's.")
+        str | None, Option(help=f"Only this format: {', '.join(FORMATS)}, or a package's.")
     ] = None,
-    space: Annotated[str | None, typer.Option("--space", help="Only this action space.")] = None,
-    dims: Annotated[int | None, typer.Option("--dims", help="Only this many action dims.")] = None,
-    hz: Annotated[str | None, typer.Option("--hz", help="Only this rate, or: unknown.")] = None,
+    space: Annotated[str | None, Option(help="Only this action space.")] = None,
+    dims: Annotated[int | None, Option(help="Only this number of action dims.")] = None,
+    hz: Annotated[str | None, Option(help="Only this rate, or: unknown.")] = None,
     json: Json = False,
 ) -> None:
     """List every embodiment that can be found by its id.
@@ -97,11 +87,12 @@ def _rate_is(rate: float | str | None, wanted: str) -> bool:
 
 
 def _print_list(rows: list[dict[str, Any]]) -> None:
-    cells = [[row[fact] for fact in LISTED.values()] for row in rows]
-    for row, shown in zip(rows, cells, strict=True):
-        if row["rate_hz"] is None:  # a word such as "unknown" says more than a blank
-            shown[list(LISTED).index("Hz")] = row["frequency_hz"]
-    print_table(list(LISTED), [[", ".join(v) if isinstance(v, list) else v for v in row] for row in cells])
+    cells = []
+    for row in rows:
+        rate = row["frequency_hz"] if row["rate_hz"] is None else row["rate_hz"]  # "unknown", not a blank
+        shown = {**row, "rate_hz": rate, "cameras": ", ".join(row["cameras"])}
+        cells.append([shown[fact] for fact in LISTED.values()])
+    print_table(list(LISTED), cells)
     print(f"{len(rows):,} embodiment{'s' if len(rows) != 1 else ''}")
 
 
@@ -133,7 +124,7 @@ def _known(value: Any) -> str:
 @registry_app.command("validate")
 def registry_validate(
     paths: Annotated[
-        list[Path] | None, typer.Argument(help="Files or folders; the whole registry without any.")
+        list[Path] | None, Argument(help="Files or folders; the whole registry without any.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -147,10 +138,10 @@ def registry_validate(
     files: list[Path] = []
     for path in paths or []:
         if not path.exists():
-            raise RegistryError(path, "does not exist")
+            raise RegistryError(path, "no such file or folder")
         files += registry_files([path]) if path.is_dir() else [path]
     if paths and not files:
-        raise RegistryError(", ".join(map(str, paths)), "has no .yaml or .yml file")
+        raise RegistryError(", ".join(map(str, paths)), "holds no .yaml or .yml file")
     judged = entries(files if paths else None)
     found = [(entry, problem) for entry in judged for problem in entry.problems]
     if json:
@@ -172,9 +163,7 @@ def _line(problem: dict[str, str | None]) -> str:
 
 
 @registry_app.command("schema")
-def registry_schema(
-    out: Annotated[Path | None, typer.Option("--out", help="File to write; default: print.")] = None,
-) -> None:
+def registry_schema(out: Out = None) -> None:
     """Print or write the JSON Schema of a registry YAML, for editors.
 
     Example: hma registry schema --out registry/embodiment.schema.json
@@ -185,7 +174,7 @@ def registry_schema(
         print_json(schema())
         return
     _write_schema(out)
-    print(f"wrote {out}; a YAML beside it is completed by editors with the line")
+    print(f"wrote {out}; an editor completes a YAML beside it that begins with the line")
     print(f"# yaml-language-server: $schema={out.name}")
 
 
@@ -201,8 +190,8 @@ def _write_schema(out: Path) -> None:
 @registry_app.command("export")
 def registry_export(
     id: Id,
-    to: Annotated[Convention, typer.Option("--to", help="Whose convention.")],
-    out: Annotated[Path | None, typer.Option("--out", help="File to write; default: print.")] = None,
+    to: Annotated[Literal["modality.json", "lerobot-features"], Option(help="Format of the other project.")],
+    out: Out = None,
 ) -> None:
     """Export an embodiment to another project's format: GR00T's modality.json, or LeRobotDataset features.
 
@@ -215,7 +204,7 @@ def registry_export(
     from hma_data.storage.files import write_atomic
 
     embodiment = find(id)
-    values = modality(embodiment) if to is Convention.modality else lerobot_features(embodiment)
+    values = modality(embodiment) if to == "modality.json" else lerobot_features(embodiment)
     if out is None:
         print_json(values)
         return
@@ -225,9 +214,9 @@ def registry_export(
 
 @registry_app.command("infer")
 def registry_infer(
-    uri: Annotated[str, typer.Argument(help="A recording of the robot.")],
-    id: Annotated[str, typer.Option("--id", help="Id of the new embodiment.")],
-    out: Annotated[Path | None, typer.Option("--out", help="File to write; default: print.")] = None,
+    uri: Annotated[str, Argument(help="A recording of the robot.")],
+    id: Annotated[str, Option(help="Id of the new embodiment.")],
+    out: Out = None,
 ) -> None:
     """Write a robot's YAML from one of its recordings.
 
@@ -240,7 +229,7 @@ def registry_infer(
     from hma_data.storage.yaml_io import parse_yaml
 
     if out is not None and out.exists():
-        raise OutputError(out, "exists already", "choose another --out, or delete it first")
+        raise OutputError(out, "exists already", "name another file with --out, or delete it first")
     text = infer(uri, id)
     if out is None:
         print(text, end="")

@@ -1,14 +1,11 @@
-"""Run `hma shards`: look at shard sets, verify them, and make new sets from them.
-
-Only light modules are imported here. Each verb imports what it needs when it runs.
-"""
+"""Run `hma shards`: look at shard sets, verify them, and make new sets from them."""
 
 from collections.abc import Callable
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
 from hma_data.console import Update, human_bytes, print_json, print_table, progress
 
@@ -16,22 +13,14 @@ if TYPE_CHECKING:
     from hma_data.shards.manifest import Manifest
 
 shards_app = typer.Typer(
-    no_args_is_help=True, help="Look at shard sets, verify them, and make others of them."
+    no_args_is_help=True, help="Look at shard sets, verify them, and make new sets from them."
 )
 
-Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; default: one a core.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder of the new shard set.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-
-
-class Layout(StrEnum):
-    memmap = "memmap"
-
-
-class Together(StrEnum):
-    episode = "episode"
-    instruction = "instruction"
-    source = "source"
+Folder = Annotated[Path, Argument(help="A shard set.")]
+Workers = Annotated[int | None, Option(min=1, help="Threads; default: one a core.")]
+Out = Annotated[Path, Option(help="Folder of the new shard set.")]
+Camera = Annotated[str | None, Option(help="Camera to take; default: the first.")]
+Json = Annotated[bool, Option("--json", help="Print JSON.")]
 
 
 def _in(update: Update, unit: float = 1) -> Callable[[int, int], None]:
@@ -40,7 +29,7 @@ def _in(update: Update, unit: float = 1) -> Callable[[int, int], None]:
 
 
 @shards_app.command("info")
-def shards_info(folder: Annotated[Path, typer.Argument(help="A shard set.")], json: Json = False) -> None:
+def shards_info(folder: Folder, json: Json = False) -> None:
     """Show the totals of a shard set.
 
     Example: hma shards info shards/my_arm
@@ -94,11 +83,9 @@ def _print_info(facts: dict[str, Any]) -> None:
 
 @shards_app.command("verify")
 def shards_verify(
-    folders: Annotated[list[Path], typer.Argument(help="Shard sets.")],
+    folders: Annotated[list[Path], Argument(help="Shard sets.")],
     workers: Workers = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Sizes and footers only: no hashes, no rows.")
-    ] = False,
+    quick: Annotated[bool, Option("--quick", help="Check only sizes and footers.")] = False,
     json: Json = False,
 ) -> None:
     """Check every hash, row count and invariant.
@@ -111,9 +98,8 @@ def shards_verify(
     found = {}
     with progress("verify", unit="MB") as update:
         for folder in folders:
-            found[str(place(folder))] = verify(
-                folder, workers=workers, quick=quick, on_progress=_in(update, 1e6)
-            )
+            problems = verify(folder, workers=workers, quick=quick, on_progress=_in(update, 1e6))
+            found[str(place(folder))] = problems
     if json:
         print_json(found)
     else:
@@ -126,13 +112,11 @@ def shards_verify(
 
 @shards_app.command("preview")
 def shards_preview(
-    folder: Annotated[Path, typer.Argument(help="A shard set.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for sheet.png and preview.mp4.")] = None,
-    episodes: Annotated[int, typer.Option("--episodes", min=1, help="How many to show.")] = 4,
-    camera: Annotated[str | None, typer.Option("--camera", help="Which; default: the first.")] = None,
-    weights: Annotated[
-        str | None, typer.Option("--weights", help="The tokenizer's weights, if not the usual.")
-    ] = None,
+    folder: Folder,
+    out: Annotated[Path | None, Option(help="Folder for sheet.png and preview.mp4.")] = None,
+    episodes: Annotated[int, Option(min=1, help="Number of episodes to show.")] = 4,
+    camera: Camera = None,
+    weights: Annotated[str | None, Option(help="The tokenizer's weights, if not the usual ones.")] = None,
 ) -> None:
     """Write a contact sheet and a video decoded from the tokens, with the actions drawn.
 
@@ -145,22 +129,26 @@ def shards_preview(
     print(f"wrote {shown.sheet} and {shown.video} ({len(shown.episodes)} episodes)")
 
 
-def _report(out: Path, manifest: "Manifest", json: bool) -> None:
-    values = manifest.to_json()
-    if json:
-        print_json({"out": str(out), **values["totals"], "splits": values["splits"]})
-        return
+def totals_line(out: Path, manifest: "Manifest") -> str:
+    """Return one line of text about a new shard set: its episodes, frames, bytes and shards."""
+    totals = manifest.to_json()["totals"]
     splits = ", ".join(f"{name} {split['episodes']:,}" for name, split in manifest.splits.items())
-    totals = values["totals"]
-    print(
+    return (
         f"{out}: {totals['episodes']:,} episodes ({splits}), {totals['frames']:,} frames, "
         f"{human_bytes(totals['bytes'])} in {len(manifest.shards)} shards"
     )
 
 
+def _report(out: Path, manifest: "Manifest", json: bool) -> None:
+    if json:
+        print_json({"out": str(out), **manifest.to_json()["totals"], "splits": manifest.splits})
+    else:
+        print(totals_line(out, manifest))
+
+
 @shards_app.command("merge")
 def shards_merge(
-    folders: Annotated[list[Path], typer.Argument(help="Shard sets of one embodiment and tokenizer.")],
+    folders: Annotated[list[Path], Argument(help="Shard sets of one embodiment and tokenizer.")],
     out: Out,
     workers: Workers = None,
     json: Json = False,
@@ -179,43 +167,32 @@ def shards_merge(
 
 @shards_app.command("split")
 def shards_split(
-    folder: Annotated[Path, typer.Argument(help="A shard set.")],
+    folder: Folder,
     out: Out,
-    val_fraction: Annotated[
-        float, typer.Option("--val-fraction", help="Share of episodes for validation.")
-    ] = 0.05,
-    seed: Annotated[int, typer.Option("--seed", help="Of the split.")] = 0,
+    val_fraction: Annotated[float, Option(help="Share of episodes for validation.")] = 0.05,
+    seed: Annotated[int, Option(help="Seed of the split.")] = 0,
     by: Annotated[
-        Together, typer.Option("--by", help="What stays together in one split.")
-    ] = Together.episode,
+        Literal["episode", "instruction", "source"], Option(help="What stays together in one split.")
+    ] = "episode",
     workers: Workers = None,
     json: Json = False,
 ) -> None:
-    """Divide the episodes of a set anew into train and val, as a new set.
+    """Divide the episodes of a set into train and val again, as a new set.
 
     Example: hma shards split shards/my_arm --val-fraction 0.1 --out shards/my_arm_10
     """
     from hma_data.conversion.rewrite import split
     from hma_data.threads import usable_cores
 
+    options: dict[str, Any] = {"val_fraction": val_fraction, "seed": seed, "by": by}
     with progress("split") as update:
-        manifest = split(
-            folder,
-            out,
-            val_fraction=val_fraction,
-            seed=seed,
-            by=by.value,
-            workers=workers or usable_cores(),
-            on_progress=_in(update),
-        )
+        manifest = split(folder, out, **options, workers=workers or usable_cores(), on_progress=_in(update))
     _report(out, manifest, json)
 
 
 @shards_app.command("restat")
-def shards_restat(
-    folder: Annotated[Path, typer.Argument(help="A shard set.")], workers: Workers = None, json: Json = False
-) -> None:
-    """Compute the statistics again and write the manifest anew; the shards are not touched.
+def shards_restat(folder: Folder, workers: Workers = None, json: Json = False) -> None:
+    """Compute the statistics again and write a new manifest; the shards stay as they are.
 
     Example: hma shards restat shards/my_arm
     """
@@ -228,15 +205,11 @@ def shards_restat(
 
 @shards_app.command("export")
 def shards_export(
-    folder: Annotated[Path, typer.Argument(help="A shard set.")],
-    out: Annotated[Path, typer.Option("--out", help="New folder; one for each split is made in it.")],
-    to: Annotated[
-        Layout, typer.Option("--to", help="memmap: the layout of the paper's code.")
-    ] = Layout.memmap,
-    split: Annotated[
-        str | None, typer.Option("--split", help="Only this split, straight into --out.")
-    ] = None,
-    camera: Annotated[str | None, typer.Option("--camera", help="Which; default: the first.")] = None,
+    folder: Folder,
+    out: Annotated[Path, Option(help="New folder; each split gets a folder in it.")],
+    to: Annotated[Literal["memmap"], Option(help="memmap: the layout of the paper's code.")] = "memmap",
+    split: Annotated[str | None, Option(help="Only this split, straight into --out.")] = None,
+    camera: Camera = None,
 ) -> None:
     """Export flat files as the paper's code reads them: video.bin, actions, segment_ids.bin, metadata.json.
 
@@ -244,7 +217,7 @@ def shards_export(
     """
     from hma_data.shards.memmap import export
 
-    with progress(f"export to {to.value}") as update:
+    with progress(f"export to {to}") as update:
         places = export(folder, out, split=split, camera=camera, on_progress=_in(update))
     for place in places:
         print(f"wrote {place}")

@@ -4,11 +4,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from hma_data.console import human_bytes, print_json, print_table
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Json = Annotated[bool, Option("--json", help="Print JSON.")]
+Device = Annotated[str, Option(help="Where the network runs: cpu, cuda, mps.")]
 
 
 @tokenizer_app.command("list")
@@ -48,13 +50,13 @@ def _print_list(entries: list[Any]) -> None:
 
 @tokenizer_app.command("train")
 def tokenizer_train(
-    recipe: Annotated[Path, typer.Argument(help="A YAML of recipes/tokenizer.")],
+    recipe: Annotated[Path, Argument(help="A YAML of recipes/tokenizer.")],
     overrides: Annotated[
-        list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Dotted overrides.")
+        list[str] | None, Argument(metavar="[KEY=VALUE]...", help="Dotted overrides.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", help="The weights' file.")] = Path("tokenizer.safetensors"),
-    device: Annotated[str, typer.Option("--device", help="cpu, cuda, mps.")] = "cpu",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Threads that draw crops ahead.")] = 0,
+    out: Annotated[Path, Option(help="The weights' file.")] = Path("tokenizer.safetensors"),
+    device: Device = "cpu",
+    workers: Annotated[int, Option(min=0, help="Threads that draw crops ahead.")] = 0,
 ) -> None:
     """Train a tokenizer; run it again to continue.
 
@@ -68,41 +70,31 @@ def tokenizer_train(
     for text in overrides or []:
         key, equals, value = text.partition("=")
         if not key or not equals:
-            raise UsageError(text, "is not key=value")
+            raise UsageError(text, "is not an override", "write KEY=VALUE, for example training.steps=100")
         changes[key] = parse_yaml(value, text, RecipeError)
-    facts = train(
-        recipe,
-        out,
-        changes,
-        device=device,
-        workers=workers,
-        report=lambda line: typer.echo(line, err=True),
-    )
+
+    def report(line: str) -> None:
+        typer.echo(line, err=True)
+
+    facts = train(recipe, out, changes, device=device, workers=workers, report=report)
     print(f"wrote {out}: " + ", ".join(f"{key} {value}" for key, value in facts.items()))
 
 
 @tokenizer_app.command("eval")
 def tokenizer_eval(
-    tokenizer: Annotated[str, typer.Argument(help="Name of the tokenizer.")],
-    data: Annotated[
-        list[str], typer.Argument(help="Pictures, videos, folders of them, recordings, shard sets.")
-    ],
+    tokenizer: Annotated[str, Argument(help="Name of the tokenizer.")],
+    data: Annotated[list[str], Argument(help="Pictures, videos, folders of them, recordings, shard sets.")],
     embodiment: Annotated[
-        str | None, typer.Option("--embodiment", "-e", help="DATA are recordings of this robot: id or YAML.")
+        str | None, Option("--embodiment", "-e", help="DATA are recordings of this robot: id or YAML.")
     ] = None,
-    weights: Annotated[str | None, typer.Option("--weights", help="Its weights, if not the usual.")] = None,
-    frames: Annotated[
-        int, typer.Option("--frames", min=1, help="Taken from each video or episode, evenly.")
-    ] = 64,
+    weights: Annotated[str | None, Option(help="Its weights, if not the usual ones.")] = None,
+    frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 64,
     lpips: Annotated[
-        bool | None,
-        typer.Option("--lpips/--no-lpips", help="LPIPS; default: where nothing needs downloading."),
+        bool | None, Option(help="Measure LPIPS; default: if nothing has to be downloaded for it.")
     ] = None,
-    worst: Annotated[int, typer.Option("--worst", min=0, help="Worst frames to draw with --out.")] = 6,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for eval.md, eval.json, worst.png.")
-    ] = None,
-    device: Annotated[str, typer.Option("--device", help="cpu, cuda, mps.")] = "cpu",
+    worst: Annotated[int, Option(min=0, help="Worst frames to draw with --out.")] = 6,
+    out: Annotated[Path | None, Option(help="Folder for eval.md, eval.json, worst.png.")] = None,
+    device: Device = "cpu",
     json: Json = False,
 ) -> None:
     """Measure a tokenizer: PSNR, SSIM, LPIPS, use of the vocabulary, bits, speed, and the worst frames.
@@ -111,9 +103,8 @@ def tokenizer_eval(
     """
     from hma_data.registry.embodiment import find
     from hma_data.tokenizers.base import get_tokenizer
-    from hma_data.tokenizers.training.eval import evaluate
+    from hma_data.tokenizers.training.eval import evaluate, to_markdown, without_frames, write_report
     from hma_data.tokenizers.training.frames import frames_of
-    from hma_data.tokenizers.training.report import to_markdown, without_frames, write_report
 
     robot = find(embodiment) if embodiment else None
     opened = get_tokenizer(tokenizer, weights=weights, device=device)
@@ -139,9 +130,9 @@ def tokenizer_eval(
 
 
 def _perceptual(wanted: bool | None, device: str) -> tuple[Any, str]:
-    """Return what measures LPIPS, or None and the reason; raise where LPIPS is asked for and missing."""
+    """Return what measures LPIPS, or None and the reason; raise if LPIPS is asked for and missing."""
     from hma_data.errors import MissingDependencyError
-    from hma_data.tokenizers.training.perceptual import open_lpips
+    from hma_data.tokenizers.training.eval import open_lpips
 
     if wanted is False:
         return None, ""

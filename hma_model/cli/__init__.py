@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from hma_data.bench import BENCHES
-from hma_data.cli.verbs import mount
+from hma_data.cli import mount
 from hma_data.console import print_json, print_table
 from hma_data.errors import HMAError
 from hma_data.priority import take_ordinary_priority

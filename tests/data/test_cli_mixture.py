@@ -69,8 +69,6 @@ def test_short_episodes_are_counted_or_padded(sets: list[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
-        (["--split", "test"], "must be train or val"),
-        (["--short", "cut"], "must be drop or pad"),
         (["--weight", "bench_0"], "must be like NAME=VALUE"),
         (["--weight", "bench_0=much"], "'much' is not a number"),
         (["--weight", "leg=2"], "name leg"),
@@ -82,6 +80,12 @@ def test_words_that_cannot_be_are_refused(sets: list[str], words: list[str], fau
     done = mixture(*sets, *words)
     assert isinstance(done.exception, UsageError)
     assert fault in str(done.exception)
+
+
+@pytest.mark.parametrize("words", [["--split", "test"], ["--short", "cut"]])
+def test_a_word_that_is_no_choice_is_wrong_usage(sets: list[str], words: list[str]) -> None:
+    done = mixture(*sets, *words)
+    assert done.exit_code == 2 and words[1] in done.output
 
 
 def test_the_plot_is_drawn(sets: list[str], tmp_path: Path) -> None:

@@ -21,7 +21,14 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED, Entry
-from hma_data.tokenizers.training.eval import LatentMoments, evaluate, open_lpips, to_markdown, write_report
+from hma_data.tokenizers.training.eval import (
+    BACKBONE,
+    LatentMoments,
+    evaluate,
+    open_lpips,
+    to_markdown,
+    write_report,
+)
 from hma_data.tokenizers.training.frames import frames_of, read_frames
 from tests.conftest import ARM_YAML, write_toy
 from tests.data.tokenizer_files import draw_scene

@@ -314,7 +314,7 @@ def altered(**changes: Tensor | None) -> dict[str, Tensor]:
             r"size mismatch for encoder\.conv_in\.weight",
         ),
         (altered(encoder__conv_in__weight=torch.zeros(0, 3, 3, 3)), "does not hold the weights"),
-        (altered(encoder__conv_in__weight=torch.zeros(3)), "does not fit the network"),
+        (altered(encoder__conv_in__weight=torch.zeros(3)), "does not hold the weights"),
         (altered(decoder__conv_in__bias=torch.full((32,), torch.nan)), "not finite"),
     ],
 )
