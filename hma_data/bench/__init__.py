@@ -9,12 +9,13 @@ generated; nothing is downloaded.
 import os
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
 from hma_data.errors import UsageError
+from hma_data.threads import usable_cores
 
 BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
     "convert": "hma_data.bench.convert",
@@ -44,9 +45,8 @@ def load(name: str) -> Bench:
         UsageError: there is no such benchmark.
     """
     if name not in BENCHES:
-        raise UsageError(
-            f"benchmark {name!r}", "there is none of that name", f"known: {', '.join(sorted(BENCHES))}"
-        )
+        known = ", ".join(sorted(BENCHES))
+        raise UsageError(f"benchmark {name!r}", "there is none of that name", f"known: {known}")
     bench: Any = import_module(BENCHES[name])
     return bench
 
@@ -81,10 +81,10 @@ def report(name: str, settings: dict[str, Any], results: list[dict[str, Any]]) -
 
 def machine() -> dict[str, Any]:
     """Describe the machine on which the figures were measured."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    models = _values_of("/proc/cpuinfo", "model name")
     return {
-        "processor": _processor(),
-        "cores": cores,
+        "processor": models[0] if models else platform.processor() or platform.machine(),
+        "cores": usable_cores(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         "system": platform.platform(terse=True),
         "python": platform.python_version(),
@@ -93,24 +93,28 @@ def machine() -> dict[str, Any]:
     }
 
 
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    except OSError:
-        names = []
-    return names[0] if names else platform.processor() or platform.machine()
-
-
 def peak_rss_mib() -> float:
     """Return the most memory this process has held, in MiB, without what its parent held before."""
     import resource
 
+    peaks = _values_of("/proc/self/status", "VmHWM")
+    kib = int(peaks[0].split()[0]) if peaks else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(kib / 1024, 1)
+
+
+def _values_of(path: str, key: str) -> list[str]:
+    """Return the values of a key in a file of `key: value` lines; none where Linux has no such file."""
     try:
-        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
     except OSError:
-        lines = []
-    for line in lines:
-        if line.startswith("VmHWM:"):
-            return round(int(line.split()[1]) / 1024, 1)
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
+        return []
+    return [line.partition(":")[2].strip() for line in lines if line.startswith(key)]
+
+
+def in_fresh_process[T](task: Callable[..., T], *arguments: Any) -> T:
+    """Return the task's result, computed in a new process where nothing has taken memory yet."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
+        return fresh.submit(task, *arguments).result()

@@ -1,9 +1,10 @@
 """Measure the cost of `hma convert` beside its tokenizer, and whether its workers' memory stays constant."""
 
+import os
 import tempfile
 import threading
 import time
-from dataclasses import dataclass, field
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,51 +38,48 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     from hma_data.conversion.plan import Settings
     from hma_data.registry.embodiment import Embodiment
 
+    workers, engine = settings["workers"], settings["engine"]
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "recording.hdf5"
         _record(recording, settings)
         rows = settings["episodes"] * settings["frames"]
         alone, alone_cpu = _tokenizer_alone(settings, rows)
-        watch = _Watch(settings["workers"], settings["engine"])
-        with watch:
-            began = time.perf_counter()
-            summary = convert(
-                Embodiment.from_yaml(_ROBOT.format(uri=recording)),
-                None,
-                settings["tokenizer"],
-                Path(folder) / "out",
-                settings=Settings(shard_frames=settings["shard_frames"]),
-                workers=settings["workers"],
-                engine=settings["engine"],
-                limits=Limits(quiet_s=None),
-                on_progress=watch.mark,
-            )
-            seconds = time.perf_counter() - began
-        after = 1 - watch.starting.frames / rows  # share of frames made after the first report
-        working_s = (seconds - watch.starting.seconds) * max(settings["workers"], 1)
-        working_cpu_s = watch.worker_cpu_s - watch.starting.worker_cpu_s
-        return [
-            {
-                "engine": settings["engine"],
-                "workers": settings["workers"],
-                "tokenizer": settings["tokenizer"],
-                "seconds": round(seconds, 2),
-                "start_seconds": round(watch.starting.seconds, 2),
-                "frames_per_second": round(rows * after / (seconds - watch.starting.seconds), 1),
-                "tokenizer_seconds": round(alone, 2),
-                "overhead_share": round(1 - alone * after / working_s, 4),
-                "tokenizer_cpu_seconds": round(alone_cpu * after, 2),
-                "worker_cpu_seconds": round(working_cpu_s, 2),
-                "overhead_cpu_share": round(1 - alone_cpu * after / working_cpu_s, 4)
-                if working_cpu_s
-                else None,
-                "parent_cpu_seconds": round(watch.parent_cpu_s - watch.starting.parent_cpu_s, 2),
-                "other_cpu_seconds": round(watch.other_cpu_s - watch.starting.other_cpu_s, 2),
-                **watch.memory(),
-                "episodes": sum(split["episodes"] for split in summary.manifest.splits.values()),
-                "bytes_per_frame": round(summary.manifest.to_json()["totals"]["bytes"] / rows, 1),
-            }
-        ]
+        watch = _Watch(workers, engine)
+        summary = convert(
+            Embodiment.from_yaml(_ROBOT.format(uri=recording)),
+            None,
+            settings["tokenizer"],
+            Path(folder) / "out",
+            settings=Settings(shard_frames=settings["shard_frames"]),
+            workers=workers,
+            engine=engine,
+            limits=Limits(quiet_s=None),
+            on_progress=watch.mark,
+        )
+        watch.stop()
+    seconds = watch.seconds - watch.start_seconds
+    after = 1 - watch.start_frames / rows  # share of frames made after the first report
+    cpu = {role: round(used - watch.start_cpu_s[role], 2) for role, used in watch.cpu_s.items()}
+    return [
+        {
+            "engine": engine,
+            "workers": workers,
+            "tokenizer": settings["tokenizer"],
+            "seconds": round(watch.seconds, 2),
+            "start_seconds": round(watch.start_seconds, 2),
+            "frames_per_second": round(rows * after / seconds, 1),
+            "tokenizer_seconds": round(alone, 2),
+            "overhead_share": round(1 - alone * after / (seconds * max(workers, 1)), 4),
+            "tokenizer_cpu_seconds": round(alone_cpu * after, 2),
+            "worker_cpu_seconds": cpu["worker"],
+            "overhead_cpu_share": round(1 - alone_cpu * after / cpu["worker"], 4) if cpu["worker"] else None,
+            "parent_cpu_seconds": cpu["parent"],
+            "other_cpu_seconds": cpu["other"],
+            **watch.memory(),
+            "episodes": sum(split["episodes"] for split in summary.manifest.splits.values()),
+            "bytes_per_frame": round(summary.manifest.to_json()["totals"]["bytes"] / rows, 1),
+        }
+    ]
 
 
 def _record(path: Path, settings: dict[str, Any]) -> None:
@@ -128,70 +126,52 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]
     return (time.perf_counter() - began) * rows / done, (time.process_time() - used) * rows / done
 
 
-@dataclass(frozen=True)
-class _Starting:
-    """The figures at the first report of finished frames."""
-
-    seconds: float = 0.0
-    frames: int = 0
-    worker_cpu_s: float = 0.0
-    parent_cpu_s: float = 0.0
-    other_cpu_s: float = 0.0
-
-
-@dataclass
 class _Watch:
-    """Memory and CPU time of this process and of those it started, sampled while the conversion runs."""
+    """Memory and CPU time of this process and of those it started, sampled while the conversion runs.
 
-    workers: int
-    engine: str
-    share: float = 0.0  # of the frames that are done
-    starting: _Starting = field(default_factory=_Starting)
-    worker_cpu_s: float = 0.0  # last sample; Ray's actors count as workers
-    parent_cpu_s: float = 0.0  # without the CPU time of the sampling itself
-    other_cpu_s: float = 0.0  # Ray's own processes
-    samples: list[tuple[float, dict[str, float]]] = field(default_factory=list)  # share, MiB by role
-    _stop: threading.Event = field(default_factory=threading.Event)
+    Attributes:
+        cpu_s: CPU seconds until now of the workers (and Ray's actors), of this process without the sampling,
+            and of Ray's other processes.
+        seconds: wall time of the conversion; measured by `stop`.
+        start_seconds, start_frames, start_cpu_s: the figures at the first report of finished frames.
+        samples: share of the frames that are done, and MiB by role.
+    """
+
+    def __init__(self, workers: int, engine: str) -> None:
+        self.workers, self.engine = workers, engine
+        self.cpu_s = {"worker": 0.0, "parent": 0.0, "other": 0.0}
+        self.seconds = self.start_seconds = self._share = 0.0
+        self.start_frames, self.start_cpu_s = 0, dict(self.cpu_s)
+        self.samples: list[tuple[float, dict[str, float]]] = []
+        self._began, self._stop = time.perf_counter(), threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
 
     def mark(self, progress: Any) -> None:
         """Record the progress of the conversion."""
-        if progress.frames and not self.starting.frames:
-            self.starting = _Starting(
-                time.perf_counter() - self._began,
-                progress.frames,
-                self.worker_cpu_s,
-                self.parent_cpu_s,
-                self.other_cpu_s,
-            )
-        self.share = progress.frames / max(progress.total_frames, 1)
+        if progress.frames and not self.start_frames:
+            self.start_seconds = time.perf_counter() - self._began
+            self.start_frames, self.start_cpu_s = progress.frames, dict(self.cpu_s)
+        self._share = progress.frames / max(progress.total_frames, 1)
 
-    def __enter__(self) -> "_Watch":
-        self._began = time.perf_counter()
-        self._thread = threading.Thread(target=self._look, daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def stop(self) -> None:
+        """End the sampling."""
+        self.seconds = time.perf_counter() - self._began
         self._stop.set()
         self._thread.join()
 
-    def memory(self) -> dict[str, float | None]:
+    def memory(self) -> dict[str, float]:
         """Return the resident MiB of the largest worker, the largest of Ray's actors, and this process."""
-        points = {"a_tenth": 0.1, "half": 0.5, "the_end": 1.0}
-        return {
-            f"{role}_rss_mib_at_{name}": self._at(role, share)
-            for role in ("worker", "actor", "parent")
-            for name, share in points.items()
-            if any(role in found for _, found in self.samples)
-        }
-
-    def _at(self, role: str, share: float) -> float:
-        having = [sample for sample in self.samples if role in sample[1]]
-        return round(min(having, key=lambda sample: abs(sample[0] - share))[1][role], 1)
+        figures = {}
+        for role in ("worker", "actor", "parent"):
+            having = [(share, found[role]) for share, found in self.samples if role in found]
+            for name, at in {"a_tenth": 0.1, "half": 0.5, "the_end": 1.0}.items():
+                if having:
+                    nearest = min(having, key=lambda sample: abs(sample[0] - at))
+                    figures[f"{role}_rss_mib_at_{name}"] = round(nearest[1], 1)
+        return figures
 
     def _look(self) -> None:
-        import os
-
         pid = os.getpid()
         while not self._stop.wait(0.2):
             roles = _roles(pid, self.engine)
@@ -199,12 +179,11 @@ class _Watch:
                 roles["worker"] = [pid]
             if not roles["worker"] and self.samples and "worker" in self.samples[-1][1]:
                 continue  # the workers have ended; the manifest is being written
-            self.worker_cpu_s = max(self.worker_cpu_s, _cpu_s(roles["worker"] + roles["actor"]))
-            self.other_cpu_s = max(self.other_cpu_s, _cpu_s(roles["other"]))
-            self.parent_cpu_s = time.process_time() - time.thread_time()
+            found = {"worker": _cpu_s(roles["worker"] + roles["actor"]), "other": _cpu_s(roles["other"])}
+            found["parent"] = time.process_time() - time.thread_time()
+            self.cpu_s = {role: max(used, found[role]) for role, used in self.cpu_s.items()}
             roles["parent"] = [pid]
-            memory = {role: max(map(_rss_mib, pids)) for role, pids in roles.items() if pids}
-            self.samples.append((self.share, memory))
+            self.samples.append((self._share, {role: _rss_mib(pids) for role, pids in roles.items() if pids}))
 
 
 def _roles(pid: int, engine: str) -> dict[str, list[int]]:
@@ -212,49 +191,40 @@ def _roles(pid: int, engine: str) -> dict[str, list[int]]:
     parents: dict[int, int] = {}
     commands: dict[int, bytes] = {}
     for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+        with suppress(OSError):  # it has ended
+            parents[int(entry.name)] = int(_stat(entry.name)[1])
             commands[int(entry.name)] = (entry / "cmdline").read_bytes()
-        except OSError:
-            continue
-    ours = _descendants(pid, parents)
+    ours, newest = set[int](), {pid}
+    while newest:
+        newest = {child for child, parent in parents.items() if parent in newest} - ours
+        ours |= newest
     actors = {other for other, command in commands.items() if command.startswith(b"ray::Worker")}
     if engine != "ray" or actors & ours:  # actors of a running cluster are not descendants
         actors &= ours
-    workers = {
-        other
-        for other, command in commands.items()
-        if b"spawn_main" in command and parents[other] in {pid, *actors}
-    }
+    spawned = {other for other, command in commands.items() if b"spawn_main" in command}
+    workers = {other for other in spawned if parents[other] in {pid, *actors}}
     return {"worker": [*workers], "actor": [*actors], "other": [*(ours - workers - actors)]}
 
 
-def _descendants(pid: int, parents: dict[int, int]) -> set[int]:
-    found: set[int] = set()
-    newest = {pid}
-    while newest:
-        newest = {child for child, parent in parents.items() if parent in newest} - found
-        found |= newest
-    return found
+def _stat(pid: int | str) -> list[str]:
+    """Return the fields of a process's state that follow its name; raise OSError if it has ended."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
 
 
 def _cpu_s(pids: list[int]) -> float:
     """Return the CPU seconds of processes, including their threads."""
-    import os
-
     ticks = 0
     for pid in pids:
-        try:
-            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        ticks += int(fields[11]) + int(fields[12])
+        with suppress(OSError):
+            user, system = _stat(pid)[11:13]
+            ticks += int(user) + int(system)
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
-def _rss_mib(pid: int) -> float:
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except OSError:
-        return 0.0
-    return pages * 4096 / 2**20
+def _rss_mib(pids: list[int]) -> float:
+    """Return the resident memory of the largest of some processes."""
+    pages = [0]
+    for pid in pids:
+        with suppress(OSError):
+            pages.append(int(Path(f"/proc/{pid}/statm").read_text().split()[1]))
+    return max(pages) * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench.recordings import HZ, TASK
-from hma_data.bench.scenes import scene
+from hma_data.bench.sources import HZ, TASK, scene
 from hma_data.lab.write_lerobot import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
 

@@ -8,13 +8,13 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from hma_data.bench import in_fresh_process, peak_rss_mib
 
 ABOUT = "windows of a shuffled mixture out of cached local shards: speed, opening, memory"
 DEFAULTS: dict[str, Any] = {
@@ -50,11 +50,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Run the cases: `mixture` streams shuffled batches of all sets; `random` reads one set in any order."""
     with tempfile.TemporaryDirectory() as folder:
         sets = [make_set(Path(folder) / str(i), i, settings) for i in range(settings["embodiments"])]
-        results = []
-        for case in settings["cases"]:
-            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
-                results.append(fresh.submit(_CASES[case], sets, settings).result())
-        return results
+        return [in_fresh_process(_measure, case, sets, settings) for case in settings["cases"]]
 
 
 def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
@@ -126,92 +122,46 @@ def _write_shard(
             tokens = rng.integers(0, spec.vocab_size, (length, *spec.grid), dtype=np.uint32)
             actions = rng.standard_normal((length, robot.action_dim), dtype=np.float32)
             stats.merge(Stats.of(actions))
-            row = EpisodeRow(
-                episode_index=i,
-                id=str(i),
-                split="train",
-                shard=_name(0),
-                row_start=writer.rows,
-                rows=length,
-                length=length,
-                instruction="",
-                success=None,
-                fingerprint="",
-                skew_p50_ms=0.0,
-                skew_p95_ms=0.0,
-                skew_max_ms=0.0,
-                skew="{}",
-                trimmed=0,
-                flags="",
-            )
+            where = (str(i), "train", _name(0), writer.rows, length, length)
+            rows.append(EpisodeRow(i, *where, "", None, "", 0.0, 0.0, 0.0, "{}", 0, ""))
             writer.add(EpisodeRows(i, np.arange(length) / robot.rate_hz, tokens, actions, None, "top"))
-            rows.append(row)
         writer.close(Footer(plan, _name(0), "train", tuple(rows), (), {"action": stats}))
 
 
-def _mixture(sets: list[Path], settings: dict[str, Any]) -> dict[str, Any]:
-    from hma_data.loading.dataset import MixtureDataset
+def _measure(case: str, sets: list[Path], settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of a case: opening, the first batch, speed and memory."""
+    from hma_data.loading.dataset import MixtureDataset, WindowDataset
 
-    before = _memory()
-    began = time.perf_counter()
-    data = MixtureDataset(sets, settings["batch"], settings["window"], draw=settings["draw"])
-    opened = time.perf_counter() - began
-    after = _memory()
-    batches = data.batches(settings["workers"])
+    before, began = _memory(), time.perf_counter()
+    data: Any
+    if case == "mixture":
+        data = MixtureDataset(sets, settings["batch"], settings["window"], draw=settings["draw"])
+    else:
+        sets = sets[:1]
+        data = WindowDataset(sets[0], "train", settings["window"])
+    opened, after = time.perf_counter() - began, _memory()
+    mixed = case == "mixture"
+    batches = data.batches(settings["workers"]) if mixed else _random(data, settings["batch"])
     next(batches)
     first = time.perf_counter() - began
     return {
-        "case": "mixture",
-        **_opening(settings, opened, first, before, after),
-        **_speed(batches, settings),
-        **_peak(),
-    }
-
-
-def _random(sets: list[Path], settings: dict[str, Any]) -> dict[str, Any]:
-    from hma_data.loading.dataset import WindowDataset
-
-    before = _memory()
-    began = time.perf_counter()
-    data = WindowDataset(sets[0], "train", settings["window"])
-    opened = time.perf_counter() - began
-    after = _memory()
-    rng = np.random.default_rng(0)
-    near = min(len(data), 8 * 2048)  # as many as the cache holds: small data
-
-    def batches() -> Iterator[Any]:
-        while True:
-            yield data.batch(rng.integers(0, near, settings["batch"]))
-
-    found = batches()
-    next(found)
-    first = time.perf_counter() - began
-    return {
-        "case": "random",
-        **_opening(settings, opened, first, before, after, sets=1),
-        **_speed(found, settings),
-        **_peak(),
-    }
-
-
-_CASES = {"mixture": _mixture, "random": _random}
-
-
-def _opening(
-    settings: dict[str, Any],
-    opened: float,
-    first: float,
-    before: float,
-    after: float,
-    sets: int | None = None,
-) -> dict[str, Any]:
-    return {
-        "embodiments": sets or settings["embodiments"],
-        "frames": settings["frames"] * (sets or settings["embodiments"]),
+        "case": case,
+        "embodiments": len(sets),
+        "frames": settings["frames"] * len(sets),
         "open_seconds": round(opened, 4),
         "first_batch_seconds": round(first, 3),
         "open_rss_mib": round(after - before, 1),
+        **_speed(batches, settings),
+        "peak_rss_mib": peak_rss_mib(),
     }
+
+
+def _random(windows: Any, count: int) -> Iterator[Any]:
+    """Yield batches of random windows, of as many as the cache holds: small data."""
+    rng = np.random.default_rng(0)
+    near = min(len(windows), 8 * 2048)
+    while True:
+        yield windows.batch(rng.integers(0, near, count))
 
 
 def _speed(batches: Iterator[Any], settings: dict[str, Any]) -> dict[str, Any]:
@@ -227,12 +177,6 @@ def _speed(batches: Iterator[Any], settings: dict[str, Any]) -> dict[str, Any]:
     if not settings["workers"]:
         figures["windows_per_cpu_second"] = round(max(cpu))
     return figures
-
-
-def _peak() -> dict[str, Any]:
-    from hma_data.bench import peak_rss_mib
-
-    return {"peak_rss_mib": peak_rss_mib()}
 
 
 def _memory() -> float:

@@ -1,7 +1,5 @@
 """Measure writing, reading and verifying shards of generated tokens: speed, size and memory."""
 
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -9,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hma_data.bench import in_fresh_process, peak_rss_mib
 
 if TYPE_CHECKING:
     from hma_data.shards.manifest import Manifest
@@ -29,18 +29,19 @@ source: {format: hdf5}
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Run each step in a process of its own, so that its memory is measured alone."""
     with tempfile.TemporaryDirectory() as folder:
-        results = []
-        for step in ("write", "read", "verify", "verify --quick"):
-            words = [step, folder, *(str(settings[key]) for key in DEFAULTS)]
-            command = [sys.executable, "-m", "hma_data.bench.shards", *words]
-            done = subprocess.run(command, check=True, capture_output=True, text=True)
-            results.append({"step": step, **_figures(done.stdout)})
-        return results
+        steps = ("write", "read", "verify", "verify --quick")
+        return [in_fresh_process(_step, step, Path(folder), settings) for step in steps]
 
 
-def _figures(text: str) -> dict[str, float]:
-    pairs = (line.split("=") for line in text.split())
-    return {name: float(value) for name, value in pairs}
+def _step(step: str, folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    if step == "write":
+        figures = _write(folder, settings)
+    elif step == "read":
+        figures = _read(folder)
+    else:
+        figures = _verify(folder, settings["workers"], step.endswith("--quick"))
+    figures["peak_rss_mib"] = peak_rss_mib()
+    return {"step": step, **{name: float(f"{value:.4g}") for name, value in figures.items()}}
 
 
 def _teleoperated(rng: np.random.Generator, length: int) -> NDArray[np.float32]:
@@ -131,22 +132,3 @@ def _verify(folder: Path, workers: int, quick: bool) -> dict[str, float]:
     frames = sum(split["frames"] for split in manifest.splits.values())
     size = sum(shard.bytes for shard in manifest.shards)
     return {"frames_per_second": frames / seconds, "gigabytes_per_second": size / 1e9 / seconds}
-
-
-def _step(words: list[str]) -> None:
-    from hma_data.bench import peak_rss_mib
-
-    step, folder = words[0], Path(words[1])
-    settings = dict(zip(DEFAULTS, map(int, words[2:])))
-    if step == "write":
-        figures = _write(folder, settings)
-    elif step == "read":
-        figures = _read(folder)
-    else:
-        figures = _verify(folder, settings["workers"], step.endswith("--quick"))
-    for name, value in {**figures, "peak_rss_mib": peak_rss_mib()}.items():
-        print(f"{name}={value:.4g}")
-
-
-if __name__ == "__main__":
-    _step(sys.argv[1:])

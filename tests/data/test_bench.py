@@ -11,8 +11,7 @@ import pytest
 from hma_data import bench
 from hma_data.bench import lerobot as bench_lerobot
 from hma_data.bench import sources
-from hma_data.bench.recordings import CASES, actions
-from hma_data.bench.scenes import scene
+from hma_data.bench.sources import CASES, actions, scene
 from hma_data.episodes.align import to_clip
 from hma_data.errors import UsageError
 from hma_data.sources.base import open_source
