@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from hma_data.bench import peak_rss_mib
 from hma_data.episodes.images import Images
-from hma_data.errors import UsageError
+from hma_data.errors import HMAError, UsageError
 from hma_data.priority import ordinary_priority
 from hma_data.registry.embodiment import Embodiment
 from hma_data.threads import usable_cores
@@ -152,9 +152,13 @@ def _work(name: str, uri: str, share: int, shares: int) -> dict[str, Any]:
 
     cv2.setNumThreads(1)
     robot = CASES[name].embodiment()
-    source = open_source(robot.source.format)
-    names = [ref.id for ref in source.index(uri, robot)]
-    _episode(source, uri, names[share % len(names)], robot, limit=1)
+    try:
+        source = open_source(robot.source.format)
+        names = [ref.id for ref in source.index(uri, robot)]
+        _episode(source, uri, names[share % len(names)], robot, limit=1)
+    except HMAError:
+        _start.abort()  # the others need not wait
+        raise
     _start.wait(DEADLINE_S)
     began, cpu = time.monotonic(), time.process_time()
     frames = sum(_episode(source, uri, one, robot) for one in names[share::shares])

@@ -68,31 +68,27 @@ class Entry:
             return (EMBEDDED / self.file).stat().st_size
         return self.bytes or 0
 
-    def downloaded(self) -> bool:
-        """Check whether the hub's cache on this machine holds the weights."""
-        if self.weights != "download":
-            return False
-        from huggingface_hub import try_to_load_from_cache
-
-        found = try_to_load_from_cache(
-            self.repo, self.file, revision=self.revision or None, repo_type=self.repo_type
-        )
-        return isinstance(found, str)
-
     def state(self) -> str:
         """Return "ready" or what it still needs: an install, a path, or a download on first use."""
         if missing := self.missing():
             return f"needs {', '.join(missing)}: {self.extra}"
         if self.weights == "path":
             return "needs --weights PATH"
-        if self.weights == "download" and not self.downloaded():
+        if self.weights == "download" and self.cached() is None:
             return "downloads on first use"
         return "ready"
 
+    def cached(self) -> str | None:
+        """Return the path of the weights in the hub's cache on this machine, if they are there."""
+        from huggingface_hub import try_to_load_from_cache
+
+        place = {"revision": self.revision or None, "repo_type": self.repo_type}
+        found = try_to_load_from_cache(self.repo, self.file, **place)
+        return found if isinstance(found, str) else None
+
     def to_json(self) -> dict[str, Any]:
         """Return plain values, with the state and the measured size."""
-        values = asdict(self)
-        del values["module"], values["arguments"]
+        values = {key: value for key, value in asdict(self).items() if key not in ("module", "arguments")}
         return values | {
             "grid": list(self.grid),
             "imports": list(self.imports),

@@ -107,18 +107,11 @@ def _from_hub(name: str, entry: Entry) -> Path:
 
 
 def _download(entry: Entry) -> str:
-    from huggingface_hub import (
-        get_hf_file_metadata,
-        hf_hub_download,
-        hf_hub_url,
-        try_to_load_from_cache,
-    )
+    from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
 
     kind, revision = entry.repo_type, entry.revision
-    if re.fullmatch(r"[0-9a-f]{40}", revision):  # a branch or a tag can move, a commit cannot
-        cached = try_to_load_from_cache(entry.repo, entry.file, revision=revision, repo_type=kind)
-        if isinstance(cached, str):
-            return cached
+    if re.fullmatch(r"[0-9a-f]{40}", revision) and (cached := entry.cached()):
+        return cached  # a branch or a tag can move, a commit cannot
     # Ask once first: without a connection, the download would retry for half a minute and log each try.
     get_hf_file_metadata(hf_hub_url(entry.repo, entry.file, repo_type=kind, revision=revision))
     return hf_hub_download(entry.repo, entry.file, revision=revision, repo_type=kind)

@@ -200,6 +200,7 @@ class Decoder(nn.Module):
 class FsqAutoencoder(nn.Module):
     """An autoencoder of `encoder`, `quantizer` and `decoder`; `forward` is the training pass."""
 
+    format = FORMAT
     stride = STRIDE
     linear_gain = 1.7  # least-squares estimate of z as 1.7 u, from u = erf(z/√2), z standard normal
 

@@ -28,6 +28,7 @@ from hma_data.tokenizers.checkpoints import (
     fill,
     find_weights,
     numbers,
+    one_file,
     pair_of,
     read_tensors,
     shapes_of,
@@ -109,7 +110,7 @@ class Decoder(nn.Module):
 
 
 class TinyAutoencoder(nn.Module):
-    """An autoencoder of `encoder` and `decoder`, built from the names and shapes that `in_order` returned.
+    """An autoencoder of `encoder` and `decoder`, built from the names and shapes that `read_halves` returned.
 
     Attributes:
         channels: number of latent channels.
@@ -146,50 +147,32 @@ def find_files(name: str, path: Path) -> list[Path]:
     Raises:
         TokenizerError: the folder holds neither, or one file of the pair is missing.
     """
-    if path.is_dir():
-        for whole in (*WHOLE, f"{name}.safetensors"):
-            if (path / whole).is_file():
-                return [path / whole]
-        for suffix in SUFFIXES:
-            pair = [path / f"{name}_{half}{suffix}" for half in HALVES]
-            if all(file.is_file() for file in pair):
-                return pair
-        raise TokenizerError(
-            path, f"holds neither {WHOLE[0]} nor {name}_encoder and {name}_decoder", "name another folder"
-        )
-    return pair_of(path) or [path]
+    halves = (f"{name}_{HALVES[0]}{suffix}" for suffix in SUFFIXES)
+    file = one_file(path, (*WHOLE, f"{name}.safetensors", *halves), name)
+    return pair_of(file) or [file]
 
 
 def read_halves(files: list[Path]) -> Tensors:
-    """Read all weights, named `<half>.<number>.…`.
+    """Read all weights, named `<half>.layers.<place>.…`; layers without weights have no place.
 
     Raises:
-        TokenizerError: a file cannot be read, or holds other tensors than those of encoder and decoder.
+        TokenizerError: a file cannot be read.
     """
-    if len(files) == 2:
-        return {
-            f"{half}.{key}": tensor
-            for half, file in zip(HALVES, files, strict=True)
-            for key, tensor in read_tensors(file).items()
-        }
-    tensors = {key.replace(".layers.", ".", 1): t for key, t in read_tensors(files[0]).items()}
-    if foreign := [key for key in tensors if not key.startswith(("encoder.", "decoder."))]:
-        raise TokenizerError(files[0], f"does not hold the weights of {WHAT}: has {foreign[0]}", OTHER)
-    return tensors
-
-
-def in_order(tensors: Mapping[str, Tensor]) -> Tensors:
-    """Rename the weights to `<half>.layers.<place>.…`; layers without weights have no place."""
+    if len(files) == 1:
+        named = {key.replace(".layers.", ".", 1): t for key, t in read_tensors(files[0]).items()}
+    else:
+        halves = zip(HALVES, files, strict=True)
+        named = {f"{half}.{key}": t for half, file in halves for key, t in read_tensors(file).items()}
     places = {
         f"{half}.{number}": f"{half}.layers.{place}"
         for half in HALVES
-        for place, number in enumerate(numbers(tensors, f"{half}."))
+        for place, number in enumerate(numbers(named, f"{half}."))
     }
-    named = {}
-    for key, tensor in tensors.items():
-        half, number, *rest = key.split(".")
-        named[".".join([places.get(f"{half}.{number}", f"{half}.{number}"), *rest])] = tensor
-    return named
+    renamed = {}
+    for key, tensor in named.items():
+        layer = ".".join(key.split(".")[:2])
+        renamed[key.replace(layer, places.get(layer, layer), 1)] = tensor
+    return renamed
 
 
 def read_network(files: list[Path]) -> TinyAutoencoder:
@@ -199,7 +182,7 @@ def read_network(files: list[Path]) -> TinyAutoencoder:
         TokenizerError: the files cannot be read, or hold another network.
     """
     where = " and ".join(map(str, files))
-    tensors = in_order(read_halves(files))
+    tensors = read_halves(files)
     with shapes_of(where, WHAT), torch.device("meta"):
         network = TinyAutoencoder(tensors)
     fill(network, tensors, where)

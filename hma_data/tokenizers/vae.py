@@ -94,6 +94,7 @@ class Decoder(nn.Module):
 class VaeAutoencoder(nn.Module):
     """An autoencoder of `encoder` and `decoder`; `forward` is the training pass."""
 
+    format = FORMAT
     stride = PATCH
     linear_gain = 1.0  # the decoder takes the latents unchanged
 

@@ -220,8 +220,10 @@ def test_half_a_pair_is_refused(tmp_path):
     (tmp_path / "taesd_decoder.pth").unlink()
     with pytest.raises(TokenizerError, match=r"taesd_decoder\.pth: is not there"):
         get_tokenizer("taesd", weights=str(tmp_path / "taesd_encoder.pth"))
-    with pytest.raises(TokenizerError, match="holds neither"):
+    with pytest.raises(TokenizerError, match=r"taesd_decoder\.pth: is not there"):
         get_tokenizer("taesd", weights=str(tmp_path))
+    with pytest.raises(TokenizerError, match="holds none of"):
+        get_tokenizer("taef2", weights=str(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -31,12 +31,11 @@ from hma_data.errors import RecipeError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.checkpoints import save_weights
-from hma_data.tokenizers.fsq import FORMAT, FsqAutoencoder, FsqConfig
+from hma_data.tokenizers.fsq import FsqAutoencoder, FsqConfig
 from hma_data.tokenizers.network import open_device
 from hma_data.tokenizers.training.eval import GREY, ssim_map
 from hma_data.tokenizers.training.frames import Pool, draw_batch, load_pools
 from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
-from hma_data.tokenizers.vae import FORMAT as VAE_FORMAT
 from hma_data.tokenizers.vae import VaeAutoencoder, VaeConfig
 
 START, END = 2**32 - 1, 2**32 - 2  # step numbers of the batches that initialise and measure a network
@@ -143,11 +142,9 @@ class Run:
     def write_weights(self, path: Path, facts: dict[str, Any]) -> None:
         """Write the averaged weights as a tokenizer's file, with the facts of the training."""
         config = self.recipe.network
-        if isinstance(config, FsqConfig):
-            save_weights(path, FORMAT, config, self.average, facts)
-        else:
-            scaled = config.model_copy(update={"latent_scale": self._latent_scale(config)})
-            save_weights(path, VAE_FORMAT, scaled, self.average, facts)
+        if isinstance(config, VaeConfig):
+            config = config.model_copy(update={"latent_scale": self._latent_scale(config)})
+        save_weights(path, self.network.format, config, self.average, facts)
 
     @torch.no_grad()
     def _latent_scale(self, config: VaeConfig) -> float:
