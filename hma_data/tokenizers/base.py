@@ -6,6 +6,7 @@ A module of this package makes one tokenizer or a family; `get_tokenizer` import
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -54,6 +55,22 @@ class TokenizerSpec:
     resize_filter: Literal["area", "linear"] = "area"
     weights_sha256: str = ""
 
+    @classmethod
+    def discrete(
+        cls, name: str, version: int, size: int, stride: int, factored: tuple[int, ...], **values: Any
+    ) -> "TokenizerSpec":
+        """Return the spec of a tokenizer that makes ids of digits `factored` from cells of stride² pixels."""
+        grid, vocab_size = (size // stride, size // stride), math.prod(factored)
+        return cls(name, version, "discrete", size, grid, vocab_size, factored, **values)
+
+    @classmethod
+    def continuous(
+        cls, name: str, version: int, size: int, stride: int, channels: int, **values: Any
+    ) -> "TokenizerSpec":
+        """Return the spec of a tokenizer that makes float16 latents from cells of stride² pixels."""
+        grid, values = (size // stride, size // stride), {"dtype": "float16", **values}
+        return cls(name, version, "continuous", size, grid, channels=channels, **values)
+
     def to_json(self) -> dict[str, Any]:
         """Return plain values, as the manifest and the checkpoint hold them."""
         return json.loads(json.dumps(asdict(self)))
@@ -90,7 +107,7 @@ class Tokenizer(Protocol):
 
 
 def get_tokenizer(name_or_path: StrPath, *, weights: StrPath | None = None, device: str = "cpu") -> Tokenizer:
-    """Return the tokenizer of that name, ready to use.
+    """Return the tokenizer of that name, ready to use: `load` of its module makes it.
 
     Args:
         name_or_path: a name of `hma tokenizer list`.

@@ -118,11 +118,7 @@ def _download(entry: Entry) -> str:
 
 
 def one_file(path: Path, names: Iterable[str], what: str) -> Path:
-    """Return the path if it is a file, else the first of `names` in the folder.
-
-    Raises:
-        TokenizerError: none of them is there.
-    """
+    """Return the path if it is a file, else the first of `names` in the folder; raise if there is none."""
     for file in (path, *(path / name for name in names)):
         if file.is_file():
             return file
@@ -132,8 +128,7 @@ def one_file(path: Path, names: Iterable[str], what: str) -> Path:
 def pair_of(path: Path) -> list[Path]:
     """Return the encoder's and the decoder's file if the path is named after one of them; else an empty list.
 
-    Raises:
-        TokenizerError: the other file is not there.
+    Raise TokenizerError if the other file is not there.
     """
     named = re.search(r"(?<![A-Za-z])(encoder|decoder)", path.name)
     if not named:
@@ -201,11 +196,7 @@ def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
 
 
 def stated_scale(folder: Path, default: float) -> float:
-    """Return the `scaling_factor` that a folder's `config.json` states; `default` if it states none.
-
-    Raises:
-        TokenizerError: the file is not a JSON object, or the factor is not a positive number.
-    """
+    """Return the `scaling_factor` that a folder's `config.json` states; `default` if it states none."""
     path = folder / "config.json"
     try:
         scale = float(json.loads(path.read_text("utf-8")).get("scaling_factor", default))

@@ -24,7 +24,7 @@ from hma_data.tokenizers.network import NetworkTokenizer, open_device
 
 VERSION = 1
 IMAGE_SIZE = 256
-SIDE = 16
+STRIDE = 16
 CHANNELS = 16
 DIGITS = (8 * 8 * 8, 5 * 5 * 5)
 REMEDY = "name the folder with the encoder.jit and decoder.jit of NVIDIA's release"
@@ -39,11 +39,7 @@ class CosmosNetwork(nn.Module):
 
 
 def read_program(path: Path) -> torch.jit.ScriptModule:
-    """Load a TorchScript file. Loading trusts the file: see the module's docstring.
-
-    Raises:
-        TokenizerError: the file is not a TorchScript program, or is truncated.
-    """
+    """Load a TorchScript file, which is trusted; raise TokenizerError if it is no whole program."""
     try:
         program: torch.jit.ScriptModule = torch.jit.load(str(path), map_location="cpu")
     except (RuntimeError, ValueError, EOFError) as fault:
@@ -73,14 +69,11 @@ def _try(tokenizer: NetworkTokenizer, files: list[Path]) -> None:
 
 
 def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
-    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors.
 
     Args:
         weights: the folder of `encoder.jit` and `decoder.jit`, or one of them. They are trusted: see the
             module's docstring.
-
-    Raises:
-        TokenizerError: the files cannot be used, or there is no such device.
     """
     place = open_device(name, device)
     path = find_weights(name, weights)
@@ -88,20 +81,12 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
     if not files:
         raise TokenizerError(path, "is named after neither encoder nor decoder", REMEDY)
     encoder, decoder = (read_program(file) for file in files)
-    discrete = name == "cosmos-di16"
-    spec = TokenizerSpec(
-        name=name,
-        version=VERSION,
-        kind="discrete" if discrete else "continuous",
-        image_size=IMAGE_SIZE,
-        grid=(SIDE, SIDE),
-        vocab_size=DIGITS[0] * DIGITS[1] if discrete else None,
-        factored=DIGITS if discrete else (),
-        channels=None if discrete else CHANNELS,
-        dtype="uint16" if discrete else "float16",
-        weights_sha256=digest_of(files),
-    )
-    cells = (SIDE, SIDE) if discrete else (CHANNELS, SIDE, SIDE)
+    discrete, facts = name == "cosmos-di16", {"weights_sha256": digest_of(files)}
+    if discrete:
+        spec = TokenizerSpec.discrete(name, VERSION, IMAGE_SIZE, STRIDE, DIGITS, dtype="uint16", **facts)
+    else:
+        spec = TokenizerSpec.continuous(name, VERSION, IMAGE_SIZE, STRIDE, CHANNELS, **facts)
+    cells = spec.grid if discrete else (CHANNELS, *spec.grid)
 
     def encode(pixels: Tensor) -> Tensor:
         # The optimiser rewrites a program after its first runs, which may change the last bits.

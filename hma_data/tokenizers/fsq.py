@@ -221,12 +221,9 @@ class FsqAutoencoder(nn.Module):
 
 
 def load(name: str, *, weights: str | None, device: str, image_size: int) -> NetworkTokenizer:
-    """Return the tokenizer of that name; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors.
 
     Its `.network` has `encoder`, `quantizer` and `decoder`.
-
-    Raises:
-        TokenizerError: the weights cannot be used, or there is no such device.
     """
     place = open_device(name, device)
     path = Path(weights).expanduser() if weights else WEIGHTS
@@ -235,17 +232,7 @@ def load(name: str, *, weights: str | None, device: str, image_size: int) -> Net
         network = FsqAutoencoder(config)
     quantizer = network.quantizer = Quantizer(config)  # its buffers are not in the weights' file
     fill(network, tensors, path)
-    spec = TokenizerSpec(
-        name=name,
-        version=VERSION,
-        kind="discrete",
-        image_size=image_size,
-        grid=(image_size // STRIDE, image_size // STRIDE),
-        vocab_size=math.prod(config.factored),
-        factored=config.factored,
-        dtype="uint32",
-        weights_sha256=sha256,
-    )
+    spec = TokenizerSpec.discrete(name, VERSION, image_size, STRIDE, config.factored, weights_sha256=sha256)
 
     def encode(pixels: Tensor) -> Tensor:
         return quantizer.to_ids(quantizer.to_levels(network.encoder(pixels)))

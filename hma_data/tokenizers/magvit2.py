@@ -235,13 +235,9 @@ class Magvit2(nn.Module):
 def choose_weights(tensors: Mapping[str, Tensor], where: object, *, averaged: bool = True) -> Tensors:
     """Return the parameters of encoder and decoder in a checkpoint, under their plain names.
 
-    The trainer's prefix is removed, and parameters of the loss (the discriminator) are left out.
-
-    Args:
-        averaged: whether to take the averaged weights if there are any.
-
-    Raises:
-        TokenizerError: the checkpoint holds no such network, or averages only a part of it.
+    The trainer's prefix is removed, and parameters of the loss (the discriminator) are left out. With
+    `averaged`, the averaged weights are taken if there are any. Raise TokenizerError if the checkpoint holds
+    another network, or averages only a part of it.
     """
     prefix = min((name.removesuffix(FIRST) for name in tensors if name.endswith(FIRST)), key=len, default="")
     named = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
@@ -269,11 +265,7 @@ def derive_config(tensors: Mapping[str, Tensor]) -> Magvit2Config:
 
 
 def read_network(path: Path, *, averaged: bool = True) -> Magvit2:
-    """Read the network from a weights' file, with its averaged weights or the plain ones.
-
-    Raises:
-        TokenizerError: the file cannot be read, or holds another network.
-    """
+    """Read the network from a weights' file; raise TokenizerError if the file holds another one."""
     tensors = choose_weights(read_tensors(path), path, averaged=averaged)
     with shapes_of(path, WHAT), torch.device("meta"):
         network = Magvit2(derive_config(tensors))
@@ -282,30 +274,19 @@ def read_network(path: Path, *, averaged: bool = True) -> Magvit2:
 
 
 def load(name: str, *, weights: str | None, device: str, averaged: bool) -> NetworkTokenizer:
-    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors.
 
     Args:
         weights: a file, a folder with one of `FILES`, or `hf://…`; None takes 1X's from the hub.
         averaged: whether to take the averaged weights if there are any.
-
-    Raises:
-        TokenizerError: the weights cannot be obtained or used, or there is no such device.
     """
     place = open_device(name, device)
     path = one_file(find_weights(name, weights), FILES, name)
     network = read_network(path, averaged=averaged)
     config = network.config
-    side = IMAGE_SIZE // config.stride
-    spec = TokenizerSpec(
-        name=name,
-        version=VERSION,
-        kind="discrete",
-        image_size=IMAGE_SIZE,
-        grid=(side, side),
-        vocab_size=2**config.z,
-        factored=config.factored,
-        dtype="uint32",
-        weights_sha256=digest_of([path]),
+    sha256 = digest_of([path])
+    spec = TokenizerSpec.discrete(
+        name, VERSION, IMAGE_SIZE, config.stride, config.factored, weights_sha256=sha256
     )
 
     def encode(pixels: Tensor) -> Tensor:

@@ -19,16 +19,7 @@ class RawTokenizer:
     """A tokenizer that returns its pixels unchanged; see `hma_data.tokenizers.base.Tokenizer`."""
 
     def __init__(self, name: str) -> None:
-        self.spec = TokenizerSpec(
-            name=name,
-            version=1,
-            kind="continuous",
-            image_size=SIZE,
-            grid=(SIZE, SIZE),
-            channels=3,
-            latent_scale=1 / 255,
-            dtype="uint8",
-        )
+        self.spec = TokenizerSpec.continuous(name, 1, SIZE, 1, 3, latent_scale=1 / 255, dtype="uint8")
 
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return (N, 256, 256, 3) uint8 frames as (N, 3, 256, 256) uint8."""

@@ -50,11 +50,7 @@ def derive_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def read_network(path: Path) -> nn.Module:
-    """Read the network from a weights' file.
-
-    Raises:
-        TokenizerError: the file cannot be read, or holds another network.
-    """
+    """Read the network from a weights' file; raise TokenizerError if it is another one."""
     from diffusers import AutoencoderKLTemporalDecoder
 
     tensors = read_tensors(path)
@@ -65,29 +61,18 @@ def read_network(path: Path) -> nn.Module:
 
 
 def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
-    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors.
 
     Args:
         weights: a file, a folder as diffusers writes it, or `hf://…`; None takes them from the hub.
-
-    Raises:
-        TokenizerError: the weights cannot be obtained or used, or there is no such device.
     """
     place = open_device(name, device)
     path = one_file(find_weights(name, weights), FILES, name)
     network: Any = read_network(path)
-    side = IMAGE_SIZE // 2 ** (len(network.config.block_out_channels) - 1)
-    spec = TokenizerSpec(
-        name=name,
-        version=VERSION,
-        kind="continuous",
-        image_size=IMAGE_SIZE,
-        grid=(side, side),
-        channels=network.config.latent_channels,
-        latent_scale=stated_scale(path.parent, LATENT_SCALE),
-        dtype="float16",
-        weights_sha256=digest_of([path]),
-    )
+    stride = 2 ** (len(network.config.block_out_channels) - 1)
+    facts = {"latent_scale": stated_scale(path.parent, LATENT_SCALE), "weights_sha256": digest_of([path])}
+    channels = network.config.latent_channels
+    spec = TokenizerSpec.continuous(name, VERSION, IMAGE_SIZE, stride, channels, **facts)
 
     def encode(pixels: Tensor) -> Tensor:
         return network.encode(pixels).latent_dist.mean

@@ -142,22 +142,14 @@ def _layer(tensors: Mapping[str, Tensor], prefix: str, stride: int) -> nn.Module
 
 
 def find_files(name: str, path: Path) -> list[Path]:
-    """Return the one file of encoder and decoder, or their two files.
-
-    Raises:
-        TokenizerError: the folder holds neither, or one file of the pair is missing.
-    """
+    """Return the one file of encoder and decoder, or their two files; raise if one of them is missing."""
     halves = (f"{name}_{HALVES[0]}{suffix}" for suffix in SUFFIXES)
     file = one_file(path, (*WHOLE, f"{name}.safetensors", *halves), name)
     return pair_of(file) or [file]
 
 
 def read_halves(files: list[Path]) -> Tensors:
-    """Read all weights, named `<half>.layers.<place>.…`; layers without weights have no place.
-
-    Raises:
-        TokenizerError: a file cannot be read.
-    """
+    """Read all weights, named `<half>.layers.<place>.…`; layers without weights have no place."""
     if len(files) == 1:
         named = {key.replace(".layers.", ".", 1): t for key, t in read_tensors(files[0]).items()}
     else:
@@ -176,11 +168,7 @@ def read_halves(files: list[Path]) -> Tensors:
 
 
 def read_network(files: list[Path]) -> TinyAutoencoder:
-    """Read the network from one file or from a pair.
-
-    Raises:
-        TokenizerError: the files cannot be read, or hold another network.
-    """
+    """Read the network from one file or from a pair; raise TokenizerError if it is another one."""
     where = " and ".join(map(str, files))
     tensors = read_halves(files)
     with shapes_of(where, WHAT), torch.device("meta"):
@@ -190,14 +178,11 @@ def read_network(files: list[Path]) -> TinyAutoencoder:
 
 
 def load(name: str, *, weights: str | None, device: str, channels: int) -> NetworkTokenizer:
-    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` calls this.
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors.
 
     Args:
         weights: a file, one file of a pair, a folder, or `hf://…`; None takes them from the hub.
         channels: number of latent channels that a tokenizer of this name has.
-
-    Raises:
-        TokenizerError: the weights cannot be obtained or used, or there is no such device.
     """
     place = open_device(name, device)
     files = find_files(name, find_weights(name, weights))
@@ -205,17 +190,8 @@ def load(name: str, *, weights: str | None, device: str, channels: int) -> Netwo
     if network.channels != channels:
         fault = f"has latents of {network.channels} channels, {name} has {channels}"
         raise TokenizerError(files[0], fault, OTHER)
-    side = IMAGE_SIZE // network.stride
-    spec = TokenizerSpec(
-        name=name,
-        version=VERSION,
-        kind="continuous",
-        image_size=IMAGE_SIZE,
-        grid=(side, side),
-        channels=channels,
-        # A config.json beside a pair of files belongs to other weights.
-        latent_scale=stated_scale(files[0].parent, 1.0) if files[0].name in WHOLE else 1.0,
-        dtype="float16",
-        weights_sha256=digest_of(files),
-    )
+    # A config.json beside a pair of files belongs to other weights.
+    scale = stated_scale(files[0].parent, 1.0) if files[0].name in WHOLE else 1.0
+    facts = {"latent_scale": scale, "weights_sha256": digest_of(files)}
+    spec = TokenizerSpec.continuous(name, VERSION, IMAGE_SIZE, network.stride, channels, **facts)
     return NetworkTokenizer(spec, network, place, network.encoder, network.decoder)

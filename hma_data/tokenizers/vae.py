@@ -112,28 +112,15 @@ class VaeAutoencoder(nn.Module):
 
 
 def load(name: str, *, weights: str | None, device: str, image_size: int) -> NetworkTokenizer:
-    """Return the tokenizer of that name; `hma_data.tokenizers.base.get_tokenizer` calls this.
-
-    Raises:
-        TokenizerError: the weights cannot be used, or there is no such device.
-    """
+    """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors."""
     place = open_device(name, device)
     path = Path(weights).expanduser() if weights else WEIGHTS
     config, tensors, sha256 = read_weights(path, FORMAT, VaeConfig)
     with torch.device("meta"):
         network = VaeAutoencoder(config)
     fill(network, tensors, path)
-    spec = TokenizerSpec(
-        name=name,
-        version=VERSION,
-        kind="continuous",
-        image_size=image_size,
-        grid=(image_size // PATCH, image_size // PATCH),
-        channels=config.channels,
-        latent_scale=config.latent_scale,
-        dtype="float16",
-        weights_sha256=sha256,
-    )
+    facts = {"latent_scale": config.latent_scale, "weights_sha256": sha256}
+    spec = TokenizerSpec.continuous(name, VERSION, image_size, PATCH, config.channels, **facts)
 
     def decode(latents: Tensor) -> Tensor:
         return network.decoder(latents.contiguous(memory_format=torch.channels_last))
