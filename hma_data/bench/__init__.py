@@ -12,10 +12,13 @@ import time
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import UsageError
 from hma_data.threads import usable_cores
+
+if TYPE_CHECKING:
+    from hma_data.registry.embodiment import Embodiment
 
 BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
     "convert": "hma_data.bench.convert",
@@ -27,31 +30,19 @@ BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
 }
 
 
-class Bench(Protocol):
-    """The attributes of a benchmark's module."""
-
-    ABOUT: str
-    DEFAULTS: dict[str, Any]
-
-    def run(self, settings: dict[str, Any]) -> list[dict[str, Any]]:
-        """Measure and return the results; `settings` are DEFAULTS with the user's changes."""
-        ...
-
-
-def load(name: str) -> Bench:
-    """Return the benchmark of that name.
+def load(name: str) -> Any:
+    """Return the module of a benchmark.
 
     Raises:
         UsageError: there is no such benchmark.
     """
     if name not in BENCHES:
         known = ", ".join(sorted(BENCHES))
-        raise UsageError(f"benchmark {name!r}", "there is none of that name", f"known: {known}")
-    bench: Any = import_module(BENCHES[name])
-    return bench
+        raise UsageError(f"benchmark {name!r}", "does not exist", f"known: {known}")
+    return import_module(BENCHES[name])
 
 
-def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, Any]:
+def settings_of(bench: Any, name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """Return DEFAULTS changed by `key=value` words; each value has the type of its default.
 
     Raises:
@@ -118,3 +109,20 @@ def in_fresh_process[T](task: Callable[..., T], *arguments: Any) -> T:
 
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
         return fresh.submit(task, *arguments).result()
+
+
+def make_robot(
+    id: str, format: str, action: str, camera: str, hz: int = 10, dims: int = 7, **values: Any
+) -> "Embodiment":
+    """Return an embodiment of one camera, `main`; `values` are further top-level keys of its YAML."""
+    from hma_data.registry.embodiment import Embodiment
+
+    usual = {
+        "id": id,
+        "kind": "simulation",
+        "frequency_hz": hz,
+        "action": {"space": "joint_delta", "components": [{"key": action, "dims": dims}]},
+        "cameras": [{"name": "main", "key": camera}],
+        "source": {"format": format},
+    }
+    return Embodiment.from_values(usual | values, id)

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from hma_data.bench import make_robot
+
 ABOUT = "hma convert over many short episodes: overhead beside the tokenizer, memory of its workers over time"
 DEFAULTS: dict[str, Any] = {
     "episodes": 10_000,
@@ -21,22 +23,12 @@ DEFAULTS: dict[str, Any] = {
     "shard_frames": 4_096,
 }
 
-_ROBOT = """
-id: bench_arm
-kind: simulation
-frequency_hz: 10
-action: {{space: joint_delta, components: [{{key: actions, dims: 7}}]}}
-cameras: [{{name: top, key: obs/image}}]
-source: {{format: hdf5, uri: {uri}}}
-"""
-
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Time the tokenizer alone on as many frames, then run the conversion and measure its processes."""
     from hma_data.conversion.engines.base import Limits
     from hma_data.conversion.job import convert
     from hma_data.conversion.plan import Settings
-    from hma_data.registry.embodiment import Embodiment
 
     workers, engine = settings["workers"], settings["engine"]
     with tempfile.TemporaryDirectory() as folder:
@@ -46,8 +38,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         alone, alone_cpu = _tokenizer_alone(settings, rows)
         watch = _Watch(workers, engine)
         summary = convert(
-            Embodiment.from_yaml(_ROBOT.format(uri=recording)),
-            None,
+            make_robot("bench_arm", "hdf5", "actions", "obs/image"),
+            recording,
             settings["tokenizer"],
             Path(folder) / "out",
             settings=Settings(shard_frames=settings["shard_frames"]),

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from hma_data.bench import make_robot
 from hma_data.bench.sources import HZ, TASK, scene
 from hma_data.lab.write_lerobot import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
@@ -32,7 +33,11 @@ OPEN = {
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one result for each reader and order."""
     with tempfile.TemporaryDirectory(prefix="hma-bench-") as folder:
-        root, robot = Path(folder) / "set", _robot(settings)
+        size = [settings["height"], settings["width"]]
+        cameras = [{"name": "main", "key": CAMERA, "size": size}]
+        state = {"components": [{"key": "observation.state", "dims": DIMS}]}
+        robot = make_robot("bench", "lerobot", "action", CAMERA, HZ, DIMS, cameras=cameras, state=state)
+        root = Path(folder) / "set"
         write_lerobot(root, robot, _episodes(settings))
         readers = {"hma": _ours(root, robot), "lerobot": _theirs(root)}
         results = []
@@ -41,20 +46,6 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             for order, rows in _orders(settings).items():
                 results.append({"reader": name, "order": order, "start_cpu_s": start, **_speed(read, rows)})
         return results
-
-
-def _robot(settings: dict[str, Any]) -> Embodiment:
-    size = [settings["height"], settings["width"]]
-    values = {
-        "id": "bench",
-        "kind": "simulation",
-        "frequency_hz": HZ,
-        "action": {"space": "joint_position", "components": [{"key": "action", "dims": DIMS}]},
-        "state": {"components": [{"key": "observation.state", "dims": DIMS}]},
-        "cameras": [{"name": "main", "key": CAMERA, "size": size}],
-        "source": {"format": "lerobot"},
-    }
-    return Embodiment.from_values(values, "bench")
 
 
 def _episodes(settings: dict[str, Any]) -> Iterator[LeRobotEpisode]:

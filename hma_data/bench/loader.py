@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench import in_fresh_process, peak_rss_mib
+from hma_data.bench import in_fresh_process, make_robot, peak_rss_mib
 
 ABOUT = "windows of a shuffled mixture out of cached local shards: speed, opening, memory"
 DEFAULTS: dict[str, Any] = {
@@ -35,16 +35,6 @@ DEFAULTS: dict[str, Any] = {
     "runs": 3,
 }
 
-_ROBOT = """
-id: bench_{number}
-kind: simulation
-frequency_hz: {hz}
-target_hz: 1
-action: {{space: joint_delta, components: [{{key: actions, dims: {dims}}}]}}
-cameras: [{{name: top, key: obs/image}}]
-source: {{format: hdf5}}
-"""
-
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Run the cases: `mixture` streams shuffled batches of all sets; `random` reads one set in any order."""
@@ -55,22 +45,22 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
     """Write a shard set of random tokens and actions; only its first shard is a file of its own."""
-    from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.manifest import Derived, Gathered, Manifest, ShardFile, plan_hash, split_totals
     from hma_data.shards.schema import Footer, read_footer
     from hma_data.storage.files import file_sha256
     from hma_data.tokenizers.base import TokenizerSpec
 
     h, w = settings["grid"]
-    robot = Embodiment.from_yaml(
-        _ROBOT.format(number=number, hz=settings["stride"], dims=settings["action_dims"])
+    rate = {"hz": settings["stride"], "target_hz": 1}
+    robot = make_robot(
+        f"bench_{number}", "hdf5", "actions", "obs/image", dims=settings["action_dims"], **rate
     )
     spec = TokenizerSpec("random", 1, "discrete", 16 * h, (h, w), settings["vocabulary"])
     facts = {
         "embodiment": robot.id,
         "embodiment_hash": robot.digest,
         "tokenizer": spec.to_json(),
-        "cameras": ["top"],
+        "cameras": ["main"],
         "frames": "all",
         "frame_stride": 1,
     }
@@ -124,7 +114,7 @@ def _write_shard(
             stats.merge(Stats.of(actions))
             where = (str(i), "train", _name(0), writer.rows, length, length)
             rows.append(EpisodeRow(i, *where, "", None, "", 0.0, 0.0, 0.0, "{}", 0, ""))
-            writer.add(EpisodeRows(i, np.arange(length) / robot.rate_hz, tokens, actions, None, "top"))
+            writer.add(EpisodeRows(i, np.arange(length) / robot.rate_hz, tokens, actions, None, "main"))
         writer.close(Footer(plan, _name(0), "train", tuple(rows), (), {"action": stats}))
 
 

@@ -8,22 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.bench import in_fresh_process, peak_rss_mib
+from hma_data.bench import in_fresh_process, make_robot, peak_rss_mib
 
 if TYPE_CHECKING:
     from hma_data.shards.manifest import Manifest
 
 ABOUT = "shards of random 18-bit tokens: write, read, verify; frames a second, bytes a frame, memory"
 DEFAULTS: dict[str, Any] = {"frames": 100_000, "episode": 200, "workers": 2, "seed": 0}
-
-_YAML = """
-id: bench_arm
-kind: simulation
-frequency_hz: 10
-action: {space: eef_delta, components: [{key: actions, dims: 7}]}
-cameras: [{name: front, key: obs/front}]
-source: {format: hdf5}
-"""
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -53,7 +44,6 @@ def _teleoperated(rng: np.random.Generator, length: int) -> NDArray[np.float32]:
 
 def _write(folder: Path, settings: dict[str, int]) -> dict[str, float]:
     from hma_data.conversion.plan import Settings, make_plan
-    from hma_data.registry.embodiment import Embodiment
     from hma_data.shards.manifest import finish
     from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema
     from hma_data.shards.stats import Stats
@@ -62,7 +52,7 @@ def _write(folder: Path, settings: dict[str, int]) -> dict[str, float]:
     from hma_data.tokenizers.base import TokenizerSpec
 
     rng, length = np.random.default_rng(settings["seed"]), settings["episode"]
-    robot = Embodiment.from_yaml(_YAML)
+    robot = make_robot("bench_arm", "hdf5", "actions", "obs/front")
     spec = TokenizerSpec("random-18", 1, "discrete", 256, (16, 16), 2**18, (512, 512))
     refs = [EpisodeRef(f"episode_{i}", length) for i in range(max(2, settings["frames"] // length))]
     plan = make_plan(refs, robot, spec, Settings(shard_frames=25_000), "generated")
@@ -76,7 +66,7 @@ def _write(folder: Path, settings: dict[str, int]) -> dict[str, float]:
                 actions = _teleoperated(rng, length)
                 begun = time.perf_counter()
                 place = (ref.id, unit.split, unit.name, writer.rows, length, length)
-                writer.add(EpisodeRows(index, clock, tokens, actions, None, "front"))
+                writer.add(EpisodeRows(index, clock, tokens, actions, None, "main"))
                 stats["action"].merge(Stats.of(actions))
                 rows.append(EpisodeRow(index, *place, "", None, "", 0.0, 0.0, 0.0, "{}", 0, ""))
                 seconds += time.perf_counter() - begun

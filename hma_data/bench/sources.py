@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.bench import peak_rss_mib
+from hma_data.bench import make_robot, peak_rss_mib
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError, UsageError
 from hma_data.priority import ordinary_priority
@@ -79,16 +79,9 @@ class Case:
 
     def embodiment(self) -> Embodiment:
         """Return the embodiment that reads it."""
-        values: dict[str, Any] = {
-            "id": f"bench_{self.name.replace('-', '_')}",
-            "kind": "simulation",
-            "frequency_hz": HZ,
-            "stride": self.stride,
-            "action": {"space": "eef_delta", "components": [{"key": self.action, "dims": A}]},
-            "cameras": [{"name": "main", "key": self.camera}],
-            "source": {"format": self.format},
-        }
-        return Embodiment.from_values(values | self.extra, self.name)
+        name = f"bench_{self.name.replace('-', '_')}"
+        values = {"stride": self.stride, **self.extra}
+        return make_robot(name, self.format, self.action, self.camera, HZ, A, **values)
 
 
 # -- measuring
@@ -103,7 +96,9 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     wanted = list(CASES) if settings["formats"] == ["all"] else settings["formats"]
     unknown = [name for name in wanted if name not in CASES]
     if unknown:
-        raise UsageError("bench sources", f"there is no format {unknown[0]!r}", f"known: {', '.join(CASES)}")
+        raise UsageError(
+            "bench sources", f"the format {unknown[0]!r} does not exist", f"known: {', '.join(CASES)}"
+        )
     episodes = max(1, min(settings["episodes"], settings["frames"]))
     length = max(2, settings["frames"] // episodes)
     results: list[dict[str, Any]] = []

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from typer import Argument, Option
 
 from hma_data.console import print_json, print_table
+from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
     from hma_data.loading.mixture import Mixture
@@ -37,7 +38,6 @@ def mixture(
 
     Example: hma mixture shards/a shards/b --temperature 3 --plot mixture.png
     """
-    from hma_data.errors import UsageError
     from hma_data.loading.dataset import open_sets
     from hma_data.loading.mixture import TEMPERATURES, Mixture, plot_mixture
     from hma_data.shards.windows import WindowIndex
@@ -92,20 +92,16 @@ def _rows(
 
 
 def _pairs(option: str, words: Pairs) -> dict[str, str]:
-    from hma_data.errors import UsageError
-
     pairs = {}
     for word in words or []:
-        name, given, value = word.partition("=")
-        if not given or not name or not value:
+        name, _, value = word.partition("=")
+        if not name or not value:
             raise UsageError(option, f"must be like NAME=VALUE, is {word!r}")
         pairs[name] = value
     return pairs
 
 
 def _numbers(option: str, words: Pairs) -> dict[str, float]:
-    from hma_data.errors import UsageError
-
     numbers = {}
     for name, text in _pairs(option, words).items():
         try:

@@ -1,6 +1,7 @@
 """Run `hma registry`: list and show embodiments, check their YAML, write a new robot's YAML, export it."""
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -56,17 +57,24 @@ def registry_list(
         else:
             found.setdefault(entry.facts["id"], entry.facts)
     exact = {"kind": kind, "format": source, "space": space, "action_dim": dims}
+    exact = {key: wanted for key, wanted in exact.items() if wanted is not None}
     rows = [
         row
         for _, row in sorted(found.items())
-        if all(wanted is None or row[key] == wanted for key, wanted in exact.items())
+        if all(row[key] == wanted for key, wanted in exact.items())
         and (hz is None or _rate_is(row["frequency_hz"], hz))
         and _mentions(row, words or [])
     ]
     if json:
         print_json(rows)
     else:
-        _print_list(rows)
+        cells = []
+        for row in rows:
+            rate = row["frequency_hz"] if row["rate_hz"] is None else row["rate_hz"]  # "unknown", not a blank
+            shown = {**row, "rate_hz": rate, "cameras": ", ".join(row["cameras"])}
+            cells.append([shown[fact] for fact in LISTED.values()])
+        print_table(list(LISTED), cells)
+        print(f"{len(rows):,} embodiment{'s' if len(rows) != 1 else ''}")
     for line in broken:
         print(f"not listed: {line}", file=sys.stderr)
     raise typer.Exit(1 if broken else 0)
@@ -78,22 +86,10 @@ def _mentions(row: dict[str, Any], words: list[str]) -> bool:
 
 
 def _rate_is(rate: float | str | None, wanted: str) -> bool:
-    if rate is None or isinstance(rate, str):
-        return wanted == (rate or "null")
-    try:
-        return rate == float(wanted)
-    except ValueError:
-        return False
-
-
-def _print_list(rows: list[dict[str, Any]]) -> None:
-    cells = []
-    for row in rows:
-        rate = row["frequency_hz"] if row["rate_hz"] is None else row["rate_hz"]  # "unknown", not a blank
-        shown = {**row, "rate_hz": rate, "cameras": ", ".join(row["cameras"])}
-        cells.append([shown[fact] for fact in LISTED.values()])
-    print_table(list(LISTED), cells)
-    print(f"{len(rows):,} embodiment{'s' if len(rows) != 1 else ''}")
+    if isinstance(rate, int | float):
+        with suppress(ValueError):
+            return rate == float(wanted)
+    return wanted == (rate or "null")
 
 
 @registry_app.command("show")
@@ -168,23 +164,22 @@ def registry_schema(out: Out = None) -> None:
 
     Example: hma registry schema --out registry/embodiment.schema.json
     """
-    if out is None:
-        from hma_data.registry.embodiment import schema
+    from hma_data.registry.embodiment import schema
 
+    if out is None:
         print_json(schema())
         return
-    _write_schema(out)
+    _write_json(out, schema())
     print(f"wrote {out}; an editor completes a YAML beside it that begins with the line")
     print(f"# yaml-language-server: $schema={out.name}")
 
 
-def _write_schema(out: Path) -> None:
+def _write_json(out: Path, values: Any, indent: int = 1) -> None:
     import json
 
-    from hma_data.registry.embodiment import schema
     from hma_data.storage.files import write_atomic
 
-    write_atomic(out, json.dumps(schema(), indent=1) + "\n")
+    write_atomic(out, json.dumps(values, indent=indent) + "\n")
 
 
 @registry_app.command("export")
@@ -197,19 +192,16 @@ def registry_export(
 
     Example: hma registry export so100 --to modality.json --out meta/modality.json
     """
-    import json
-
     from hma_data.registry.embodiment import find
     from hma_data.registry.export import lerobot_features, modality
-    from hma_data.storage.files import write_atomic
 
     embodiment = find(id)
     values = modality(embodiment) if to == "modality.json" else lerobot_features(embodiment)
     if out is None:
         print_json(values)
-        return
-    write_atomic(out, json.dumps(values, indent=4) + "\n")
-    print(f"wrote {out}")
+    else:
+        _write_json(out, values, indent=4)
+        print(f"wrote {out}")
 
 
 @registry_app.command("infer")
@@ -242,9 +234,11 @@ def registry_infer(
 
 def _schema_for(out: Path) -> str:
     """Return the path of a YAML's schema, relative to the YAML; write one beside it where there is none."""
+    from hma_data.registry.embodiment import schema
+
     for up in range(3):
         place = Path(*[".."] * up, SCHEMA)
         if (out.parent / place).is_file():
             return str(place)
-    _write_schema(out.parent / SCHEMA)
+    _write_json(out.parent / SCHEMA, schema())
     return SCHEMA

@@ -7,6 +7,7 @@ import typer
 from typer import Argument, Option
 
 from hma_data.console import human_bytes, print_json, print_table
+from hma_data.errors import MissingDependencyError, RecipeError, UsageError
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
@@ -62,7 +63,6 @@ def tokenizer_train(
 
     Example: hma tokenizer train recipes/tokenizer/fsq.yaml --out fsq.safetensors
     """
-    from hma_data.errors import RecipeError, UsageError
     from hma_data.storage.yaml_io import parse_yaml
     from hma_data.tokenizers.training.train import train
 
@@ -131,7 +131,6 @@ def tokenizer_eval(
 
 def _perceptual(wanted: bool | None, device: str) -> tuple[Any, str]:
     """Return what measures LPIPS, or None and the reason; raise if LPIPS is asked for and missing."""
-    from hma_data.errors import MissingDependencyError
     from hma_data.tokenizers.training.eval import open_lpips
 
     if wanted is False:

@@ -140,7 +140,7 @@ def _of_package(entry: Entry, keywords: dict[str, Any]) -> Tokenizer:
     tokenizer = plugin.call("load()", module.load, entry.name, **keywords)
     if not isinstance(tokenizer, Tokenizer) or not isinstance(tokenizer.spec, TokenizerSpec):
         kind = type(tokenizer).__name__
-        raise plugin.broken(f"load() gave {kind}, which is no hma_data.tokenizers.base.Tokenizer")
+        raise plugin.broken(f"load() returns {kind}, not a hma_data.tokenizers.base.Tokenizer")
     if tokenizer.spec.name != entry.name:
         raise plugin.broken(f"its spec is named {tokenizer.spec.name!r}, not {entry.name!r}")
     return tokenizer
@@ -166,5 +166,6 @@ def check_tokens(tokens: NDArray[Any], spec: TokenizerSpec) -> None:
         raise TokenizerError(spec.name, f"decodes {form}, was given {tokens.dtype} {tokens.shape}")
     if spec.vocab_size and tokens.size and (int(tokens.max()) >= spec.vocab_size or int(tokens.min()) < 0):
         raise TokenizerError(
-            spec.name, f"ids must lie in 0..{spec.vocab_size - 1}, met {tokens.min()}..{tokens.max()}"
+            spec.name,
+            f"ids must lie in 0..{spec.vocab_size - 1}, but these lie in {tokens.min()}..{tokens.max()}",
         )

@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -77,7 +77,9 @@ def _parse_uri(uri: str) -> Entry:
     form = r"hf://(datasets/)?([\w.-]+/[\w.-]+?)(?:@([\w.-]+))?/([\w./-]+)"
     found = re.fullmatch(form, uri)
     if not found or ".." in uri:
-        raise TokenizerError(uri, "is no file on the hub", "write hf://ORGANISATION/NAME@REVISION/FILE")
+        raise TokenizerError(
+            uri, "is not the address of a file on the hub", "write hf://ORGANISATION/NAME@REVISION/FILE"
+        )
     dataset, repo, revision, file = found.groups()
     place: dict[str, Any] = {"repo": repo, "file": file, "revision": revision or "main"}
     place["repo_type"] = "dataset" if dataset else "model"
@@ -117,7 +119,7 @@ def _download(entry: Entry) -> str:
     return hf_hub_download(entry.repo, entry.file, revision=revision, repo_type=kind)
 
 
-def one_file(path: Path, names: Iterable[str], what: str) -> Path:
+def one_file(path: Path, names: Sequence[str], what: str) -> Path:
     """Return the path if it is a file, else the first of `names` in the folder; raise if there is none."""
     for file in (path, *(path / name for name in names)):
         if file.is_file():
@@ -168,21 +170,21 @@ def read_tensors(path: Path) -> Tensors:
     except pickle.UnpicklingError as fault:
         raise TokenizerError(
             path,
-            "is no torch checkpoint, or holds more than tensors and plain values; it was not unpickled",
+            "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled",
             "save its state_dict as safetensors where it can be trusted",
         ) from fault
     except TokenizerError:
         raise
     except Exception as fault:  # torch raises many kinds of errors on a damaged file
-        text = f"is no whole safetensors file or torch checkpoint: {type(fault).__name__}: {_one_line(fault)}"
-        raise TokenizerError(path, text, "fetch it again") from fault
+        text = f"is not a complete safetensors file or torch checkpoint: {type(fault).__name__}"
+        raise TokenizerError(path, f"{text}: {_one_line(fault)}", "download it again") from fault
     for key in NESTED:
         if isinstance(values, Mapping) and isinstance(values.get(key), Mapping):
             values = values[key]
     named = values.items() if isinstance(values, Mapping) else ()
     tensors = {str(name): value for name, value in named if isinstance(value, Tensor)}
     if not tensors:
-        raise TokenizerError(path, f"holds no weights by name, but a {type(values).__name__}", OTHER)
+        raise TokenizerError(path, f"holds a {type(values).__name__} without weights by name", OTHER)
     return tensors
 
 
@@ -192,7 +194,9 @@ def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (SafetensorError, OSError) as fault:
-        raise TokenizerError(path, f"is no whole safetensors file: {_one_line(fault)}", OTHER) from fault
+        raise TokenizerError(
+            path, f"is not a complete safetensors file: {_one_line(fault)}", OTHER
+        ) from fault
 
 
 def stated_scale(folder: Path, default: float) -> float:
@@ -220,7 +224,7 @@ def fill(network: nn.Module, tensors: Mapping[str, Tensor], where: object) -> No
     state = {name: tensor.to(torch.float32, copy=True).contiguous() for name, tensor in tensors.items()}
     for name, tensor in state.items():
         if not torch.isfinite(tensor).all():
-            raise TokenizerError(where, f"{name} holds values that are not finite", "fetch it again")
+            raise TokenizerError(where, f"{name} holds values that are not finite", "download it again")
     try:
         network.load_state_dict(state, assign=True)
     except RuntimeError as fault:
@@ -273,11 +277,13 @@ def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[
     tensors, metadata = _read_safetensors(path)
     remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
     if metadata.get("format") != form:
-        raise TokenizerError(path, f"holds no {form} weights (format {metadata.get('format')!r})", remedy)
+        raise TokenizerError(
+            path, f"does not hold {form} weights (format {metadata.get('format')!r})", remedy
+        )
     try:
         shape = config.model_validate_json(metadata.get("config", ""))
     except ValueError as fault:
         raise TokenizerError(
-            path, f"its metadata describes no network: {_one_line(fault)}", remedy
+            path, f"its metadata does not describe the network: {_one_line(fault)}", remedy
         ) from fault
     return shape, tensors, file_sha256(path)

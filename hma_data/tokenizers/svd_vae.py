@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.checkpoints import (
@@ -49,13 +49,13 @@ def derive_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
     }
 
 
-def read_network(path: Path) -> nn.Module:
+def read_network(path: Path) -> Any:
     """Read the network from a weights' file; raise TokenizerError if it is another one."""
     from diffusers import AutoencoderKLTemporalDecoder
 
     tensors = read_tensors(path)
     with shapes_of(path, WHAT):
-        network: nn.Module = AutoencoderKLTemporalDecoder(**derive_config(tensors))
+        network: Any = AutoencoderKLTemporalDecoder(**derive_config(tensors))
     fill(network, tensors, path)
     return network
 
@@ -68,7 +68,7 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
     """
     place = open_device(name, device)
     path = one_file(find_weights(name, weights), FILES, name)
-    network: Any = read_network(path)
+    network = read_network(path)
     stride = 2 ** (len(network.config.block_out_channels) - 1)
     facts = {"latent_scale": stated_scale(path.parent, LATENT_SCALE), "weights_sha256": digest_of([path])}
     channels = network.config.latent_channels

@@ -74,7 +74,7 @@ def test_a_file_of_something_else_is_refused(tmp_path, content):
 @pytest.mark.parametrize("value", [[torch.ones(2)], torch.ones(2), {"epoch": 3}, {}])
 def test_a_checkpoint_without_named_weights_is_refused(tmp_path, value):
     torch.save(value, tmp_path / "a.pt")
-    with pytest.raises(TokenizerError, match="holds no weights by name"):
+    with pytest.raises(TokenizerError, match="without weights by name"):
         read_tensors(tmp_path / "a.pt")
 
 
@@ -233,7 +233,7 @@ def test_another_file_of_the_hub_can_be_named(hub, tmp_path):
 
 @pytest.mark.parametrize("uri", ["hf://", "hf://one/two", "hf://a/b/../../c", "hf://a/b@/c d"])
 def test_an_address_of_the_hub_that_is_none_is_refused(uri):
-    with pytest.raises(TokenizerError, match="is no file on the hub"):
+    with pytest.raises(TokenizerError, match="is not the address of a file"):
         find_weights("magvit2", uri)
 
 

@@ -103,7 +103,7 @@ def test_a_film_without_pictures_is_refused(tmp_path):
         frame.sample_rate = 8000
         container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    with pytest.raises(TokenizerError, match="is no video that can be decoded"):
+    with pytest.raises(TokenizerError, match="cannot be decoded as a video"):
         list(read_frames(tmp_path / "sound.mp4", 64))
 
 

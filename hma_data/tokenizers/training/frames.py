@@ -122,7 +122,7 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
     if path.suffix.lower() not in VIDEOS:
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if picture is None:
-            raise TokenizerError(path, "is no picture that can be decoded")
+            raise TokenizerError(path, "cannot be decoded as a picture")
         yield np.ascontiguousarray(picture[:, :, ::-1])
         return
     try:
@@ -134,7 +134,7 @@ def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
                 if index in wanted:
                     yield frame.to_ndarray(format="rgb24")
     except (av.FFmpegError, IndexError) as fault:  # a container without video has no stream 0
-        raise TokenizerError(path, f"is no video that can be decoded: {fault}") from fault
+        raise TokenizerError(path, f"cannot be decoded as a video: {fault}") from fault
 
 
 def recording_frames(
@@ -176,7 +176,7 @@ def recording_frames(
             fault = str(problem)
             on_skip(fault)
     if not read:
-        raise SourceError(as_text(uri), f"gave no frame: {fault}")
+        raise SourceError(as_text(uri), f"no frame could be read: {fault}")
 
 
 def _evenly(count: int, wanted: int) -> list[int]:

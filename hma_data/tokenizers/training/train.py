@@ -180,7 +180,9 @@ class Run:
                 metadata = file.metadata() or {}
                 state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         except (SafetensorError, OSError) as fault:
-            raise RecipeError(path, f"is no state of a training: {fault!s:.120}", remedy) from fault
+            raise RecipeError(
+                path, f"is not the saved state of a training: {fault!s:.120}", remedy
+            ) from fault
         step = int(metadata.get("step", 0))
         past = (metadata.get("course"), metadata.get("rates"))
         if past != (self.recipe.course(), self._past_rates(step)):
@@ -251,19 +253,17 @@ class Muon(torch.optim.Optimizer):
         """Take one step; `closure` is not called."""
         for group in self.param_groups:
             for parameter in group["params"]:
-                if parameter.grad is not None:
-                    self._step_one(parameter, parameter.grad, group)
-
-    def _step_one(self, parameter: Tensor, grad: Tensor, group: dict[str, Any]) -> None:
-        state = self.state[parameter]
-        if "momentum" not in state:
-            state["momentum"] = torch.zeros_like(grad)
-        state["momentum"].lerp_(grad, 1 - group["momentum"])
-        ahead = grad.lerp(state["momentum"], group["momentum"])
-        flat = ahead.reshape(len(ahead), -1)
-        update = orthogonal(flat) * max(1.0, flat.shape[0] / flat.shape[1]) ** 0.5
-        parameter.mul_(1 - group["lr"] * group["decay"])
-        parameter.add_(update.view(parameter.shape), alpha=-group["lr"])
+                grad = parameter.grad
+                if grad is None:
+                    continue
+                state = self.state[parameter]
+                if "momentum" not in state:
+                    state["momentum"] = torch.zeros_like(grad)
+                state["momentum"].lerp_(grad, 1 - group["momentum"])
+                flat = grad.lerp(state["momentum"], group["momentum"]).reshape(len(grad), -1)
+                update = orthogonal(flat) * max(1.0, flat.shape[0] / flat.shape[1]) ** 0.5
+                parameter.mul_(1 - group["lr"] * group["decay"])
+                parameter.add_(update.view(parameter.shape), alpha=-group["lr"])
 
 
 def _latent_penalty(latents: Tensor) -> Tensor:
@@ -327,8 +327,20 @@ def train(
     }
     # Far below zero the slope of silu is a denormal number; denormal numbers make a step seven times slower.
     torch.set_flush_denormal(True)
+    errors: list[float] = []
+    last = time.monotonic()
     try:
-        _advance(run, out, facts, workers, report, report_every)
+        for crops in _crops(run, workers):
+            errors.append(run.advance(crops))
+            now = time.monotonic()
+            run.seconds, last = run.seconds + now - last, now
+            if run.step % report_every == 0 or run.step == recipe.training.steps:
+                psnr = round(-10 * math.log10(sum(errors) / len(errors)), 2)
+                facts |= {"steps": run.step, "train_psnr_db": psnr, "seconds": round(run.seconds)}
+                errors.clear()
+                run.write_weights(out, facts)
+                run.save(state)
+                report(f"step {run.step}: training PSNR {psnr} dB, {run.seconds:.0f} s")
     finally:
         torch.set_flush_denormal(False)
     state.unlink(missing_ok=True)
@@ -346,27 +358,3 @@ def _crops(run: Run, workers: int) -> Iterator[Tensor]:
         while ahead:
             yield ahead.popleft().result()
             ahead.extend(pool.submit(run.batch, step, count) for step in islice(steps, 1))
-
-
-def _advance(
-    run: Run,
-    out: Path,
-    facts: dict[str, Any],
-    workers: int,
-    report: Callable[[str], None],
-    report_every: int,
-) -> None:
-    """Take all remaining steps; at every report write weights and state."""
-    errors: list[float] = []
-    last = time.monotonic()
-    for crops in _crops(run, workers):
-        errors.append(run.advance(crops))
-        now = time.monotonic()
-        run.seconds, last = run.seconds + now - last, now
-        if run.step % report_every == 0 or run.step == run.recipe.training.steps:
-            psnr = round(-10 * math.log10(sum(errors) / len(errors)), 2)
-            facts |= {"steps": run.step, "train_psnr_db": psnr, "seconds": round(run.seconds)}
-            errors.clear()
-            run.write_weights(out, facts)
-            run.save(out.with_name(out.name + ".state"))
-            report(f"step {run.step}: training PSNR {psnr} dB, {run.seconds:.0f} s")
