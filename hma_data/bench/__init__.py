@@ -93,8 +93,14 @@ def peak_rss_mib() -> float:
     return round(kib / 1024, 1)
 
 
+def rss_mib(pid: int | str = "self") -> float:
+    """Return the resident memory of a process in MiB; 0 if it has ended, or without Linux's /proc."""
+    sizes = _values_of(f"/proc/{pid}/status", "VmRSS")
+    return int(sizes[0].split()[0]) / 1024 if sizes else 0.0
+
+
 def _values_of(path: str, key: str) -> list[str]:
-    """Return the values of a key in a file of `key: value` lines; none where Linux has no such file."""
+    """Return the values of a key in a file of `key: value` lines; none if there is no such file."""
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench import make_robot
+from hma_data.bench import make_robot, rss_mib
 
 ABOUT = "hma convert over many short episodes: overhead beside the tokenizer, memory of its workers over time"
 DEFAULTS: dict[str, Any] = {
@@ -175,7 +175,8 @@ class _Watch:
             found["parent"] = time.process_time() - time.thread_time()
             self.cpu_s = {role: max(used, found[role]) for role, used in self.cpu_s.items()}
             roles["parent"] = [pid]
-            self.samples.append((self._share, {role: _rss_mib(pids) for role, pids in roles.items() if pids}))
+            memory = {role: max(map(rss_mib, pids)) for role, pids in roles.items() if pids}
+            self.samples.append((self._share, memory))
 
 
 def _roles(pid: int, engine: str) -> dict[str, list[int]]:
@@ -211,12 +212,3 @@ def _cpu_s(pids: list[int]) -> float:
             user, system = _stat(pid)[11:13]
             ticks += int(user) + int(system)
     return ticks / os.sysconf("SC_CLK_TCK")
-
-
-def _rss_mib(pids: list[int]) -> float:
-    """Return the resident memory of the largest of some processes."""
-    pages = [0]
-    for pid in pids:
-        with suppress(OSError):
-            pages.append(int(Path(f"/proc/{pid}/statm").read_text().split()[1]))
-    return max(pages) * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench import in_fresh_process, make_robot, peak_rss_mib
+from hma_data.bench import in_fresh_process, make_robot, peak_rss_mib, rss_mib
 
 ABOUT = "windows of a shuffled mixture out of cached local shards: speed, opening, memory"
 DEFAULTS: dict[str, Any] = {
@@ -122,14 +122,14 @@ def _measure(case: str, sets: list[Path], settings: dict[str, Any]) -> dict[str,
     """Return the figures of a case: opening, the first batch, speed and memory."""
     from hma_data.loading.dataset import MixtureDataset, WindowDataset
 
-    before, began = _memory(), time.perf_counter()
+    before, began = rss_mib(), time.perf_counter()
     data: Any
     if case == "mixture":
         data = MixtureDataset(sets, settings["batch"], settings["window"], draw=settings["draw"])
     else:
         sets = sets[:1]
         data = WindowDataset(sets[0], "train", settings["window"])
-    opened, after = time.perf_counter() - began, _memory()
+    opened, after = time.perf_counter() - began, rss_mib()
     mixed = case == "mixture"
     batches = data.batches(settings["workers"]) if mixed else _random(data, settings["batch"])
     next(batches)
@@ -167,12 +167,3 @@ def _speed(batches: Iterator[Any], settings: dict[str, Any]) -> dict[str, Any]:
     if not settings["workers"]:
         figures["windows_per_cpu_second"] = round(max(cpu))
     return figures
-
-
-def _memory() -> float:
-    """Return the resident memory in MiB."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except OSError:
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -196,8 +196,15 @@ class Pool:
     pictures: list[list[Frame]]
 
 
-def shrink(picture: Frame, short_side: int) -> Frame:
-    """Return the picture shrunk by area averaging to at most that short side."""
+def _levels(picture: Frame) -> list[Frame]:
+    """Return the picture shrunk by area averaging to LARGEST, then to halves down to about 160 pixels."""
+    levels = [_shrunk(picture, LARGEST)]
+    while (short := min(levels[-1].shape[:2])) > 160:
+        levels.append(_shrunk(levels[-1], short // 2))
+    return levels
+
+
+def _shrunk(picture: Frame, short_side: int) -> Frame:
     import cv2
 
     height, width = picture.shape[:2]
@@ -206,13 +213,6 @@ def shrink(picture: Frame, short_side: int) -> Frame:
         return picture
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _levels(picture: Frame) -> list[Frame]:
-    levels = [shrink(picture, LARGEST)]
-    while min(levels[-1].shape[:2]) > 160:
-        levels.append(shrink(levels[-1], min(levels[-1].shape[:2]) // 2))
-    return levels
 
 
 def _source_files(source: FileSource | DrawnSource, corpus: Path) -> list[Path]:

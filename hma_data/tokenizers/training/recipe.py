@@ -16,6 +16,7 @@ from hma_data.storage.yaml_io import read_yaml
 from hma_data.tokenizers.fsq import STRIDE, FsqConfig
 from hma_data.tokenizers.vae import VaeConfig
 
+LOCAL: dict[str, Any] = {"corpus": True, "network": {"latent_scale"}}  # a place, and a measured value
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -120,7 +121,7 @@ class TokenizerRecipe(_Strict):
 
     def digest(self) -> str:
         """Return the SHA-256 of all values except the corpus's location and what training measures."""
-        return _digest(self._values())
+        return _digest(self.model_dump(mode="json", exclude=LOCAL))
 
     def course(self) -> str:
         """Return the SHA-256 of the values that must not change when a run is resumed.
@@ -128,13 +129,8 @@ class TokenizerRecipe(_Strict):
         It covers the values of `digest` except `steps`, `fall` and `threads`. A run can be resumed if this
         digest and the rates of its past steps are the same.
         """
-        values = self._values()
-        for key in ("steps", "fall", "threads"):
-            values["training"].pop(key)
+        values = self.model_dump(mode="json", exclude={**LOCAL, "training": {"steps", "fall", "threads"}})
         return _digest(values)
-
-    def _values(self) -> dict[str, Any]:
-        return self.model_dump(mode="json", exclude={"corpus": True, "network": {"latent_scale"}})
 
 
 def _digest(values: dict[str, Any]) -> str:
