@@ -15,17 +15,35 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HMAError, RegistryError
-from hma_data.registry.formats import FORMATS
+from hma_data.plugins import SOURCE_GROUP, installed
 from hma_data.storage.files import cache_folder, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.shipped import shipped
 from hma_data.storage.yaml_io import decode_yaml, parse_yaml, read_bytes
 
+FORMATS = {  # name -> package: RECOGNITION in it, open() in its module `source`; asked in this order
+    "rlds": "hma_data.sources.rlds",
+    "rosbag": "hma_data.sources.bags",
+    "hdf5": "hma_data.sources.hdf5",
+    "lerobot": "hma_data.sources.lerobot",
+    "hands": "hma_data.sources.hands",
+}
+MORE = f"an installed package may add formats by entry points of {SOURCE_GROUP}"
 MAX_KEPT = 100_000  # judgements kept in the cache
 _JUDGES = (
     "registry/embodiment.py", "registry/components.py", "registry/formats.py", "registry/catalog.py",
     "storage/yaml_io.py",
 )  # fmt: skip
+
+
+def known_formats() -> list[str]:
+    """Return the built-in formats, then those of installed packages."""
+    return [*FORMATS, *(name for name in installed(SOURCE_GROUP) if name not in FORMATS)]
+
+
+def is_known(name: str) -> bool:
+    """Check whether there is a source of that format."""
+    return name in FORMATS or name in installed(SOURCE_GROUP)
 
 
 def registry_folders(beside: StrPath | None = None) -> list[Path]:

@@ -16,7 +16,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from hma_data.registry.formats import MORE, is_known, known_formats
+from hma_data.registry.catalog import MORE, is_known, known_formats
 
 Space = Literal[
     "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",

@@ -109,7 +109,6 @@ def _draw(scores: Tensor, decoding: Decoding) -> Tensor:
     """Choose the value (B, k) of a digit from its scores (B, k, V)."""
     if decoding.temperature > 0:
         noise = uniform(scores.shape, decoding.generator, scores.device).clamp(min=1e-20)
-        scores = (
-            scores / decoding.temperature - (-noise.log()).log()
-        )  # the largest is a sample from the softmax
+        # The largest of these sums is a sample from the softmax.
+        scores = scores / decoding.temperature - (-noise.log()).log()
     return scores.argmax(-1)

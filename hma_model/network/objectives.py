@@ -1,6 +1,6 @@
 """Compute the losses of the training objectives (paper section 3).
 
-`hma_model.objective.OBJECTIVES` states what each objective predicts, sees and hides.
+`hma_model.config.OBJECTIVES` states what each objective predicts, sees and hides.
 
 B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = stride * action dim.
 """
@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.config import HMAConfig
+from hma_model.config import OBJECTIVES, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition
 from hma_model.network.embed import patchify, to_digits
 from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks, uniform
-from hma_model.objective import OBJECTIVES, Readout
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -63,7 +62,7 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
         raise HMAError("objective", f"{name!r} is unknown", "give one of " + ", ".join(OBJECTIVES))
     chosen = OBJECTIVES[name]
     frames, count, size = _frames(model, batch), batch.actions.shape[1], len(batch.actions)
-    groups, clock = Groups.of(batch.embodiment, size), model.clock(count)
+    groups, times = Groups.of(batch.embodiment, size), model.time_positions(count)
 
     own = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
     seen = frames if own is None else _frames(model, batch, own)
@@ -81,9 +80,9 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     given = None
     if chosen.sees_actions:
         given = align(config, batch.actions, batch.action_mask & ~dropped, count)
-    conditioning = condition(model, given, groups, clock.positions)
+    conditioning = condition(model, given, groups, times.positions)
     x = _embed(model, seen, video, groups, generator)
-    features = model.trunk(x, conditioning, clock)
+    features = model.trunk(x, conditioning, times)
 
     video_loss = action_loss = logits = None
     per_sample = torch.zeros(size, device=features.device)
@@ -93,7 +92,7 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
         )
     if chosen.predicts_video:
         own = model.video_features(features)
-        predictors = own if config.kind == "discrete" else model.latent_readout(own, clock.positions)
+        predictors = own if config.kind == "discrete" else model.latent_readout(own, times.positions)
         video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
         if config.kind == "discrete" and not model.training:
             scores = model.token_readout.split(model.token_readout(own.detach()))

@@ -202,7 +202,7 @@ def test_wrong_decoding_is_refused(change: dict, message: str) -> None:
 def test_too_few_actions_are_refused() -> None:
     model = small_model()
     batch = small_batch(model.config, ["arm"])
-    with pytest.raises(HMAError, match="5 action chunks for 3 \\+ 4 frames"):
+    with pytest.raises(HMAError, match="5 chunks for 3 \\+ 4 frames"):
         model.generate(batch.tokens[:, :3], batch.actions, "arm", 4)
 
 
