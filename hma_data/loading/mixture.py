@@ -49,25 +49,24 @@ def probabilities(
     """
     n = np.asarray(counts, np.float64)
     if not len(n) or n.max() <= 0 or n.min() < 0:
-        raise UsageError("mixture", f"needs windows to draw from, has {[int(c) for c in n]}")
+        raise UsageError("mixture", f"needs windows to draw from, but the counts are {[int(c) for c in n]}")
     if not temperature > 0:
-        raise UsageError("mixture temperature", f"must be above 0, is {temperature}")
+        raise UsageError("mixture temperature", f"must be above 0, not {temperature}")
     share = np.zeros_like(n)
     present = n > 0
     share[present] = np.exp((np.log(n[present]) - np.log(n.max())) / temperature)  # no overflow at any count
     if weights is not None:
-        share *= _factors("weights", weights, len(n))
+        share *= _factors("weights", weights)
     if groups is not None:
-        factors = _factors("weights", list((group_weights or {}).values()), len(group_weights or {}))
-        factor = dict(zip(group_weights or {}, factors))
+        factor = dict(zip(group_weights or {}, _factors("weights", list((group_weights or {}).values()))))
         for name in dict.fromkeys(groups):
             members = np.array([group == name for group in groups])
             if share[members].sum() > 0:
                 share[members] *= factor.get(name, 1.0) / share[members].sum()
     if share.sum() <= 0:
-        raise UsageError("mixture weights", "leave nothing to draw")
+        raise UsageError("mixture weights", "leave nothing to draw", "give one embodiment a weight above 0")
     share /= share.sum()
-    return share if caps is None else _capped(share, _factors("caps", caps, len(n)))
+    return share if caps is None else _capped(share, _factors("caps", caps))
 
 
 def epoch_caps(counts: Sequence[int], max_epochs: float, samples: int) -> Floats:
@@ -77,29 +76,28 @@ def epoch_caps(counts: Sequence[int], max_epochs: float, samples: int) -> Floats
         UsageError: so many samples cannot be drawn.
     """
     if not max_epochs > 0 or samples < 1:
-        raise UsageError(
-            "mixture max_epochs", f"must be above 0 and of at least 1 sample, is {max_epochs} of {samples}"
-        )
-    most = max_epochs * sum(counts)
-    if samples > most:
-        raise UsageError(
-            "mixture max_epochs",
-            f"{max_epochs:g} passes over {sum(counts):,} windows are fewer than {samples:,} planned samples",
-            f"allow {samples / max(1, sum(counts)):.3g} passes, or plan {int(most):,} samples",
-        )
+        fault = f"must be above 0, for at least 1 sample; it is {max_epochs} for {samples}"
+        raise UsageError("mixture max_epochs", fault)
+    windows = sum(counts)
+    most = int(max_epochs * windows)
+    if samples > max_epochs * windows:
+        fault = f"{max_epochs:g} passes over {windows:,} windows are fewer than {samples:,} planned samples"
+        remedy = f"allow {samples / max(1, windows):.3g} passes, or plan {most:,} samples"
+        raise UsageError("mixture max_epochs", fault, remedy)
     return np.minimum(1.0, max_epochs * np.asarray(counts, np.float64) / samples)
 
 
-def _factors(name: str, values: Sequence[float], count: int) -> Floats:
+def _factors(name: str, values: Sequence[float]) -> Floats:
     factors = np.asarray(values, np.float64)
-    if len(factors) != count or not np.isfinite(factors).all() or (factors < 0).any():
-        raise UsageError(f"mixture {name}", f"must be {count} numbers of at least 0, are {list(values)}")
+    if not np.isfinite(factors).all() or (factors < 0).any():
+        raise UsageError(f"mixture {name}", f"must be numbers of at least 0, not {list(values)}")
     return factors
 
 
 def _capped(share: Floats, limit: Floats) -> Floats:
     if limit[share > 0].sum() < 1 - 1e-12:
-        raise UsageError("mixture caps", f"sum to {limit[share > 0].sum():g}, so not everything can be drawn")
+        fault = f"sum to {limit[share > 0].sum():g}; probabilities must sum to 1"
+        raise UsageError("mixture caps", fault, "raise a cap")
     fixed = np.zeros(len(share), bool)
     while True:
         over = ~fixed & (share > limit + 1e-15)
@@ -153,15 +151,15 @@ class Mixture:
             caps: embodiment -> its largest probability.
             max_epochs: most passes over any one embodiment while `samples` are drawn in all.
 
-            Raises:
-                UsageError: a name is unknown, or the values cannot be met.
+        Raises:
+            UsageError: a name is unknown, or the values cannot be met.
         """
         group = {name: (groups or {}).get(name, name) for name in counts}
         _known("groups", groups, counts)
         _known("weights", weights, [*counts, *(group.values() if groups else [])])
         _known("caps", caps, counts)
         if seed < 0:
-            raise UsageError("mixture seed", f"must be at least 0, is {seed}")
+            raise UsageError("mixture seed", f"must be at least 0, not {seed}")
         shared = {name for name in group.values() if name not in counts}
         size = list(counts.values())
         limits: Floats | None = None
@@ -213,7 +211,8 @@ class Mixture:
 def _known(what: str, named: Mapping[str, object] | None, known: Iterable[str]) -> None:
     unknown = set(named or {}) - set(known)
     if unknown:
-        raise UsageError(f"mixture {what}", f"name {', '.join(sorted(unknown))}, which is not in the mixture")
+        fault = f"name {', '.join(sorted(unknown))}, which the mixture does not have"
+        raise UsageError(f"mixture {what}", fault)
 
 
 def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:
@@ -228,18 +227,18 @@ def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:
     order = np.argsort(-np.array(mixture.counts), kind="stable")
     counts, p = np.array(mixture.counts)[order], mixture.p[order]
     proportional = counts / max(1, counts.sum())
-    place, few = np.arange(len(order)), len(order) <= 12
+    row, few = np.arange(len(order)), len(order) <= 12
     figure = Figure(figsize=(8, 1.2 + (0.42 if few else 0.27) * len(order)), layout="constrained")
     axes = figure.subplots()
-    axes.barh(place - 0.2, p, 0.4, color=BLUE, label=f"drawn, τ = {temperature:g}")
+    axes.barh(row - 0.2, p, 0.4, color=BLUE, label=f"drawn, τ = {temperature:g}")
     style: dict[str, Any] = {"color": ORANGE, "hatch": "////", "edgecolor": "white", "linewidth": 0}
-    axes.barh(place + 0.2, proportional, 0.4, label="share of windows", **style)
+    axes.barh(row + 0.2, proportional, 0.4, label="share of windows", **style)
     largest = np.maximum(p, proportional)
     for i, count in enumerate(counts):
         text = f"{p[i]:.3f}; {count:,} windows"
-        place_of = (float(largest[i]), i)
-        axes.annotate(text, place_of, (4, 0), textcoords="offset points", va="center", fontsize=7, color=GREY)
-    axes.set_yticks(place, [_short(mixture.names[i]) for i in order], fontsize=9 if few else 7)
+        end = (float(largest[i]), i)
+        axes.annotate(text, end, (4, 0), textcoords="offset points", va="center", fontsize=7, color=GREY)
+    axes.set_yticks(row, [_short(mixture.names[i]) for i in order], fontsize=9 if few else 7)
     axes.set_ylim(len(order) - 0.4, -0.6)
     axes.set_xlim(0, 1.45 * largest.max())
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= min(1.0, 1.45 * largest.max())])

@@ -87,9 +87,9 @@ class Deal:
         sizes = np.maximum(0, windows - units[:, 1] + parts - 1) // parts
         units, sizes = units[sizes > 0], sizes[sizes > 0]
         order = np.argsort(-sizes, kind="stable")  # the largest first, in alternating direction: equal sums
-        turn, place = np.divmod(np.arange(len(units)), readers)
+        turn, reader = np.divmod(np.arange(len(units)), readers)
         owner = np.empty(len(units), np.int64)
-        owner[order] = np.where(turn % 2, readers - 1 - place, place)
+        owner[order] = np.where(turn % 2, readers - 1 - reader, reader)
         return cls(units, sizes, owner, parts)
 
     def of_reader(self, reader: int) -> tuple[Ints, Ints]:
@@ -120,7 +120,7 @@ class Stream:
 
     def take(self, start: int, count: int) -> dict[str, NDArray[Any]]:
         """Return windows start to start + count of the sequence: those of `Rows.cut`, and camera (n,)."""
-        parts = []
+        cuts = []
         while count:
             epoch, offset = divmod(start, self.length)
             order, ends = self._rounds(epoch)
@@ -131,11 +131,11 @@ class Stream:
             chosen = slice(inside, inside + some)
             last = None if self._last is None else self._last[chosen]
             cut = rows.cut(self._first[chosen], last, self._decoder.index)
-            parts.append(cut | {"camera": self._camera[chosen]})
+            cuts.append(cut | {"camera": self._camera[chosen]})
             start, count = start + some, count - some
-        if len(parts) == 1:
-            return parts[0]
-        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        if len(cuts) == 1:
+            return cuts[0]
+        return {key: np.concatenate([cut[key] for cut in cuts]) for key in cuts[0]}
 
     def _rounds(self, epoch: int) -> tuple[Ints, Ints]:
         """Return the order of the units in an epoch, and the number of windows up to the end of each pool."""
