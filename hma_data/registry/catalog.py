@@ -113,7 +113,7 @@ def _entry(path: Path, cache: "_Cache") -> Entry:
     try:
         found = cache.judgement(read_bytes(path), path)
     except HMAError as fault:
-        return Entry(path, None, (_plain("", fault.fault),), None)
+        found = _unreadable(fault)
     return Entry(path, found["facts"], tuple(found["problems"]), found["name"])
 
 
@@ -123,7 +123,7 @@ def _judge(content: bytes, path: Path) -> dict[str, Any]:
     try:
         values = parse_yaml(decode_yaml(content, path), path.name)
     except HMAError as fault:
-        return {"facts": None, "problems": [_plain("", fault.fault)], "name": None}
+        return _unreadable(fault)
     faults = find_problems(values)
     name = values.get("id") if isinstance(values, dict) else None
     return {
@@ -161,32 +161,31 @@ def facts(embodiment: Any) -> dict[str, Any]:
     }
 
 
-def _plain(path: str, fault: str, value: str | None = None) -> dict[str, str | None]:
-    return {"path": path, "fault": fault, "value": value, "allowed": None}
+def _unreadable(fault: HMAError) -> dict[str, Any]:
+    problem = {"path": "", "fault": fault.fault, "value": None, "allowed": None}
+    return {"facts": None, "problems": [problem], "name": None}
 
 
-def _with(entry: Entry, problem: dict[str, str | None]) -> Entry:
+def _with(entry: Entry, fault: str) -> Entry:
+    problem = {"path": "id", "fault": fault, "value": repr(entry.name), "allowed": None}
     return Entry(entry.path, None, (*entry.problems, problem), entry.name)
 
 
 def _doubles(found: list[Entry]) -> list[Entry]:
     """Add a problem to every file whose id an earlier file has."""
-    first: dict[str, Path] = {}
-    result = []
-    for entry in found:
-        owner = first.setdefault(entry.name, entry.path) if entry.name is not None else entry.path
+    owners: dict[str, Path] = {}
+    for i, entry in enumerate(found):
+        owner = entry.path if entry.name is None else owners.setdefault(entry.name, entry.path)
         if owner != entry.path:
-            entry = _with(entry, _plain("id", f"is also the id of {owner}", repr(entry.name)))
-        result.append(entry)
-    return result
+            found[i] = _with(entry, f"is also the id of {owner}")
+    return found
 
 
 def _misnamed(entry: Entry) -> Entry:
     """Add a problem to a file of a registry folder whose name is not its id."""
     if entry.facts is None or file_id(entry.path) == entry.name:
         return entry
-    fault = f"does not find its file {entry.path.name}: file name and id must be the same"
-    return _with(entry, _plain("id", fault, repr(entry.name)))
+    return _with(entry, f"does not find its file {entry.path.name}: file name and id must be the same")
 
 
 class _Cache:

@@ -5,13 +5,7 @@ They are frozen and validated when made; `hma_data.registry.embodiment` puts the
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from hma_data.registry.catalog import FORMATS, MORE, known_formats

@@ -253,8 +253,7 @@ class Rollout:
                 values = values if following is None else self._chunk(following)
             new.chunks[:, 0], new.known[:, 0] = values, True
         self.given = ActionConditioning(
-            torch.cat([self.given.chunks, new.chunks], 1),
-            torch.cat([self.given.known, new.known], 1),
+            torch.cat([self.given.chunks, new.chunks], 1), torch.cat([self.given.known, new.known], 1)
         )
 
     def _chunk(self, chunk: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import ShardError, UsageError
 from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset
-from hma_data.loading.mixture import probabilities
+from hma_data.loading.mixture import Mixture
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
@@ -232,4 +232,4 @@ def test_windows_of_an_episode_longer_than_a_row_group_are_whole(tmp_path: Path)
 def test_each_split_has_the_papers_temperature(sets: list[Path], split: str, temperature: float) -> None:
     mixture = MixtureDataset(sets, 4, 1, split=split).mixture
     assert mixture.counts[0] != mixture.counts[1]
-    np.testing.assert_allclose(mixture.p, probabilities(mixture.counts, temperature))
+    np.testing.assert_allclose(mixture.p, Mixture.of(dict(zip("abcdefgh", mixture.counts)), temperature).p)
