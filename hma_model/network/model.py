@@ -56,13 +56,13 @@ class HMA(nn.Module):
     @property
     def token_readout(self) -> TokenReadout:
         """Return the readout of a discrete model."""
-        assert isinstance(self.readout, TokenReadout), f"the model is {self.config.kind}, not discrete"
+        assert isinstance(self.readout, TokenReadout)
         return self.readout
 
     @property
     def latent_readout(self) -> LatentReadout:
         """Return the readout of a continuous model."""
-        assert isinstance(self.readout, LatentReadout), f"the model is {self.config.kind}, not continuous"
+        assert isinstance(self.readout, LatentReadout)
         return self.readout
 
     # -- embodiments ------------------------------------------------------------------------------------
@@ -200,6 +200,7 @@ class HMA(nn.Module):
         Returns:
             (B, T, h, w, F, V) float32, low digit first.
         """
+        self._require("discrete", "video_logits")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
         conditioning = self._condition(actions, action_mask, groups, times)
         x = self.embed_tokens(groups.sort(tokens.flatten(2)))
@@ -224,6 +225,7 @@ class HMA(nn.Module):
         Returns:
             (B, T, H/p, W/p, D).
         """
+        self._require("continuous", "video_conditions")
         groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
         conditioning = self._condition(actions, action_mask, groups, times)
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
@@ -350,12 +352,12 @@ class HMA(nn.Module):
 
     def embed_tokens(self, tokens: Tensor) -> Tensor:
         """Embed ids (B, T, S) as (B, T, S, D)."""
-        assert isinstance(self.trunk.embed, TokenEmbedding), f"the model is {self.config.kind}"
+        assert isinstance(self.trunk.embed, TokenEmbedding)
         return self.trunk.embed(tokens)
 
     def embed_patches(self, patches: Tensor, masked: Tensor) -> Tensor:
         """Embed scaled patches (B, T, S, c*p*p) with masks of pixels (B, T, S, p*p or 1) as (B, T, S, D)."""
-        assert isinstance(self.trunk.embed, LatentEmbedding), f"the model is {self.config.kind}"
+        assert isinstance(self.trunk.embed, LatentEmbedding)
         return self.trunk.embed(patches, masked)
 
     def video_features(self, features: Tensor) -> Tensor:
@@ -370,6 +372,10 @@ class HMA(nn.Module):
         if self.config.absent_action == "tokens":  # the released code takes as many of the last tokens
             return features[:, :, -self.config.action_tokens :].mean(2)
         return features.mean(2)
+
+    def _require(self, kind: str, name: str) -> None:
+        if self.config.kind != kind:
+            raise HMAError(name, f"is of {kind} models; this one is {self.config.kind}")
 
 
 def module_key(embodiment: str) -> str:
