@@ -23,6 +23,7 @@ from hma_data.registry.components import Component, Sync
 from hma_data.registry.embodiment import Embodiment
 
 Moved = tuple[NDArray[np.int64], Floats]
+Timed = tuple[str, Floats, str]  # name, times and method of a stream
 ROUNDING_S = 1e-7  # the error of periods added up over hours; far below any sensor's interval
 
 
@@ -169,7 +170,7 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     """Build the clip of a bag: move every stream onto the grid by the method that the embodiment names."""
     sync, primary = embodiment.sync, embodiment.primary_camera.name
     signals = _signals(episode, embodiment)
-    timed = [(name, stream.timestamps, sync.images) for name, stream in episode.streams.items()]
+    timed: list[Timed] = [(name, stream.timestamps, sync.images) for name, stream in episode.streams.items()]
     timed += [(name, signal.timestamps, method) for name, signal, _, method in signals]
     for name, times, _ in timed:
         _check_times(episode.id, name, times)
@@ -233,12 +234,10 @@ def _moved(
     return values, signal.known[before] & signal.known[after], skew
 
 
-def _grid(
-    episode_id: str, frames: Floats, embodiment: Embodiment, timed: list[tuple[str, Floats, str]]
-) -> tuple[Floats, int]:
+def _grid(episode_id: str, frames: Floats, embodiment: Embodiment, timed: list[Timed]) -> tuple[Floats, int]:
     """Return the target times at which every stream is running, and the number of frames outside them.
 
-    `timed` holds name, times and method of each stream. A held value stays in force after its last sample;
+    A held value stays in force after its last sample;
     every other stream ends with its last sample. The grid may reach `max_skew_ms` (without one, half a
     period) beyond a stream's samples.
     """

@@ -187,8 +187,8 @@ class DiffusionHead(nn.Module):
         share = self.levels.float()[level].unsqueeze(-1)
         signal, spread = share.sqrt(), (1 - share).sqrt()
         predicted = self(signal * target + spread * noise, level, condition)
-        wanted = signal * noise - spread * target if self.velocity else noise
-        return F.mse_loss(predicted, wanted, reduction="none").mean(-1).view(self.repeats, rows).mean(0)
+        goal = signal * noise - spread * target if self.velocity else noise
+        return F.mse_loss(predicted, goal, reduction="none").mean(-1).view(self.repeats, rows).mean(0)
 
     @torch.no_grad()
     def sample(

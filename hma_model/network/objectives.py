@@ -98,10 +98,8 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
             scores = model.token_readout.split(model.token_readout(own.detach()))
             logits = groups.unsort(scores).unflatten(2, config.token_grid)
     loss = torch.zeros((), device=features.device)
-    if video_loss is not None:
-        loss = loss + video_loss
-    if action_loss is not None:
-        loss = loss + config.action_loss_weight * action_loss
+    loss = loss if video_loss is None else loss + video_loss
+    loss = loss if action_loss is None else loss + config.action_loss_weight * action_loss
     masked = video.masked.to(features.device).unflatten(2, config.token_grid)
     return Output(loss, video_loss, action_loss, per_sample.detach(), masked, name, logits)
 
@@ -118,17 +116,16 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
 
 def _frames(model: "HMA", batch: Windows, instead: Tensor | None = None) -> Tensor:
     """Return token ids (B, T, S), or scaled patches (B, T, S, c*p*p), in the batch's order."""
-    config = model.config
-    values = batch.tokens if config.kind == "discrete" else batch.latents
-    values = values if instead is None else instead
+    config, discrete = model.config, model.config.kind == "discrete"
+    values = instead if instead is not None else batch.tokens if discrete else batch.latents
     if values is None:
-        have = "latents" if config.kind == "discrete" else "tokens"
-        raise HMAError("batch", f"has {have} for a {config.kind} model", "use the tokenizer the model is for")
-    shape = config.grid if config.kind == "discrete" else (config.channels, *config.grid)
+        have = "latents" if discrete else "tokens"
+        raise HMAError("batch", f"has {have} for a {config.kind} model", "use the model's tokenizer")
+    shape = config.grid if discrete else (config.channels, *config.grid)
     if tuple(values.shape[2:]) != tuple(shape):
-        fault = f"frames of shape {tuple(values.shape[2:])} where the model takes {tuple(shape)}"
-        raise HMAError("batch", fault, "use the tokenizer the model is for")
-    if config.kind == "discrete":
+        fault = f"frames have the shape {tuple(values.shape[2:])}, but the model takes {tuple(shape)}"
+        raise HMAError("batch", fault, "use the model's tokenizer")
+    if discrete:
         return values.flatten(2).long()
     return patchify(values.float() * config.latent_scale, config.patch)
 
@@ -174,23 +171,23 @@ def _action_loss(
     generator: torch.Generator | None,
 ) -> tuple[Tensor, Tensor]:
     """Return the mean loss over predicted chunks, and each sample's (B,), in the batch's order."""
-    wanted = batch.action_mask.clone()
+    predicted = batch.action_mask.clone()
     if readout.lag or model.config.action_alignment == "current":
-        wanted &= dropped  # a chunk that the model saw is not predicted
+        predicted &= dropped  # a chunk that the model saw is not predicted
     pooled = model.action_features(features)[:, readout.lag :]
-    wanted = wanted[:, : pooled.shape[1]]
-    actions, wanted = groups.sort(batch.actions)[:, : wanted.shape[1]], groups.sort(wanted)
+    predicted = groups.sort(predicted[:, : pooled.shape[1]])
+    chunks = groups.sort(batch.actions)
     losses, samples = [], []
     for name, span in groups.spans():
-        sample, frame = wanted[span].nonzero(as_tuple=True)
+        sample, frame = predicted[span].nonzero(as_tuple=True)
         stem = model.stem(name)
-        target = actions[span, :, : stem.input.in_features][sample, frame]
+        target = chunks[span, :, : stem.input.in_features][sample, frame]
         if model.config.action_target == "normalized":
             target = stem.normalizer(target)
         losses.append(model.head(name).loss(pooled[span][sample, frame], target, readout, generator))
         samples.append(sample + span.start)
     flat = torch.cat(losses)
-    return flat.sum() / max(len(flat), 1), groups.unsort(_means(flat, torch.cat(samples), len(actions)))
+    return flat.sum() / max(len(flat), 1), groups.unsort(_means(flat, torch.cat(samples), len(chunks)))
 
 
 def _means(losses: Tensor, sample: Tensor, batch: int) -> Tensor:
