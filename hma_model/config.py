@@ -181,6 +181,11 @@ class HMAConfig:
         return self.grid[0] // side, self.grid[1] // side
 
     @property
+    def frame_shape(self) -> tuple[int, ...]:
+        """Return the shape of a stored frame: (h, w) of tokens, or (c, H, W) of latents."""
+        return self.grid if self.kind == "discrete" else (self.channels, *self.grid)
+
+    @property
     def tokens_per_frame(self) -> int:
         """Return S, the number of tokens a frame, without action tokens."""
         return math.prod(self.token_grid)

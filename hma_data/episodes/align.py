@@ -237,9 +237,8 @@ def _moved(
 def _grid(episode_id: str, frames: Floats, embodiment: Embodiment, timed: list[Timed]) -> tuple[Floats, int]:
     """Return the target times at which every stream is running, and the number of frames outside them.
 
-    A held value stays in force after its last sample;
-    every other stream ends with its last sample. The grid may reach `max_skew_ms` (without one, half a
-    period) beyond a stream's samples.
+    A held value stays in force after its last sample; every other stream ends with its last sample. The grid
+    may reach `max_skew_ms` (without one, half a period) beyond a stream's samples.
     """
     sync = embodiment.sync
     close = rounding(*(times for _, times, _ in timed))

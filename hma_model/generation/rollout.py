@@ -25,7 +25,7 @@ from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame
 from hma_model.network.conditioning import ActionConditioning, Groups, condition, no_chunks
-from hma_model.network.embed import patchify, unpatchify
+from hma_model.network.embed import unpatchify
 from hma_model.network.masking import masked_after
 from hma_model.network.model import HMA
 from hma_model.network.trunk import (
@@ -135,14 +135,9 @@ class Rollout:
             actions: (B, P - 1 or more, K) raw; chunk k holds the commands from frame k to k+1. Later chunks
                 are not used. None for no actions.
         """
-        self._check_prompt(frames)
-        if self.config.kind == "discrete":
-            values = frames.flatten(2).long()
-        else:
-            values = patchify(frames.float() * self.config.latent_scale, self.config.patch)
-        count = frames.shape[1]
-        self.frames = self.groups.sort(values.to(self.model.device))
-        self.given = self._condition_on(actions, count)
+        values = self.model.frame_values(frames).to(self.model.device)
+        self.frames = self.groups.sort(values)
+        self.given = self._condition_on(actions, frames.shape[1])
         self.passive = actions is None
         self.begun, self.cache = False, None
         self._keep(self.config.frames)
@@ -299,14 +294,6 @@ class Rollout:
             return values.unflatten(1, self.config.token_grid)
         latents = unpatchify(values.unsqueeze(1), self.config.patch, self.config.token_grid)
         return latents.squeeze(1) / self.config.latent_scale
-
-    def _check_prompt(self, frames: Tensor) -> None:
-        config = self.config
-        shape = config.grid if config.kind == "discrete" else (config.channels, *config.grid)
-        if (frames.shape[0], *frames.shape[2:]) != (self.batch, *shape) or frames.shape[1] < 1:
-            fault = f"frames have the shape {tuple(frames.shape)}"
-            allowed = f"({self.batch}, at least 1, {', '.join(map(str, shape))})"
-            raise HMAError("prompt", fault, f"give {allowed}")
 
 
 def _compiled(trunk: Trunk) -> Callable[..., Tensor]:

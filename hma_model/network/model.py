@@ -272,11 +272,11 @@ class HMA(nn.Module):
         elif self.config.absent_action != "tokens":
             given = unknown(self, groups, count)
         conditioning = condition(self, given, groups, times.positions)
-        if frames.is_floating_point():
-            patches = patchify(frames.float() * self.config.latent_scale, self.config.patch)
-            x = self.embed_patches(groups.sort(patches), torch.zeros_like(patches[..., :1], dtype=torch.bool))
+        values = groups.sort(self.frame_values(frames))
+        if self.config.kind == "discrete":
+            x = self.embed_tokens(values)
         else:
-            x = self.embed_tokens(groups.sort(frames.flatten(2)))
+            x = self.embed_patches(values, torch.zeros_like(values[..., :1], dtype=torch.bool))
         pooled = self.action_features(self.trunk(x, conditioning, times))
         chunks = [
             self._predict(part, name, READOUTS[readout], generator)
@@ -349,6 +349,23 @@ class HMA(nn.Module):
             fault = f"{frames} frames where the learned positions end at {self.config.frames}"
             raise HMAError("window", fault, "give a shorter window")
         return window_times(self.config, frames, self.device)
+
+    def frame_values(self, frames: Tensor) -> Tensor:
+        """Return the token ids (B, T, S), or the scaled patches (B, T, S, c*p*p), of stored frames.
+
+        Args:
+            frames: tokens (B, T, h, w) int64, or latents (B, T, c, H, W).
+
+        Raises:
+            HMAError: the frames have another shape.
+        """
+        config, shape = self.config, tuple(frames.shape[2:])
+        if shape != config.frame_shape:
+            fault = f"a frame has the shape {shape}, but the model takes {config.frame_shape}"
+            raise HMAError("frames", fault, "use the model's tokenizer")
+        if config.kind == "discrete":
+            return frames.flatten(2).long()
+        return patchify(frames.float() * config.latent_scale, config.patch)
 
     def embed_tokens(self, tokens: Tensor) -> Tensor:
         """Embed ids (B, T, S) as (B, T, S, D)."""

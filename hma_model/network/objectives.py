@@ -14,7 +14,7 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition
-from hma_model.network.embed import patchify, to_digits
+from hma_model.network.embed import to_digits
 from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks, uniform
 
 if TYPE_CHECKING:
@@ -61,11 +61,14 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     if name not in OBJECTIVES:
         raise HMAError("objective", f"{name!r} is unknown", "give one of " + ", ".join(OBJECTIVES))
     chosen = OBJECTIVES[name]
-    frames, count, size = _frames(model, batch), batch.actions.shape[1], len(batch.actions)
+    stored = batch.tokens if config.kind == "discrete" else batch.latents
+    if stored is None:
+        raise HMAError("batch", f"has no frames for a {config.kind} model", "use the model's tokenizer")
+    frames, count, size = model.frame_values(stored), batch.actions.shape[1], len(batch.actions)
     groups, times = Groups.of(batch.embodiment, size), model.time_positions(count)
 
-    own = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
-    seen = frames if own is None else _frames(model, batch, own)
+    context = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
+    seen = frames if context is None else model.frame_values(context)
     video = draw_video_mask(config, size, count, generator)
     inside = getattr(batch, "frame_mask", None)
     if inside is not None:  # padding of a short episode has no loss
@@ -112,22 +115,6 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
     limits = torch.tensor(weights, dtype=torch.float64).cumsum(0)
     index = int((uniform((1,), generator).double() * limits[-1] >= limits).sum())
     return names[min(index, len(names) - 1)]
-
-
-def _frames(model: "HMA", batch: Windows, instead: Tensor | None = None) -> Tensor:
-    """Return token ids (B, T, S), or scaled patches (B, T, S, c*p*p), in the batch's order."""
-    config, discrete = model.config, model.config.kind == "discrete"
-    values = instead if instead is not None else batch.tokens if discrete else batch.latents
-    if values is None:
-        have = "latents" if discrete else "tokens"
-        raise HMAError("batch", f"has {have} for a {config.kind} model", "use the model's tokenizer")
-    shape = config.grid if discrete else (config.channels, *config.grid)
-    if tuple(values.shape[2:]) != tuple(shape):
-        fault = f"frames have the shape {tuple(values.shape[2:])}, but the model takes {tuple(shape)}"
-        raise HMAError("batch", fault, "use the model's tokenizer")
-    if discrete:
-        return values.flatten(2).long()
-    return patchify(values.float() * config.latent_scale, config.patch)
 
 
 def _embed(

@@ -207,5 +207,5 @@ def test_too_few_actions_are_refused() -> None:
 
 
 def test_a_prompt_of_another_shape_is_refused() -> None:
-    with pytest.raises(HMAError, match="prompt"):
+    with pytest.raises(HMAError, match="a frame has the shape"):
         small_model().generate(torch.zeros(1, 2, 4, 3, dtype=torch.long), None, ARM.id, 1)
