@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 
 from hma_data.errors import HMAError, ShardError, UsageError
 from hma_data.loading.mixture import TEMPERATURES, Draw, Mixture
-from hma_data.loading.pools import Deal, Stream, pool_size
+from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
 from hma_data.loading.rows import MIB, Batch, Decoder, as_batch, assemble
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints, Short
@@ -208,8 +208,8 @@ class MixtureDataset(IterableDataset[Batch]):
             seed=seed,
         )
         self._pools = [pool or pool_size(d, share * 4 / 5 / lanes) for d in self._decoders.values()]
-        self._deals: dict[int, Deal] = {}
-        self._streams: dict[tuple[int, int], Stream] = {}
+        self._assignments: dict[int, UnitAssignment] = {}
+        self._sequences: dict[tuple[int, int], WindowSequence] = {}
         self._step = 0
         self._origin: int | None = None  # in a DataLoader worker: the step that worker 0 began with
         self._taken: Ints = np.zeros((lanes, len(counts)), np.int64)
@@ -271,23 +271,23 @@ class MixtureDataset(IterableDataset[Batch]):
         order = np.argsort(draws, kind="stable")
         for samples in np.split(order, np.flatnonzero(np.diff(draws[order])) + 1):
             which = int(draws[samples[0]])
-            stream = self._stream(lane, which)
-            windows_of[names[which]] = (samples, stream.take(int(taken[which]), len(samples)))
+            sequence = self._sequence(lane, which)
+            windows_of[names[which]] = (samples, sequence.take(int(taken[which]), len(samples)))
         return assemble(self.sets, [names[i] for i in draws], windows_of, self._short)
 
-    def _stream(self, lane: int, which: int) -> Stream:
-        if (lane, which) not in self._streams:
+    def _sequence(self, lane: int, which: int) -> WindowSequence:
+        if (lane, which) not in self._sequences:
             decoder = self._decoders[self.mixture.names[which]]
-            if which not in self._deals:
-                self._deals[which] = Deal.of(decoder.index, self.world * self.lanes)
+            if which not in self._assignments:
+                self._assignments[which] = UnitAssignment.of(decoder.index, self.world * self.lanes)
             reader = self.rank * self.lanes + lane
-            self._streams[lane, which] = Stream(
-                decoder, self._deals[which], self.seed, reader, self._pools[which]
+            self._sequences[lane, which] = WindowSequence(
+                decoder, self._assignments[which], self.seed, reader, self._pools[which]
             )
-        return self._streams[lane, which]
+        return self._sequences[lane, which]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_streams": {}, "_deals": {}}  # a worker makes these anew
+        return {**self.__dict__, "_sequences": {}, "_assignments": {}}  # a worker makes these anew
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position of the stream after the last batch taken, as plain values of a few kB."""

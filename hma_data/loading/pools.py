@@ -57,7 +57,7 @@ def spread(rows: Ints, span: int, rng: np.random.Generator) -> tuple[Ints, int]:
 
 
 @dataclass(frozen=True)
-class Deal:
+class UnitAssignment:
     """The assignment of units to readers.
 
     A unit is (row group, part); a part has every `parts`-th window of the group.
@@ -75,7 +75,7 @@ class Deal:
     parts: int
 
     @classmethod
-    def of(cls, index: WindowIndex, readers: int) -> "Deal":
+    def of(cls, index: WindowIndex, readers: int) -> "UnitAssignment":
         """Give every window to one reader; with fewer windows than readers, give all to every reader."""
         groups = index.units()
         if index.count < readers:
@@ -98,21 +98,23 @@ class Deal:
         return self.units[mine], self.sizes[mine]
 
 
-class Stream:
+class WindowSequence:
     """The sequence of windows of one reader.
 
     Args:
         decoder: of the shard set.
-        deal: which reader reads which units.
+        assignment: which reader reads which units.
         seed: of the order.
         reader: number of this reader.
         pool: row groups decoded together.
     """
 
-    def __init__(self, decoder: Decoder, deal: Deal, seed: int, reader: int, pool: int) -> None:
-        self._decoder, self._pool, self._parts = decoder, pool, deal.parts
+    def __init__(
+        self, decoder: Decoder, assignment: UnitAssignment, seed: int, reader: int, pool: int
+    ) -> None:
+        self._decoder, self._pool, self._parts = decoder, pool, assignment.parts
         self._entropy = [seed, zlib.crc32(decoder.shards.embodiment.id.encode()), reader]
-        self._units, self._sizes = deal.of_reader(reader)
+        self._units, self._sizes = assignment.of_reader(reader)
         self.length = int(self._sizes.sum())
         self._epoch: tuple[int, Ints, Ints] | None = None
         self._at: tuple[int, int] | None = None

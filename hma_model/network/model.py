@@ -82,9 +82,7 @@ class HMA(nn.Module):
         if known is not None:
             if known.agrees_with(space):
                 return
-            fault = (
-                f"the model has it with {known.action_dim} dims, stride {known.stride}, or other statistics"
-            )
+            fault = f"has {known.action_dim} dims, stride {known.stride}, or other statistics in the model"
             raise CheckpointError(space.id, fault, "use another id, or the statistics it was trained with")
         like = self.trunk.position
         self.stems[module_key(space.id)] = Stem(self.config, space).to(like.device, like.dtype)

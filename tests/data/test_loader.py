@@ -76,12 +76,12 @@ def test_every_window_is_its_rows_and_stays_in_its_episode(sets: list[Path]) -> 
 def test_one_epoch_of_a_mixture_is_every_window_once(sets: list[Path]) -> None:
     data = MixtureDataset(sets[:1], batch_size=1, frames=FRAMES, lanes=3, pool=2)
     count = data.mixture.counts[0]
-    lengths = [data._stream(lane, 0).length for lane in range(3)]
+    lengths = [data._sequence(lane, 0).length for lane in range(3)]
     assert sum(lengths) == count
     seen = [
         (int(e), int(f))
         for lane, length in enumerate(lengths)
-        for cut in [data._stream(lane, 0).take(0, length)]
+        for cut in [data._sequence(lane, 0).take(0, length)]
         for e, f in zip(cut["episode"], cut["frame"], strict=True)
     ]
     assert len(set(seen)) == len(seen) == count
@@ -102,7 +102,7 @@ def test_ranks_see_disjoint_windows(sets: list[Path]) -> None:
     seen = []
     for rank in (0, 1):
         data = MixtureDataset(sets[:1], 2, FRAMES, rank=rank, world=2, lanes=2)
-        streams = [data._stream(lane, 0) for lane in range(2)]
+        streams = [data._sequence(lane, 0) for lane in range(2)]
         cuts = [stream.take(0, stream.length) for stream in streams]
         seen.append(
             {(int(e), int(f)) for cut in cuts for e, f in zip(cut["episode"], cut["frame"], strict=True)}
