@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from hma_data.console import print_json, print_table
-from hma_data.registry.catalog import FORMATS
+from hma_data.registry import FORMATS
 
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]

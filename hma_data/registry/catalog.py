@@ -1,11 +1,8 @@
-"""List the recording formats and every embodiment of the registry, fast enough for ten thousand of them.
+"""List every embodiment of the registry, fast enough for ten thousand of them.
 
 Each file is read and hashed. A cache keeps the facts and problems found in a file of those bytes, so each
 YAML is parsed and validated only once. The key of an entry is a hash of the bytes and of the code that
 judged them, never a time stamp; an entry cannot be out of date.
-
-`FORMATS` is the one list of formats that registry and sources use. A format that an installed package adds is
-known too.
 """
 
 import hashlib
@@ -19,25 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HMAError, RegistryError
-from hma_data.plugins import SOURCE_GROUP, installed
+from hma_data.registry import FORMATS
 from hma_data.storage.files import cache_folder, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.shipped import shipped
 from hma_data.storage.yaml_io import decode_yaml, parse_yaml, read_bytes
-
-FORMATS = {  # name -> package: RECOGNITION in it, open() in its module `source`; asked in this order
-    "rlds": "hma_data.sources.rlds",
-    "rosbag": "hma_data.sources.bags",
-    "hdf5": "hma_data.sources.hdf5",
-    "lerobot": "hma_data.sources.lerobot",
-    "hands": "hma_data.sources.hands",
-}
-MORE = f"an installed package may add formats by entry points of {SOURCE_GROUP}"
-
-
-def known_formats() -> list[str]:
-    """Return the built-in formats, then those of installed packages."""
-    return [*FORMATS, *(name for name in installed(SOURCE_GROUP) if name not in FORMATS)]
 
 
 def registry_folders(beside: StrPath | None = None) -> list[Path]:
@@ -189,12 +172,12 @@ def _misnamed(entry: Entry) -> Entry:
 
 
 class _Cache:
-    """The judgements of YAML files by the hash of their bytes, in one JSON file per version of this room."""
+    """The judgements of YAML files by the hash of their bytes, in one JSON file per version of the code."""
 
     def __init__(self) -> None:
         code = hashlib.blake2b(f"{version('pydantic')} {version('pyyaml')}".encode(), digest_size=12)
-        for module in ("catalog", "components", "embodiment"):
-            code.update(Path(__file__).with_name(f"{module}.py").read_bytes())
+        for module in ("__init__", "catalog", "components", "embodiment", "../storage/yaml_io"):
+            code.update((Path(__file__).parent / f"{module}.py").read_bytes())
         self._path = cache_folder() / f"registry-{code.hexdigest()}.json"
         self._kept: dict[str, dict[str, Any]] = {}
         self._new = False

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from hma_data.registry.catalog import FORMATS, MORE, known_formats
+from hma_data.registry import FORMATS, MORE, known_formats
 
 Space = Literal[
     "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Episode
 from hma_data.errors import EpisodeError, PluginError, SourceError
 from hma_data.plugins import SOURCE_GROUP, installed
-from hma_data.registry.catalog import FORMATS, MORE, known_formats
+from hma_data.registry import FORMATS, MORE, known_formats
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.common.findings import Finding
