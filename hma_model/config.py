@@ -1,7 +1,13 @@
-"""Define the network's configuration and the action space of each embodiment.
+"""Define the network's configuration, the training objectives and the action space of each embodiment.
 
 `HMAConfig` describes everything that the embodiments share. `ActionSpace` describes one embodiment as far as
 the network depends on it. Both are validated when made. `HMAConfig` converts to JSON and back without loss.
+
+`OBJECTIVES` states what each objective predicts, from what, and what it hides (paper section 3). forward:
+predict masked video from past video and actions. passive: the same without actions. policy: predict the
+chunk to command from each frame on. inverse: predict the chunk that led from one frame to the next. full:
+video and policy together. A new objective is a row of the table; all other code asks a row's attributes.
+This module is free of torch; `hma_model.network.objectives` computes the losses.
 """
 
 import dataclasses
@@ -9,12 +15,63 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from hma_data.errors import RecipeError
-from hma_model.objective import OBJECTIVES as OBJECTIVES
+
+if TYPE_CHECKING:
+    from hma_data.registry.embodiment import Embodiment
+
+
+@dataclass(frozen=True)
+class Readout:
+    """A readout of action chunks from the frames.
+
+    Attributes:
+        name: the layer of `ActionHead` that reads.
+        lag: chunk k is read from frame k + lag.
+    """
+
+    name: str
+    lag: int
+
+
+@dataclass(frozen=True)
+class Objective:
+    """One training objective.
+
+    Frames and chunks that are not hidden are inputs. Every objective corrupts the visible tokens in the same
+    way (`HMAConfig.corrupt_max`), so corruption is no attribute.
+
+    Attributes:
+        name: its name in recipes, configurations and metrics.
+        predicts_video: whether tokens of the frames after the first are hidden and predicted.
+        sees_actions: whether the trunk is conditioned on the chunks that are not hidden.
+        readout: the readout that predicts hidden chunks; None if no chunk is hidden or predicted.
+    """
+
+    name: str
+    predicts_video: bool
+    sees_actions: bool
+    readout: Readout | None
+
+
+POLICY = Readout("policy", lag=0)  # the chunk to command from the frame on
+INVERSE = Readout("inverse", lag=1)  # the chunk that led to the frame
+READOUTS: Mapping[str, Readout] = {readout.name: readout for readout in (POLICY, INVERSE)}
+
+OBJECTIVES: Mapping[str, Objective] = {
+    objective.name: objective
+    for objective in (
+        Objective("forward", predicts_video=True, sees_actions=True, readout=None),
+        Objective("passive", predicts_video=True, sees_actions=False, readout=None),
+        Objective("policy", predicts_video=False, sees_actions=True, readout=POLICY),
+        Objective("full", predicts_video=True, sees_actions=True, readout=POLICY),
+        Objective("inverse", predicts_video=False, sees_actions=True, readout=INVERSE),
+    )
+}
 
 CONDITIONINGS = ("modulation", "concat", "add", "cross_attention")
 _CHOICES = {
@@ -51,10 +108,7 @@ class HMAConfig:
     heads: int = 8
     mlp_ratio: float = 4.0
     frames: int = 12  # T, the window; in a longer rollout, temporal attention sees this many frames
-    grid: tuple[int, int] = (
-        16,
-        16,
-    )  # the tokenizer's (h, w); the continuous model's tokens are patches of it
+    grid: tuple[int, int] = (16, 16)  # the tokenizer's (h, w); a continuous model's tokens are patches of it
     dropout: float = 0.0  # in the MLPs
 
     factored: tuple[int, ...] = (512, 512)  # discrete: values a digit, low digit first
@@ -86,17 +140,15 @@ class HMAConfig:
     mup: bool = False  # attention scale 8 / head_dim, and a readout scaled down as the width grows
     base_width: int = 256  # the width at which muP's multipliers are one
 
-    objectives: Mapping[str, float] = field(
-        default_factory=lambda: {"forward": 1.0}
-    )  # how often each is drawn
+    # How often each objective is drawn.
+    objectives: Mapping[str, float] = field(default_factory=lambda: {"forward": 1.0})
     action_loss: str = "mse"
     action_target: str = "normalized"  # "raw": the released action heads were trained on raw actions
     action_loss_weight: float = 0.5  # relative to the video loss
     label_smoothing: float = 0.01
     corrupt_max: float = 0.2  # discrete: a sample's share of digits replaced at random is U(0, this)
-    history_probability: float = (
-        0.2  # share of samples whose longer history stays unmasked, with later frames corrupted more
-    )
+    # The share of samples whose longer history stays unmasked, with later frames corrupted more.
+    history_probability: float = 0.2
     history_frames: int = 4  # the shortest such history
     mask_ratio_min: float = 0.0  # a masked frame's smallest mask probability
 
@@ -112,14 +164,12 @@ class HMAConfig:
     tokenizer: Mapping[str, Any] = field(default_factory=dict)  # the tokenizer's spec, kept for checkpoints
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "grid", tuple(self.grid))
-        object.__setattr__(self, "factored", tuple(self.factored))
-        conditioning = self.conditioning
-        if isinstance(conditioning, str):
-            conditioning = tuple(conditioning.split("+"))
-        object.__setattr__(self, "conditioning", tuple(conditioning))
-        object.__setattr__(self, "objectives", dict(self.objectives))
-        object.__setattr__(self, "tokenizer", dict(self.tokenizer))
+        if isinstance(self.conditioning, str):
+            object.__setattr__(self, "conditioning", self.conditioning.split("+"))
+        for name in ("grid", "factored", "conditioning"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name in ("objectives", "tokenizer"):
+            object.__setattr__(self, name, dict(getattr(self, name)))
         _check_scalars(self)
         _check_shapes(self)
         _check_sets(self)
@@ -129,6 +179,11 @@ class HMAConfig:
         """Return (h, w), the grid of the tokens that the trunk sees in a frame."""
         side = self.patch if self.kind == "continuous" else 1
         return self.grid[0] // side, self.grid[1] // side
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        """Return the shape of a stored frame: (h, w) of tokens, or (c, H, W) of latents."""
+        return self.grid if self.kind == "discrete" else (self.channels, *self.grid)
 
     @property
     def tokens_per_frame(self) -> int:
@@ -180,9 +235,7 @@ class HMAConfig:
         unknown = sorted(set(values) - {f.name for f in dataclasses.fields(cls)})
         if unknown:
             names = ", ".join(f.name for f in dataclasses.fields(cls))
-            raise RecipeError(
-                f"{where}.{unknown[0]}", "is not a field of the model", f"the fields are {names}"
-            )
+            raise RecipeError(f"{where}.{unknown[0]}", "is not a field of the model", f"choose from {names}")
         return cls(**values)
 
 
@@ -236,24 +289,6 @@ def _check_sets(config: HMAConfig) -> None:
         raise _refuse("modulation_out", "embodiment", "trunk, as shared_modulation is on")
 
 
-class _Embodiment(Protocol):
-    @property
-    def id(self) -> str: ...
-    @property
-    def action_dim(self) -> int: ...
-    @property
-    def stride(self) -> int: ...
-    @property
-    def normalize_mask(self) -> Any: ...
-
-
-class _Stats(Protocol):
-    @property
-    def mean(self) -> Any: ...
-    @property
-    def std(self) -> Any: ...
-
-
 @dataclass(frozen=True)
 class ActionSpace:
     """The action space of an embodiment, and the statistics of its actions.
@@ -280,16 +315,10 @@ class ActionSpace:
     zero_variance: str = "zero"
 
     def __post_init__(self) -> None:
-        if self.action_dim < 1 or self.stride < 1:
-            raise RecipeError(
-                self.id, f"action_dim {self.action_dim} and stride {self.stride} must be at least 1"
-            )
         for name in ("mean", "std", "normalize"):
             if len(getattr(self, name)) != self.action_dim:
                 fault = f"{name} has {len(getattr(self, name))} values where the action has {self.action_dim}"
                 raise RecipeError(self.id, fault, "recompute the statistics of this embodiment")
-        if self.zero_variance not in ("zero", "divide"):
-            raise RecipeError(self.id, f"zero_variance is {self.zero_variance!r}", "give zero or divide")
         if not all(map(math.isfinite, (*self.mean, *self.std))) or min(self.std) < 0:
             raise RecipeError(self.id, "action statistics are not finite", "recompute them on clean data")
 
@@ -301,18 +330,20 @@ class ActionSpace:
     def agrees_with(self, other: "ActionSpace") -> bool:
         """Check whether two spaces are equal, up to the rounding of statistics to float32 in a stem."""
         sizes = ("id", "action_dim", "stride", "normalize", "zero_variance")
-        return all(getattr(self, name) == getattr(other, name) for name in sizes) and all(
-            np.allclose(getattr(self, name), getattr(other, name), rtol=1e-6, atol=1e-30)
-            for name in ("mean", "std")
+        return all(getattr(self, name) == getattr(other, name) for name in sizes) and np.allclose(
+            [self.mean, self.std], [other.mean, other.std], rtol=1e-6, atol=1e-30
         )
 
     @classmethod
-    def of(cls, embodiment: _Embodiment, stats: _Stats | None = None) -> Self:
-        """Make one from a registry embodiment and its statistics; without them actions pass unchanged."""
+    def of(cls, embodiment: "Embodiment", stats: Any = None) -> Self:
+        """Return the action space of a registry embodiment.
+
+        Args:
+            stats: its `Stats`, with mean and std (A,); without them actions pass unchanged.
+        """
         dims = embodiment.action_dim
-        mean = np.zeros(dims) if stats is None else np.asarray(stats.mean, dtype=np.float64)
-        std = np.ones(dims) if stats is None else np.asarray(stats.std, dtype=np.float64)
-        mask = np.asarray(embodiment.normalize_mask, dtype=bool)
-        center, spread, normalize = (tuple(array.tolist()) for array in (mean, std, mask))
+        mean = [0.0] * dims if stats is None else np.asarray(stats.mean, np.float64).tolist()
+        std = [1.0] * dims if stats is None else np.asarray(stats.std, np.float64).tolist()
+        normalize = np.asarray(embodiment.normalize_mask, bool).tolist()
         rule = getattr(stats, "zero_variance", "zero")
-        return cls(embodiment.id, dims, embodiment.stride, center, spread, normalize, rule)
+        return cls(embodiment.id, dims, embodiment.stride, tuple(mean), tuple(std), tuple(normalize), rule)

@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from hma_data.console import print_json, print_table
-from hma_data.registry.formats import FORMATS
+from hma_data.registry import FORMATS
 
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
 Json = Annotated[bool, Option("--json", help="Print JSON.")]

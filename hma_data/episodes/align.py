@@ -19,19 +19,20 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Clip, Episode, Floats, Known, Signal
 from hma_data.episodes.rotations import between
 from hma_data.errors import AlignmentError, EpisodeError
-from hma_data.registry.components import Component, Sync, Vector
+from hma_data.registry.components import Component, Sync
 from hma_data.registry.embodiment import Embodiment
 
 Moved = tuple[NDArray[np.int64], Floats]
+Timed = tuple[str, Floats, str]  # name, times and method of a stream
 ROUNDING_S = 1e-7  # the error of periods added up over hours; far below any sensor's interval
 
 
-def rounding(*clocks: Floats) -> float:
+def rounding(*times: Floats) -> float:
     """Return the seconds by which equal times may differ: 100 ns and 4 units in the largest's last place.
 
     A float64 of seconds since 1970 is exact to 0.24 µs, so the result is 1.1 µs for such times.
     """
-    largest = max((float(np.abs(times[[0, -1]]).max()) for times in clocks if len(times)), default=0.0)
+    largest = max((float(np.abs(some[[0, -1]]).max()) for some in times if len(some)), default=0.0)
     return ROUNDING_S + 4 * float(np.spacing(largest))
 
 
@@ -91,7 +92,7 @@ def to_clip(episode: Episode, embodiment: Embodiment) -> Clip:
         raise EpisodeError(episode.id, "has no actions")
     clip = _shared_index(episode, embodiment) if episode.rate_stamped else _aligned(episode, embodiment)
     if clip.action_known is not None and not clip.action_known.any():
-        raise EpisodeError(episode.id, f"not one of its {len(clip)} actions is known: all would be masked")
+        raise EpisodeError(episode.id, f"none of its {len(clip)} actions is known: all would be masked")
     for name, values in (("actions", clip.actions), ("states", clip.states)):
         if values is not None and not np.isfinite(values).all():
             frame = int(np.argwhere(~np.isfinite(values).all(axis=1))[0, 0])
@@ -104,46 +105,37 @@ def to_clip(episode: Episode, embodiment: Embodiment) -> Clip:
 
 def _shared_index(episode: Episode, embodiment: Embodiment) -> Clip:
     """Build the clip of an RLDS, HDF5 or LeRobot episode: frame i, action i and state i belong together."""
-    lengths = [(name, len(stream.timestamps)) for name, stream in episode.streams.items()]
-    lengths += [(name, len(signal.values)) for name, signal, _, _ in _signals(episode, embodiment)]
-    if len({length for _, length in lengths}) != 1:
-        told = ", ".join(f"{name} {length}" for name, length in lengths)
-        raise EpisodeError(episode.id, f"its streams differ in length: {told}")
+    lengths = {name: len(stream.timestamps) for name, stream in episode.streams.items()}
+    lengths |= {name: len(signal.values) for name, signal, _, _ in _signals(episode, embodiment)}
+    if len({*lengths.values()}) != 1:
+        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise EpisodeError(episode.id, f"its streams differ in length: {listed}")
     times = episode.streams[embodiment.primary_camera.name].timestamps
     _check_times(episode.id, embodiment.primary_camera.name, times)
     shift = embodiment.sync.action_shift
     index = np.arange(max(0, -shift), len(times) - max(0, shift))
     if not len(index):
-        raise EpisodeError(episode.id, f"has {len(times)} frames, sync.action_shift is {shift}")
+        raise EpisodeError(episode.id, f"it has {len(times)} frames, but sync.action_shift is {shift}")
     actions, action_known = _join(episode.actions, index + shift)
     states, state_known = _join(episode.states, index) if episode.states else (None, None)
+    skew = {name: np.abs(stream.timestamps - times)[index] * 1e3 for name, stream in episode.streams.items()}
     return Clip(
-        episode=episode,
-        timestamps=times[index] - times[index[0]],
-        actions=actions,
-        states=states,
-        frame_indices=dict.fromkeys(episode.streams, index),
-        skew_ms={
-            name: np.abs(stream.timestamps - times)[index] * 1e3 for name, stream in episode.streams.items()
-        },
-        trimmed=abs(shift),
-        action_known=action_known,
-        state_known=state_known,
-    )
+        episode, times[index] - times[index[0]], actions, states, dict.fromkeys(episode.streams, index),
+        skew, abs(shift), 0, action_known, state_known,
+    )  # fmt: skip
 
 
 def _join(signals: Sequence[Signal], index: NDArray[np.int64]) -> tuple[NDArray[np.float32], Known]:
     values = np.concatenate([signal.values for signal in signals], axis=1)[index]
-    return _masked(values, [signal.known[index] for signal in signals if signal.known is not None])
+    return _masked(values, [None if signal.known is None else signal.known[index] for signal in signals])
 
 
-def _masked(
-    values: NDArray[np.float32], marks: Sequence[NDArray[np.bool_]]
-) -> tuple[NDArray[np.float32], Known]:
+def _masked(values: NDArray[np.float32], marks: Sequence[Known]) -> tuple[NDArray[np.float32], Known]:
     """Return the values with zeros in rows where a mark is False, and the known rows (None without marks)."""
-    if not marks:
+    stated = [mark for mark in marks if mark is not None]
+    if not stated:
         return values, None
-    known: NDArray[np.bool_] = np.logical_and.reduce(list(marks))
+    known: NDArray[np.bool_] = np.logical_and.reduce(stated)
     return np.where(known[:, None], values, np.float32(0)), known
 
 
@@ -156,16 +148,15 @@ def _signals(
     kind (action or state) comes before it. Components of one key share a name.
     """
     sync, taken = embodiment.sync, {*episode.streams}
-    vectors: tuple[tuple[str, tuple[Signal, ...], Vector | None, str], ...] = (
-        ("action", episode.actions, embodiment.action, sync.actions),
-        ("state", episode.states, embodiment.state, sync.states),
-    )
+    states = embodiment.state.components if embodiment.state else ()
     found: list[tuple[str, Signal, tuple[Component, ...], str]] = []
-    for kind, signals, vector, method in vectors:
-        parts = vector.components if vector else ()
-        apart = len(signals) == len(parts)
+    for kind, signals, components, method in (
+        ("action", episode.actions, embodiment.action.components, sync.actions),
+        ("state", episode.states, states, sync.states),
+    ):
+        apart = len(signals) == len(components)
         for i, signal in enumerate(signals):
-            own = parts[i : i + 1] if apart else parts
+            own = components[i : i + 1] if apart else components
             key = own[0].key if apart else kind
             found.append((f"{kind} {key}" if key in taken else key, signal, own, method))
         taken |= {name for name, *_ in found}
@@ -179,53 +170,49 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     """Build the clip of a bag: move every stream onto the grid by the method that the embodiment names."""
     sync, primary = embodiment.sync, embodiment.primary_camera.name
     signals = _signals(episode, embodiment)
-    clocks: list[tuple[str, Floats, str]] = [
-        *((name, stream.timestamps, sync.images) for name, stream in episode.streams.items()),
-        *((name, signal.timestamps, method) for name, signal, _, method in signals),
-    ]
-    for name, times, _ in clocks:
+    timed: list[Timed] = [(name, stream.timestamps, sync.images) for name, stream in episode.streams.items()]
+    timed += [(name, signal.timestamps, method) for name, signal, _, method in signals]
+    for name, times, _ in timed:
         _check_times(episode.id, name, times)
     frames = np.unique(episode.streams[primary].timestamps)
     repeated = len(episode.streams[primary].timestamps) - len(frames)
     if repeated > len(frames):
-        fault = f"{repeated} of {repeated + len(frames)} frames of {primary} bear the stamp of the one before"
+        total = repeated + len(frames)
+        fault = f"{repeated} of {total} frames of {primary} have the same stamp as the frame before"
         raise AlignmentError(episode.id, fault, "try stamp: receive")
-    grid, trimmed = _grid(episode.id, frames, embodiment, clocks)
+    grid, trimmed = _grid(episode.id, frames, embodiment, timed)
 
     skew: dict[str, Floats] = {}
     indices: dict[str, NDArray[np.int64]] = {}
     for name, stream in episode.streams.items():
         indices[name], skew[name] = _INDEX[sync.images](stream.timestamps, grid)
     limit = sync.max_skew_ms and sync.max_skew_ms + 1e3 * rounding(grid, frames)
-    pieces, marks = [], []
-    for name, signal, parts, method in signals:
-        values, known, off = _moved(signal, parts, method, grid)
+    moved, marks = [], []
+    for name, signal, components, method in signals:
+        values, known, off = _moved(signal, components, method, grid)
         skew[name] = np.maximum(skew.get(name, off), off)
         if limit and sync.beyond == "mask":
             near = off <= limit
             known = near if known is None else known & near
-        pieces.append(values)
+        moved.append(values)
         marks.append(known)
-    _check_skew(
-        episode.id, skew if sync.beyond == "refuse" else {k: skew[k] for k in indices}, limit, sync, grid
-    )
-
-    def vector(chosen: slice) -> tuple[NDArray[np.float32], Known]:
-        values = np.concatenate(pieces[chosen], axis=1)
-        return _masked(values, [known for known in marks[chosen] if known is not None])
+    if limit:
+        refusing = skew if sync.beyond == "refuse" else {name: skew[name] for name in indices}
+        _check_skew(episode.id, refusing, limit, sync, grid)
 
     count = len(episode.actions)
-    actions, action_known = vector(slice(None, count))
-    states, state_known = vector(slice(count, None)) if episode.states else (None, None)
-    times = grid - grid[0]
+    actions, action_known = _masked(np.concatenate(moved[:count], axis=1), marks[:count])
+    states, state_known = None, None
+    if episode.states:
+        states, state_known = _masked(np.concatenate(moved[count:], axis=1), marks[count:])
     return Clip(
-        episode, times, actions, states, indices, skew, trimmed,
+        episode, grid - grid[0], actions, states, indices, skew, trimmed,
         0 if sync.rate_hz else repeated, action_known, state_known,
     )  # fmt: skip
 
 
 def _moved(
-    signal: Signal, parts: tuple[Component, ...], method: str, grid: Floats
+    signal: Signal, components: tuple[Component, ...], method: str, grid: Floats
 ) -> tuple[NDArray[np.float32], Known, Floats]:
     """Return the values (T, A) of a signal on the grid, which of them are known (T,), and skew_ms (T,)."""
     if method != "interpolate":
@@ -233,11 +220,11 @@ def _moved(
         return signal.values[index], None if signal.known is None else signal.known[index], skew
     values, skew = interpolate(signal.timestamps, signal.values, grid)
     start = 0
-    for part in parts:
-        span = slice(start, start := start + part.dims)
-        if part.representation:
+    for component in components:
+        span = slice(start, start := start + component.dims)
+        if component.representation:
             values[:, span] = between(
-                signal.timestamps, signal.values[:, span], grid, part.representation, part.unit
+                signal.timestamps, signal.values[:, span], grid, component.representation, component.unit
             )
     if signal.known is None:
         return values, None, skew
@@ -247,18 +234,16 @@ def _moved(
     return values, signal.known[before] & signal.known[after], skew
 
 
-def _grid(
-    episode_id: str, frames: Floats, embodiment: Embodiment, clocks: list[tuple[str, Floats, str]]
-) -> tuple[Floats, int]:
+def _grid(episode_id: str, frames: Floats, embodiment: Embodiment, timed: list[Timed]) -> tuple[Floats, int]:
     """Return the target times at which every stream is running, and the number of frames outside them.
 
     A held value stays in force after its last sample; every other stream ends with its last sample. The grid
     may reach `max_skew_ms` (without one, half a period) beyond a stream's samples.
     """
     sync = embodiment.sync
-    close = rounding(*(times for _, times, _ in clocks))
+    close = rounding(*(times for _, times, _ in timed))
     start, stop = -np.inf, np.inf
-    for name, times, method in clocks:
+    for name, times, method in timed:
         if name == embodiment.primary_camera.name and not sync.rate_hz:
             continue
         period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
@@ -277,10 +262,9 @@ def _grid(
     else:
         grid, total = frames[(frames >= start - close) & (frames <= stop + close)], len(frames)
     if not len(grid):
-        spans = ", ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times, _ in clocks)
-        raise AlignmentError(
-            episode_id, f"its streams never run together: {spans}", "check the topics, or stamp: receive"
-        )
+        spans = ", ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times, _ in timed)
+        fault = f"its streams never run together: {spans}"
+        raise AlignmentError(episode_id, fault, "check the topics, or try stamp: receive")
     return grid, total - len(grid)
 
 
@@ -292,24 +276,14 @@ def _check_times(episode_id: str, name: str, times: Floats) -> None:
     backwards = np.flatnonzero(np.diff(times) < 0)
     if len(backwards):
         i = int(backwards[0])
-        raise AlignmentError(
-            episode_id,
-            f"{name} goes back in time at sample {i + 1}: {times[i]:.6f} then {times[i + 1]:.6f} s",
-            "try stamp: receive",
-        )
+        fault = f"{name} goes back in time at sample {i + 1}: {times[i]:.6f} then {times[i + 1]:.6f} s"
+        raise AlignmentError(episode_id, fault, "try stamp: receive")
 
 
-def _check_skew(
-    episode_id: str, skew: dict[str, Floats], limit_ms: float | None, sync: Sync, grid: Floats
-) -> None:
-    if not limit_ms:
-        return
+def _check_skew(episode_id: str, skew: dict[str, Floats], limit_ms: float, sync: Sync, grid: Floats) -> None:
     for name, values in skew.items():
         worst = int(np.argmax(values))
         if values[worst] > limit_ms:
-            raise AlignmentError(
-                episode_id,
-                f"{name} is {values[worst]:.1f} ms off at {grid[worst] - grid[0]:.3f} s, "
-                f"sync.max_skew_ms is {sync.max_skew_ms:g}",
-                "raise max_skew_ms, or leave the episode in quarantine",
-            )
+            off, time = values[worst], grid[worst] - grid[0]
+            fault = f"{name} is {off:.1f} ms off at {time:.3f} s; sync.max_skew_ms is {sync.max_skew_ms:g}"
+            raise AlignmentError(episode_id, fault, "raise max_skew_ms, or leave the episode in quarantine")

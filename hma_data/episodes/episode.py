@@ -4,7 +4,7 @@ An Episode is lazy: it knows its times and values, and decodes a picture only wh
 T frames, A values a sample; times are float64 seconds, pictures uint8 RGB.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,6 +15,7 @@ from hma_data.errors import EpisodeError
 
 Floats = NDArray[np.float64]
 Known = NDArray[np.bool_] | None
+Decode = Callable[[int], NDArray[np.uint8]]  # index -> (H, W, 3) RGB
 
 
 class Stream(Protocol):
@@ -38,7 +39,7 @@ class OneByOne(Protocol):
 
 @dataclass(frozen=True)
 class Signal:
-    """Numbers over time: an action or a state vector.
+    """Actions or states at times of their own: all components, or one of them.
 
     Attributes:
         timestamps: (T,) seconds.
@@ -52,9 +53,7 @@ class Signal:
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or len(self.timestamps) != len(self.values):
-            raise ValueError(f"{len(self.timestamps)} times for values {self.values.shape}")
-        if self.known is not None and self.known.shape != self.timestamps.shape:
-            raise ValueError(f"{len(self.timestamps)} times for marks {self.known.shape}")
+            raise ValueError(f"values have the shape {self.values.shape} for {len(self.timestamps)} times")
 
 
 @dataclass(frozen=True)
@@ -125,9 +124,9 @@ class Clip:
     @property
     def known_states(self) -> NDArray[np.float32] | None:
         """Return the states (N, A') that are known; None where there are no states."""
-        return (
-            self.states if self.states is None or self.state_known is None else self.states[self.state_known]
-        )
+        if self.states is None or self.state_known is None:
+            return self.states
+        return self.states[self.state_known]
 
     @property
     def flags(self) -> dict[str, int]:
@@ -151,7 +150,7 @@ class Pictures:
         decode: index -> (H, W, 3) uint8 RGB.
     """
 
-    def __init__(self, timestamps: Floats, decode: "Decode") -> None:
+    def __init__(self, timestamps: Floats, decode: Decode) -> None:
         self.timestamps = timestamps
         self._decode = decode
 
@@ -164,23 +163,17 @@ class Pictures:
             return first[None]
         pictures = np.empty((len(indices), *first.shape), np.uint8)
         pictures[0] = first
-        for place, index in enumerate(indices[1:], 1):
+        for i, index in enumerate(indices[1:], 1):
             picture = self._decode(int(index))
             if picture.shape != first.shape:
-                sizes = sorted({first.shape, picture.shape})
+                sizes = f"{first.shape} and {picture.shape}"
                 raise EpisodeError("", f"pictures change size within the episode: {sizes}")
-            pictures[place] = picture
+            pictures[i] = picture
         return pictures
 
     def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
         """Yield pictures one by one; see OneByOne."""
         return (self._decode(int(index)) for index in indices)
-
-
-class Decode(Protocol):
-    """A function that decodes one picture."""
-
-    def __call__(self, index: int, /) -> NDArray[np.uint8]: ...
 
 
 def rate_times(length: int, hz: float) -> Floats:

@@ -24,18 +24,15 @@ def opencv() -> Any:
     """Import and return the cv2 module.
 
     Raises:
-        MissingDependencyError: it cannot be imported, usually because a build
-            for displays replaced the headless one.
+        MissingDependencyError: the import fails, usually because a build for displays replaced the headless
+            one.
     """
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read once, when it is loaded
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # OpenCV reads it when it is loaded
     try:
         import cv2
     except ImportError as fault:
-        raise MissingDependencyError(
-            "opencv",
-            str(fault),
-            "pip uninstall opencv-python && pip install --force-reinstall opencv-python-headless",
-        ) from fault
+        remedy = "pip uninstall opencv-python && pip install --force-reinstall opencv-python-headless"
+        raise MissingDependencyError("opencv", str(fault), remedy) from fault
     return cv2
 
 
@@ -43,39 +40,22 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str) -> Images:
     """Decode a JPEG, PNG or other still picture to (H, W, 3) RGB.
 
     Raises:
-        EpisodeError: the bytes are not a colour picture, or the picture claims too many pixels.
+        EpisodeError: the bytes are not a colour picture, or the picture claims more than MAX_PIXELS.
     """
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
-    head = buffer[:65536].tobytes()
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:26] in (b"\x10\0", b"\x10\4"):
-        raise EpisodeError(where, "a picture is grey of 16 bits, so depth, not colour", "name another camera")
-    width, height = claimed_size(head)
-    if width * height > MAX_PIXELS:
-        raise EpisodeError(where, f"a picture claims {width}×{height} pixels, more than {MAX_PIXELS:,}")
+    head = buffer[:26].tobytes()
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] in (b"\x10\0", b"\x10\4"):
+        raise EpisodeError(where, "a picture has 16 bits of grey: depth, not colour", "name another camera")
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    fault = ""
     try:
         picture = cv2.imdecode(buffer, flags) if len(buffer) else None
-    except cv2.error as fault:
-        raise EpisodeError(
-            where, f"a picture of {len(buffer)} bytes cannot be decoded: {fault.err}"
-        ) from fault
+    except cv2.error as error:  # OpenCV checks the claimed size before it decodes
+        picture, fault = None, f": {error.err}"
     if picture is None:
-        raise EpisodeError(where, f"a picture of {len(buffer)} bytes cannot be decoded")
+        raise EpisodeError(where, f"a picture of {len(buffer)} bytes cannot be decoded{fault}")
     return picture
-
-
-def claimed_size(head: bytes) -> tuple[int, int]:
-    """Return the width and height that the first bytes of a PNG or JPEG claim; (0, 0) for anything else."""
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
-        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-    at = 2
-    while head[:2] == b"\xff\xd8" and at + 9 <= len(head) and head[at] == 0xFF:
-        marker = head[at + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
-            return int.from_bytes(head[at + 7 : at + 9], "big"), int.from_bytes(head[at + 5 : at + 7], "big")
-        at += 2 + (0 if marker == 0xFF else int.from_bytes(head[at + 2 : at + 4], "big"))
-    return 0, 0
 
 
 def prepare(
@@ -97,10 +77,8 @@ def prepare(
     if camera.crop:
         x, y, width, height = camera.crop
         if y + height > frames.shape[1] or x + width > frames.shape[2]:
-            raise EpisodeError(
-                f"camera {camera.name}",
-                f"crop {list(camera.crop)} leaves the picture of {frames.shape[2]}×{frames.shape[1]}",
-            )
+            fault = f"crop {list(camera.crop)} leaves the picture of {frames.shape[2]}×{frames.shape[1]}"
+            raise EpisodeError(f"camera {camera.name}", fault)
         frames = frames[:, y : y + height, x : x + width]
     return resize(frames, size, camera.resize, resize_filter, out)
 
@@ -120,9 +98,9 @@ def prepared(
     if not isinstance(stream, OneByOne) or not len(indices):
         return prepare(stream.frames(indices), camera, size, resize_filter)
     distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
-    squares = _empty(len(distinct), size)
-    for place, picture in enumerate(stream.each(distinct)):
-        prepare(picture[None], camera, size, resize_filter, squares[place : place + 1])
+    squares = np.empty((len(distinct), size, size, 3), np.uint8)
+    for i, picture in enumerate(stream.each(distinct)):
+        prepare(picture[None], camera, size, resize_filter, squares[i : i + 1])
     return squares if np.array_equal(inverse, np.arange(len(squares))) else squares[inverse]
 
 
@@ -153,7 +131,7 @@ def resize(
             return np.ascontiguousarray(frames)
         out[:] = frames
         return out
-    out = _empty(len(frames), size) if out is None else out
+    out = np.empty((len(frames), size, size, 3), np.uint8) if out is None else out
     if rule == "letterbox":
         scale = size / max(height, width)
         inner_h, inner_w = max(1, round(height * scale)), max(1, round(width * scale))
@@ -174,7 +152,3 @@ def _packed(frame: Images) -> Images:
     """Return the picture in a memory layout that OpenCV takes: gaps between rows, but not between pixels."""
     rows, *pixel = frame.strides
     return frame if rows > 0 and pixel == [3, 1] else np.ascontiguousarray(frame)
-
-
-def _empty(count: int, size: int) -> Images:
-    return np.empty((count, size, size, 3), np.uint8)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,8 @@ from hma_data.episodes.images import opencv
 from hma_data.storage.files import atomic_path
 
 Images = NDArray[np.uint8]
-INK, PAPER, BAR, NEGATIVE = (
-    (30, 30, 30),
-    (250, 250, 250),
-    (0, 114, 178),
-    (213, 94, 0),
-)  # safe without colour vision
+INK, PAPER = (30, 30, 30), (250, 250, 250)
+BAR, NEGATIVE = (0, 114, 178), (213, 94, 0)  # safe without colour vision
 
 
 def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = (), gap: int = 4) -> Images:
@@ -59,12 +56,12 @@ def with_actions(
     out = np.full((count, height + dims * line + 4, width, 3), PAPER, np.uint8)
     out[:, :height] = frames
     span = np.where(high > low, high - low, 1.0)
-    place = np.clip((actions - low) / span, 0, 1)
+    share = np.clip((actions - low) / span, 0, 1)
     zero = np.clip((0 - low) / span, 0, 1)
     for t in range(count):
         for d in range(dims):
             top = height + 2 + d * line
-            a, b = sorted((round(zero[d] * (width - 1)), round(place[t, d] * (width - 1))))
+            a, b = sorted((round(zero[d] * (width - 1)), round(share[t, d] * (width - 1))))
             out[t, top : top + line - 1, a : b + 1] = BAR if actions[t, d] >= 0 else NEGATIVE
     return out
 
@@ -79,18 +76,10 @@ def webp_bytes(frames: Images, fps: float) -> bytes:
     """Return frames (N, H, W, 3) as the bytes of an animated WebP that loops."""
     from PIL import Image
 
-    pictures = [Image.fromarray(frame) for frame in frames]
+    first, *rest = (Image.fromarray(frame) for frame in frames)
     buffer = io.BytesIO()
-    pictures[0].save(
-        buffer,
-        "WEBP",
-        save_all=True,
-        append_images=pictures[1:],
-        duration=round(1000 / fps),
-        loop=0,
-        quality=85,
-        method=4,
-    )
+    settings: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0, "quality": 85, "method": 4}
+    first.save(buffer, "WEBP", save_all=True, append_images=rest, **settings)
     return buffer.getvalue()
 
 

@@ -12,17 +12,15 @@ B batch, T frames, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from hma_data.errors import HMAError, ShardError, UsageError
-from hma_data.loading.batch import Batch, as_batch, assemble
 from hma_data.loading.mixture import TEMPERATURES, Draw, Mixture
-from hma_data.loading.pools import Deal, Stream, pool_size
-from hma_data.loading.rows import MIB, Decoder
+from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
+from hma_data.loading.rows import MIB, Batch, Decoder, as_batch, assemble
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints, Short
 from hma_data.storage.paths import StrPath
@@ -44,22 +42,18 @@ def open_sets(data: Sequence[StrPath | ShardSet]) -> dict[str, ShardSet]:
         shards = item if isinstance(item, ShardSet) else ShardSet(item)
         name = shards.embodiment.id
         if name in sets:
-            raise ShardError(
-                shards.folder,
-                f"is of embodiment {name}, and so is {sets[name].folder}",
-                "give each embodiment once",
-            )
+            fault = f"has embodiment {name}, and so has {sets[name].folder}"
+            raise ShardError(shards.folder, fault, "give each embodiment once")
         sets[name] = shards
     if not sets:
-        raise ShardError("data", "names no shard sets", "give at least one --out of hma convert")
-    first = next(iter(sets.values()))
-    for shards in sets.values():
+        raise ShardError("data", "names no shard sets", "give the --out of at least one hma convert")
+    first, *others = sets.values()
+    for shards in others:
         if shards.spec != first.spec:
+            mine, other = (f"{spec.name} ({spec.digest})" for spec in (shards.spec, first.spec))
+            fault = f"was tokenized by {mine}, but {first.folder} by {other}"
             raise ShardError(
-                shards.folder,
-                f"was tokenized by {shards.spec.name} ({shards.spec.digest}), {first.folder} by "
-                f"{first.spec.name} ({first.spec.digest})",
-                "one mixture takes one tokenizer: convert again with the same",
+                shards.folder, fault, "one mixture takes one tokenizer: convert one of them again"
             )
     return sets
 
@@ -91,7 +85,6 @@ class WindowDataset(Dataset[Batch]):
         cache_mib: int = 256,
     ) -> None:
         self.shards = data if isinstance(data, ShardSet) else ShardSet(data)
-        _check_frames(frames)
         self._decoder = Decoder(self.shards, split, frames, stride, short, cache_mib * MIB)
         self._short: Short = short
         self.index = self._decoder.index
@@ -112,29 +105,27 @@ class WindowDataset(Dataset[Batch]):
             IndexError: there are no numbers, or one is outside 0..len-1.
             ShardError: a shard is missing or damaged.
         """
-        wanted = np.asarray(windows, np.int64)
-        outside = wanted[(wanted < 0) | (wanted >= len(self))]
-        if not len(wanted) or len(outside):
-            which = f"window {outside[0]}" if len(outside) else "no window"
-            raise IndexError(f"{which} of the {len(self)} of {self.shards.folder}")
+        numbers = np.asarray(windows, np.int64)
+        if not len(numbers) or numbers.min() < 0 or numbers.max() >= len(self):
+            raise IndexError(f"window numbers must be 0 to {len(self) - 1} in {self.shards.folder}")
         index = self.index
-        first = index.first_rows(wanted)
-        last = index.last_rows(wanted) if index.padded_episodes else None
+        first = index.first_rows(numbers)
+        last = index.last_rows(numbers) if index.padded_episodes else None
         group = np.searchsorted(index.edges, first, side="right") - 1
-        over = np.minimum(first + index.span - 1, index.last_rows(wanted)) >= index.edges[group + 1]
-        places, cuts = [], []  # a window may continue in the next row group
+        over = np.minimum(first + index.span - 1, index.last_rows(numbers)) >= index.edges[group + 1]
+        samples, cuts = [], []  # a window may continue in the next row group
         for key in np.unique(2 * group + over):
             chosen = np.flatnonzero(2 * group + over == key)
             rows = self._decoder.rows(int(key // 2), whole=bool(key % 2))
             edge = index.edges[key // 2]
             end = None if last is None else last[chosen] - edge
             cuts.append(rows.cut(first[chosen] - edge, end, index))
-            places.append(chosen)
+            samples.append(chosen)
         joined = {name: np.concatenate([cut[name] for cut in cuts]) for name in cuts[0]}
-        order = np.concatenate(places)
-        joined["camera"] = index.cameras(wanted)[order]
+        order = np.concatenate(samples)
+        joined["camera"] = index.cameras(numbers)[order]
         name = self.shards.embodiment.id
-        return assemble({name: self.shards}, [name] * len(wanted), {name: (order, joined)}, self._short)
+        return assemble({name: self.shards}, [name] * len(numbers), {name: (order, joined)}, self._short)
 
 
 class MixtureDataset(IterableDataset[Batch]):
@@ -162,9 +153,9 @@ class MixtureDataset(IterableDataset[Batch]):
         lanes: independent streams per rank; at least the number of workers for full speed.
         memory_mib: memory for decoded rows in all lanes together, in MiB, about.
 
-        Raises:
-            ShardError: the sets do not fit together, or one has no window or is damaged.
-            UsageError: a value is out of range.
+    Raises:
+        ShardError: the sets do not fit together, or one has no window.
+        UsageError: a value is out of range.
     """
 
     def __init__(
@@ -189,11 +180,11 @@ class MixtureDataset(IterableDataset[Batch]):
         lanes: int = 4,
         memory_mib: int = 1024,
     ) -> None:
-        if batch_size < 1 or not 0 <= rank < world:
-            raise UsageError("batches", f"batch_size {batch_size}, rank {rank} of {world} is not possible")
-        if lanes < 1 or (pool is not None and pool < 1):
-            raise UsageError("batches", f"lanes {lanes}, pool {pool} must be at least 1")
-        _check_frames(frames)
+        if not 0 <= rank < world:
+            raise UsageError("rank", f"{rank} is not one of 0 to {world - 1}")
+        for name, value in (("batch_size", batch_size), ("lanes", lanes), ("pool", pool)):
+            if value is not None and value < 1:
+                raise UsageError(name, f"must be at least 1, not {value}")
         self.sets = open_sets(data)
         self.batch_size, self.rank, self.world, self.lanes = batch_size, rank, world, lanes
         self.seed, self._short = seed, short
@@ -202,7 +193,8 @@ class MixtureDataset(IterableDataset[Batch]):
             name: Decoder(shards, split, frames, None, short, int(share / 5))
             for name, shards in self.sets.items()
         }
-        _check_windows(self._decoders, frames, split)
+        for decoder in self._decoders.values():
+            _check_windows(decoder, frames)
         counts = {name: decoder.index.count for name, decoder in self._decoders.items()}
         self.mixture = Mixture.of(
             counts,
@@ -216,8 +208,8 @@ class MixtureDataset(IterableDataset[Batch]):
             seed=seed,
         )
         self._pools = [pool or pool_size(d, share * 4 / 5 / lanes) for d in self._decoders.values()]
-        self._deals: dict[int, Deal] = {}
-        self._streams: dict[tuple[int, int], Stream] = {}
+        self._assignments: dict[int, UnitAssignment] = {}
+        self._sequences: dict[tuple[int, int], WindowSequence] = {}
         self._step = 0
         self._origin: int | None = None  # in a DataLoader worker: the step that worker 0 began with
         self._taken: Ints = np.zeros((lanes, len(counts)), np.int64)
@@ -229,15 +221,11 @@ class MixtureDataset(IterableDataset[Batch]):
         if info and self._origin is None:
             self._origin = self._step  # the DataLoader asks worker 0 for this one
         while True:
-            step, taken = self._step, self._taken
-            lane, draws = step % self.lanes, self._draws(step)
-            self._step, self._taken = step + 1, _counted(taken, lane, draws)
-            if (step - (self._origin or 0)) % workers == worker:
-                try:
-                    batch = self._make(lane, draws, taken[lane])
-                except HMAError:
-                    self._step, self._taken = step, taken
-                    raise
+            lane, draws = self._step % self.lanes, self._draws(self._step)
+            mine = (self._step - (self._origin or 0)) % workers == worker
+            batch = self._make(lane, draws, self._taken[lane]) if mine else None
+            self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
+            if batch is not None:
                 yield batch
 
     def batches(self, workers: int = 0, context: str = "spawn") -> Iterator[Batch]:
@@ -279,27 +267,27 @@ class MixtureDataset(IterableDataset[Batch]):
 
     def _make(self, lane: int, draws: Ints, taken: Ints) -> Batch:
         names = self.mixture.names
-        pieces = {}
+        windows_of = {}
         order = np.argsort(draws, kind="stable")
-        for places in np.split(order, np.flatnonzero(np.diff(draws[order])) + 1):
-            which = int(draws[places[0]])
-            stream = self._stream(lane, which)
-            pieces[names[which]] = (places, stream.take(int(taken[which]), len(places)))
-        return assemble(self.sets, [names[i] for i in draws], pieces, self._short)
+        for samples in np.split(order, np.flatnonzero(np.diff(draws[order])) + 1):
+            which = int(draws[samples[0]])
+            sequence = self._sequence(lane, which)
+            windows_of[names[which]] = (samples, sequence.take(int(taken[which]), len(samples)))
+        return assemble(self.sets, [names[i] for i in draws], windows_of, self._short)
 
-    def _stream(self, lane: int, which: int) -> Stream:
-        if (lane, which) not in self._streams:
+    def _sequence(self, lane: int, which: int) -> WindowSequence:
+        if (lane, which) not in self._sequences:
             decoder = self._decoders[self.mixture.names[which]]
-            if which not in self._deals:
-                self._deals[which] = Deal.of(decoder.index, self.world * self.lanes)
+            if which not in self._assignments:
+                self._assignments[which] = UnitAssignment.of(decoder.index, self.world * self.lanes)
             reader = self.rank * self.lanes + lane
-            self._streams[lane, which] = Stream(
-                decoder, self._deals[which], self.seed, reader, self._pools[which]
+            self._sequences[lane, which] = WindowSequence(
+                decoder, self._assignments[which], self.seed, reader, self._pools[which]
             )
-        return self._streams[lane, which]
+        return self._sequences[lane, which]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_streams": {}, "_deals": {}}  # a worker makes these anew
+        return {**self.__dict__, "_sequences": {}, "_assignments": {}}  # a worker makes these anew
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position of the stream after the last batch taken, as plain values of a few kB."""
@@ -341,10 +329,10 @@ class MixtureDataset(IterableDataset[Batch]):
             if state.get(key) != mine:
                 raise UsageError(
                     "sampler state",
-                    f"has {key} {state.get(key)}, this run has {mine}",
-                    "go on with the settings and data it was saved with, or begin anew",
+                    f"was saved with {key} {state.get(key)}, but this run has {mine}",
+                    "continue with the same settings and data, or start a new run",
                 )
-        step, taken = _place(state, self._taken.shape, self.batch_size)
+        step, taken = int(state["step"]), np.asarray(state["taken"], np.int64)
         if state.get("rank") != self.rank:
             taken = np.zeros_like(taken)
             for before in range(step):
@@ -354,7 +342,7 @@ class MixtureDataset(IterableDataset[Batch]):
 
 
 class _Carrier(IterableDataset[Any]):
-    """A dataset that yields its errors as items: torch would pass on only their text."""
+    """A dataset that yields its errors as items, because torch passes on only their text."""
 
     def __init__(self, dataset: MixtureDataset) -> None:
         self._dataset = dataset
@@ -366,40 +354,15 @@ class _Carrier(IterableDataset[Any]):
             yield fault
 
 
-def _place(state: Mapping[str, Any], shape: tuple[int, ...], batch_size: int) -> tuple[int, Ints]:
-    """Return the step and the counts of a state; raise UsageError where they do not agree."""
-    try:
-        step, taken = int(state["step"]), np.asarray(state["taken"], np.int64)
-    except (KeyError, TypeError, ValueError) as fault:
-        raise UsageError("sampler state", f"is damaged: {fault}", "begin anew") from fault
-    if step < 0 or taken.shape != shape or (taken < 0).any() or taken.sum() != step * batch_size:
-        raise UsageError(
-            "sampler state",
-            f"is damaged: counts {taken.sum()} windows of {taken.shape} streams at step {step}, "
-            f"not {step * batch_size} of {shape}",
-            "begin anew",
+def _check_windows(decoder: Decoder, frames: int) -> None:
+    index = decoder.index
+    if not index.count:
+        raise ShardError(
+            decoder.shards.folder,
+            f"has no window of {frames} frames, {index.row_stride} rows apart, in {decoder.split} "
+            f"({index.short_episodes} episodes, all shorter)",
+            "use fewer frames, or leave this embodiment out",
         )
-    return step, taken
-
-
-def _check_frames(frames: int) -> None:
-    if frames < 1:
-        raise UsageError("frames", f"of a window must be at least 1, are {frames}")
-
-
-def _check_windows(decoders: Mapping[str, Decoder], frames: int, split: str) -> None:
-    """Raise ShardError where a set has no window, or where its first row group with windows is damaged."""
-    for decoder in decoders.values():
-        index = decoder.index
-        if not index.count:
-            raise ShardError(
-                decoder.shards.folder,
-                f"has no window of {frames} frames, {index.row_stride} rows apart, in {split} "
-                f"({index.short_episodes} episodes, all shorter)",
-                "use fewer frames, or leave this embodiment out",
-            )
-    with ThreadPoolExecutor(min(8, len(decoders))) as threads:
-        list(threads.map(Decoder.check, decoders.values()))
 
 
 def _counted(taken: Ints, lane: int, draws: Ints) -> Ints:

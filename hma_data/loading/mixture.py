@@ -7,6 +7,7 @@ Draws are a pure function of (seed, step), so every rank and worker can compute 
 E embodiments, B samples a batch.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -25,51 +26,6 @@ LONGEST_NAME = 34
 TEMPERATURES = {"train": 3.0, "val": 4.0}  # τ of the paper's code, by split
 
 
-def probabilities(
-    counts: Sequence[int] | NDArray[np.int64],
-    temperature: float = 3.0,
-    *,
-    weights: Sequence[float] | None = None,
-    groups: Sequence[str] | None = None,
-    caps: Sequence[float] | None = None,
-    group_weights: Mapping[str, float] | None = None,
-) -> Floats:
-    """Return the probability (E,) of each embodiment; the probabilities sum to one.
-
-    Args:
-        counts: training windows of each.
-        temperature: τ above; math.inf is uniform.
-        weights: multiply the probabilities before they are normalized; with groups, within each group.
-        groups: group of each; groups get equal shares, and the rule above divides the share of a group.
-        caps: no probability exceeds its cap; what is cut goes to the others in proportion.
-        group_weights: multiply the shares of groups.
-
-    Raises:
-        UsageError: a value is out of range, there are no windows, or the caps sum to less than one.
-    """
-    n = np.asarray(counts, np.float64)
-    if not len(n) or n.max() <= 0 or n.min() < 0:
-        raise UsageError("mixture", f"needs windows to draw from, has {[int(c) for c in n]}")
-    if not temperature > 0:
-        raise UsageError("mixture temperature", f"must be above 0, is {temperature}")
-    share = np.zeros_like(n)
-    present = n > 0
-    share[present] = np.exp((np.log(n[present]) - np.log(n.max())) / temperature)  # no overflow at any count
-    if weights is not None:
-        share *= _factors("weights", weights, len(n))
-    if groups is not None:
-        factors = _factors("weights", list((group_weights or {}).values()), len(group_weights or {}))
-        factor = dict(zip(group_weights or {}, factors))
-        for name in dict.fromkeys(groups):
-            members = np.array([group == name for group in groups])
-            if share[members].sum() > 0:
-                share[members] *= factor.get(name, 1.0) / share[members].sum()
-    if share.sum() <= 0:
-        raise UsageError("mixture weights", "leave nothing to draw")
-    share /= share.sum()
-    return share if caps is None else _capped(share, _factors("caps", caps, len(n)))
-
-
 def epoch_caps(counts: Sequence[int], max_epochs: float, samples: int) -> Floats:
     """Return the probabilities (E,) above which `samples` draws pass over a set more than `max_epochs` times.
 
@@ -77,29 +33,21 @@ def epoch_caps(counts: Sequence[int], max_epochs: float, samples: int) -> Floats
         UsageError: so many samples cannot be drawn.
     """
     if not max_epochs > 0 or samples < 1:
-        raise UsageError(
-            "mixture max_epochs", f"must be above 0 and of at least 1 sample, is {max_epochs} of {samples}"
-        )
-    most = max_epochs * sum(counts)
-    if samples > most:
-        raise UsageError(
-            "mixture max_epochs",
-            f"{max_epochs:g} passes over {sum(counts):,} windows are fewer than {samples:,} planned samples",
-            f"allow {samples / max(1, sum(counts)):.3g} passes, or plan {int(most):,} samples",
-        )
+        fault = f"must be above 0, for at least 1 sample; it is {max_epochs} for {samples}"
+        raise UsageError("mixture max_epochs", fault)
+    windows = sum(counts)
+    most = int(max_epochs * windows)
+    if samples > max_epochs * windows:
+        fault = f"{max_epochs:g} passes over {windows:,} windows are fewer than {samples:,} planned samples"
+        remedy = f"allow {samples / max(1, windows):.3g} passes, or plan {most:,} samples"
+        raise UsageError("mixture max_epochs", fault, remedy)
     return np.minimum(1.0, max_epochs * np.asarray(counts, np.float64) / samples)
-
-
-def _factors(name: str, values: Sequence[float], count: int) -> Floats:
-    factors = np.asarray(values, np.float64)
-    if len(factors) != count or not np.isfinite(factors).all() or (factors < 0).any():
-        raise UsageError(f"mixture {name}", f"must be {count} numbers of at least 0, are {list(values)}")
-    return factors
 
 
 def _capped(share: Floats, limit: Floats) -> Floats:
     if limit[share > 0].sum() < 1 - 1e-12:
-        raise UsageError("mixture caps", f"sum to {limit[share > 0].sum():g}, so not everything can be drawn")
+        fault = f"sum to {limit[share > 0].sum():g}; probabilities must sum to 1"
+        raise UsageError("mixture caps", fault, "raise a cap")
     fixed = np.zeros(len(share), bool)
     while True:
         over = ~fixed & (share > limit + 1e-15)
@@ -144,40 +92,44 @@ class Mixture:
         draw: Draw = "per_sample",
         seed: int = 0,
     ) -> "Mixture":
-        """Return the mixture over named counts; see `probabilities`.
+        """Return the mixture over named counts.
 
         Args:
             counts: embodiment -> training windows.
+            temperature: τ above; math.inf is uniform.
             weights: embodiment or group -> factor on its probability; 1 where not named.
-            groups: embodiment -> group; an embodiment that is not named is a group of its own.
-            caps: embodiment -> its largest probability.
+            groups: embodiment -> group; an embodiment that is not named is a group of its own. Groups get
+                equal shares, and the rule above divides the share of a group.
+            caps: embodiment -> its largest probability; what is cut goes to the others in proportion.
             max_epochs: most passes over any one embodiment while `samples` are drawn in all.
 
-            Raises:
-                UsageError: a name is unknown, or the values cannot be met.
+        Raises:
+            UsageError: a name is unknown, a value is out of range, there are no windows, or the caps sum to
+                less than one.
         """
-        group = {name: (groups or {}).get(name, name) for name in counts}
-        _known("groups", groups, counts)
-        _known("weights", weights, [*counts, *(group.values() if groups else [])])
-        _known("caps", caps, counts)
+        weights, groups, caps = weights or {}, groups or {}, caps or {}
+        group = {name: groups.get(name, name) for name in counts}
+        _check_names("groups", groups, counts)
+        _check_factors("weights", weights, [*counts, *(group.values() if groups else [])])
+        _check_factors("caps", caps, counts)
         if seed < 0:
-            raise UsageError("mixture seed", f"must be at least 0, is {seed}")
-        shared = {name for name in group.values() if name not in counts}
-        size = list(counts.values())
-        limits: Floats | None = None
+            raise UsageError("mixture seed", f"must be at least 0, not {seed}")
+        share = _shares(list(counts.values()), temperature)
+        share *= np.array([weights.get(name, 1.0) for name in counts])
+        for label in dict.fromkeys(group.values()) if groups else ():
+            members = np.array([group[name] == label for name in counts])
+            if share[members].sum() > 0:
+                factor = 1.0 if label in counts else weights.get(label, 1.0)
+                share[members] *= factor / share[members].sum()
+        if share.sum() <= 0:
+            raise UsageError("mixture weights", "leave nothing to draw", "give a weight above 0")
+        share /= share.sum()
         if caps or max_epochs is not None:
-            limits = np.array([(caps or {}).get(name, 1.0) for name in counts])
-        if limits is not None and max_epochs is not None:
-            limits = np.minimum(limits, epoch_caps(size, max_epochs, samples or 0))
-        p = probabilities(
-            size,
-            temperature,
-            weights=[(weights or {}).get(name, 1.0) for name in counts],
-            groups=list(group.values()) if groups else None,
-            caps=None if limits is None else limits.tolist(),
-            group_weights={name: w for name, w in (weights or {}).items() if name in shared},
-        )
-        return cls(tuple(counts), tuple(size), p, draw, seed)
+            limits = np.array([caps.get(name, 1.0) for name in counts])
+            if max_epochs is not None:
+                limits = np.minimum(limits, epoch_caps(list(counts.values()), max_epochs, samples or 0))
+            share = _capped(share, limits)
+        return cls(tuple(counts), tuple(counts.values()), share, draw, seed)
 
     def batch(self, step: int, size: int) -> NDArray[np.int64]:
         """Return the index (B,) of each sample's embodiment in batch `step`, the same in every process."""
@@ -210,10 +162,30 @@ class Mixture:
         ]
 
 
-def _known(what: str, named: Mapping[str, object] | None, known: Iterable[str]) -> None:
-    unknown = set(named or {}) - set(known)
+def _shares(counts: Sequence[int], temperature: float) -> Floats:
+    """Return n^(1/τ) of each embodiment, relative to the largest: there is no overflow at any count."""
+    n = np.asarray(counts, np.float64)
+    if not len(n) or n.max() <= 0 or n.min() < 0:
+        raise UsageError("mixture", f"needs windows to draw from, but the counts are {list(counts)}")
+    if not temperature > 0:
+        raise UsageError("mixture temperature", f"must be above 0, not {temperature}")
+    share = np.zeros_like(n)
+    present = n > 0
+    share[present] = np.exp((np.log(n[present]) - np.log(n.max())) / temperature)
+    return share
+
+
+def _check_factors(what: str, factors: Mapping[str, float], known: Iterable[str]) -> None:
+    _check_names(what, factors, known)
+    if not all(0 <= factor < math.inf for factor in factors.values()):
+        raise UsageError(f"mixture {what}", f"must be numbers of at least 0, not {dict(factors)}")
+
+
+def _check_names(what: str, named: Mapping[str, object], known: Iterable[str]) -> None:
+    unknown = set(named) - set(known)
     if unknown:
-        raise UsageError(f"mixture {what}", f"name {', '.join(sorted(unknown))}, which is not in the mixture")
+        fault = f"name {', '.join(sorted(unknown))}, which the mixture does not have"
+        raise UsageError(f"mixture {what}", fault)
 
 
 def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:
@@ -228,18 +200,18 @@ def plot_mixture(mixture: Mixture, temperature: float, path: StrPath) -> None:
     order = np.argsort(-np.array(mixture.counts), kind="stable")
     counts, p = np.array(mixture.counts)[order], mixture.p[order]
     proportional = counts / max(1, counts.sum())
-    place, few = np.arange(len(order)), len(order) <= 12
+    row, few = np.arange(len(order)), len(order) <= 12
     figure = Figure(figsize=(8, 1.2 + (0.42 if few else 0.27) * len(order)), layout="constrained")
     axes = figure.subplots()
-    axes.barh(place - 0.2, p, 0.4, color=BLUE, label=f"drawn, τ = {temperature:g}")
+    axes.barh(row - 0.2, p, 0.4, color=BLUE, label=f"drawn, τ = {temperature:g}")
     style: dict[str, Any] = {"color": ORANGE, "hatch": "////", "edgecolor": "white", "linewidth": 0}
-    axes.barh(place + 0.2, proportional, 0.4, label="share of windows", **style)
+    axes.barh(row + 0.2, proportional, 0.4, label="share of windows", **style)
     largest = np.maximum(p, proportional)
     for i, count in enumerate(counts):
         text = f"{p[i]:.3f}; {count:,} windows"
-        place_of = (float(largest[i]), i)
-        axes.annotate(text, place_of, (4, 0), textcoords="offset points", va="center", fontsize=7, color=GREY)
-    axes.set_yticks(place, [_short(mixture.names[i]) for i in order], fontsize=9 if few else 7)
+        end = (float(largest[i]), i)
+        axes.annotate(text, end, (4, 0), textcoords="offset points", va="center", fontsize=7, color=GREY)
+    axes.set_yticks(row, [_short(mixture.names[i]) for i in order], fontsize=9 if few else 7)
     axes.set_ylim(len(order) - 0.4, -0.6)
     axes.set_xlim(0, 1.45 * largest.max())
     axes.set_xticks([tick for tick in axes.get_xticks() if tick <= min(1.0, 1.45 * largest.max())])

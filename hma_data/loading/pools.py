@@ -57,7 +57,7 @@ def spread(rows: Ints, span: int, rng: np.random.Generator) -> tuple[Ints, int]:
 
 
 @dataclass(frozen=True)
-class Deal:
+class UnitAssignment:
     """The assignment of units to readers.
 
     A unit is (row group, part); a part has every `parts`-th window of the group.
@@ -75,7 +75,7 @@ class Deal:
     parts: int
 
     @classmethod
-    def of(cls, index: WindowIndex, readers: int) -> "Deal":
+    def of(cls, index: WindowIndex, readers: int) -> "UnitAssignment":
         """Give every window to one reader; with fewer windows than readers, give all to every reader."""
         groups = index.units()
         if index.count < readers:
@@ -87,9 +87,9 @@ class Deal:
         sizes = np.maximum(0, windows - units[:, 1] + parts - 1) // parts
         units, sizes = units[sizes > 0], sizes[sizes > 0]
         order = np.argsort(-sizes, kind="stable")  # the largest first, in alternating direction: equal sums
-        turn, place = np.divmod(np.arange(len(units)), readers)
+        turn, reader = np.divmod(np.arange(len(units)), readers)
         owner = np.empty(len(units), np.int64)
-        owner[order] = np.where(turn % 2, readers - 1 - place, place)
+        owner[order] = np.where(turn % 2, readers - 1 - reader, reader)
         return cls(units, sizes, owner, parts)
 
     def of_reader(self, reader: int) -> tuple[Ints, Ints]:
@@ -98,21 +98,23 @@ class Deal:
         return self.units[mine], self.sizes[mine]
 
 
-class Stream:
+class WindowSequence:
     """The sequence of windows of one reader.
 
     Args:
         decoder: of the shard set.
-        deal: which reader reads which units.
+        assignment: which reader reads which units.
         seed: of the order.
         reader: number of this reader.
         pool: row groups decoded together.
     """
 
-    def __init__(self, decoder: Decoder, deal: Deal, seed: int, reader: int, pool: int) -> None:
-        self._decoder, self._pool, self._parts = decoder, pool, deal.parts
+    def __init__(
+        self, decoder: Decoder, assignment: UnitAssignment, seed: int, reader: int, pool: int
+    ) -> None:
+        self._decoder, self._pool, self._parts = decoder, pool, assignment.parts
         self._entropy = [seed, zlib.crc32(decoder.shards.embodiment.id.encode()), reader]
-        self._units, self._sizes = deal.of_reader(reader)
+        self._units, self._sizes = assignment.of_reader(reader)
         self.length = int(self._sizes.sum())
         self._epoch: tuple[int, Ints, Ints] | None = None
         self._at: tuple[int, int] | None = None
@@ -120,7 +122,7 @@ class Stream:
 
     def take(self, start: int, count: int) -> dict[str, NDArray[Any]]:
         """Return windows start to start + count of the sequence: those of `Rows.cut`, and camera (n,)."""
-        parts = []
+        cuts = []
         while count:
             epoch, offset = divmod(start, self.length)
             order, ends = self._rounds(epoch)
@@ -131,11 +133,11 @@ class Stream:
             chosen = slice(inside, inside + some)
             last = None if self._last is None else self._last[chosen]
             cut = rows.cut(self._first[chosen], last, self._decoder.index)
-            parts.append(cut | {"camera": self._camera[chosen]})
+            cuts.append(cut | {"camera": self._camera[chosen]})
             start, count = start + some, count - some
-        if len(parts) == 1:
-            return parts[0]
-        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        if len(cuts) == 1:
+            return cuts[0]
+        return {key: np.concatenate([cut[key] for cut in cuts]) for key in cuts[0]}
 
     def _rounds(self, epoch: int) -> tuple[Ints, Ints]:
         """Return the order of the units in an epoch, and the number of windows up to the end of each pool."""

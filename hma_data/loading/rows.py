@@ -1,17 +1,19 @@
-"""Decode row groups of a shard set, check them, and cut them into windows.
+"""Decode row groups of a shard set, cut them into windows, and assemble the batches that the model takes.
 
-n windows, T frames, S values a frame, K = stride·A.
+n windows, B batch, T frames, S values a frame, h·w grid, c·H·W latents, A action dims, K = stride·A.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from hma_data.errors import ShardError
+from hma_data.errors import ShardError, UsageError
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns, token_column
 from hma_data.shards.windows import Ints, Short, WindowIndex
@@ -30,11 +32,11 @@ class Rows:
     known: NDArray[np.bool_] | None  # True where the row's action is known; None where all are
 
     @classmethod
-    def join(cls, parts: "Sequence[Rows]") -> "Rows":
-        """Concatenate parts in their order."""
-        if len(parts) == 1:
-            return parts[0]
-        columns = [[getattr(part, f.name) for part in parts] for f in fields(cls)]
+    def join(cls, several: "Sequence[Rows]") -> "Rows":
+        """Concatenate rows in their order."""
+        if len(several) == 1:
+            return several[0]
+        columns = [[getattr(rows, f.name) for rows in several] for f in fields(cls)]
         joined: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
         return cls(*joined)
 
@@ -104,6 +106,7 @@ class Decoder:
         cache_bytes: memory for decoded rows that are kept; at least two row groups are kept.
 
     Raises:
+        UsageError: `frames` is below 1.
         ShardError: the set contradicts itself.
     """
 
@@ -116,14 +119,17 @@ class Decoder:
         short: Short = "drop",
         cache_bytes: int = 256 * MIB,
     ) -> None:
+        if frames < 1:
+            raise UsageError("frames", f"a window must have at least 1, not {frames}")
         self.shards, self.split = shards, split
         _check_stride(shards)
         self.index = WindowIndex.of(shards, split, frames, stride, short)
-        name, width = token_column(shards.spec)
+        tokens, width = token_column(shards.spec)
         strided = shards.manifest.plan.get("frames") == "strided"
         robot = shards.embodiment
-        self._widths = {name: width, "action": robot.chunk_dim if strided else robot.action_dim}
-        self._columns = [name, "action", "episode_index", "frame_index"]
+        action_width = robot.chunk_dim if strided else robot.action_dim
+        self._row_bytes = width * np.dtype(shards.spec.dtype).itemsize + action_width * 4 + 9
+        self._columns = [tokens, "action", "episode_index", "frame_index"]
         self._columns += [mask for mask in mask_columns(robot) if mask == "action_known"]
         self._names = shards.shards(split)
         self._kept: OrderedDict[int, Rows] = OrderedDict()
@@ -132,10 +138,7 @@ class Decoder:
     @property
     def group_bytes(self) -> int:
         """Return the average bytes of a decoded row group."""
-        rows = self.index.edges[-1] / max(1, len(self.index.groups))
-        token = np.dtype(self.shards.spec.dtype).itemsize
-        width, actions = self._widths.values()
-        return int(rows * (width * token + actions * 4 + 9))
+        return int(self.index.edges[-1] / max(1, len(self.index.groups)) * self._row_bytes)
 
     def rows(self, group: int, whole: bool = True) -> Rows:
         """Return all rows that the windows starting in row group `group` need; its own rows come first.
@@ -144,27 +147,20 @@ class Decoder:
             whole: False leaves out the rows of the row groups after it.
 
         Raises:
-            ShardError: the shard is missing or damaged, or its rows are not what the set says.
+            ShardError: the shard is missing or damaged.
         """
         reach = self.index.reach(group) if whole else group
         if reach == group:
             return self._group(group)
-        own = int(self.index.edges[group + 1] - self.index.edges[group])
-        parts = [self._group(g) for g in range(group, reach + 1)]
-        return Rows.join([parts[0], Rows.join(parts[1:]).first(self.index.span - 1)]).first(
-            own + self.index.span - 1
-        )
-
-    def check(self) -> None:
-        """Decode one row group, so that a fault of all row groups shows before the first batch."""
-        if self.index.count:
-            self.rows(int(self.index.units()[0]))
+        own = self._group(group)
+        after = Rows.join([self._group(g) for g in range(group + 1, reach + 1)])
+        return Rows.join([own, after.first(self.index.span - 1)])
 
     def _group(self, group: int) -> Rows:
         if group not in self._kept:
             shard, number = (int(v) for v in self.index.groups[group])
             values = self.shards.read(self._names[shard], [number], self._columns)
-            self._check(group, self._names[shard], values)
+            self._check(self._names[shard], values)
             tokens, actions, episode, frame, *known = (values[name] for name in self._columns)
             self._kept[group] = Rows(tokens, actions, episode, frame, known[0] if known else None)
             while len(self._kept) > self._keep:
@@ -172,35 +168,21 @@ class Decoder:
         self._kept.move_to_end(group)
         return self._kept[group]
 
-    def _check(self, group: int, shard: str, values: dict[str, NDArray[Any]]) -> None:
-        fault = self._fault(group, values)
-        if fault:
-            where = f"{self.shards.folder}/{shard}"
-            raise ShardError(where, fault, f"hma shards verify {self.shards.folder} tells what is damaged")
-
-    def _fault(self, group: int, values: dict[str, NDArray[Any]]) -> str:
-        """Return how rows contradict the manifest or episodes.parquet; empty where they do not."""
-        name, spec = self._columns[0], self.shards.spec
-        tokens, actions, frame = values[name], values["action"], values["frame_index"]
-        for column, width in self._widths.items():
-            if values[column].shape[1:] != (width,):
-                found = values[column].shape[1] if values[column].ndim > 1 else 1
-                return f"has {found} values a row in column {column}, where its manifest says {width}"
-        rows = int(self.index.edges[group + 1] - self.index.edges[group])
-        if len(frame) != rows:
-            number = self.index.groups[group, 1]
-            return f"has {len(frame):,} rows in row group {number}, where its manifest says {rows:,}"
-        if frame[self.index.episode_starts(group)].any():
-            return "does not begin its episodes at the rows that episodes.parquet names"
+    def _check(self, shard: str, values: dict[str, NDArray[Any]]) -> None:
+        """Raise ShardError for tokens or actions that would spoil the training without an error."""
+        tokens, actions, episode, frame = (values[name] for name in self._columns[:4])
+        size, fault = self.shards.spec.vocab_size, ""
         bad = np.flatnonzero(~np.isfinite(actions).all(axis=1))
         if len(bad):
-            place = f"episode {values['episode_index'][bad[0]]} frame {frame[bad[0]]}"
-            return f"has {len(bad):,} rows whose actions are not finite numbers, the first in {place}"
-        if spec.vocab_size and int(tokens.max(initial=0)) >= spec.vocab_size:
-            return f"has token {tokens.max()}, where {spec.name} knows 0 to {spec.vocab_size - 1}"
-        if tokens.dtype.kind == "f" and not np.isfinite(tokens).all():
-            return f"has {name} that are not finite numbers"
-        return ""
+            first = f"episode {episode[bad[0]]} frame {frame[bad[0]]}"
+            fault = f"{len(bad):,} rows have actions that are not finite; the first is {first}"
+        elif size and int(tokens.max(initial=0)) >= size:
+            fault = f"token {tokens.max()} is outside the vocabulary, 0 to {size - 1}"
+        elif tokens.dtype.kind == "f" and not np.isfinite(tokens).all():
+            fault = "latents are not finite"
+        if fault:
+            folder = self.shards.folder
+            raise ShardError(f"{folder}/{shard}", fault, f"run: hma shards verify {folder}")
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_kept": OrderedDict()}  # a worker decodes its own
@@ -211,6 +193,95 @@ def _check_stride(shards: ShardSet) -> None:
     if kept < 1 or stride % kept:
         raise ShardError(
             shards.folder,
-            f"keeps every {kept}. frame, which cannot give frames {stride} steps apart",
-            "convert again with --frames all, or with a stride that it divides",
+            f"keeps one of every {kept} recorded frames, but the stride is {stride}",
+            f"convert again with --frames all, or set a stride that is a multiple of {kept}",
         )
+
+
+@dataclass
+class Batch:
+    """A batch of windows, as the model takes it.
+
+    Attributes:
+        embodiment: B ids; may mix.
+        actions: (B, T, Kmax) float32 raw; rows of narrower embodiments are zero at the end.
+        action_mask: (B, T) bool, True where all steps of the chunk are known.
+        tokens: (B, T, h, w) int64, or None.
+        latents: (B, T, c, H, W) float32 as stored, or None.
+        episode, frame: (B,) int64, the episode of the window and the frame it starts at.
+        camera: (B,) int64, index of the camera among those of the shard set.
+        frame_mask: (B, T) bool, False where a short episode was padded; such frames give no loss. None where
+            episodes are not padded.
+    """
+
+    embodiment: list[str]
+    actions: Tensor
+    action_mask: Tensor
+    tokens: Tensor | None = None
+    latents: Tensor | None = None
+    episode: Tensor | None = None
+    frame: Tensor | None = None
+    camera: Tensor | None = None
+    frame_mask: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.embodiment)
+
+    def to(self, device: torch.device | str) -> "Batch":
+        """Return the same batch on another device."""
+        return self._map(lambda value: value.to(device, non_blocking=True))
+
+    def pin_memory(self) -> "Batch":
+        """Return the same batch in pinned memory; a DataLoader with pin_memory=True calls this."""
+        return self._map(Tensor.pin_memory)
+
+    def _map(self, change: Any) -> "Batch":
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Batch(**{k: change(v) if isinstance(v, Tensor) else v for k, v in values.items()})
+
+
+def assemble(
+    sets: Mapping[str, ShardSet],
+    names: list[str],
+    windows_of: Mapping[str, tuple[Ints, dict[str, NDArray[Any]]]],
+    short: Short,
+) -> Batch:
+    """Assemble one batch.
+
+    Args:
+        names: (B,) the embodiment of each sample.
+        windows_of: embodiment -> the indices (n,) of its samples in the batch, and its windows.
+    """
+    size = len(names)
+    width = max(windows["actions"].shape[2] for _, windows in windows_of.values())
+    frames = next(iter(windows_of.values()))[1]["actions"].shape[1]
+    spec = next(iter(sets.values())).spec
+    discrete = spec.kind == "discrete"
+    shape = spec.grid if discrete else (spec.channels or 1, *spec.grid)
+    actions = np.zeros((size, frames, width), np.float32)
+    pictures = np.empty((size, frames, *shape), np.int64 if discrete else np.float32)
+    known, inside = np.ones((size, frames), np.bool_), np.ones((size, frames), np.bool_)
+    where = {key: np.empty(size, np.int64) for key in ("episode", "frame", "camera")}
+    for samples, windows in windows_of.values():
+        actions[samples, :, : windows["actions"].shape[2]] = windows["actions"]
+        pictures[samples] = windows["tokens"].reshape(len(samples), frames, *shape)
+        if "known" in windows:
+            known[samples] = windows["known"]
+        if "inside" in windows:
+            inside[samples] = windows["inside"]
+        for key, values in where.items():
+            values[samples] = windows[key]
+    return Batch(
+        embodiment=names,
+        actions=torch.from_numpy(actions),
+        action_mask=torch.from_numpy(known),
+        tokens=torch.from_numpy(pictures) if discrete else None,
+        latents=None if discrete else torch.from_numpy(pictures),
+        **{key: torch.from_numpy(values) for key, values in where.items()},
+        frame_mask=torch.from_numpy(inside) if short == "pad" else None,
+    )
+
+
+def as_batch(batch: Batch) -> Batch:
+    """Return the batch unchanged: a `collate_fn` for datasets that make whole batches."""
+    return batch

@@ -9,23 +9,18 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HMAError, RegistryError
-from hma_data.registry.formats import FORMATS
+from hma_data.registry import FORMATS
 from hma_data.storage.files import cache_folder, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.shipped import shipped
 from hma_data.storage.yaml_io import decode_yaml, parse_yaml, read_bytes
-
-MAX_KEPT = 100_000  # judgements kept in the cache
-_JUDGES = (
-    "registry/embodiment.py", "registry/components.py", "registry/formats.py", "registry/catalog.py",
-    "storage/yaml_io.py",
-)  # fmt: skip
 
 
 def registry_folders(beside: StrPath | None = None) -> list[Path]:
@@ -85,37 +80,33 @@ def entries(files: Iterable[StrPath] | None = None) -> list[Entry]:
     Problems between files are added: two files of one folder tree with the same id, and, in a registry
     folder, a file whose name is not its id.
     """
-    judged = _Cache()
+    cache = _Cache()
     if files is not None:
-        found = [_entry(as_path(path), judged) for path in files]
-        judged.save()
-        return _doubles(found)
-    found = []
-    for folder in registry_folders():
-        judged_here = [_entry(path, judged) for path in registry_files([folder])]
-        found += [_misnamed(entry) for entry in _doubles(judged_here)]
-    judged.save()
+        found = _doubles([_entry(as_path(path), cache) for path in files])
+    else:
+        found = []
+        for folder in registry_folders():
+            here = _doubles([_entry(path, cache) for path in registry_files([folder])])
+            found += [_misnamed(entry) for entry in here]
+    cache.save()
     return found
 
 
-def _entry(path: Path, judged: "_Cache") -> Entry:
+def _entry(path: Path, cache: "_Cache") -> Entry:
     try:
-        content = read_bytes(path)
-        said = judged.get(content) or judged.put(content, _judge(content, path))
+        found = cache.judgement(read_bytes(path), path)
     except HMAError as fault:
-        return Entry(path, None, (_plain("", fault.fault),), None)
-    return Entry(path, said["facts"], tuple(said["problems"]), said["name"])
+        found = _unreadable(fault)
+    return Entry(path, found["facts"], tuple(found["problems"]), found["name"])
 
 
 def _judge(content: bytes, path: Path) -> dict[str, Any]:
-    from dataclasses import asdict
-
     from hma_data.registry.embodiment import Embodiment, find_problems
 
     try:
         values = parse_yaml(decode_yaml(content, path), path.name)
     except HMAError as fault:
-        return {"facts": None, "problems": [_plain("", fault.fault)], "name": None}
+        return _unreadable(fault)
     faults = find_problems(values)
     name = values.get("id") if isinstance(values, dict) else None
     return {
@@ -153,86 +144,65 @@ def facts(embodiment: Any) -> dict[str, Any]:
     }
 
 
-def _plain(path: str, fault: str, value: str | None = None) -> dict[str, str | None]:
-    return {"path": path, "fault": fault, "value": value, "allowed": None}
+def _unreadable(fault: HMAError) -> dict[str, Any]:
+    problem = {"path": "", "fault": fault.fault, "value": None, "allowed": None}
+    return {"facts": None, "problems": [problem], "name": None}
 
 
-def _with(entry: Entry, problem: dict[str, str | None]) -> Entry:
+def _with(entry: Entry, fault: str) -> Entry:
+    problem = {"path": "id", "fault": fault, "value": repr(entry.name), "allowed": None}
     return Entry(entry.path, None, (*entry.problems, problem), entry.name)
 
 
 def _doubles(found: list[Entry]) -> list[Entry]:
     """Add a problem to every file whose id an earlier file has."""
-    first: dict[str, Path] = {}
-    result = []
-    for entry in found:
-        owner = first.setdefault(entry.name, entry.path) if entry.name is not None else entry.path
+    owners: dict[str, Path] = {}
+    for i, entry in enumerate(found):
+        owner = entry.path if entry.name is None else owners.setdefault(entry.name, entry.path)
         if owner != entry.path:
-            entry = _with(entry, _plain("id", f"is also the id of {owner}", repr(entry.name)))
-        result.append(entry)
-    return result
+            found[i] = _with(entry, f"is also the id of {owner}")
+    return found
 
 
 def _misnamed(entry: Entry) -> Entry:
     """Add a problem to a file of a registry folder whose name is not its id."""
     if entry.facts is None or file_id(entry.path) == entry.name:
         return entry
-    fault = f"does not find its file {entry.path.name}: file name and id must be the same"
-    return _with(entry, _plain("id", fault, repr(entry.name)))
-
-
-def _asked_packages(said: dict[str, Any]) -> bool:
-    """Check whether a judgement was of a format that is not built in: installing a package changes it."""
-    if said["facts"]:
-        return said["facts"]["format"] not in FORMATS
-    return any(problem["path"] == "source.format" for problem in said["problems"])
+    return _with(entry, f"does not find its file {entry.path.name}: file name and id must be the same")
 
 
 class _Cache:
-    """Facts and problems by the hash of a YAML's bytes, in one JSON file per version of the judging code."""
+    """The judgements of YAML files by the hash of their bytes, in one JSON file per version of the code."""
 
     def __init__(self) -> None:
-        package = Path(__file__).parents[1]
-        code = hashlib.blake2b(digest_size=12)
-        for name in _JUDGES:
-            code.update((package / name).read_bytes())
-        code.update(f"{version('pydantic')} {version('pyyaml')}".encode())
+        code = hashlib.blake2b(f"{version('pydantic')} {version('pyyaml')}".encode(), digest_size=12)
+        for module in ("__init__", "catalog", "components", "embodiment", "../storage/yaml_io"):
+            code.update((Path(__file__).parent / f"{module}.py").read_bytes())
         self._path = cache_folder() / f"registry-{code.hexdigest()}.json"
-        self._kept = self._load()
-        self._used: dict[str, Any] = {}
+        self._kept: dict[str, dict[str, Any]] = {}
         self._new = False
+        with suppress(OSError, ValueError):
+            self._kept = json.loads(self._path.read_bytes())
 
-    def _load(self) -> dict[str, Any]:
-        try:
-            kept = json.loads(self._path.read_bytes())
-        except (OSError, ValueError):
-            return {}
-        return kept if isinstance(kept, dict) else {}
-
-    def get(self, content: bytes) -> dict[str, Any] | None:
-        name = hashlib.sha256(content).hexdigest()
-        said = self._kept.get(name)
-        if not isinstance(said, dict) or said.keys() != {"facts", "problems", "name"}:
-            return None
-        self._used[name] = said
-        return said
-
-    def put(self, content: bytes, said: dict[str, Any]) -> dict[str, Any]:
-        if not _asked_packages(said):
-            self._used[hashlib.sha256(content).hexdigest()] = said
-            self._new = True
-        return said
+    def judgement(self, content: bytes, path: Path) -> dict[str, Any]:
+        """Return the facts, problems and name of a YAML with that content."""
+        key = hashlib.sha256(content).hexdigest()
+        if key not in self._kept:
+            found = _judge(content, path)
+            if _depends_on_packages(found):
+                return found
+            self._kept[key], self._new = found, True
+        return self._kept[key]
 
     def save(self) -> None:
-        """Write the new entries; where the cache cannot be written, later runs are only slower."""
-        if not self._new:
-            return
-        room = MAX_KEPT - len(self._used)
-        older = [name for name in self._kept if name not in self._used][: max(room, 0)]
-        try:
-            write_atomic(self._path, json.dumps({name: self._kept[name] for name in older} | self._used))
-            for old in self._path.parent.glob("registry-*.json"):
-                if old != self._path and old.stat().st_mtime < self._path.stat().st_mtime - 30 * 86_400:
-                    old.unlink()
-        except (HMAError, OSError):
-            return
+        """Write new entries; where the cache cannot be written, later runs are only slower."""
+        if self._new:
+            with suppress(HMAError, OSError):
+                write_atomic(self._path, json.dumps(self._kept))
+
+
+def _depends_on_packages(judgement: dict[str, Any]) -> bool:
+    """Check whether the format is not built in: installing a package changes such a judgement."""
+    if judgement["facts"]:
+        return judgement["facts"]["format"] not in FORMATS
+    return any(problem["path"] == "source.format" for problem in judgement["problems"])

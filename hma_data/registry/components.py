@@ -5,18 +5,10 @@ They are frozen and validated when made; `hma_data.registry.embodiment` puts the
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from hma_data.registry.formats import MORE, is_known, known_formats
+from hma_data.registry import FORMATS, MORE, known_formats
 
 Space = Literal[
     "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",
@@ -35,18 +27,14 @@ def _no_bool(value: Any) -> Any:
     return value
 
 
-def _no_minus_zero(value: float) -> float:
-    return value + 0.0  # -0.0 equals 0.0 but prints and hashes apart
-
-
-Number = Annotated[
-    float, BeforeValidator(_no_bool), Field(allow_inf_nan=False), AfterValidator(_no_minus_zero)
-]
+Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
 Count = Annotated[int, BeforeValidator(_no_bool)]
+Positive = Annotated[Count, Field(ge=1)]
+Start = Annotated[Count, Field(ge=0)]
 
 
 def _known_format(value: Any) -> Any:
-    if not isinstance(value, str) or not is_known(value):
+    if not isinstance(value, str) or (value not in FORMATS and value not in known_formats()):
         allowed = f"{', '.join(map(repr, known_formats()))}; {MORE}"
         raise PydanticCustomError("literal_error", "must be a known format", {"expected": allowed})
     return value
@@ -66,17 +54,17 @@ class SpecModel(BaseModel):
 
 
 class Component(SpecModel):
-    """A piece of the action (or state) vector.
+    """A named part of the action or state vector.
 
     `sign` and `offset` change values (value * sign + offset); `range` and `representation`
     state conventions and change nothing.
     """
 
-    key: str = Field(min_length=1, description="where the values are: a path or a topic field, by format")
-    dims: Count = Field(ge=1, le=4096, description="how many values it gives")
-    slice: tuple[Count, Count] | None = Field(None, description="[from, to) of the vector found at key")
+    key: str = Field(min_length=1, description="where the recording has the values: a path or a topic field")
+    dims: Count = Field(ge=1, le=4096, description="the number of values")
+    slice: tuple[Start, Count] | None = Field(None, description="[from, to) of the vector found at key")
     names: tuple[str, ...] | None = Field(
-        None, description="one a value; selects by name where messages have names"
+        None, description="one name for each value; messages with names are read by these names"
     )
     unit: str | None = None
     normalize: bool = True
@@ -86,26 +74,22 @@ class Component(SpecModel):
     representation: Representation | None = None
     gripper: Gripper | None = Field(
         None,
-        description="which way it opens; opening_ and closing_is_high are of commands that move it a bit",
+        description="how a value opens it; opening_ and closing_is_high are for commands that move it a bit",
     )
     stamp: Literal["header", "receive"] | None = None
 
     @model_validator(mode="after")
     def _widths(self) -> Self:
-        if self.slice and not 0 <= self.slice[0] < self.slice[1]:
-            raise ValueError(f"slice {list(self.slice)} must be [from, to) with 0 <= from < to")
-        if self.slice and self.slice[1] - self.slice[0] != self.dims:
-            raise ValueError(
-                f"slice {list(self.slice)} has {self.slice[1] - self.slice[0]} values, dims says {self.dims}"
-            )
+        if self.slice and (width := self.slice[1] - self.slice[0]) != self.dims:
+            raise ValueError(f"slice {list(self.slice)} has {width} values, but dims is {self.dims}")
         if self.names and len(self.names) != self.dims:
-            raise ValueError(f"{len(self.names)} names for {self.dims} dims")
+            raise ValueError(f"there are {len(self.names)} names for {self.dims} dims")
         for label in ("sign", "offset"):
             value = getattr(self, label)
             if isinstance(value, tuple) and len(value) != self.dims:
                 raise ValueError(f"{label} has {len(value)} values for {self.dims} dims")
         if self.range and self.range[0] >= self.range[1]:
-            raise ValueError(f"range {list(self.range)} must rise")
+            raise ValueError(f"range {list(self.range)} must be [low, high] with low < high")
         return self
 
 
@@ -123,8 +107,8 @@ class Vector(SpecModel):
         """Return a name for each value, made from the key where the YAML gives none."""
         return [
             name
-            for part in self.components
-            for name in (part.names or [f"{part.key}.{i}" for i in range(part.dims)])
+            for component in self.components
+            for name in (component.names or [f"{component.key}.{i}" for i in range(component.dims)])
         ]
 
 
@@ -139,55 +123,45 @@ class Camera(SpecModel):
 
     name: str = Field(min_length=1, pattern=r"^[A-Za-z0-9_.-]+$")
     key: str = Field(min_length=1)
-    size: tuple[Count, Count] | None = Field(
-        None, description="[height, width] of the recorded picture in pixels; states a fact, changes nothing"
+    size: tuple[Positive, Positive] | None = Field(
+        None, description="[height, width] of the recorded picture in pixels; changes nothing"
     )
     color: Literal["rgb", "bgr"] = "rgb"
     resize: Literal["short_side_crop", "letterbox", "stretch"] = "short_side_crop"
     rotate: Literal[0, 90, 180, 270] = Field(0, description="degrees clockwise")
     flip: Literal["vertical", "horizontal"] | None = Field(
-        None, description="vertical: rows are stored bottom to top; before rotate"
+        None, description="applied before rotate; vertical: rows are stored from bottom to top"
     )
-    crop: tuple[Count, Count, Count, Count] | None = Field(
+    crop: tuple[Start, Start, Positive, Positive] | None = Field(
         None, description="[x, y, width, height] in source pixels"
     )
     stamp: Literal["header", "receive"] | None = None
-
-    @field_validator("size")
-    @classmethod
-    def _size_positive(cls, size: tuple[int, int] | None) -> tuple[int, int] | None:
-        if size and min(size) < 1:
-            raise ValueError(f"size {list(size)} must be [height >= 1, width >= 1]")
-        return size
-
-    @field_validator("crop")
-    @classmethod
-    def _crop_positive(cls, crop: tuple[int, int, int, int] | None) -> tuple[int, int, int, int] | None:
-        if crop and (min(crop[:2]) < 0 or min(crop[2:]) < 1):
-            raise ValueError(f"crop {list(crop)} must be [x >= 0, y >= 0, width >= 1, height >= 1]")
-        return crop
 
 
 class Sync(SpecModel):
     """The grid for streams of different rates: the primary camera's frames, or a fixed rate."""
 
-    primary: str | None = Field(None, description="the camera whose frames are the grid; default the first")
+    primary: str | None = Field(
+        None, description="the camera whose frames are the grid; the first by default"
+    )
     rate_hz: Number | None = Field(
         None, gt=0, le=100_000, description="a fixed grid instead of a camera's frames"
     )
     images: Method = "nearest"
     actions: Method = "hold"
     states: Method = "interpolate"
-    max_skew_ms: Number | None = Field(None, gt=0, description="furthest that a sample may be moved")
+    max_skew_ms: Number | None = Field(
+        None, gt=0, description="the largest time by which a sample may be moved"
+    )
     beyond: Literal["refuse", "mask"] = Field(
         "refuse",
-        description="further than max_skew_ms: refuse the episode, or mask the numbers; pictures refuse",
+        description="beyond max_skew_ms, refuse the episode, or mask numbers; pictures always refuse it",
     )
     action_shift: Count = Field(
         0,
         ge=-100,
         le=100,
-        description="steps: the command of frame t is recorded at t + action_shift; not in bags",
+        description="in steps: the command of frame t is recorded at t + action_shift; not for bags",
     )
     stamp: Literal["header", "receive"] = "header"
 
@@ -198,7 +172,7 @@ class Marker(SpecModel):
     With `equals`, only messages at which the value becomes `equals` count; without it, every message does.
     """
 
-    key: str = Field(min_length=1, description="/topic, or /topic.field.path; of a service, its event topic")
+    key: str = Field(min_length=1, description="/topic or /topic.field.path; for a service, its event topic")
     equals: bool | Number | str | None = None
 
     @model_validator(mode="after")
@@ -206,7 +180,7 @@ class Marker(SpecModel):
         if not self.key.startswith("/"):
             raise ValueError(f"key {self.key!r} must begin with a topic, /topic or /topic.field.path")
         if self.equals is not None and "." not in self.key:
-            raise ValueError(f"equals needs a field to compare, {self.key} names only a topic")
+            raise ValueError(f"equals needs a field, but {self.key} names only a topic")
         return self
 
 
@@ -214,15 +188,15 @@ class Segments(SpecModel):
     """The conditions that divide one bag into several episodes; several may be given together."""
 
     gap_s: Number | None = Field(
-        None, gt=0, description="a longer pause of the primary camera parts episodes"
+        None, gt=0, description="seconds; a longer pause of the primary camera starts a new episode"
     )
-    start: Marker | None = Field(None, description="begins an episode, and ends one that runs")
+    start: Marker | None = Field(None, description="begins an episode and ends the current one")
     stop: Marker | None = Field(None, description="ends an episode; without start, the next begins there")
 
     @model_validator(mode="after")
     def _something(self) -> Self:
         if self.gap_s is None and self.start is None and self.stop is None:
-            raise ValueError("says nothing: give gap_s, start or stop")
+            raise ValueError("is empty: give gap_s, start or stop")
         return self
 
 
@@ -232,7 +206,9 @@ class SourceSpec(SpecModel):
     format: Format
     uri: str | None = None
     split: str | None = Field(None, description="the source's own split to read")
-    episodes: Count | None = Field(None, ge=1, description="how many there are, as published")
+    episodes: Count | None = Field(None, ge=1, description="the published number of episodes")
     instruction: str | None = Field(None, description="key of the language instruction")
-    layout: dict[str, str] | None = Field(None, description="by format: keys of a generic layout")
-    segments: Segments | None = Field(None, description="of bags: what parts a bag into episodes")
+    layout: dict[str, str] | None = Field(
+        None, description="where a file has its data; the keys depend on the format"
+    )
+    segments: Segments | None = Field(None, description="how one bag is divided into episodes")

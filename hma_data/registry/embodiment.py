@@ -1,7 +1,7 @@
 """Read embodiments: one robot as one dataset recorded it, described by one YAML of the registry.
 
-The YAML decides everything else: the keys a converter reads, the stride, the width of stem and head, and
-the name under which something is published. Nothing is guessed: a YAML says what is unknown.
+The YAML decides everything else: the keys that a converter reads, the stride, the width of stem and head,
+and the name under which something is published. Nothing is guessed: a YAML states what is unknown.
 
 A action dims, K = stride * A values of an action chunk.
 """
@@ -62,7 +62,7 @@ class Embodiment(SpecModel):
     robot: str | None = None
     kind: Literal["real", "simulation", "human"]
     frequency_hz: Number | Literal["unknown"] | None = Field(
-        description="control rate of the recording; null only with per-recording timestamps"
+        description="control rate of the recording in Hz; null only where every recording has timestamps"
     )
     target_hz: Number = Field(2.0, ge=0.001, le=100_000)
     stride_override: Count | None = Field(None, alias="stride", ge=1)
@@ -80,7 +80,7 @@ class Embodiment(SpecModel):
     @classmethod
     def _id_is_a_name(cls, value: str) -> str:
         if not ID_PATTERN.fullmatch(value) or ".." in value:
-            raise ValueError("an id is 1 to 100 of a-z 0-9 _ - . beginning with a letter or digit")
+            raise ValueError("must be 1 to 100 of a-z 0-9 _ - . and begin with a letter or digit")
         return value
 
     @field_validator("frequency_hz")
@@ -94,19 +94,15 @@ class Embodiment(SpecModel):
     def _names_agree(self) -> Self:
         names = [camera.name for camera in self.cameras]
         if len(set(names)) != len(names):
-            raise ValueError(f"cameras have one name twice: {', '.join(names)}")
+            raise ValueError(f"two cameras have the same name: {', '.join(names)}")
         if self.sync.primary and self.sync.primary not in names:
-            raise ValueError(
-                f"sync.primary {self.sync.primary!r} is not a camera; cameras: {', '.join(names)}"
-            )
+            raise ValueError(f"sync.primary {self.sync.primary!r} is not one of: {', '.join(names)}")
         if self.source.segments and self.source.format != "rosbag":
-            raise ValueError(f"source.segments is of bags, not of {self.source.format}")
+            raise ValueError(f"source.segments is for bags, not for {self.source.format}")
         if self.sync.beyond == "mask" and self.sync.max_skew_ms is None:
-            raise ValueError("sync.beyond: mask needs sync.max_skew_ms, beyond which is masked")
+            raise ValueError("sync.beyond: mask needs sync.max_skew_ms")
         if self.sync.action_shift and self.source.format == "rosbag":
-            raise ValueError(
-                "sync.action_shift counts steps, and messages of a bag have times instead of steps"
-            )
+            raise ValueError("sync.action_shift counts steps, but a bag has times instead of steps")
         return self
 
     # -- derived facts
@@ -127,12 +123,11 @@ class Embodiment(SpecModel):
             return self.sync.rate_hz
         if isinstance(self.frequency_hz, float):
             return self.frequency_hz
-        said = self.provenance.get("frequency_hz")
+        stated = self.provenance.get("frequency_hz", "nobody states it")
+        fault = f"is unknown ({stated})" if self.frequency_hz else "is null, and so is sync.rate_hz"
         raise RegistryError(
             f"embodiment {self.id}: frequency_hz",
-            "is unknown: nobody states the rate of this recording" + (f" ({said})" if said else "")
-            if self.frequency_hz == "unknown"
-            else "is null and sync.rate_hz is not set, so there is no rate of the grid",
+            fault,
             f"set frequency_hz in a copy of the YAML (hma registry show {self.id} > {self.id}.yaml), "
             "or give hma convert --frequency-hz HZ",
         )
@@ -145,18 +140,15 @@ class Embodiment(SpecModel):
         """
         where = f"embodiment {self.id}: frequency_hz"
         if self.frequency_hz not in ("unknown", hz):
-            raise RegistryError(
-                where, f"is {self.frequency_hz}, not {hz:g}", "correct it in a copy of the YAML"
-            )
+            fault = f"is {self.frequency_hz}, not {hz:g}"
+            raise RegistryError(where, fault, "correct it in a copy of the YAML")
         provenance = self.provenance | {"frequency_hz": "given at the conversion"}
         return Embodiment.from_values(self.to_dict() | {"frequency_hz": hz, "provenance": provenance}, where)
 
     @property
     def stride(self) -> int:
         """Return the recorded steps per frame of the model's grid: max(1, rate / target rounded half up)."""
-        if self.stride_override:
-            return self.stride_override
-        return max(1, math.floor(self.rate_hz / self.target_hz + 0.5))
+        return self.stride_override or max(1, math.floor(self.rate_hz / self.target_hz + 0.5))
 
     @property
     def effective_hz(self) -> float:
@@ -190,14 +182,14 @@ class Embodiment(SpecModel):
         """Return (A,) bool, True where the model normalizes the value."""
         import numpy as np
 
-        return np.array([part.normalize for part in self.action.components for _ in range(part.dims)])
+        components = self.action.components
+        return np.repeat([c.normalize for c in components], [c.dims for c in components])
 
     @cached_property
     def digest(self) -> str:
         """Return sixteen hex digits over the fields that decide the shards' content (no texts, no URI)."""
         content = self.model_dump(mode="json", exclude_defaults=True, include=_DECIDES)
-        hashed = json.dumps(content, sort_keys=True)
-        return hashlib.sha256(hashed.encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     # -- YAML
 
@@ -270,7 +262,8 @@ def find_problems(values: Any) -> list[Problem]:
         asked = {path for path, _ in questions}
         for item in fault.errors(include_url=False):
             path = _yaml_path(item["loc"], values, missing=item["type"] == "missing")
-            if path not in asked and not _follows_from_another(item):
+            follows = item["type"] == "too_short" and item["input"]  # pydantic leaves out the wrong items
+            if path not in asked and not follows:
                 found.append(_problem(path, item))
     return list(dict.fromkeys(found))
 
@@ -278,11 +271,8 @@ def find_problems(values: Any) -> list[Problem]:
 def todos(values: Any, path: str = "") -> list[tuple[str, str]]:
     """Return (YAML path, question) of every value that still begins with TODO."""
     if isinstance(values, dict):
-        return [
-            item
-            for key, value in values.items()
-            for item in todos(value, f"{path}.{key}" if path else str(key))
-        ]
+        inner = [(f"{path}.{key}" if path else str(key), value) for key, value in values.items()]
+        return [item for key, value in inner for item in todos(value, key)]
     if isinstance(values, list):
         return [item for i, value in enumerate(values) for item in todos(value, f"{path}[{i}]")]
     if isinstance(values, str) and values.startswith(TODO):
@@ -303,33 +293,26 @@ def _yaml_path(location: tuple[int | str, ...], values: Any, missing: bool) -> s
     return path
 
 
-def _follows_from_another(item: Any) -> bool:
-    """Check whether an error only follows from others: pydantic calls a list of wrong items too short."""
-    return item["type"] == "too_short" and bool(item["input"])
-
-
 def _problem(path: str, item: Any) -> Problem:
-    value = item.get("input")
-    kind, context = item["type"], item.get("ctx", {})
-    if kind == "missing":
+    if item["type"] == "missing":
         return Problem(path, "is missing")
-    if kind == "extra_forbidden":
+    if item["type"] == "extra_forbidden":
         return _unknown_key(path)
-    shown = None if isinstance(value, dict) else repr(value)
+    shown = None if isinstance(item["input"], dict) else repr(item["input"])
     if shown and len(shown) > 60:
         shown = shown[:57] + "..."
-    if kind == "literal_error":
-        return Problem(path, "is not one of the words that are allowed", shown, context["expected"])
+    if item["type"] == "literal_error":
+        return Problem(path, "is not one of the words that are allowed", shown, item["ctx"]["expected"])
     return Problem(path, item["msg"].removeprefix("Value error, "), shown)
 
 
 def _unknown_key(path: str) -> Problem:
     from difflib import get_close_matches
 
-    place = re.sub(r"\[\d+\]", "", path).split(".")
-    known = _KEYS_AT.get(".".join(place[:-1]), Embodiment)
+    parent, _, key = re.sub(r"\[\d+\]", "", path).rpartition(".")
+    known = _KEYS_AT.get(parent, Embodiment)
     keys = [field.alias or name for name, field in known.model_fields.items()]
-    near = get_close_matches(place[-1], keys, n=1)
+    near = get_close_matches(key, keys, n=1)
     hint = f", did you mean {near[0]!r}?" if near else ""
     return Problem(path, f"unknown key{hint}", allowed=", ".join(keys))
 
@@ -350,10 +333,8 @@ _KEYS_AT: dict[str, type[SpecModel]] = {
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema of a registry YAML, for editors."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **Embodiment.model_json_schema(by_alias=True),
-    }
+    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return dialect | Embodiment.model_json_schema(by_alias=True)
 
 
 # -- where embodiments are found
@@ -379,11 +360,9 @@ def find(name_or_path: StrPath, beside: StrPath | None = None) -> Embodiment:
             raise RegistryError(paths[1], f"has the id of {paths[0]}", "remove or rename one")
         if paths:
             embodiment = Embodiment.load(paths[0])
-            if embodiment.id != name_or_path:
-                raise RegistryError(
-                    paths[0], f"has id {embodiment.id!r}", "file name and id must be the same"
-                )
-            return embodiment
+            if embodiment.id == name_or_path:
+                return embodiment
+            raise RegistryError(paths[0], f"has id {embodiment.id!r}", "file name and id must be the same")
     from difflib import get_close_matches
 
     near = get_close_matches(name_or_path, [file_id(path) for path in registry_files(folders)], n=3)

@@ -32,8 +32,8 @@ def modality(embodiment: Embodiment) -> dict[str, Any]:
     own = embodiment.source.format == "lerobot"
     delta = embodiment.action.space in DELTA_SPACES
     values: dict[str, Any] = {
-        "state": _places(embodiment.state, "observation.state", own, delta=False),
-        "action": _places(embodiment.action, "action", own, delta=delta),
+        "state": _modalities(embodiment.state, "observation.state", own, delta=False),
+        "action": _modalities(embodiment.action, "action", own, delta=delta),
         "video": {
             camera.name: {"original_key": camera.key if own else f"observation.images.{camera.name}"}
             for camera in embodiment.cameras
@@ -44,50 +44,54 @@ def modality(embodiment: Embodiment) -> dict[str, Any]:
     return values
 
 
-def _places(vector: Vector | None, feature: str, own: bool, delta: bool) -> dict[str, dict[str, Any]]:
+def _modalities(vector: Vector | None, feature: str, own: bool, delta: bool) -> dict[str, dict[str, Any]]:
     if vector is None:
         return {}
     found: dict[str, dict[str, Any]] = {}
     names = component_names(vector)
     offset = 0
-    for name, part in zip(names, vector.components, strict=True):
-        start = (part.slice[0] if part.slice else 0) if own else offset
-        offset += part.dims
-        moves = delta if part.gripper is None else part.gripper in ("opening_is_high", "closing_is_high")
-        place: dict[str, Any] = {
+    for name, component in zip(names, vector.components, strict=True):
+        start = (component.slice[0] if component.slice else 0) if own else offset
+        offset += component.dims
+        moves = (
+            delta
+            if component.gripper is None
+            else component.gripper in ("opening_is_high", "closing_is_high")
+        )
+        entry: dict[str, Any] = {
             "start": start,
-            "end": start + part.dims,
-            "original_key": part.key if own else feature,
+            "end": start + component.dims,
+            "original_key": component.key if own else feature,
             "absolute": not moves,
             "dtype": "float32",
         }
-        if part.representation:
-            place["rotation_type"] = _ROTATIONS[part.representation]
-        if part.range:
-            place["range"] = list(part.range)
-        found[name] = place
+        if component.representation:
+            entry["rotation_type"] = _ROTATIONS[component.representation]
+        if component.range:
+            entry["range"] = list(component.range)
+        found[name] = entry
     return found
 
 
 def component_names(vector: Vector) -> list[str]:
     """Return a short name for each component: what it moves, if the YAML states it, or the end of its key."""
-    plain = [_component_name(part) for part in vector.components]
+    plain = [_component_name(component) for component in vector.components]
     return [
         name if plain.count(name) == 1 else f"{name}_{plain[: i + 1].count(name)}"
         for i, name in enumerate(plain)
     ]
 
 
-def _component_name(part: Component) -> str:
-    if part.gripper or part.names == ("gripper",):
-        return "gripper" if part.dims == 1 else "hand"
-    if part.representation:
+def _component_name(component: Component) -> str:
+    if component.gripper or component.names == ("gripper",):
+        return "gripper" if component.dims == 1 else "hand"
+    if component.representation:
         return "rotation"
-    if part.unit == "m":
+    if component.unit == "m":
         return "position"
-    if part.unit == "rad":
+    if component.unit == "rad":
         return "joints"
-    return "".join(c if c.isalnum() else "_" for c in part.key.replace(".", "/").rsplit("/", 1)[-1])
+    return "".join(c if c.isalnum() else "_" for c in component.key.replace(".", "/").rsplit("/", 1)[-1])
 
 
 def lerobot_features(embodiment: Embodiment) -> dict[str, dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 A source must be cheap to make, because every worker makes its own. Between calls it keeps no file open
 that would not survive a fork. `open_source` finds a source by the name of its format; `detect` finds the
-format of the files at a path. Formats are listed in `hma_data.registry.formats`; installed packages may
+format of the files at a path. Formats are listed in `hma_data.registry.catalog`; installed packages may
 add some.
 
 T frames of an episode, A values of a vector.
@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Episode
 from hma_data.errors import EpisodeError, PluginError, SourceError
 from hma_data.plugins import SOURCE_GROUP, installed
+from hma_data.registry import FORMATS, MORE, known_formats
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.registry.formats import FORMATS, MORE, known_formats
 from hma_data.sources.common.findings import Finding
 from hma_data.sources.common.links import nothing_there
 from hma_data.storage.paths import StrPath, as_text

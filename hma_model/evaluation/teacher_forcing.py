@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hma_model.evaluation.metrics import token_hits, token_nats
 from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
-from hma_model.network.trunk import Clock, rotary_angles
+from hma_model.network.trunk import TimePositions, rotary_angles
 
 if TYPE_CHECKING:
     from hma_data.loading.dataset import Batch
@@ -57,21 +57,21 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
     given = align(config, batch.actions, batch.action_mask, count)
     both = ActionConditioning(*(torch.cat([x, x[:, 1:]], dim=1) for x in (given.chunks, given.known)))
-    clock = _clock(config, count, frames.device)
+    times = _times(config, count, frames.device)
     masked = torch.full_like(frames[:, 1:], config.vocab_size)
     x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)))
-    features = model.trunk(x, condition(model, both, groups, clock.positions), clock)
+    features = model.trunk(x, condition(model, both, groups, times.positions), times)
     scores = model.token_readout(model.video_features(features)[:, count:])
     return groups.unsort(model.token_readout.split(scores)).unflatten(2, config.token_grid)
 
 
-def _clock(config: "HMAConfig", frames: int, device: torch.device) -> Clock:
-    """Return the clock of the true and the masked frames; each sees itself and the true frames before."""
+def _times(config: "HMAConfig", frames: int, device: torch.device) -> TimePositions:
+    """Return the times of the true and the masked frames; each sees itself and the true frames before."""
     positions = torch.cat([torch.arange(frames), torch.arange(1, frames)]).to(device)
     true = torch.arange(len(positions), device=device) < frames
     before = positions.unsqueeze(1) > positions
     allowed = (before & true) | torch.eye(len(positions), dtype=torch.bool, device=device)
-    return Clock(positions, allowed, rotary_angles(config, positions))
+    return TimePositions(positions, allowed, rotary_angles(config, positions))
 
 
 def _part(batch: "Batch", frames: slice) -> "Batch":

@@ -7,7 +7,13 @@
 A frame costs one pass for each step of unmasking. The first pass also adds the frame before it, now finished,
 to the cache. `cache=False` computes the whole history in every pass, with the same result.
 
-B batch, P frames of a prompt, h,w token grid, S = h*w, K = stride * action dim, c channels, H,W latent grid.
+Attention over time is causal, so the cached keys and values of a past frame never change. A frame at time t
+lies in slot t mod R of the cache. With rotary positions the length of a rollout has no limit. There is then
+one slot more than the window has frames, for the pass that computes a finished frame and the next one
+together.
+
+B batch, P frames of a prompt, h,w token grid, S = h*w, K = stride * action dim, c channels, H,W latent grid,
+N tokens of a frame with its action tokens, L layers, R slots, n frames of a pass.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,13 +22,65 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.generation.cache import Cache
+from hma_model.config import HMAConfig
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame
-from hma_model.network.conditioning import ActionConditioning, Groups, condition
-from hma_model.network.embed import patchify, unpatchify
+from hma_model.network.conditioning import ActionConditioning, Groups, condition, no_chunks
+from hma_model.network.embed import unpatchify
 from hma_model.network.masking import masked_after
 from hma_model.network.model import HMA
-from hma_model.network.trunk import Conditioning, Trunk, window_clock
+from hma_model.network.trunk import (
+    Conditioning,
+    LayerCache,
+    TimePositions,
+    Trunk,
+    rotary_angles,
+    window_times,
+)
+
+_NEVER = -(1 << 40)
+
+
+class Cache:
+    """The keys and values of every layer, and the time of the frame in each slot.
+
+    Args:
+        config: of the model.
+        batch: B.
+        tokens: N.
+        like: a tensor whose device and dtype the keys and values get.
+    """
+
+    def __init__(self, config: HMAConfig, batch: int, tokens: int, like: Tensor) -> None:
+        self.config = config
+        self.slots = config.frames + (config.time_position == "rotary")
+        time = (2, self.slots, batch, tokens, config.heads, config.head_dim)
+        action = (2, batch, config.heads, self.slots, config.head_dim)
+        crossed = "cross_attention" in config.conditioning
+        self.layers = [
+            LayerCache(like.new_zeros(time), like.new_zeros(action) if crossed else None)
+            for _ in range(config.layers)
+        ]
+        self.times = torch.full((self.slots,), _NEVER, device=like.device)
+
+    def clear(self) -> None:
+        """Forget every frame."""
+        self.times.fill_(_NEVER)
+
+    def hold_still(self) -> None:
+        """Mark the addresses of keys and values as static, so that a compiler may write them in place."""
+        for layer in self.layers:
+            for kept in (layer.time, layer.action):
+                if kept is not None:
+                    torch._dynamo.mark_static_address(kept)
+
+    def time_positions(self, start: int, frames: int) -> TimePositions:
+        """Return the times of a pass over n consecutive frames, and record their times in their slots."""
+        positions = torch.arange(start, start + frames, device=self.times.device)
+        slots = positions % self.slots
+        self.times.index_copy_(0, slots, positions)
+        age = positions.unsqueeze(1) - self.times
+        allowed = (age >= 0) & (age < self.config.frames)
+        return TimePositions(positions, allowed, rotary_angles(self.config, positions), slots=slots)
 
 
 class Rollout:
@@ -77,14 +135,9 @@ class Rollout:
             actions: (B, P - 1 or more, K) raw; chunk k holds the commands from frame k to k+1. Later chunks
                 are not used. None for no actions.
         """
-        self._check_prompt(frames)
-        if self.config.kind == "discrete":
-            values = frames.flatten(2).long()
-        else:
-            values = patchify(frames.float() * self.config.latent_scale, self.config.patch)
-        count = frames.shape[1]
-        self.frames = self.groups.sort(values.to(self.model.device))
-        self.given = self._condition_on(actions, count)
+        values = self.model.frame_values(frames).to(self.model.device)
+        self.frames = self.groups.sort(values)
+        self.given = self._condition_on(actions, frames.shape[1])
         self.passive = actions is None
         self.begun, self.cache = False, None
         self._keep(self.config.frames)
@@ -126,14 +179,14 @@ class Rollout:
         fresh = self.fresh if first or not self.caching else 0
         x = self._embed(frame, fresh)
         if not self.caching:
-            clock = window_clock(self.config, fresh + 1, self.model.device)
-            features = self.model.trunk(x, conditioning, clock)
+            times = window_times(self.config, fresh + 1, self.model.device)
+            features = self.model.trunk(x, conditioning, times)
         else:
-            clock = self._cache().clock(self.time - fresh, fresh + 1)
+            times = self._cache().time_positions(self.time - fresh, fresh + 1)
             part = conditioning if first else conditioning.last()
             trunk = self.compiled if self.compiled and x.shape[1] <= 2 else self.model.trunk
-            features = trunk(x, part, clock, self._cache().layers)
-        return features[:, -1], clock.positions[-1:]
+            features = trunk(x, part, times, self._cache().layers)
+        return features[:, -1], times.positions[-1:]
 
     def _embed(self, frame: TokenFrame | PatchFrame, fresh: int) -> Tensor:
         """Embed the last `fresh` frames and the new one as (B, fresh + 1, S, D)."""
@@ -161,36 +214,30 @@ class Rollout:
 
     def _condition(self, frames: int) -> Conditioning:
         """Return the conditioning of the last frames, the new one included; it is the same in every pass."""
-        start = self.given.known.shape[1] - frames
-        given = ActionConditioning(self.given.chunks[:, start:], self.given.known[:, start:])
+        skips = self.passive and self.config.absent_action != "embedding"
+        given = None if skips else self.given.frames(slice(self.given.known.shape[1] - frames, None))
         positions = torch.arange(self.time + 1 - frames, self.time + 1, device=self.model.device)
-        return condition(self.model, None if self._skips() else given, self.sorted, positions)
-
-    def _skips(self) -> bool:
-        return self.passive and self.config.absent_action != "embedding"
+        return condition(self.model, given, self.sorted, positions)
 
     def _condition_on(self, actions: Tensor | None, frames: int) -> ActionConditioning:
         """Return the chunk at each known frame; with `current` alignment `step` adds the last chunk."""
-        shape, device = (self.batch, frames), self.model.device
-        given = ActionConditioning(
-            torch.zeros(*shape, self.width, device=device),
-            torch.zeros(shape, dtype=torch.bool, device=device),
-        )
+        given = no_chunks(self.batch, frames, self.width, self.model.device)
         if actions is None or frames == 1:
             return given
         if actions.shape[1] < frames - 1 or actions.shape[2] < self.width:
-            fault = f"actions of shape {tuple(actions.shape)} for a prompt of {frames} frames"
+            fault = f"actions have the shape {tuple(actions.shape)} for a prompt of {frames} frames"
             raise HMAError("prompt", fault, f"give (batch, {frames - 1} or more, {self.width})")
         late = int(self.config.action_alignment == "previous")
-        place = slice(late, frames - 1 + late)
-        given.chunks[:, place] = self.groups.sort(actions.to(device))[:, : frames - 1, : self.width].float()
-        given.known[:, place] = True
+        conditioned = given.frames(slice(late, frames - 1 + late))  # a view
+        chunks = self.groups.sort(actions.to(self.model.device))
+        conditioned.chunks[:] = chunks[:, : frames - 1, : self.width].float()
+        conditioned.known[:] = True
         return given
 
     def _take(self, chunk: Tensor | None, following: Tensor | None) -> None:
         """Store the chunk at the frame that it conditions, and add a slot for the new frame."""
         if self.begun and self.config.absent_action != "embedding" and self.passive != (chunk is None):
-            raise HMAError("step", "actions came or went during a rollout", "give them always or never")
+            raise HMAError("step", "some steps have actions and some have none", "give them always or never")
         self.passive = self.passive and chunk is None
         self.begun = True
         new = self._condition_on(None, 1)
@@ -201,13 +248,12 @@ class Rollout:
                 values = values if following is None else self._chunk(following)
             new.chunks[:, 0], new.known[:, 0] = values, True
         self.given = ActionConditioning(
-            torch.cat([self.given.chunks, new.chunks], 1),
-            torch.cat([self.given.known, new.known], 1),
+            torch.cat([self.given.chunks, new.chunks], 1), torch.cat([self.given.known, new.known], 1)
         )
 
     def _chunk(self, chunk: Tensor) -> Tensor:
         if chunk.shape[0] != self.batch or chunk.shape[-1] < self.width or chunk.dim() != 2:
-            fault = f"a chunk of shape {tuple(chunk.shape)}"
+            fault = f"a chunk has the shape {tuple(chunk.shape)}"
             raise HMAError("step", fault, f"give ({self.batch}, {self.width})")
         return self.groups.sort(chunk.to(self.model.device))[:, : self.width].float()
 
@@ -229,10 +275,8 @@ class Rollout:
     def _keep(self, frames: int, ahead: int = 0) -> None:
         """Drop all but the last frames, and all chunks but theirs and the `ahead` chunks after them."""
         self.frames = self.frames[:, max(self.frames.shape[1] - frames, 0) :]
-        start = max(self.given.known.shape[1] - frames - ahead, 0)
-        self.given = ActionConditioning(
-            self.given.chunks[:, start:].clone(), self.given.known[:, start:].clone()
-        )
+        kept = self.given.frames(slice(max(self.given.known.shape[1] - frames - ahead, 0), None))
+        self.given = ActionConditioning(kept.chunks.clone(), kept.known.clone())
 
     # -- in and out ---------------------------------------------------------------------------------------
 
@@ -251,19 +295,6 @@ class Rollout:
         latents = unpatchify(values.unsqueeze(1), self.config.patch, self.config.token_grid)
         return latents.squeeze(1) / self.config.latent_scale
 
-    def _check_prompt(self, frames: Tensor) -> None:
-        config = self.config
-        shape = config.grid if config.kind == "discrete" else (config.channels, *config.grid)
-        if (
-            frames.dim() != 2 + len(shape)
-            or tuple(frames.shape[2:]) != shape
-            or frames.shape[0] != self.batch
-        ):
-            fault = f"frames of shape {tuple(frames.shape)}"
-            raise HMAError("prompt", fault, f"give ({self.batch}, frames, {', '.join(map(str, shape))})")
-        if frames.shape[1] < 1:
-            raise HMAError("prompt", "has no frames", "give at least one")
-
 
 def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
     """Return the trunk compiled for passes of a fixed shape; a result is valid until the next pass."""
@@ -279,14 +310,14 @@ def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
 
 
 def _check(decoding: Decoding, kind: str) -> None:
-    if decoding.steps < 1:
-        raise HMAError("unmask_steps", f"{decoding.steps} is not allowed", "give at least 1")
-    if not decoding.temperature >= 0:
-        raise HMAError("temperature", f"{decoding.temperature} is not allowed", "give at least 0")
     orders = ("random", "confidence") if kind == "discrete" else ("random",)
-    if decoding.order not in orders:
-        fault = f"{decoding.order!r} is not an order of a {kind} model"
-        raise HMAError("order", fault, "give one of " + ", ".join(orders))
+    for name, value, allowed, remedy in (
+        ("unmask_steps", decoding.steps, decoding.steps >= 1, "give at least 1"),
+        ("temperature", decoding.temperature, decoding.temperature >= 0, "give at least 0"),
+        ("order", decoding.order, decoding.order in orders, f"a {kind} model takes {' or '.join(orders)}"),
+    ):
+        if not allowed:
+            raise HMAError(name, f"{value!r} is not allowed", remedy)
 
 
 def generate(
@@ -301,7 +332,7 @@ def generate(
     known = prompt.shape[1]
     rollout = Rollout(model, embodiment, prompt.shape[0], **decoding)  # type: ignore[arg-type]
     if actions is not None and actions.shape[1] < known + frames - 1:
-        fault = f"{actions.shape[1]} action chunks for {known} + {frames} frames"
+        fault = f"there are {actions.shape[1]} chunks for {known} + {frames} frames"
         raise HMAError("actions", fault, f"give {known + frames}")
     rollout.prompt(prompt, actions)
     made = []

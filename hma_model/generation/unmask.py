@@ -88,9 +88,9 @@ class PatchFrame:
         chosen = _top(self.rank, self.masked, count)
         conditions = _gather(readout(features.unsqueeze(1), position).squeeze(1), chosen)
         way = self.decoding
-        patches = readout.diffusion.sample(
-            conditions.flatten(0, 1), way.sample_steps, way.temperature, way.generator
-        ).view(*chosen.shape, -1)
+        rows = conditions.flatten(0, 1)
+        patches = readout.diffusion.sample(rows, way.sample_steps, way.temperature, way.generator)
+        patches = patches.view(*chosen.shape, -1)
         self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
         self.masked = self.masked.scatter(1, chosen, False)
 
@@ -109,7 +109,6 @@ def _draw(scores: Tensor, decoding: Decoding) -> Tensor:
     """Choose the value (B, k) of a digit from its scores (B, k, V)."""
     if decoding.temperature > 0:
         noise = uniform(scores.shape, decoding.generator, scores.device).clamp(min=1e-20)
-        scores = (
-            scores / decoding.temperature - (-noise.log()).log()
-        )  # the largest is a sample from the softmax
+        # The largest of these sums is a sample from the softmax.
+        scores = scores / decoding.temperature - (-noise.log()).log()
     return scores.argmax(-1)

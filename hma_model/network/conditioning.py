@@ -6,8 +6,10 @@ trunk then processes the whole batch at once, and each stem and modulation is ca
 B batch, T frames, D width, K = stride * action dim, L layers.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TYPE_CHECKING, Self
 
 import torch
@@ -41,17 +43,21 @@ class Groups:
         if isinstance(embodiment, str):
             return cls(((embodiment, batch),))
         if len(embodiment) != batch:
-            raise HMAError(
-                "embodiment", f"{len(embodiment)} ids for a batch of {batch}", "give one id a sample"
-            )
-        names = list(dict.fromkeys(embodiment))
-        rank = {name: index for index, name in enumerate(names)}
+            fault = f"there are {len(embodiment)} ids for a batch of {batch}"
+            raise HMAError("embodiment", fault, "give one id for each sample")
+        counts = Counter(embodiment)  # in the order of first appearance
+        rank = {name: index for index, name in enumerate(counts)}
         order = sorted(range(batch), key=lambda sample: rank[embodiment[sample]])
-        parts = tuple((name, sum(e == name for e in embodiment)) for name in names)
+        parts = tuple(counts.items())
         if order == list(range(batch)):
             return cls(parts)
         inverse = sorted(range(batch), key=lambda sample: order[sample])
         return cls(parts, order, inverse)
+
+    @property
+    def batch(self) -> int:
+        """Return B, the number of samples."""
+        return sum(size for _, size in self.parts)
 
     def sort(self, x: Tensor) -> Tensor:
         """Return the samples sorted by embodiment."""
@@ -63,11 +69,8 @@ class Groups:
 
     def spans(self) -> list[tuple[str, slice]]:
         """Return the slice of each embodiment among the sorted samples."""
-        spans, start = [], 0
-        for name, size in self.parts:
-            spans.append((name, slice(start, start + size)))
-            start += size
-        return spans
+        ends = list(accumulate((size for _, size in self.parts), initial=0))
+        return [(name, slice(ends[i], ends[i + 1])) for i, (name, _) in enumerate(self.parts)]
 
 
 @dataclass
@@ -82,31 +85,35 @@ class ActionConditioning:
     chunks: Tensor
     known: Tensor
 
+    def frames(self, chosen: slice) -> "ActionConditioning":
+        """Return the chunks at those frames."""
+        return ActionConditioning(self.chunks[:, chosen], self.known[:, chosen])
+
 
 def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int) -> ActionConditioning:
     """Assign chunks (B, >= T-1, K), of which some are known (B, >= T-1), to the frames they condition."""
     late = config.action_alignment == "previous"
     if actions.shape[1] < frames - late:
-        fault = f"{actions.shape[1]} action chunks for {frames} frames"
+        fault = f"there are {actions.shape[1]} chunks for {frames} frames"
         raise HMAError("actions", fault, f"give {frames} chunks")
     if known is None:
         known = torch.ones(actions.shape[:2], dtype=torch.bool, device=actions.device)
     if not late:
         return ActionConditioning(actions[:, :frames], known[:, :frames])
-    return ActionConditioning(
-        F.pad(actions[:, : frames - 1], (0, 0, 1, 0)), F.pad(known[:, : frames - 1], (1, 0))
-    )
+    shifted = F.pad(actions[:, : frames - 1], (0, 0, 1, 0))
+    return ActionConditioning(shifted, F.pad(known[:, : frames - 1], (1, 0)))
 
 
 def unknown(model: "HMA", groups: Groups, frames: int) -> ActionConditioning:
     """Return a conditioning without any known chunk: on the absence of actions."""
-    batch = sum(size for _, size in groups.parts)
     widest = max(model.stem(name).input.in_features for name, _ in groups.parts)
-    shape = (batch, frames)
-    return ActionConditioning(
-        torch.zeros(*shape, widest, device=model.device),
-        torch.zeros(shape, dtype=torch.bool, device=model.device),
-    )
+    return no_chunks(groups.batch, frames, widest, model.device)
+
+
+def no_chunks(batch: int, frames: int, width: int, device: torch.device) -> ActionConditioning:
+    """Return chunks (B, T, K) of zeros, none of them known."""
+    known = torch.zeros((batch, frames), dtype=torch.bool, device=device)
+    return ActionConditioning(torch.zeros(batch, frames, width, device=device), known)
 
 
 def condition(
@@ -121,12 +128,11 @@ def condition(
         positions: (T,) int64, the times of the frames.
     """
     config, absent = model.config, rows_at(model.trunk.absent, positions)
-    if given is None and config.absent_action == "skip":
-        return Conditioning()
-    if given is None and config.absent_action == "tokens":
-        batch = sum(size for _, size in groups.parts)
-        return Conditioning(tokens=absent.expand(batch, len(positions), -1))
     if given is None:
+        if config.absent_action == "skip":
+            return Conditioning()
+        if config.absent_action == "tokens":
+            return Conditioning(tokens=absent.expand(groups.batch, len(positions), -1))
         given = unknown(model, groups, len(positions))
     chunks, known = groups.sort(given.chunks), groups.sort(given.known).unsqueeze(-1)
     shown = torch.ones_like(known) if config.absent_action == "tokens" else known
@@ -135,7 +141,7 @@ def condition(
         stem = model.stem(name)
         width = stem.input.in_features
         if chunks.shape[-1] < width:
-            fault = f"chunks of {chunks.shape[-1]} values where {name} has {width}"
+            fault = f"a chunk has {chunks.shape[-1]} values, but {name} needs {width}"
             raise HMAError("actions", fault, "flatten stride x action_dim values into a chunk")
         embedded = stem(chunks[span, :, :width].masked_fill(~shown[span], 0))
         embedding = torch.where(shown[span], embedded, absent)
@@ -143,9 +149,8 @@ def condition(
         if stem.modulation is None:
             continue
         modulations.append(stem.modulation(embedding))
-        out = stem.modulation.out
-        if out is not None:
-            outs.append((embedding.shape[0], *out))
+        if stem.modulation.out is not None:
+            outs.append((embedding.shape[0], *stem.modulation.out))
     embedding = _cat(embeddings, 0)
     tokens = torch.where(known, embedding, absent) if config.appended_tokens else None
     if model.trunk.modulation is not None:

@@ -13,23 +13,26 @@ import torch
 from torch import Tensor
 
 from hma_model.config import HMAConfig
-from hma_model.network.embed import to_digits
+from hma_model.network.embed import from_digits, to_digits
 
 
 def uniform(
     shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
 ) -> Tensor:
     """Return float32 numbers in [0, 1), drawn on the generator's device and moved to `device`."""
-    source = "cpu" if generator is None else generator.device
-    return torch.rand(tuple(shape), generator=generator, device=source).to(device)
+    return torch.rand(tuple(shape), generator=generator, device=device_of(generator)).to(device)
 
 
 def randn(
     shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
 ) -> Tensor:
     """Return standard normal float32 numbers, drawn on the generator's device and moved to `device`."""
-    source = "cpu" if generator is None else generator.device
-    return torch.randn(tuple(shape), generator=generator, device=source).to(device)
+    return torch.randn(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+
+
+def device_of(generator: torch.Generator | None) -> torch.device | str:
+    """Return the device on which a generator draws; without one, torch draws on the CPU."""
+    return "cpu" if generator is None else generator.device
 
 
 @dataclass
@@ -55,12 +58,11 @@ def draw_video_mask(
     Each sample has its own draws.
     """
     tokens = config.tokens_per_frame
-    where = "cpu" if generator is None else generator.device
+    where = device_of(generator)
     index = torch.arange(frames, device=where)
     first, long = _first_masked(config, batch, frames, generator)
-    ratio = torch.cos(uniform((batch, frames), generator, where) * (math.pi / 2)).clamp(
-        min=config.mask_ratio_min
-    )
+    ratio = torch.cos(uniform((batch, frames), generator, where) * (math.pi / 2))
+    ratio = ratio.clamp(min=config.mask_ratio_min)
     masked = uniform((batch, frames, tokens), generator, where) < ratio.unsqueeze(-1)
     masked &= (index >= first.unsqueeze(1)).unsqueeze(-1)
 
@@ -77,7 +79,7 @@ def _first_masked(
     config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor]:
     """Return (B,) the first frame that may be masked, and (B,) whether a sample keeps a long history."""
-    draw = uniform((2, batch), generator, "cpu" if generator is None else generator.device)
+    draw = uniform((2, batch), generator, device_of(generator))
     start = min(config.history_frames, frames - 1)
     long = (draw[0] < config.history_probability) & (frames > 2)
     first = start + (draw[1] * (frames - start)).long()
@@ -92,15 +94,11 @@ def corrupt_tokens(
     if config.corrupt_max:
         values = torch.tensor(config.factored, device=tokens.device)
         random = (uniform(digits.shape, generator, tokens.device) * values).long()
-        hit = (
-            uniform(digits.shape, generator, tokens.device)
-            < mask.corruption.to(tokens.device)[..., None, None]
-        )
+        draw = uniform(digits.shape, generator, tokens.device)
+        hit = draw < mask.corruption.to(tokens.device)[..., None, None]
         digits = torch.where(hit, torch.minimum(random, values - 1), digits)
-    weights = torch.tensor(
-        [math.prod(config.factored[:i]) for i in range(len(config.factored))], device=tokens.device
-    )
-    return (digits * weights).sum(-1).masked_fill(mask.masked.to(tokens.device), config.vocab_size)
+    corrupted = from_digits(digits, config.factored)
+    return corrupted.masked_fill(mask.masked.to(tokens.device), config.vocab_size)
 
 
 def drop_chunks(present: Tensor, generator: torch.Generator | None) -> Tensor:

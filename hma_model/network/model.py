@@ -17,14 +17,12 @@ from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.paths import StrPath
-from hma_model.config import ActionSpace, HMAConfig
+from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
 from hma_model.network.embed import LatentEmbedding, TokenEmbedding, patchify
 from hma_model.network.head import ActionHead, LatentReadout, TokenReadout
-from hma_model.network.state import check_fit, module_key, space_of_stem
 from hma_model.network.stem import Stem
-from hma_model.network.trunk import Clock, Conditioning, Trunk, window_clock
-from hma_model.objective import POLICY, READOUTS, Readout
+from hma_model.network.trunk import Conditioning, TimePositions, Trunk, window_times
 
 if TYPE_CHECKING:
     from hma_model.network.objectives import Output, Windows
@@ -84,7 +82,7 @@ class HMA(nn.Module):
         if known is not None:
             if known.agrees_with(space):
                 return
-            fault = f"already there with {known.action_dim} dims, stride {known.stride}, or other statistics"
+            fault = f"has {known.action_dim} dims, stride {known.stride}, or other statistics in the model"
             raise CheckpointError(space.id, fault, "use another id, or the statistics it was trained with")
         like = self.trunk.position
         self.stems[module_key(space.id)] = Stem(self.config, space).to(like.device, like.dtype)
@@ -93,30 +91,27 @@ class HMA(nn.Module):
 
     def stem(self, embodiment: str) -> Stem:
         """Return the stem of an embodiment."""
-        self._known(embodiment)
-        return self.stems[module_key(embodiment)]  # type: ignore[return-value]
+        return self._of(self.stems, embodiment)  # type: ignore[return-value]
 
     def head(self, embodiment: str) -> ActionHead:
         """Return the action head of an embodiment."""
-        self._known(embodiment)
-        return self.heads[module_key(embodiment)]  # type: ignore[return-value]
+        return self._of(self.heads, embodiment)  # type: ignore[return-value]
 
-    def _known(self, embodiment: str) -> None:
+    def _of(self, modules: nn.ModuleDict, embodiment: str) -> nn.Module:
         if embodiment not in self.embodiments:
             there = ", ".join(self.embodiments) or "none"
-            raise HMAError(
-                embodiment, f"the model has no such embodiment; it has {there}", "add or load it first"
-            )
+            fault = f"the model has no such embodiment; it has {there}"
+            raise HMAError(embodiment, fault, "add or load the embodiment first")
+        return modules[module_key(embodiment)]
 
     # -- states -----------------------------------------------------------------------------------------
 
     def trunk_state(self) -> dict[str, Tensor]:
         """Return the tensors that the embodiments share; names are relative to the model."""
-        return {
-            f"{part}.{name}": tensor
-            for part in ("trunk", "readout")
-            for name, tensor in getattr(self, part).state_dict().items()
-        }
+        return self._shared().state_dict()
+
+    def _shared(self) -> nn.ModuleDict:
+        return nn.ModuleDict({"trunk": self.trunk, "readout": self.readout})
 
     def stem_state(self, embodiment: str) -> dict[str, Tensor]:
         """Return the tensors of an embodiment's action stem, statistics and modulation."""
@@ -129,10 +124,7 @@ class HMA(nn.Module):
     def load_trunk(self, state: Mapping[str, Tensor]) -> None:
         """Load a result of `trunk_state`; a CheckpointError names the keys that do not fit."""
         check_fit("trunk", state, self.trunk_state())
-        for part in ("trunk", "readout"):
-            prefix = f"{part}."
-            own = {name.removeprefix(prefix): t for name, t in state.items() if name.startswith(prefix)}
-            getattr(self, part).load_state_dict(own)
+        self._shared().load_state_dict(state)
 
     def load_embodiment(
         self, embodiment: str, stem: Mapping[str, Tensor], head: Mapping[str, Tensor]
@@ -158,7 +150,6 @@ class HMA(nn.Module):
             source: str or path of a checkpoint or training run, a URI, or a hub repository.
             embodiments: ids; None for all.
             revision: branch, tag or commit of a repository.
-            device: where the model goes.
         """
         from hma_model.hub import publish as hub  # needs the network's client, which most uses do not
 
@@ -208,10 +199,10 @@ class HMA(nn.Module):
             (B, T, h, w, F, V) float32, low digit first.
         """
         self._require("discrete", "video_logits")
-        groups, clock = Groups.of(embodiment, len(tokens)), self.clock(tokens.shape[1])
-        conditioning = self._condition(actions, action_mask, groups, clock)
+        groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
+        conditioning = self._condition(actions, action_mask, groups, times)
         x = self.embed_tokens(groups.sort(tokens.flatten(2)))
-        scores = self.token_readout(self.video_features(self.trunk(x, conditioning, clock)))
+        scores = self.token_readout(self.video_features(self.trunk(x, conditioning, times)))
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
 
     def video_conditions(
@@ -233,12 +224,12 @@ class HMA(nn.Module):
             (B, T, H/p, W/p, D).
         """
         self._require("continuous", "video_conditions")
-        groups, clock = Groups.of(embodiment, len(latents)), self.clock(latents.shape[1])
-        conditioning = self._condition(actions, action_mask, groups, clock)
+        groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
+        conditioning = self._condition(actions, action_mask, groups, times)
         patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
         x = self.embed_patches(groups.sort(patches), groups.sort(pixels))
         conditions = self.latent_readout(
-            self.video_features(self.trunk(x, conditioning, clock)), clock.positions
+            self.video_features(self.trunk(x, conditioning, times)), times.positions
         )
         return groups.unsort(conditions).unflatten(2, self.config.token_grid)
 
@@ -272,17 +263,19 @@ class HMA(nn.Module):
         if readout not in READOUTS:
             raise HMAError("readout", f"{readout!r} is unknown", "give one of " + ", ".join(READOUTS))
         groups, count = Groups.of(embodiment, len(frames)), frames.shape[1]
-        clock = self.clock(count)
-        given = None if self.config.absent_action == "tokens" else unknown(self, groups, count)
+        times = self.time_positions(count)
+        given = None
         if actions is not None:
             given = align(self.config, actions, action_mask, count)
-        conditioning = condition(self, given, groups, clock.positions)
-        if frames.is_floating_point():
-            patches = patchify(frames.float() * self.config.latent_scale, self.config.patch)
-            x = self.embed_patches(groups.sort(patches), torch.zeros_like(patches[..., :1], dtype=torch.bool))
+        elif self.config.absent_action != "tokens":
+            given = unknown(self, groups, count)
+        conditioning = condition(self, given, groups, times.positions)
+        values = groups.sort(self.frame_values(frames))
+        if self.config.kind == "discrete":
+            x = self.embed_tokens(values)
         else:
-            x = self.embed_tokens(groups.sort(frames.flatten(2)))
-        pooled = self.action_features(self.trunk(x, conditioning, clock))
+            x = self.embed_patches(values, torch.zeros_like(values[..., :1], dtype=torch.bool))
+        pooled = self.action_features(self.trunk(x, conditioning, times))
         chunks = [
             self._predict(part, name, READOUTS[readout], generator)
             for part, (name, _) in zip(pooled.split([size for _, size in groups.parts]), groups.parts)
@@ -292,12 +285,11 @@ class HMA(nn.Module):
         return groups.unsort(torch.cat(padded))
 
     def _condition(
-        self, actions: Tensor | None, known: Tensor | None, groups: Groups, clock: Clock
+        self, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
     ) -> Conditioning:
-        if actions is None:
-            return condition(self, None, groups, clock.positions)
-        given = align(self.config, actions, known, len(clock.positions))
-        return condition(self, given, groups, clock.positions)
+        frames = len(times.positions)
+        given = None if actions is None else align(self.config, actions, known, frames)
+        return condition(self, given, groups, times.positions)
 
     def _predict(
         self, pooled: Tensor, embodiment: str, readout: Readout, generator: torch.Generator | None
@@ -349,12 +341,29 @@ class HMA(nn.Module):
 
     # -- parts that training and decoding share -----------------------------------------------------------
 
-    def clock(self, frames: int) -> Clock:
-        """Return the clock of a window of this many frames."""
+    def time_positions(self, frames: int) -> TimePositions:
+        """Return the times of a window of this many frames."""
         if frames > self.config.frames and self.config.time_position == "learned":
             fault = f"{frames} frames where the learned positions end at {self.config.frames}"
             raise HMAError("window", fault, "give a shorter window")
-        return window_clock(self.config, frames, self.device)
+        return window_times(self.config, frames, self.device)
+
+    def frame_values(self, frames: Tensor) -> Tensor:
+        """Return the token ids (B, T, S), or the scaled patches (B, T, S, c*p*p), of stored frames.
+
+        Args:
+            frames: tokens (B, T, h, w) int64, or latents (B, T, c, H, W).
+
+        Raises:
+            HMAError: the frames have another shape.
+        """
+        config, shape = self.config, tuple(frames.shape[2:])
+        if shape != config.frame_shape:
+            fault = f"a frame has the shape {shape}, but the model takes {config.frame_shape}"
+            raise HMAError("frames", fault, "use the model's tokenizer")
+        if config.kind == "discrete":
+            return frames.flatten(2).long()
+        return patchify(frames.float() * config.latent_scale, config.patch)
 
     def embed_tokens(self, tokens: Tensor) -> Tensor:
         """Embed ids (B, T, S) as (B, T, S, D)."""
@@ -382,3 +391,42 @@ class HMA(nn.Module):
     def _require(self, kind: str, name: str) -> None:
         if self.config.kind != kind:
             raise HMAError(name, f"is of {kind} models; this one is {self.config.kind}")
+
+
+def module_key(embodiment: str) -> str:
+    """Return a module name for an id, without dots and without a clash with a module's attributes."""
+    return "id_" + embodiment.replace("%", "%25").replace(".", "%2E")
+
+
+def check_fit(where: str, state: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+    """Check that a state has the names and shapes of the one that it replaces.
+
+    Raises:
+        CheckpointError: the states differ; it names every key that is missing, unknown or of another shape.
+    """
+    faults = [f"missing {name}" for name in sorted(own.keys() - state.keys())]
+    faults += [f"unknown {name}" for name in sorted(state.keys() - own.keys())]
+    faults += [
+        f"{name} is {tuple(state[name].shape)}, not {tuple(tensor.shape)}"
+        for name, tensor in sorted(own.items())
+        if name in state and state[name].shape != tensor.shape
+    ]
+    if faults:
+        raise CheckpointError(where, "; ".join(faults), "load it into the configuration it was saved from")
+
+
+def space_of_stem(embodiment: str, stem: Mapping[str, Tensor]) -> ActionSpace:
+    """Return the action space for which a stem's state was made.
+
+    Raises:
+        CheckpointError: the state is not that of a stem.
+    """
+    try:
+        mean, std, mask = (stem[f"normalizer.{name}"] for name in ("mean", "std", "normalize"))
+        chunk_dim = stem["input.weight"].shape[1]
+    except KeyError as error:
+        fault = f"the state of a stem lacks {error.args[0]}"
+        raise CheckpointError(f"{embodiment}: stem", fault, "load a stem's state") from error
+    values = tuple(mean.tolist()), tuple(std.tolist()), tuple(mask.bool().tolist())
+    rule = "divide" if "normalizer.divide" in stem else "zero"
+    return ActionSpace(embodiment, mean.numel(), chunk_dim // mean.numel(), *values, zero_variance=rule)

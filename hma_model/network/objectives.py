@@ -1,6 +1,6 @@
 """Compute the losses of the training objectives (paper section 3).
 
-`hma_model.objective.OBJECTIVES` states what each objective predicts, sees and hides.
+`hma_model.config.OBJECTIVES` states what each objective predicts, sees and hides.
 
 B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = stride * action dim.
 """
@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.config import HMAConfig
+from hma_model.config import OBJECTIVES, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition
-from hma_model.network.embed import patchify, to_digits
+from hma_model.network.embed import to_digits
 from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks, uniform
-from hma_model.objective import OBJECTIVES, Readout
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -62,11 +61,14 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     if name not in OBJECTIVES:
         raise HMAError("objective", f"{name!r} is unknown", "give one of " + ", ".join(OBJECTIVES))
     chosen = OBJECTIVES[name]
-    frames, count, size = _frames(model, batch), batch.actions.shape[1], len(batch.actions)
-    groups, clock = Groups.of(batch.embodiment, size), model.clock(count)
+    stored = batch.tokens if config.kind == "discrete" else batch.latents
+    if stored is None:
+        raise HMAError("batch", f"has no frames for a {config.kind} model", "use the model's tokenizer")
+    frames, count, size = model.frame_values(stored), batch.actions.shape[1], len(batch.actions)
+    groups, times = Groups.of(batch.embodiment, size), model.time_positions(count)
 
-    own = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
-    seen = frames if own is None else _frames(model, batch, own)
+    context = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
+    seen = frames if context is None else model.frame_values(context)
     video = draw_video_mask(config, size, count, generator)
     inside = getattr(batch, "frame_mask", None)
     if inside is not None:  # padding of a short episode has no loss
@@ -81,9 +83,9 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
     given = None
     if chosen.sees_actions:
         given = align(config, batch.actions, batch.action_mask & ~dropped, count)
-    conditioning = condition(model, given, groups, clock.positions)
+    conditioning = condition(model, given, groups, times.positions)
     x = _embed(model, seen, video, groups, generator)
-    features = model.trunk(x, conditioning, clock)
+    features = model.trunk(x, conditioning, times)
 
     video_loss = action_loss = logits = None
     per_sample = torch.zeros(size, device=features.device)
@@ -93,16 +95,14 @@ def compute(model: "HMA", batch: Windows, objective: str | None, generator: torc
         )
     if chosen.predicts_video:
         own = model.video_features(features)
-        predictors = own if config.kind == "discrete" else model.latent_readout(own, clock.positions)
+        predictors = own if config.kind == "discrete" else model.latent_readout(own, times.positions)
         video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
         if config.kind == "discrete" and not model.training:
             scores = model.token_readout.split(model.token_readout(own.detach()))
             logits = groups.unsort(scores).unflatten(2, config.token_grid)
     loss = torch.zeros((), device=features.device)
-    if video_loss is not None:
-        loss = loss + video_loss
-    if action_loss is not None:
-        loss = loss + config.action_loss_weight * action_loss
+    loss = loss if video_loss is None else loss + video_loss
+    loss = loss if action_loss is None else loss + config.action_loss_weight * action_loss
     masked = video.masked.to(features.device).unflatten(2, config.token_grid)
     return Output(loss, video_loss, action_loss, per_sample.detach(), masked, name, logits)
 
@@ -115,23 +115,6 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
     limits = torch.tensor(weights, dtype=torch.float64).cumsum(0)
     index = int((uniform((1,), generator).double() * limits[-1] >= limits).sum())
     return names[min(index, len(names) - 1)]
-
-
-def _frames(model: "HMA", batch: Windows, instead: Tensor | None = None) -> Tensor:
-    """Return token ids (B, T, S), or scaled patches (B, T, S, c*p*p), in the batch's order."""
-    config = model.config
-    values = batch.tokens if config.kind == "discrete" else batch.latents
-    values = values if instead is None else instead
-    if values is None:
-        have = "latents" if config.kind == "discrete" else "tokens"
-        raise HMAError("batch", f"has {have} for a {config.kind} model", "use the tokenizer the model is for")
-    shape = config.grid if config.kind == "discrete" else (config.channels, *config.grid)
-    if tuple(values.shape[2:]) != tuple(shape):
-        fault = f"frames of shape {tuple(values.shape[2:])} where the model takes {tuple(shape)}"
-        raise HMAError("batch", fault, "use the tokenizer the model is for")
-    if config.kind == "discrete":
-        return values.flatten(2).long()
-    return patchify(values.float() * config.latent_scale, config.patch)
 
 
 def _embed(
@@ -175,23 +158,23 @@ def _action_loss(
     generator: torch.Generator | None,
 ) -> tuple[Tensor, Tensor]:
     """Return the mean loss over predicted chunks, and each sample's (B,), in the batch's order."""
-    wanted = batch.action_mask.clone()
+    predicted = batch.action_mask.clone()
     if readout.lag or model.config.action_alignment == "current":
-        wanted &= dropped  # a chunk that the model saw is not predicted
+        predicted &= dropped  # a chunk that the model saw is not predicted
     pooled = model.action_features(features)[:, readout.lag :]
-    wanted = wanted[:, : pooled.shape[1]]
-    actions, wanted = groups.sort(batch.actions)[:, : wanted.shape[1]], groups.sort(wanted)
+    predicted = groups.sort(predicted[:, : pooled.shape[1]])
+    chunks = groups.sort(batch.actions)
     losses, samples = [], []
     for name, span in groups.spans():
-        sample, frame = wanted[span].nonzero(as_tuple=True)
+        sample, frame = predicted[span].nonzero(as_tuple=True)
         stem = model.stem(name)
-        target = actions[span, :, : stem.input.in_features][sample, frame]
+        target = chunks[span, :, : stem.input.in_features][sample, frame]
         if model.config.action_target == "normalized":
             target = stem.normalizer(target)
         losses.append(model.head(name).loss(pooled[span][sample, frame], target, readout, generator))
         samples.append(sample + span.start)
     flat = torch.cat(losses)
-    return flat.sum() / max(len(flat), 1), groups.unsort(_means(flat, torch.cat(samples), len(actions)))
+    return flat.sum() / max(len(flat), 1), groups.unsort(_means(flat, torch.cat(samples), len(chunks)))
 
 
 def _means(losses: Tensor, sample: Tensor, batch: int) -> Tensor:

@@ -1,6 +1,6 @@
-"""Define the stem of an embodiment: action normalisation, action embedding and modulation weights.
+"""Define the stem of an embodiment: normalisation, embedding and modulation weights of its action chunks.
 
-B batch, T frames, A values of an action, K = stride*A, D width, L layers.
+B batch, T frames, A values of an action, K = stride*A values of a chunk, D width, L layers.
 """
 
 import math
@@ -14,7 +14,7 @@ from hma_model.config import ActionSpace, HMAConfig
 
 
 class Normalizer(nn.Module):
-    """The normalisation of raw actions to zero mean and unit variance, and its inverse.
+    """The normalisation of raw chunks to zero mean and unit variance, and its inverse.
 
     Dims that never vary become 0 and are restored as their mean, unless the action space states "divide".
     Dims that are marked not to be normalised pass through. The statistics stay float32 if the model is cast.
@@ -33,18 +33,18 @@ class Normalizer(nn.Module):
         released = space.zero_variance == "divide"  # it is in the state only if true
         self.register_buffer("divide", torch.tensor(True) if released else None)
 
-    def forward(self, actions: Tensor) -> Tensor:
-        """Normalise raw actions (..., K) to (..., K) float32."""
+    def forward(self, chunks: Tensor) -> Tensor:
+        """Normalise raw chunks (..., K) to (..., K) float32."""
         mean, _, inverse = self._affine()
-        return ((self._steps(actions) - mean) * inverse).flatten(-2)
+        return ((self._actions(chunks) - mean) * inverse).flatten(-2)
 
-    def undo(self, actions: Tensor) -> Tensor:
-        """Convert normalised actions (..., K) to raw ones (..., K) float32."""
+    def undo(self, chunks: Tensor) -> Tensor:
+        """Convert normalised chunks (..., K) to raw ones (..., K) float32."""
         mean, scale, _ = self._affine()
-        return (self._steps(actions) * scale + mean).flatten(-2)
+        return (self._actions(chunks) * scale + mean).flatten(-2)
 
-    def _steps(self, actions: Tensor) -> Tensor:
-        return actions.float().unflatten(-1, (-1, self.mean.numel()))
+    def _actions(self, chunks: Tensor) -> Tensor:
+        return chunks.float().unflatten(-1, (-1, self.mean.numel()))
 
     def _affine(self) -> tuple[Tensor, Tensor, Tensor]:
         if self.divide is not None:
@@ -121,7 +121,7 @@ class Stem(nn.Module):
             nn.init.normal_(linear.weight, std=linear.in_features**-0.5)
             nn.init.zeros_(linear.bias)
 
-    def forward(self, actions: Tensor) -> Tensor:
+    def forward(self, chunks: Tensor) -> Tensor:
         """Map raw chunks (B, T, K) to action embeddings (B, T, D)."""
-        values = self.normalizer(actions).to(self.input.weight.dtype)
+        values = self.normalizer(chunks).to(self.input.weight.dtype)
         return self.output(F.relu(self.norm(self.input(values))))

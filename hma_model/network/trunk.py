@@ -46,8 +46,8 @@ class Conditioning:
 
 
 @dataclass
-class Clock:
-    """The times of the frames of a call, and which frames each may see.
+class TimePositions:
+    """The times of the frames of a pass, and which frames each may see.
 
     Attributes:
         positions: (T,) int64, the times of the frames.
@@ -90,12 +90,12 @@ def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]
     return angles.cos(), angles.sin()
 
 
-def window_clock(config: HMAConfig, frames: int, device: torch.device | str) -> Clock:
-    """Return the clock of consecutive frames; each sees itself and the `config.frames` - 1 before it."""
+def window_times(config: HMAConfig, frames: int, device: torch.device | str) -> TimePositions:
+    """Return the times of consecutive frames; each sees itself and the `config.frames` - 1 before it."""
     positions = torch.arange(frames, device=device)
     age = positions.unsqueeze(1) - positions
     allowed = (age >= 0) & (age < config.frames)
-    return Clock(positions, allowed, rotary_angles(config, positions), causal=frames <= config.frames)
+    return TimePositions(positions, allowed, rotary_angles(config, positions), causal=frames <= config.frames)
 
 
 def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
@@ -184,33 +184,33 @@ class TemporalAttention(Attention):
         super().__init__(config)
         self.rotary = config.time_position == "rotary"
 
-    def forward(self, x: Tensor, norm: nn.Module, clock: Clock, cache: LayerCache | None) -> Tensor:
+    def forward(self, x: Tensor, norm: nn.Module, times: TimePositions, cache: LayerCache | None) -> Tensor:
         """Apply `norm` and attention over time to (B, T, N, D); keep the shape."""
-        rotary = clock.rotary if self.rotary else None
+        rotary = times.rotary if self.rotary else None
         if cache is not None:
             q, k, v = self.project(x, norm, rotary, within=True)
-            assert clock.slots is not None
+            assert times.slots is not None
             for values, kept in zip((k, v), cache.time):
-                kept.index_copy_(0, clock.slots, values.transpose(0, 1))
-            return self.proj(self._recall(q, clock, cache.time))
+                kept.index_copy_(0, times.slots, values.transpose(0, 1))
+            return self.proj(self._recall(q, times, cache.time))
         b, t, n, width = x.shape
         q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), norm, rotary)
-        mask = None if clock.causal else clock.allowed
-        return self.merge(q, k, v, mask, clock.causal).view(b, n, t, width).transpose(1, 2)
+        mask = None if times.causal else times.allowed
+        return self.merge(q, k, v, mask, times.causal).view(b, n, t, width).transpose(1, 2)
 
-    def _recall(self, q: Tensor, clock: Clock, cache: Tensor) -> Tensor:
+    def _recall(self, q: Tensor, times: TimePositions, cache: Tensor) -> Tensor:
         """Attend from queries (B, T, N, heads, head_dim) to the whole cache; return (B, T, N, D)."""
         b, t, n, heads, size = q.shape
         if q.device.type != "cpu" or q.dtype != torch.float32:
             queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
             k, v = cache.flatten(2, 3).permute(0, 2, 3, 1, 4)
-            mixed = F.scaled_dot_product_attention(queries, k, v, clock.allowed, scale=self.scale)
+            mixed = F.scaled_dot_product_attention(queries, k, v, times.allowed, scale=self.scale)
             return mixed.view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
         # On a CPU with so few frames a place, batched products take half as long as the fused kernel. The
         # softmax takes a tenth of the time if its vectors run over places instead of frames.
         rows = q.permute(0, 2, 3, 1, 4).reshape(-1, t, size)
         k, v = cache.flatten(2, 4).transpose(1, 2)  # (B*N*heads, R, head_dim)
-        hidden = torch.zeros_like(clock.allowed, dtype=q.dtype).masked_fill(~clock.allowed, -torch.inf)
+        hidden = torch.zeros_like(times.allowed, dtype=q.dtype).masked_fill(~times.allowed, -torch.inf)
         scores = torch.baddbmm(hidden, rows, k.transpose(1, 2), alpha=self.scale)
         weights = scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
         return torch.bmm(weights, v).view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
@@ -228,22 +228,18 @@ class ActionAttention(nn.Module):
         self.kv = nn.Linear(width, 2 * width, bias=config.qkv_bias)
         self.proj = nn.Linear(width, width, bias=config.proj_bias)
 
-    def forward(self, x: Tensor, embedding: Tensor, clock: Clock, cache: LayerCache | None) -> Tensor:
+    def forward(self, x: Tensor, embedding: Tensor, times: TimePositions, cache: LayerCache | None) -> Tensor:
         """Attend from tokens (B, T, N, D) to action embeddings (B, T, D); return (B, T, N, D)."""
         b, t, n, _ = x.shape
-        q = rotate(
-            self.q(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), clock.rotary
-        )  # (B, N, T, heads, hd)
+        q = self.q(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        q = rotate(q, times.rotary)  # (B, N, T, heads, head_dim)
         k, v = self.kv(embedding).unflatten(-1, (2, self.heads, -1)).unbind(2)
-        k, v = rotate(k, clock.rotary).transpose(1, 2), v.transpose(1, 2)
+        k, v = rotate(k, times.rotary).transpose(1, 2), v.transpose(1, 2)
         if cache is not None and cache.action is not None:
-            assert clock.slots is not None
-            k, v = (
-                cache.action[0].index_copy_(2, clock.slots, k),
-                cache.action[1].index_copy_(2, clock.slots, v),
-            )
+            assert times.slots is not None
+            k, v = (c.index_copy_(2, times.slots, new) for c, new in zip(cache.action, (k, v)))
         queries = q.permute(0, 3, 2, 1, 4).flatten(2, 3)  # (B, heads, T*N, head_dim)
-        mask = clock.allowed.repeat_interleave(n, dim=0)
+        mask = times.allowed.repeat_interleave(n, dim=0)
         mixed = F.scaled_dot_product_attention(queries, k, v, mask, scale=self.scale)
         return self.proj(mixed.transpose(1, 2).flatten(-2)).view(b, t, n, -1)
 
@@ -291,7 +287,12 @@ class Block(nn.Module):
         self.mlp = MLP(config)
 
     def forward(
-        self, x: Tensor, conditioning: Conditioning, layer: int, clock: Clock, cache: LayerCache | None
+        self,
+        x: Tensor,
+        conditioning: Conditioning,
+        layer: int,
+        times: TimePositions,
+        cache: LayerCache | None,
     ) -> Tensor:
         """Apply the block to tokens (B, T, N, D); keep the shape."""
         qkv = self.space.project(x.flatten(0, 1), self.space_norm, None)
@@ -301,8 +302,8 @@ class Block(nn.Module):
         if conditioning.modulation is not None:
             x = x + light(self.modulate, x, conditioning, layer)
         if self.action is not None and conditioning.embedding is not None:
-            x = x + self.action(self.action_norm(x), conditioning.embedding, clock, cache)
-        x = x + self.time(x, self.time_norm, clock, cache)
+            x = x + self.action(self.action_norm(x), conditioning.embedding, times, cache)
+        x = x + self.time(x, self.time_norm, times, cache)
         return x + self.mlp(x, self.mlp_norm)
 
     def modulate(self, x: Tensor, conditioning: Conditioning, layer: int) -> Tensor:
@@ -329,16 +330,13 @@ class Trunk(nn.Module):
         super().__init__()
         self.config = config
         self.checkpointing = False
-        learned = config.time_position == "learned"
+        continuous = config.kind == "continuous"
+        positions = config.frames if config.time_position == "learned" else 1
         tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
-        self.embed = LatentEmbedding(config) if config.kind == "continuous" else TokenEmbedding(config)
-        self.position = nn.Parameter(
-            torch.randn(config.frames if learned else 1, tokens, config.width) * 0.02
-        )
-        self.embed_norm = (
-            nn.LayerNorm(config.width, eps=1e-6) if config.kind == "continuous" else nn.Identity()
-        )
-        self.absent = nn.Parameter(torch.randn(config.frames if learned else 1, config.width) * 0.02)
+        self.embed = LatentEmbedding(config) if continuous else TokenEmbedding(config)
+        self.position = nn.Parameter(torch.randn(positions, tokens, config.width) * 0.02)
+        self.embed_norm = nn.LayerNorm(config.width, eps=1e-6) if continuous else nn.Identity()
+        self.absent = nn.Parameter(torch.randn(positions, config.width) * 0.02)
         self.modulation: Modulation | None = None
         if "modulation" in config.conditioning and config.shared_modulation:
             self.modulation = Modulation(config)
@@ -347,19 +345,23 @@ class Trunk(nn.Module):
         initialize(self, config)
 
     def forward(
-        self, x: Tensor, conditioning: Conditioning, clock: Clock, caches: list[LayerCache] | None = None
+        self,
+        x: Tensor,
+        conditioning: Conditioning,
+        times: TimePositions,
+        caches: list[LayerCache] | None = None,
     ) -> Tensor:
         """Map embedded tokens (B, T, S, D) to features (B, T, N, D); action tokens come last in a frame."""
-        x = self.embed_norm(self.join(x, conditioning, clock))
+        x = self.embed_norm(self.join(x, conditioning, times))
         for layer, block in enumerate(self.blocks):
             cache = None if caches is None else caches[layer]
             if self.checkpointing and self.training and torch.is_grad_enabled():
-                x = checkpoint(block, x, conditioning, layer, clock, cache, use_reentrant=False)
+                x = checkpoint(block, x, conditioning, layer, times, cache, use_reentrant=False)
             else:
-                x = block(x, conditioning, layer, clock, cache)
+                x = block(x, conditioning, layer, times, cache)
         return self.norm(x)
 
-    def join(self, x: Tensor, conditioning: Conditioning, clock: Clock) -> Tensor:
+    def join(self, x: Tensor, conditioning: Conditioning, times: TimePositions) -> Tensor:
         """Add or append the action embeddings, and add the positions."""
         embedding, config = conditioning.embedding, self.config
         if embedding is not None and "add" in config.conditioning and config.add_at == "input":
@@ -367,7 +369,7 @@ class Trunk(nn.Module):
         if conditioning.tokens is not None:
             copies = conditioning.tokens.unsqueeze(2).expand(-1, -1, config.action_tokens, -1)
             x = torch.cat([x, copies.to(x.dtype)], dim=2)
-        return x + rows_at(self.position, clock.positions)[:, : x.shape[2]]
+        return x + rows_at(self.position, times.positions)[:, : x.shape[2]]
 
 
 def initialize(trunk: Trunk, config: HMAConfig) -> None:

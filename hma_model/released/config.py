@@ -14,8 +14,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from hma_data.errors import CheckpointError, RecipeError
-from hma_model.config import HMAConfig
-from hma_model.objective import INVERSE, OBJECTIVES, POLICY
+from hma_model.config import INVERSE, OBJECTIVES, POLICY, HMAConfig
 
 LATENT_SCALE = 0.18215  # the factor by which the released loader multiplies stored latents
 _WHERE = "config.json"

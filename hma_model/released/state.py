@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import CheckpointError
-from hma_model.config import HMAConfig
-from hma_model.objective import READOUTS
+from hma_model.config import READOUTS, HMAConfig
 
 State = dict[str, Tensor]
 Parts = dict[str, tuple[State, State]]

@@ -11,9 +11,9 @@ from typing import Any
 from hma_data.console import human_seconds
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.config import OBJECTIVES
 from hma_model.evaluation.html import Page
 from hma_model.evaluation.sample_images import FOLDER
-from hma_model.objective import OBJECTIVES
 from hma_model.training.logging import read_metrics
 from hma_model.training.runtime import ENVIRONMENT, RECIPE
 

@@ -24,7 +24,7 @@ from hma_data.storage.folders import finite, read_json, read_tensors, to_json, w
 from hma_model.checkpoint.io import CONFIG, HEAD, STEM, TRAINING, Checkpoint, inside
 from hma_model.checkpoint.migrate import FORMAT_VERSION
 from hma_model.config import HMAConfig
-from hma_model.network.state import check_fit, module_key
+from hma_model.network.model import check_fit, module_key
 from hma_model.training.init_from import TRAINED_BY
 from hma_model.training.recipe import Recipe, differences
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from hma_model.objective import OBJECTIVES
+from hma_model.config import OBJECTIVES
 from hma_model.training.parallel import World
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from hma_model.config import OBJECTIVES, Objective
 from hma_model.evaluation.evaluate import Means, validation_losses
 from hma_model.evaluation.metrics import perplexity
-from hma_model.objective import OBJECTIVES, Objective
 
 if TYPE_CHECKING:
     from hma_data.loading.dataset import Batch

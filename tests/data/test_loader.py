@@ -11,7 +11,7 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import ShardError, UsageError
 from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset
-from hma_data.loading.mixture import probabilities
+from hma_data.loading.mixture import Mixture
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
@@ -76,12 +76,12 @@ def test_every_window_is_its_rows_and_stays_in_its_episode(sets: list[Path]) -> 
 def test_one_epoch_of_a_mixture_is_every_window_once(sets: list[Path]) -> None:
     data = MixtureDataset(sets[:1], batch_size=1, frames=FRAMES, lanes=3, pool=2)
     count = data.mixture.counts[0]
-    lengths = [data._stream(lane, 0).length for lane in range(3)]
+    lengths = [data._sequence(lane, 0).length for lane in range(3)]
     assert sum(lengths) == count
     seen = [
         (int(e), int(f))
         for lane, length in enumerate(lengths)
-        for cut in [data._stream(lane, 0).take(0, length)]
+        for cut in [data._sequence(lane, 0).take(0, length)]
         for e, f in zip(cut["episode"], cut["frame"], strict=True)
     ]
     assert len(set(seen)) == len(seen) == count
@@ -102,7 +102,7 @@ def test_ranks_see_disjoint_windows(sets: list[Path]) -> None:
     seen = []
     for rank in (0, 1):
         data = MixtureDataset(sets[:1], 2, FRAMES, rank=rank, world=2, lanes=2)
-        streams = [data._stream(lane, 0) for lane in range(2)]
+        streams = [data._sequence(lane, 0) for lane in range(2)]
         cuts = [stream.take(0, stream.length) for stream in streams]
         seen.append(
             {(int(e), int(f)) for cut in cuts for e, f in zip(cut["episode"], cut["frame"], strict=True)}
@@ -232,4 +232,4 @@ def test_windows_of_an_episode_longer_than_a_row_group_are_whole(tmp_path: Path)
 def test_each_split_has_the_papers_temperature(sets: list[Path], split: str, temperature: float) -> None:
     mixture = MixtureDataset(sets, 4, 1, split=split).mixture
     assert mixture.counts[0] != mixture.counts[1]
-    np.testing.assert_allclose(mixture.p, probabilities(mixture.counts, temperature))
+    np.testing.assert_allclose(mixture.p, Mixture.of(dict(zip("abcdefgh", mixture.counts)), temperature).p)

@@ -109,7 +109,7 @@ def test_a_bag_of_which_no_command_is_known_is_refused(tmp_path: Path, block_tok
         commands=whole.commands[[0, -1]],
     )
     path = write_mcap(tmp_path / "run.mcap", late, as_json())
-    with pytest.raises(SourceError, match=r"not one of its \d+ actions is known"):
+    with pytest.raises(SourceError, match=r"none of its \d+ actions is known"):
         convert(robot("mask"), str(path), block_tokenizer, tmp_path / "out")
 
 

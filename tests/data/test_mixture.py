@@ -1,6 +1,8 @@
 """The mixture's probabilities and draws, against worked numbers."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.errors import UsageError
-from hma_data.loading.mixture import Mixture, epoch_caps, plot_mixture, probabilities
+from hma_data.loading.mixture import Mixture, epoch_caps, plot_mixture
 
 COUNTS = [10**6, 10**5, 10**4, 10**3]
+
+
+def probabilities(counts: Sequence[int], temperature: float = 3.0, **options: Sequence[Any]) -> np.ndarray:
+    named = {key: {str(i): value for i, value in enumerate(values)} for key, values in options.items()}
+    return Mixture.of({str(i): n for i, n in enumerate(counts)}, temperature, **named).p
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hma_data.bench.loader import DEFAULTS, make_set
-from hma_data.loading.pools import LARGEST_POOL, Deal, Stream, pool_size, spread
+from hma_data.loading.pools import LARGEST_POOL, UnitAssignment, WindowSequence, pool_size, spread
 from hma_data.loading.rows import MIB, Decoder
 from hma_data.shards import writer
 from hma_data.shards.reader import ShardSet
@@ -38,7 +38,7 @@ def decoder(made: Path) -> Decoder:
     return Decoder(ShardSet(made), "train", 6)
 
 
-def rows_of(stream: Stream, start: int, count: int) -> list[float]:
+def rows_of(stream: WindowSequence, start: int, count: int) -> list[float]:
     """Windows are told apart by their first action: the shards are links, so episodes are not unique."""
     cut = stream.take(start, count)
     return [hash(window.tobytes()) for window in cut["actions"]]
@@ -84,7 +84,7 @@ def test_every_window_is_dealt_to_one_reader(lengths: list[int], readers: int, f
     index = WindowIndex.of(fake(lengths), "train", frames)
     if not index.count:
         return
-    deal = Deal.of(index, readers)
+    deal = UnitAssignment.of(index, readers)
     shares = []
     for reader in range(readers):
         units, sizes = deal.of_reader(reader)
@@ -105,14 +105,14 @@ def test_every_window_is_dealt_to_one_reader(lengths: list[int], readers: int, f
 @pytest.mark.parametrize(("episodes", "readers"), [(500, 256), (500, 8), (3, 4), (40, 64), (2_000, 16)])
 def test_readers_get_about_the_same_number_of_windows(episodes: int, readers: int) -> None:
     lengths = np.random.default_rng(0).integers(20, 400, episodes).tolist()
-    deal = Deal.of(WindowIndex.of(fake(lengths, group=256), "train", 12), readers)
+    deal = UnitAssignment.of(WindowIndex.of(fake(lengths, group=256), "train", 12), readers)
     shares = [int(deal.of_reader(reader)[1].sum()) for reader in range(readers)]
     assert max(shares) <= 1.15 * min(shares) + 2
 
 
 def test_an_epoch_of_all_readers_is_every_window_once(decoder: Decoder) -> None:
-    deal = Deal.of(decoder.index, 3)
-    streams = [Stream(decoder, deal, 5, reader, 2) for reader in range(3)]
+    deal = UnitAssignment.of(decoder.index, 3)
+    streams = [WindowSequence(decoder, deal, 5, reader, 2) for reader in range(3)]
     first = [window for stream in streams for window in rows_of(stream, 0, stream.length)]
     again = [window for stream in streams for window in rows_of(stream, stream.length, stream.length)]
     assert len(first) == decoder.index.count
@@ -121,18 +121,18 @@ def test_an_epoch_of_all_readers_is_every_window_once(decoder: Decoder) -> None:
 
 
 def test_the_sequence_does_not_depend_on_how_it_is_taken(decoder: Decoder) -> None:
-    deal = Deal.of(decoder.index, 2)
-    length = Stream(decoder, deal, 5, 1, 3).length
-    whole = rows_of(Stream(decoder, deal, 5, 1, 3), 0, 2 * length + 7)
-    stream = Stream(decoder, deal, 5, 1, 3)
+    deal = UnitAssignment.of(decoder.index, 2)
+    length = WindowSequence(decoder, deal, 5, 1, 3).length
+    whole = rows_of(WindowSequence(decoder, deal, 5, 1, 3), 0, 2 * length + 7)
+    stream = WindowSequence(decoder, deal, 5, 1, 3)
     rng = np.random.default_rng(0)
     for start in [0, length - 3, 2 * length, 1, *rng.integers(0, 2 * length, 6).tolist()]:
         assert rows_of(stream, start, 7) == whole[start : start + 7]
 
 
 def test_seeds_and_readers_have_orders_of_their_own(decoder: Decoder) -> None:
-    deal = Deal.of(decoder.index, 1)
-    one, other = (rows_of(Stream(decoder, deal, seed, 0, 4), 0, 50) for seed in (1, 2))
+    deal = UnitAssignment.of(decoder.index, 1)
+    one, other = (rows_of(WindowSequence(decoder, deal, seed, 0, 4), 0, 50) for seed in (1, 2))
     assert one != other
 
 
@@ -146,8 +146,8 @@ def test_row_groups_that_are_used_again_are_decoded_once(made: Path, monkeypatch
     shards, reads = ShardSet(made), []
     read = shards.read
     monkeypatch.setattr(shards, "read", lambda *a: reads.append(a[:2]) or read(*a))
-    stream = Stream(
-        kept := Decoder(shards, "train", 6, cache_bytes=100 * MIB), Deal.of(kept.index, 1), 0, 0, 4
+    stream = WindowSequence(
+        kept := Decoder(shards, "train", 6, cache_bytes=100 * MIB), UnitAssignment.of(kept.index, 1), 0, 0, 4
     )
     stream.take(0, 3 * stream.length)
     assert len(reads) == len(kept.index.groups)

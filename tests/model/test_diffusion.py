@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hma_model.network.diffusion import DiffusionHead, cosine_levels
+from hma_model.network.head import DiffusionHead, cosine_levels
 from tests.model.network_parts import small_config
 
 TARGETS = pytest.mark.parametrize("target", ["noise", "velocity"])

@@ -289,5 +289,8 @@ def test_a_batch_of_another_tokenizer_is_refused() -> None:
     model = small_model()
     batch = small_batch(model.config, ["arm"])
     batch.tokens = batch.tokens[:, :, :2]
-    with pytest.raises(HMAError, match=r"frames of shape \(2, 4\) where the model takes \(4, 4\)"):
+    with pytest.raises(
+        HMAError,
+        match=r"a frame has the shape \(2, 4\), but the model takes \(4, 4\)",
+    ):
         model(batch)

@@ -8,8 +8,7 @@ import torch
 
 import hma_model
 from hma_data.errors import HMAError
-from hma_model.config import OBJECTIVES
-from hma_model.objective import READOUTS, Objective
+from hma_model.config import OBJECTIVES, READOUTS, Objective
 from tests.model.network_parts import small_batch, small_model
 
 PACKAGE = Path(hma_model.__file__).parent

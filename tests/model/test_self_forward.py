@@ -185,7 +185,7 @@ def test_a_past_of_its_own_is_what_generation_makes_of_the_same_prompt_and_actio
     with torch.no_grad():  # fresh gates, modulations and outputs are zero, so that actions would not matter
         for parameter in model.parameters():
             parameter.add_(0.2 * torch.randn_like(parameter))
-    monkeypatch.setattr("hma_model.network.diffusion.randn", lambda shape, *_: torch.full(tuple(shape), 0.3))
+    monkeypatch.setattr("hma_model.network.head.randn", lambda shape, *_: torch.full(tuple(shape), 0.3))
     true, depth = batch(4, continuous), 1 + seed
     stored = true.latents if continuous else true.tokens
     given = forwarded(model, true, 1.0, depth, torch.Generator().manual_seed(seed))
