@@ -400,7 +400,7 @@ def test_depth_is_not_a_colour_picture(tmp_path):
     [
         (lambda d: (d / "features.json").unlink(), "has no features.json"),
         (lambda d: (d / "features.json").write_text("{"), "not a TFDS features.json"),
-        (lambda d: (d / "dataset_info.json").write_text("{"), "is not JSON"),
+        (lambda d: (d / "dataset_info.json").write_text("{"), "Invalid JSON"),
         (lambda d: (d / "dataset_info.json").write_text('{"fileFormat": "riegeli"}'), "'riegeli'"),
         (lambda d: next(d.glob("*.tfrecord*")).unlink(), "holds no TFRecord or ArrayRecord file"),
         (lambda d: next(d.glob("*.tfrecord*")).write_bytes(b""), "holds no readable episode"),

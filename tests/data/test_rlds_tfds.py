@@ -12,7 +12,7 @@ from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.sources.rlds.folder import open_folder
-from hma_data.sources.rlds.steps import Steps
+from hma_data.sources.rlds.source import Steps
 
 pytestmark = pytest.mark.slow
 RLDS = open_source("rlds")

@@ -25,7 +25,7 @@ Shape = tuple[int | None, ...]
 BFLOAT16 = "bfloat16"  # NumPy lacks this dtype: values become float32
 MAX_TENSOR_BYTES = 1 << 28  # most bytes of one value, against decompression bombs and errors
 
-# Content keys of a feature in features.json -> the class that wrote it; legacy files name the class only.
+# Content keys of a feature in features.json -> the class that wrote it; files before TFDS 4.6 name the class.
 CONTENT = {
     "featuresDict": "FeaturesDict", "sequence": "Sequence", "tensor": "Tensor", "image": "Image",
     "video": "Video", "text": "Text", "classLabel": "ClassLabel", "boundingBox": "BBoxFeature",
@@ -62,7 +62,7 @@ class Feature:
         return None if None in sizes else math.prod(size for size in sizes if size is not None)
 
 
-def read_features(text: str, where: str) -> dict[str, Feature]:
+def read_features(text: bytes, where: str) -> dict[str, Feature]:
     """Return the leaves of a features.json by name, in its order.
 
     Raises:
@@ -70,7 +70,7 @@ def read_features(text: str, where: str) -> dict[str, Feature]:
     """
     try:
         return {leaf.name: leaf for leaf in _leaves(json.loads(text), "", ())}
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as fault:
+    except (ValueError, KeyError, TypeError, AttributeError) as fault:
         raise SourceError(
             where, f"is not a TFDS features.json: {fault!r}", "write it again with tensorflow_datasets"
         ) from fault
@@ -132,13 +132,10 @@ def _content(node: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         if isinstance(content, str):
             content = json.loads(content)
         return kind, content
-    kind = str(node.get("pythonClassName") or node.get("python_class_name") or "").rsplit(".", 1)[-1]
-    for key, general in CONTENT.items():
-        snake = "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in key)
-        content = node.get(key, node.get(snake))
-        if content is not None:
-            return general, content
-    return kind, {}
+    for key, kind in CONTENT.items():
+        if node.get(key) is not None:
+            return kind, node[key]
+    return str(node.get("pythonClassName") or "").rsplit(".", 1)[-1], {}
 
 
 def _shape(value: Any) -> Shape:
@@ -151,7 +148,7 @@ def _size(value: Any) -> int | None:
     return None if value is None or int(value) < 0 else int(value)
 
 
-# -- columns
+# -- columns of a record
 
 
 def step_count(example: Example, features: dict[str, Feature], where: str) -> int:
@@ -192,11 +189,12 @@ def column(example: Example, feature: Feature, steps: int, where: str) -> NDArra
         EpisodeError: the feature is missing, of another kind, ragged, or has not T rows.
     """
     name, sizes = _stored(example, feature, steps, where)
+    inner = feature.shape
     if feature.encoding != "none":
         values = _decoded(example, feature, name, where)
+        inner = values.shape[1:]
     else:
         values = example.numbers(name).astype(_given(feature), copy=False)
-    inner = values.shape[1:] if feature.encoding != "none" else feature.shape
     shape = [*sizes, *(-1 if size is None else size for size in inner)]
     try:
         return values.reshape(shape)
@@ -250,7 +248,7 @@ def _stored(example: Example, feature: Feature, steps: int, where: str) -> tuple
 
 
 def _given(feature: Feature) -> np.dtype:
-    """Return the dtype in which the values are returned."""
+    """Return the dtype of the values that are handed out."""
     return np.dtype(np.float32 if feature.dtype == BFLOAT16 else feature.dtype)
 
 

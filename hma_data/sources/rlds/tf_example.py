@@ -18,7 +18,7 @@ Span = tuple[int, int]
 
 
 class WireError(ValueError):
-    """Raised where bytes are not the protobuf message they should be."""
+    """The error of bytes that are not the protobuf message they should be."""
 
 
 class Example:
