@@ -11,7 +11,7 @@ import hashlib
 import logging
 import math
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -263,38 +263,14 @@ class Steps:
 
     def decoder(self, key: str) -> Decode:
         """Return a function that maps a step to the picture (H, W, 3) of a key."""
-        return (
-            _EncodedPictures(self, key) if self.features[key].kind == "picture" else _RawPictures(self, key)
-        )
-
-
-class _EncodedPictures:
-    """Pictures stored as JPEG or PNG."""
-
-    def __init__(self, steps: Steps, key: str) -> None:
-        self._blobs = steps.blobs(key)
-        self._where = f"{steps.name}: {key}"
-
-    def __call__(self, index: int, /) -> NDArray[np.uint8]:
-        return decode_image(np.frombuffer(self._blobs[index], np.uint8), f"{self._where}, step {index}")
-
-
-class _RawPictures:
-    """Pictures stored as tensors of uint8."""
-
-    def __init__(self, steps: Steps, key: str) -> None:
-        self._steps, self._key, self._feature = steps, key, steps.features[key]
-        whole = self._feature.encoding == "none" or self._feature.shape.count(None) > 1
-        self._blobs = [] if whole else steps.blobs(key)
-
-    @cached_property
-    def _all(self) -> NDArray[np.uint8]:
-        return self._steps.numbers(self._key)
-
-    def __call__(self, index: int, /) -> NDArray[np.uint8]:
-        if not self._blobs:
-            return self._all[index]
-        return tensor(self._blobs[index], self._feature, self._feature.shape, self._steps.name)
+        feature, where = self.features[key], f"{self.name}: {key}"
+        if feature.kind == "number" and (feature.encoding == "none" or feature.shape.count(None) > 1):
+            whole = cache(lambda: self.numbers(key))  # decoded when the first picture is asked for
+            return lambda index: whole()[index]
+        blobs = self.blobs(key)
+        if feature.kind == "number":
+            return lambda index: tensor(blobs[index], feature, feature.shape, self.name)
+        return lambda index: decode_image(np.frombuffer(blobs[index], np.uint8), f"{where}, step {index}")
 
 
 def _signals(steps: Steps, vector: Vector | None, times: Floats) -> tuple[Signal, ...]:
