@@ -330,7 +330,7 @@ def test_metadata_out_of_bounds_is_one_clear_line(
         ("episodes.jsonl", '{"episode_index": -1, "length": 3}', "whole number from 0, is -1"),
         ("episodes.jsonl", '{"episode_index": 0, "length": 3}\n' * 2, "lists episode 0 a second time"),
         ("episodes.jsonl", "", "has no episodes"),
-        ("tasks.jsonl", None, r"tasks\.jsonl: no such file"),
+        ("tasks.jsonl", None, r"tasks\.jsonl: cannot be read: No such file"),
     ],
 )
 def test_damaged_metadata_is_one_clear_line(

@@ -354,8 +354,7 @@ def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
 def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
     """Return the rows (n, …) of the given indices, in the order asked for.
 
-    Neighbours are read as one slice. Rows of one chunk that is too large for the cache are also read as one
-    slice, so that it is decompressed once.
+    Neighbours are read as one slice.
 
     Raises:
         IndexError: an index lies outside the dataset.
@@ -366,16 +365,11 @@ def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDA
     if not 0 <= wanted.min() <= wanted.max() < len(found):
         raise IndexError(f"{found.name} has {len(found)} rows, asked for {wanted.min()} to {wanted.max()}")
     ordered = np.unique(wanted)
-    apart = np.diff(ordered) > 1
-    if _band_bytes(found) > HELD_BYTES:
-        apart &= np.diff(ordered // found.chunks[0]) > 0
     read = np.empty((len(ordered), *found.shape[1:]), found.dtype)
-    ends = [0, *(np.flatnonzero(apart) + 1), len(ordered)]
+    ends = [0, *(np.flatnonzero(np.diff(ordered) > 1) + 1), len(ordered)]
     for start, stop in pairwise(ends):
         first, last = int(ordered[start]), int(ordered[stop - 1])
-        if last - first + 1 > stop - start:
-            read[start:stop] = found[first : last + 1][ordered[start:stop] - first]
-        elif read.dtype.hasobject:
+        if read.dtype.hasobject:
             read[start:stop] = found[first : last + 1]
         else:
             found.read_direct(read, np.s_[first : last + 1], np.s_[int(start) : int(stop)])

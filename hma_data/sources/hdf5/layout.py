@@ -79,7 +79,7 @@ def layout_of(embodiment: Embodiment | None) -> Layout:
 
 
 class PictureRows:
-    """A camera's Stream: the pictures of one dataset.
+    """A camera's Stream: the pictures of one dataset, `rows` in all.
 
     Args:
         finder, files: of the source; the dataset is kept open in `files`.
@@ -104,6 +104,7 @@ class PictureRows:
         self._finder, self._files, self._place = finder, files, place
         self._key, self._layout, self._where = key, layout, f"{place} {key}"
         found = dataset(finder.group(place), key, str(place))
+        self.rows = len(found)
         self._kind = picture_kind(found, layout)
         if self._kind is None:
             fault = f"{key!r} holds {found.shape} {found.dtype}, not colour pictures"

@@ -17,6 +17,7 @@ T frames of an episode.
 
 import hashlib
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Episode, Floats, Signal, rate_times
+from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
@@ -111,18 +112,23 @@ class Hdf5Source:
         with explained(where):
             group = self._finder.group(place)
             actions = _vector(group, embodiment.action, where)
-            series = _Series(len(actions), layout, where)
-            times = series.times(group, embodiment)
-            states = ()
+            check = partial(_check_length, layout, where, len(actions))
+            times = _times(group, embodiment, layout, len(actions), where)
+            check(layout.timestamps or "", len(times))
+            times = times[: len(actions)]
+            states: tuple[Signal, ...] = ()
             if embodiment.state:
                 values = _vector(group, embodiment.state, where)
-                states = (Signal(times, series.trimmed(embodiment.state.components[0].key, values)),)
+                check(embodiment.state.components[0].key, len(values))
+                states = (Signal(times, values[: len(actions)]),)
+            streams: dict[str, Stream] = {}
+            for camera in embodiment.cameras:
+                pictures = self._pictures(place, group, camera.key, layout, times)
+                check(camera.key, pictures.rows)
+                streams[camera.name] = pictures
             return Episode(
                 id=episode_id,
-                streams={
-                    camera.name: self._pictures(place, group, camera.key, series, times)
-                    for camera in embodiment.cameras
-                },
+                streams=streams,
                 actions=(Signal(times, actions),),
                 states=states,
                 instruction=_instruction(group, embodiment.source.instruction, where),
@@ -132,18 +138,16 @@ class Hdf5Source:
             )
 
     def _pictures(
-        self, place: EpisodeGroup, group: h5py.Group, key: str, series: "_Series", times: Floats
+        self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Layout, times: Floats
     ) -> PictureRows:
         try:
-            found = dataset(group, key, str(place))
+            return PictureRows(self._finder, self._files, place, key, layout, times)
         except EpisodeError as fault:
             if "states" in group and not any(picture_kind(item) for _, item in walk(group)):
                 said = "holds a simulator's states and no pictures"
                 remedy = "render them first, as robomimic's dataset_states_to_obs.py does"
                 raise EpisodeError(place, said, remedy) from fault
             raise
-        series.check(key, len(found))
-        return PictureRows(self._finder, self._files, place, key, series.layout, times)
 
     def _length(self, place: EpisodeGroup, embodiment: Embodiment | None) -> int:
         """Return T, the rows of the action or else the most rows of any dataset; 0 when it cannot be read."""
@@ -179,56 +183,30 @@ def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
     return next((ours for mask, ours in _SPLITS.items() if demo in masks.get(mask, ())), None)
 
 
-class _Series:
-    """The length that all series of an episode must have.
-
-    Args:
-        length: of the actions.
-        layout: of the source, from the YAML.
-        where: the episode, for errors.
-    """
-
-    def __init__(self, length: int, layout: Layout, where: str) -> None:
-        self._length, self.layout, self._where = length, layout, where
-
-    def check(self, key: str, length: int) -> None:
-        """Check that a series is as long as the actions; one row more is allowed where the last is dropped.
-
-        Raises:
-            EpisodeError: it is not.
-        """
-        one_more = length == self._length + 1
-        if length == self._length or (one_more and self.layout.last_observation == "drop"):
-            return
+def _check_length(layout: Layout, where: str, actions: int, key: str, length: int) -> None:
+    """Raise an EpisodeError where a series is not as long as the actions, or one row longer to be dropped."""
+    one_more = length == actions + 1
+    if length != actions and not (one_more and layout.last_observation == "drop"):
         remedy = "if the last was observed after the last action, set source.layout.last_observation: drop"
-        raise EpisodeError(
-            self._where,
-            f"differ in length: actions {self._length}, {key} {length}",
-            remedy if one_more else "",
+        fault = f"differ in length: actions {actions}, {key} {length}"
+        raise EpisodeError(where, fault, remedy if one_more else "")
+
+
+def _times(group: h5py.Group, embodiment: Embodiment, layout: Layout, length: int, where: str) -> Floats:
+    """Return the seconds of the frames: the episode's own where the YAML names their key."""
+    key, hz = layout.timestamps, embodiment.frequency_hz
+    if key is None and hz is None:
+        raise SourceError(
+            f"embodiment {embodiment.id}",
+            "frequency_hz is null, and HDF5 keeps no times of itself",
+            "set frequency_hz, or source.layout.timestamps to the key of the seconds",
         )
-
-    def trimmed(self, key: str, values: NDArray[Any]) -> NDArray[Any]:
-        """Return (T, …) values without the observation after the last action."""
-        self.check(key, len(values))
-        return values[: self._length]
-
-    def times(self, group: h5py.Group, embodiment: Embodiment) -> Floats:
-        """Return the seconds (T,) of the frames: the episode's own where the YAML names their key."""
-        key, hz = self.layout.timestamps, embodiment.frequency_hz
-        if key is None and hz is None:
-            raise SourceError(
-                f"embodiment {embodiment.id}",
-                "frequency_hz is null, and HDF5 keeps no times of itself",
-                "set frequency_hz, or source.layout.timestamps to the key of the seconds",
-            )
-        if key is None:  # With an unknown rate a recording can be looked at; converting it is refused before.
-            return rate_times(self._length, hz if isinstance(hz, float) else 1.0)
-        values = numbers(group, key, self._where)
-        if values.dtype.kind not in "fiu" or values.size != len(values):
-            raise EpisodeError(
-                self._where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame"
-            )
-        return self.trimmed(key, values.reshape(-1).astype(np.float64))
+    if key is None:  # With an unknown rate a recording can be looked at; converting it is refused before.
+        return rate_times(length, hz if isinstance(hz, float) else 1.0)
+    values = numbers(group, key, where)
+    if values.dtype.kind not in "fiu" or values.size != len(values):
+        raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")
+    return values.reshape(-1).astype(np.float64)
 
 
 def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32]:

@@ -135,9 +135,8 @@ class Folder:
         """
         pure = PurePosixPath(relative)
         if pure.is_absolute() or ".." in pure.parts:
-            raise EpisodeError(
-                self.uri, f"names a file outside the dataset: {relative!r}", "correct its paths"
-            )
+            fault = f"names a file outside the dataset: {relative!r}"
+            raise EpisodeError(self.uri, fault, "correct its paths")
         path = self.root / relative
         return self._fetch(self.repo, relative) if self.repo and not path.is_file() else path
 
@@ -195,7 +194,9 @@ class Metadata:
     """The content of meta/.
 
     Attributes:
-        info: of info.json; fps is of both rows and videos.
+        info: the content of info.json.
+        fps: frames a second, of both rows and videos.
+        features: by name.
         episodes: by index, rows of plain values with at least `length`.
         tasks: text by task index.
         splits: name -> range of episode indices.
@@ -205,23 +206,13 @@ class Metadata:
         self.folder = folder
         self._where = folder.root / "meta" / "info.json"
         self.info = _info(self._where)
-        is_v3 = self.info.codebase_version == "v3.0"
-        self._is_v3 = is_v3
+        self.fps, self.features = self.info.fps, self.info.features
+        self._is_v3 = is_v3 = self.info.codebase_version == "v3.0"
         self.splits = _splits(self.info.splits)
         self.tasks = _tasks_v3(folder) if is_v3 else _tasks_v2(folder)
         self.episodes = _by_index(_episodes_v3(folder) if is_v3 else _lines(folder, "episodes.jsonl"))
         if not self.episodes:
             raise SourceError(folder.uri, "has no episodes", "record some, or check meta/")
-
-    @property
-    def fps(self) -> float:
-        """Return the frames a second, of both rows and videos."""
-        return self.info.fps
-
-    @property
-    def features(self) -> dict[str, Feature]:
-        """Return the features by name."""
-        return self.info.features
 
     def data_path(self, index: int) -> str:
         """Return the path of the parquet file with an episode's rows, relative to the folder."""
@@ -291,14 +282,13 @@ def parquet_explained(where: object, error: type[HMAError]) -> Iterator[None]:
         raise error(where, "no such file") from fault
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError) as fault:
         said = (str(fault).splitlines() or [type(fault).__name__])[0]
-        raise error(
-            where, f"cannot be read as parquet: {said}", "the file may be cut off or damaged"
-        ) from fault
+        remedy = "the file may be cut off or damaged"
+        raise error(where, f"cannot be read as parquet: {said}", remedy) from fault
 
 
 def _info(path: Path) -> Info:
     try:
-        info = Info.model_validate_json(_text(path))
+        info = Info.model_validate_json(_content(path))
     except ValidationError as fault:
         first = fault.errors()[0]
         key = ".".join(map(str, first["loc"]))
@@ -310,13 +300,11 @@ def _info(path: Path) -> Info:
     return info
 
 
-def _text(path: Path) -> str:
+def _content(path: Path) -> bytes:
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as fault:
-        raise SourceError(path, "no such file", "the dataset is not complete") from fault
-    except (OSError, UnicodeDecodeError) as fault:
-        raise SourceError(path, f"cannot be read: {fault}") from fault
+        return path.read_bytes()
+    except OSError as fault:
+        raise SourceError(path, f"cannot be read: {fault.strerror}", "the dataset is not complete") from fault
 
 
 Row = tuple[str, dict[str, Any]]  # where it is written, and what it holds
@@ -324,17 +312,13 @@ Row = tuple[str, dict[str, Any]]  # where it is written, and what it holds
 
 def _lines(folder: Folder, name: str) -> Iterator[Row]:
     path = folder.root / "meta" / name
-    for i, line in enumerate(_text(path).splitlines(), 1):
-        if not line.strip():
-            continue
-        where = f"{path} line {i}"
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError as fault:
-            raise SourceError(where, f"is not JSON: {fault}", "the dataset is damaged") from fault
-        if not isinstance(row, dict):
-            raise SourceError(where, f"must be a mapping, is {type(row).__name__}")
-        yield where, row
+    for i, line in enumerate(_content(path).splitlines(), 1):
+        if line.strip():
+            where = f"{path} line {i}"
+            try:
+                yield where, json.loads(line)
+            except ValueError as fault:
+                raise SourceError(where, f"is not JSON: {fault}", "the dataset is damaged") from fault
 
 
 def _splits(found: dict[str, Any]) -> dict[str, range]:

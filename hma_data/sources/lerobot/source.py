@@ -72,9 +72,8 @@ class LeRobotSource:
             _check_rate(meta, embodiment)
         chosen = embodiment.source.split if embodiment else None
         if chosen and chosen not in meta.splits:
-            raise SourceError(
-                uri, f"has no split {chosen!r}", f"its splits: {', '.join(meta.splits) or 'none'}"
-            )
+            known = ", ".join(meta.splits) or "none"
+            raise SourceError(uri, f"has no split {chosen!r}", f"its splits: {known}")
         samples: dict[str, str] = {}
         return [
             EpisodeRef(
@@ -244,7 +243,7 @@ class Rows:
 
 
 def rows_of(meta: Metadata, index: int) -> Rows:
-    """Return the rows of an episode, found by `episode_index`; all rows where the file has no such column.
+    """Return the rows of an episode, found by `episode_index`.
 
     Raises:
         EpisodeError: the file is missing or damaged, or has no such rows.
@@ -258,11 +257,8 @@ def rows_of(meta: Metadata, index: int) -> Rows:
         for group in range(metadata.num_row_groups):
             if not _may_hold(metadata.row_group(group), index):
                 continue
-            if "episode_index" in columns:
-                stored = _column_of_group(path, _changed(path), group, "episode_index")
-                within = np.flatnonzero(stored.to_numpy(zero_copy_only=False) == index)
-            else:
-                within = np.arange(metadata.row_group(group).num_rows)
+            stored = _column_of_group(path, _changed(path), group, "episode_index")
+            within = np.flatnonzero(stored.to_numpy(zero_copy_only=False) == index)
             places.append(np.stack([np.full(len(within), group), within], axis=1))
         placed = np.concatenate(places)
         if not len(placed):

@@ -215,49 +215,33 @@ def _open_local(uri: str, files: Any, root: str, only: str, changed: tuple[int, 
 
 
 def _version_folder(uri: str, files: Any, path: str) -> str:
-    """Return the folder with features.json, at most two levels below `path` (configuration and version)."""
-    if _is_described(files, path):
+    """Return the folder with features.json: `path`, or one at most two levels below it."""
+    if is_listless(files) or files.isfile(f"{path}/features.json"):
         return path
-    if not is_listless(files) and not files.exists(path):
+    if not files.exists(path):
         raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
-    found = _described(files, path)
-    if len(found) == 1:
-        return files._parent(found[0])
-    if found:
-        names = ", ".join(sorted(files._parent(item)[len(path) + 1 :] for item in found))
+    found: list[Any] = []
+    for pattern in ("*/features.json", "*/*/features.json"):
+        if is_local(files):  # its name may contain the wildcards of patterns
+            found += sorted(Path(path).glob(pattern))
+        else:
+            found += files.glob(f"{path}/{pattern}")
+    folders = [files._parent(str(item)) for item in found]
+    if len(folders) > 1:
+        names = ", ".join(sorted(folder[len(path) + 1 :] for folder in folders))
         raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
-    raise SourceError(
-        uri,
-        "has no features.json, without which its records cannot be understood",
-        "copy it from where the records are from, or write it with TFDS",
-    )
-
-
-def _is_described(files: Any, path: str) -> bool:
-    if not is_listless(files):
-        return bool(files.isfile(f"{path}/features.json"))
-    try:  # on a web server, isfile() reports a lost connection as a missing file
-        files.cat_file(f"{path}/features.json", start=0, end=1)
-    except FileNotFoundError:
-        return False
-    return True
-
-
-def _described(files: Any, path: str) -> list[str]:
-    """Return the paths of all features.json one or two folders below `path`."""
-    patterns = ("*/features.json", "*/*/features.json")
-    if is_listless(files):
-        return []
-    if is_local(files):  # its name may contain the wildcards of patterns
-        return [str(found) for pattern in patterns for found in sorted(Path(path).glob(pattern))]
-    return [str(found) for pattern in patterns for found in files.glob(f"{path}/{pattern}")]
+    return folders[0] if folders else path
 
 
 def _open(uri: str, files: Any, root: str, only: str) -> Folder:
     """Make the folder of `open_folder`; `only` is the path of the one shard that the user chose, or empty."""
-    features = read_features(
-        fetch_whole(files, f"{root}/features.json", LONGEST_JSON) or b"", f"{root}/features.json"
-    )
+    described = fetch_whole(files, f"{root}/features.json", LONGEST_JSON)
+    if described is None:
+        raise SourceError(
+            uri,
+            "has no features.json, without which its records cannot be understood",
+            "copy it from where the records are from, or write it with TFDS",
+        )
     info = _dataset_info(files, f"{root}/dataset_info.json")
     listing = [only] if only else None
     if not only and not is_listless(files):
@@ -266,24 +250,21 @@ def _open(uri: str, files: Any, root: str, only: str) -> Folder:
     if not shards:
         shards, more = _named_shards(files, root, info, listing or [])
         problems += more
-    if not is_local(files) and any(
-        is_array_record(shard.path) for items in shards.values() for shard in items
-    ):
-        raise SourceError(
-            uri, "holds ArrayRecord files, which are read from this machine's disks only", "copy it here"
-        )
     if not shards:
-        raise SourceError(
-            uri, "holds no TFRecord or ArrayRecord file", "names are like name-train.tfrecord-00000-of-00001"
-        )
+        fault = "holds no TFRecord or ArrayRecord file"
+        raise SourceError(uri, fault, "names are like name-train.tfrecord-00000-of-00001")
+    paths = [shard.path for items in shards.values() for shard in items]
+    if not is_local(files) and any(map(is_array_record, paths)):
+        fault = "holds ArrayRecord files, which are read from this machine's disks only"
+        raise SourceError(uri, fault, "copy it here")
     return Folder(
-        uri,
-        features,
-        {split: _counted(items) for split, items in shards.items()},
-        not is_local(files),
-        info.name,
-        info.version,
-        () if only else tuple(problems),  # the user chose one shard: the others are not missing
+        uri=uri,
+        features=read_features(described, f"{root}/features.json"),
+        splits={split: _counted(items) for split, items in shards.items()},
+        remote=not is_local(files),
+        name=info.name,
+        version=info.version,
+        problems=() if only else tuple(problems),  # the user chose one shard: the others are not missing
     )
 
 

@@ -215,43 +215,41 @@ def scan_tfrecord(files: Any, path: str, size: int, known: Framing = EMPTY, limi
     Raises:
         SourceError: the file cannot be read, or is compressed.
     """
-    found = (known.offsets.tolist(), known.lengths.tolist(), known.checks.tolist())
-    start = found[0][-1] + found[1][-1] + FOOTER.size if len(known) else 0
+    offsets, lengths, checks = known.offsets.tolist(), known.lengths.tolist(), known.checks.tolist()
+    position, fault = offsets[-1] + lengths[-1] + FOOTER.size if offsets else 0, ""
     with _reader(files, path, size) as read:
-        end, fault = _walk(read, start, size, limit, found, path)
-    offsets, lengths, checks = found
+        header = read(position, min(size, position + HEADER.size))
+        if not position and header[:2] == b"\x1f\x8b":
+            raise SourceError(path, "is gzip-compressed", "decompress it: gunzip")
+        while position < size and len(offsets) != limit:
+            end, fault = _data_end(header, position, size)
+            if fault:
+                break
+            tail = read(end, min(size, end + FOOTER.size + HEADER.size))
+            offsets.append(position + HEADER.size)
+            lengths.append(end - position - HEADER.size)
+            checks.append(FOOTER.unpack_from(tail)[0])
+            header, position = tail[FOOTER.size :], end + FOOTER.size
     return Framing(
         np.array(offsets, np.int64),
         np.array(lengths, np.int64),
         np.array(checks, np.uint32),
         fault,
-        bool(fault) or end >= size,
+        bool(fault) or position >= size,
     )
 
 
-def _walk(
-    read: Read, position: int, size: int, limit: int, found: tuple[list[int], list[int], list[int]], path: str
-) -> tuple[int, str]:
-    """Append the offset, length and checksum of each record; return where and why the walk ended."""
-    offsets, lengths, checks = found
-    header = read(position, min(size, position + HEADER.size)) if position < size else b""
-    if not position and header[:2] == b"\x1f\x8b":
-        raise SourceError(path, "is gzip-compressed", "decompress it: gunzip")
-    while position < size and len(offsets) != limit:
-        if len(header) < HEADER.size:
-            return position, f"cut off at byte {size}, within the header of the record at byte {position}"
-        length, check = HEADER.unpack(header)
-        if masked_crc(header[:8]) != check:
-            return position, f"the length of the record at byte {position} fails its checksum"
-        data_end = position + HEADER.size + length
-        if data_end + FOOTER.size > size:
-            return position, f"cut off at byte {size}, within the record of {length} bytes at byte {position}"
-        tail = read(data_end, min(size, data_end + FOOTER.size + HEADER.size))
-        offsets.append(position + HEADER.size)
-        lengths.append(length)
-        checks.append(FOOTER.unpack_from(tail)[0])
-        header, position = tail[FOOTER.size :], data_end + FOOTER.size
-    return position, ""
+def _data_end(header: bytes, position: int, size: int) -> tuple[int, str]:
+    """Return where the data of the record at `position` end, and why that cannot be known (else empty)."""
+    if len(header) < HEADER.size:
+        return 0, f"cut off at byte {size}, within the header of the record at byte {position}"
+    length, check = HEADER.unpack(header)
+    if masked_crc(header[:8]) != check:
+        return 0, f"the length of the record at byte {position} fails its checksum"
+    end = position + HEADER.size + length
+    if end + FOOTER.size > size:
+        return 0, f"cut off at byte {size}, within the record of {length} bytes at byte {position}"
+    return end, ""
 
 
 @contextmanager
