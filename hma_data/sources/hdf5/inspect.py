@@ -179,7 +179,6 @@ def _length(sizes: dict[str, int]) -> int:
 def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict[str, str]:
     """Return facts about the recording: simulator, controller, layout, and the key of the instruction."""
     data = group.file.get("data")
-    words = (name for name in TEXT_KEYS if name in group.attrs and text(group.attrs[name]))
     simulated = [group.attrs.get("sim"), group.file.attrs.get("sim")]
     simulator = ""
     if any(isinstance(value, bool | np.bool_) and value for value in simulated):
@@ -193,7 +192,7 @@ def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict
         "simulator": simulator,
         "controller": _controller(said),
         "layout": "one file an episode" if place.group == WHOLE_FILE else "",
-        "instruction": next(words, ""),
+        "instruction": next((name for name in TEXT_KEYS if text(group.attrs.get(name))), ""),
     }
 
 

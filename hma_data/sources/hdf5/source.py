@@ -228,9 +228,7 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
         return text(found[()] if found.size == 1 else found[0] if found.shape else "")
     for holder in (group, group.parent, group.file):
         for name in TEXT_KEYS:
-            if name in holder.attrs and (said := text(holder.attrs[name])):
-                return said
-            if said := _single_text(holder.get(name), group):
+            if said := text(holder.attrs.get(name)) or _single_text(holder.get(name), group):
                 return said
         stated = json_of(holder, "problem_info").get("language_instruction", "")
         if said := text("".join(map(str, stated)) if isinstance(stated, list) else stated):

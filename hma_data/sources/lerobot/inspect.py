@@ -4,6 +4,8 @@ All of the metadata is checked. Numbers, times and a few pictures are checked fo
 whose files are there. Nothing is fetched from the Hub for this.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
@@ -12,7 +14,7 @@ from hma_data.sources.common import image_checks, timestamp_checks
 from hma_data.sources.common.findings import Finding
 from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
+from hma_data.sources.lerobot.metadata import Feature, Metadata, episode_name
 from hma_data.sources.lerobot.source import Rows, StillPictures, rows_of
 
 LENGTHS = 1_000  # most lengths in the inspection
@@ -63,15 +65,14 @@ class _Looking:
     def __init__(self, meta: Metadata, survey: Survey, episodes: int) -> None:
         self._meta, self._survey, self._episodes = meta, survey, episodes
         self._videos = [name for name, item in meta.features.items() if item.dtype == "video"]
-        self._spans: dict[str, dict[int, Span]] = {}
         indices = list(meta.episodes)
         self._indices = [indices[i] for i in sampled(len(indices), LOOKED_FOR)]
 
     def look(self) -> None:
         """Find which files are there; then sample the episodes that have all of their files."""
-        whole = self._with_rows()
+        whole = self._present("parquet files", self._meta.data_path)
         for key in self._videos:
-            whole &= self._with_video(key)
+            whole &= self._present(f"videos of {key}", lambda i, key=key: self._meta.video(i, key).path, key)
         order = [index for index in self._indices if index in whole]
         chosen = [order[i] for i in sampled(len(order), self._episodes)] if order else []
         pairs = max(1, image_checks.PAIRS // max(len(chosen), 1))
@@ -84,35 +85,23 @@ class _Looking:
             for index in sorted(shown):
                 self._video(key, index, pairs)
 
-    def _with_rows(self) -> set[int]:
+    def _present(self, what: str, path_of: Callable[[int], str], key: str = "") -> set[int]:
+        """Return the episodes whose file is there; report the missing files as one finding."""
         paths = {}
         for index in self._indices:
             try:
-                paths[index] = self._meta.data_path(index)
+                paths[index] = path_of(index)
             except EpisodeError as fault:
                 self._survey.fault(episode_name(index), fault)
-        return self._present("parquet files", paths)
-
-    def _with_video(self, key: str) -> set[int]:
-        try:
-            self._spans[key] = {index: self._meta.video(index, key) for index in self._indices}
-        except EpisodeError as fault:
-            self._survey.note(Finding("files", "warn", str(fault), key=key))
-            return set()
-        paths = {index: span.path for index, span in self._spans[key].items()}
-        return self._present(f"videos of {key}", paths, key)
-
-    def _present(self, what: str, paths: dict[int, str], key: str = "") -> set[int]:
-        """Return the episodes whose file is there; report the missing files as one finding."""
         distinct = list(dict.fromkeys(paths.values()))
-        missing = {path for path in distinct if not (self._meta.folder.root / path).is_file()}
+        missing = [path for path in distinct if not (self._meta.folder.root / path).is_file()]
         if missing:
-            first = next(path for path in distinct if path in missing)
             part = " looked for" if len(self._indices) < len(self._meta.episodes) else ""
-            said = f"{len(missing):,} of {len(distinct):,} {what}{part} are missing, {first} first"
+            said = f"{len(missing):,} of {len(distinct):,} {what}{part} are missing, {missing[0]} first"
             numbers = {"missing": len(missing), "files": len(distinct)}
             self._survey.note(Finding("files", "warn", said, key=key, numbers=numbers))
-        return {index for index, path in paths.items() if path not in missing}
+        there = set(distinct) - set(missing)
+        return {index for index, path in paths.items() if path in there}
 
     def _rows(self, index: int, pairs: int) -> None:
         """Hand one episode's numbers, times and parquet pictures to the survey."""
@@ -154,7 +143,7 @@ class _Looking:
 
     def _video(self, key: str, index: int, pairs: int) -> None:
         """Compare the frames of an episode's video with its rows; hand some pictures to the survey."""
-        meta, name, span = self._meta, episode_name(index), self._spans[key][index]
+        meta, name, span = self._meta, episode_name(index), self._meta.video(index, key)
         self._survey.made.add("frames")
         try:
             file = VideoFile(meta.folder.path(span.path))

@@ -295,8 +295,8 @@ def _info(path: Path) -> Info:
         said = f"{key} is {first['input']!r}: {first['msg']}" if key else first["msg"]
         raise SourceError(path, said, "the dataset is damaged or not complete") from fault
     if info.codebase_version not in VERSIONS:
-        fault = f"is of version {info.codebase_version!r}; {', '.join(VERSIONS)} are read"
-        raise SourceError(path, fault, "convert it with lerobot's own scripts")
+        said = f"is of version {info.codebase_version!r}; {', '.join(VERSIONS)} are read"
+        raise SourceError(path, said, "convert it with lerobot's own scripts")
     return info
 
 

@@ -31,6 +31,11 @@ CONTENT = {
     "video": "Video", "text": "Text", "classLabel": "ClassLabel", "boundingBox": "BBoxFeature",
     "audio": "Audio", "translation": "Translation", "jsonFeature": "Json",
 }  # fmt: skip
+FIXED: dict[str, tuple[str, Shape, str]] = {  # class -> kind, shape and dtype
+    "Text": ("text", (), "string"),
+    "ClassLabel": ("number", (), "int64"),
+    "BBoxFeature": ("number", (4,), "float32"),
+}
 
 
 @dataclass(frozen=True)
@@ -96,12 +101,8 @@ def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
 
 def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feature:
     shape, dtype = _shape(content.get("shape")), str(content.get("dtype") or "")
-    if kind == "Text":
-        return Feature(name, "text", (), "string", nesting)
-    if kind == "ClassLabel":
-        return Feature(name, "number", (), "int64", nesting)
-    if kind == "BBoxFeature":
-        return Feature(name, "number", (4,), "float32", nesting)
+    if kind in FIXED:
+        return Feature(name, *FIXED[kind], nesting)
     if kind in ("Image", "LabeledImage", "Video"):
         if kind == "Video":
             nesting = (*nesting, shape[0] if shape else None)
