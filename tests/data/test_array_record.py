@@ -152,5 +152,5 @@ def test_a_record_that_is_not_what_was_indexed_is_refused(tmp_path):
     path = write(tmp_path / "x.array_record", contents([50] * 5))
     frames = scan_array_record(FILES, str(path), path.stat().st_size)
     frames.checks[3] += 1
-    with pytest.raises(EpisodeError, match="record 3 of .* is not what it was"):
+    with pytest.raises(EpisodeError, match="record 3 of .* has changed since"):
         read_array_record(FILES, str(path), frames, 3, "e")

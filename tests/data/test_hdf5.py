@@ -396,7 +396,7 @@ def test_two_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
     for name in ("a.h5", "a.hdf5"):
         with h5py.File(tmp_path / name, "w") as file:
             fill(file.create_group("data/demo_0"))
-    with pytest.raises(SourceError, match=r"has the name of a\.h5"):
+    with pytest.raises(SourceError, match=r"differs from a\.h5 in its suffix"):
         open_source("hdf5").index(str(tmp_path))
 
 

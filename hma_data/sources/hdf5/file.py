@@ -235,7 +235,7 @@ def _stems(uri: str) -> dict[str, Path]:
             continue
         stem = "/".join(map(_safe, file.relative_to(path).with_suffix("").parts))
         if stem in found:
-            raise SourceError(file, f"has the name of {found[stem].name} but for its suffix", "rename one")
+            raise SourceError(file, f"differs from {found[stem].name} in its suffix only", "rename one")
         found[stem] = file
     if not found:
         raise nothing_there(uri, path, "holds no HDF5 files", f"looked for {', '.join(SUFFIXES)}")
@@ -252,7 +252,7 @@ def _episodes(handle: h5py.File, file: Path, pattern: str | None) -> dict[str, E
     for group in sorted(_matching(handle, parts), key=_natural):
         name = "/".join(map(_safe, group.split("/")[fixed:]))
         if name in found:
-            raise SourceError(file, f"two of its groups would be called {name!r}", "rename one")
+            raise SourceError(file, f"two of its groups give an episode called {name!r}", "rename one")
         found[name] = EpisodeGroup(file, group)
     return found
 
@@ -321,7 +321,7 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
     if is_elsewhere(found, group):
         raise EpisodeError(where, f"{key!r} keeps its values in other files", "write them into this one")
     if not found.shape:
-        raise EpisodeError(where, f"{key!r} is a single value, not one a frame")
+        raise EpisodeError(where, f"{key!r} is a single value, not one value a frame")
     if not found.shape[0]:
         raise EpisodeError(where, f"{key!r} is empty")
     if not is_plausible(found):

@@ -31,7 +31,6 @@ from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hdf5.file import (
-    MAX_NUMBERS,
     WHOLE_FILE,
     EpisodeFinder,
     EpisodeGroup,
@@ -155,12 +154,10 @@ class Hdf5Source:
         try:
             with explained(place):
                 group = self._finder.group(place)
-                for key in keys:
-                    if key.strip("/") in group:
-                        found = dataset(group, key, str(place))
-                        return len(found) if len(found) <= MAX_NUMBERS else 0
-                lengths = [item.shape[0] for _, item in walk(group) if item.shape]
-                return max((length for length in lengths if length <= MAX_NUMBERS), default=0)
+                key = next((key for key in keys if key.strip("/") in group), None)
+                if key:
+                    return len(dataset(group, key, str(place)))
+                return max((item.shape[0] for _, item in walk(group) if item.shape), default=0)
         except HMAError:
             return 0
 
@@ -188,7 +185,7 @@ def _check_length(layout: Layout, where: str, actions: int, key: str, length: in
     one_more = length == actions + 1
     if length != actions and not (one_more and layout.last_observation == "drop"):
         remedy = "if the last was observed after the last action, set source.layout.last_observation: drop"
-        fault = f"differ in length: actions {actions}, {key} {length}"
+        fault = f"its series differ in length: actions {actions}, {key} {length}"
         raise EpisodeError(where, fault, remedy if one_more else "")
 
 
@@ -198,7 +195,7 @@ def _times(group: h5py.Group, embodiment: Embodiment, layout: Layout, length: in
     if key is None and hz is None:
         raise SourceError(
             f"embodiment {embodiment.id}",
-            "frequency_hz is null, and HDF5 keeps no times of itself",
+            "frequency_hz is null, and HDF5 stores no times by itself",
             "set frequency_hz, or source.layout.timestamps to the key of the seconds",
         )
     if key is None:  # With an unknown rate a recording can be looked at; converting it is refused before.
@@ -213,7 +210,7 @@ def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32
     read = {key: numbers(group, key, where) for key in dict.fromkeys(part.key for part in vector.components)}
     if len({len(values) for values in read.values()}) > 1:
         said = ", ".join(f"{key} {len(values)}" for key, values in read.items())
-        raise EpisodeError(where, f"differ in length: {said}")
+        raise EpisodeError(where, f"its series differ in length: {said}")
     return compose(vector, [read[part.key] for part in vector.components], where)
 
 

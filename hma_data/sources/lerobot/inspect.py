@@ -4,8 +4,6 @@ All of the metadata is checked. Numbers, times and a few pictures are checked fo
 whose files are there. Nothing is fetched from the Hub for this.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
@@ -70,9 +68,9 @@ class _Looking:
 
     def look(self) -> None:
         """Find which files are there; then sample the episodes that have all of their files."""
-        whole = self._present("parquet files", self._meta.data_path)
+        whole = self._present("parquet files")
         for key in self._videos:
-            whole &= self._present(f"videos of {key}", lambda i, key=key: self._meta.video(i, key).path, key)
+            whole &= self._present(f"videos of {key}", key)
         order = [index for index in self._indices if index in whole]
         chosen = [order[i] for i in sampled(len(order), self._episodes)] if order else []
         pairs = max(1, image_checks.PAIRS // max(len(chosen), 1))
@@ -85,12 +83,12 @@ class _Looking:
             for index in sorted(shown):
                 self._video(key, index, pairs)
 
-    def _present(self, what: str, path_of: Callable[[int], str], key: str = "") -> set[int]:
+    def _present(self, what: str, key: str = "") -> set[int]:
         """Return the episodes whose file is there; report the missing files as one finding."""
         paths = {}
         for index in self._indices:
             try:
-                paths[index] = path_of(index)
+                paths[index] = self._meta.video(index, key).path if key else self._meta.data_path(index)
             except EpisodeError as fault:
                 self._survey.fault(episode_name(index), fault)
         distinct = list(dict.fromkeys(paths.values()))

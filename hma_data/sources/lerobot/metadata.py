@@ -136,7 +136,7 @@ class Folder:
         pure = PurePosixPath(relative)
         if pure.is_absolute() or ".." in pure.parts:
             fault = f"names a file outside the dataset: {relative!r}"
-            raise EpisodeError(self.uri, fault, "correct its paths")
+            raise EpisodeError(self.uri, fault, "correct the paths in meta/info.json or in its rows")
         path = self.root / relative
         return self._fetch(self.repo, relative) if self.repo and not path.is_file() else path
 
@@ -266,7 +266,7 @@ def fill(template: str, values: dict[str, Any], where: object) -> str:
     field = re.compile(rf"\{{({known})(?::0?(\d?)d)?\}}")
     path = field.sub(lambda part: str(values[part[1]]).zfill(int(part[2] or 0)), template)
     if "{" in path:
-        fault = f"has a path template that cannot be filled: {template!r}"
+        fault = f"has a path template that cannot be filled in: {template!r}"
         raise SourceError(where, fault, f"it may name {', '.join(values)}")
     return path
 

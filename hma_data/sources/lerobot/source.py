@@ -349,14 +349,7 @@ def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Float
 
 
 class _Video:
-    """A camera's Stream: one episode's part of a video file.
-
-    Args:
-        path: of the file.
-        span: the episode's part of the file.
-        times: (T,) seconds of the rows, from the episode's first frame.
-        fps: of the dataset.
-    """
+    """A camera's Stream: the part of a video file that holds an episode with rows at `times` (T,) seconds."""
 
     def __init__(self, path: Path, span: Span, times: Floats, fps: float) -> None:
         self.timestamps = times

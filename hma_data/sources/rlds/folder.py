@@ -100,7 +100,7 @@ class Shard:
         return open_records(self.files, self.path)
 
     def framing(self, limit: int = -1) -> Framing:
-        """Return where the shard's records lie; for a remote shard at least the first `limit`, -1 for all.
+        """Return where the shard's records lie; see `RecordFile.framing`.
 
         Raises:
             SourceError: it cannot be read, or has more records than dataset_info.json says.
@@ -110,7 +110,7 @@ class Shard:
             raise SourceError(
                 self.path,
                 f"has {len(frames)} records, dataset_info.json says {self.stated}",
-                "write dataset_info.json again, or remove it: the records are then counted",
+                "write dataset_info.json again, or remove it: then the records are counted",
             )
         return frames
 
@@ -168,7 +168,7 @@ class Folder:
         shard = shards[max(0, bisect_right([item.first for item in shards], int(index)) - 1)]
         position = int(index) - shard.first
         if not 0 <= position < shard.count():
-            raise EpisodeError(episode_id, f"lies in no shard of {self.uri}")
+            raise EpisodeError(episode_id, f"is in no shard of {self.uri}")
         return Example(shard.records.read(position, episode_id), episode_id), shard.path
 
 

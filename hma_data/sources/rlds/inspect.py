@@ -71,8 +71,6 @@ def _survey(
         if i in wanted:
             survey.episode(name)
             _look(steps, survey, pairs)
-    if budget < 0:
-        lengths = {i: lengths[i] for i in sorted(lengths)}
     return tuple(lengths[i] for i in sorted(lengths)), first
 
 

@@ -39,8 +39,7 @@ from hma_data.storage.files import PART, cache_folder
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
 READ_AHEAD = 32 << 10  # bytes of one request, while records are shorter than that
-KEPT_FROM = 64  # least records of a local file for an index on disk; fewer are scanned just as fast
-KEPT_EVERY = 32  # new records after which the index of a remote file is written again
+KEPT_EVERY = 32  # new records after which an index is written; fewer of a local file are scanned just as fast
 RANDOM_ACCESS = "readahead_buffer_size:0,max_parallelism:0"  # for the array_record package
 Read = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
 
@@ -93,7 +92,8 @@ class RecordFile:
             self._scan, self._pick = scan_array_record, read_array_record
         digest = hashlib.sha256(f"{protocol(files)}://{path}\n{state}".encode()).hexdigest()[:32]
         self._index = cache_folder() / "rlds" / f"{digest}.npz"
-        self._frames, self._kept, self._asked = EMPTY, 0, False
+        self._frames: Framing | None = None
+        self._kept = 0
         self._lock = Lock()
 
     def framing(self, limit: int = -1) -> Framing:
@@ -103,14 +103,16 @@ class RecordFile:
             SourceError: the file cannot be read, or is not of its format.
         """
         with self._lock:
-            if not self._enough(limit) and not self._asked:
-                self._asked = True
+            if self._frames is None:
                 self._frames = _load_index(self._index)
                 self._kept = len(self._frames)
-            if not self._enough(limit):
-                stop = -1 if is_local(self._files) else limit
-                self._frames = self._scan(self._files, self._path, self._size, self._frames, stop)
-                self._keep()
+            if not (self._frames.whole or 0 <= limit <= len(self._frames)):
+                local = is_local(self._files)
+                stop = -1 if local else limit
+                self._frames = frames = self._scan(self._files, self._path, self._size, self._frames, stop)
+                if len(frames) - self._kept >= KEPT_EVERY or (frames.whole and not local):
+                    _save_index(self._index, frames)
+                    self._kept = len(frames)
             return self._frames
 
     def read(self, index: int, where: str) -> bytes:
@@ -127,19 +129,6 @@ class RecordFile:
         if index >= len(frames):
             raise EpisodeError(where, f"{self._path}: {frames.fault or f'ends after {len(frames)} records'}")
         return self._pick(self._files, self._path, frames, index, where)
-
-    def _enough(self, limit: int) -> bool:
-        return self._frames.whole or 0 <= limit <= len(self._frames)
-
-    def _keep(self) -> None:
-        count = len(self._frames)
-        if is_local(self._files):
-            due = count >= KEPT_FROM and self._frames.whole
-        else:
-            due = self._frames.whole or count - self._kept >= KEPT_EVERY
-        if due:
-            _save_index(self._index, self._frames)
-            self._kept = count
 
 
 def is_array_record(path: str) -> bool:
@@ -304,8 +293,8 @@ def read_tfrecord(files: Any, path: str, frames: Framing, index: int, where: str
 def scan_array_record(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
     """Return the numbers, lengths and CRC-32C of an ArrayRecord file's records.
 
-    Every record is read once. A damaged record gets length 0, and fails when it is read. Only `path` is used
-    of the arguments, which are those of `scan_tfrecord`.
+    Every record is read once. A damaged record gets length 0, and fails when it is read. The arguments are
+    those of `scan_tfrecord`; only `path` is used.
 
     Raises:
         MissingDependencyError: the array_record package is not installed.
@@ -338,7 +327,7 @@ def read_array_record(files: Any, path: str, frames: Framing, index: int, where:
     except RuntimeError as fault:
         raise EpisodeError(where, f"cannot be read from {path}: {fault}") from fault
     if google_crc32c.value(data) != frames.checks[index]:
-        raise EpisodeError(where, f"record {index} of {path} is not what it was when the file was indexed")
+        raise EpisodeError(where, f"record {index} of {path} has changed since the file was indexed")
     return bytes(data)
 
 
