@@ -193,7 +193,7 @@ def open_folder(uri: str) -> Folder:
     root = _version_folder(uri, files, str(path.parent if path.is_file() else path))
     described = [Path(root, name) for name in ("", "features.json", "dataset_info.json")]
     changed = tuple(item.stat().st_mtime_ns if item.exists() else 0 for item in described)
-    return _open_local(uri, files, root, str(path) if path.is_file() else "", changed)
+    return _open(uri, files, root, str(path) if path.is_file() else "", changed)
 
 
 @lru_cache(maxsize=64)
@@ -206,12 +206,7 @@ def _open_remote(uri: str, pid: int) -> Folder:
     is_file = not is_listless(files) and attempt(files, uri, lambda: files.isfile(path))
     above = files._parent(path) if is_file else path
     root = attempt(files, uri, lambda: _version_folder(uri, files, above))
-    return _open(uri, files, root, path if is_file else "")
-
-
-@lru_cache(maxsize=64)
-def _open_local(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) -> Folder:
-    return _open(uri, files, root, only)
+    return _open(uri, files, root, path if is_file else "", ())
 
 
 def _version_folder(uri: str, files: Any, path: str) -> str:
@@ -233,7 +228,8 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
     return folders[0] if folders else path
 
 
-def _open(uri: str, files: Any, root: str, only: str) -> Folder:
+@lru_cache(maxsize=64)
+def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) -> Folder:
     """Make the folder of `open_folder`; `only` is the path of the one shard that the user chose, or empty."""
     described = fetch_whole(files, f"{root}/features.json", LONGEST_JSON)
     if described is None:

@@ -8,8 +8,9 @@ from hma_data.sources.common import image_checks
 from hma_data.sources.common.dtype_hints import is_times, seconds_of
 from hma_data.sources.common.findings import Finding
 from hma_data.sources.common.survey import Survey, sampled
+from hma_data.sources.rlds.features import Steps
 from hma_data.sources.rlds.folder import Folder, open_folder
-from hma_data.sources.rlds.source import MAX_VECTOR, Steps, is_camera
+from hma_data.sources.rlds.source import MAX_VECTOR, is_camera
 
 INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20  # most episodes and bytes read for their lengths
 
@@ -61,7 +62,7 @@ def _survey(
             break
         name = refs[i].id
         try:
-            steps = Steps(folder, folder.example(name)[0], name)
+            steps = Steps(folder.example(name)[0], folder.step_features, name)
         except EpisodeError as fault:
             survey.fault(name, fault)
             continue

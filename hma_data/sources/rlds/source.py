@@ -4,26 +4,21 @@ An episode is one record, a tf.train.Example whose `steps/…` features run over
 embodiment are paths inside a step (`observation/image`, `action/world_vector`). An episode's id is its split
 and its index in the split (`train/000012`). Numbers are decoded when an episode is read, pictures on demand.
 
-T steps, H×W pixels.
+T steps.
 """
 
 import hashlib
 import logging
 import math
 from difflib import get_close_matches
-from functools import cache
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hma_data.episodes.episode import Decode, Episode, Floats, Pictures, Signal, rate_times
-from hma_data.episodes.images import decode_image
+from hma_data.episodes.episode import Episode, Floats, Pictures, Signal, rate_times
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Component, Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
-from hma_data.sources.rlds.features import Feature, column, column_blobs, scalar, step_count, tensor
+from hma_data.sources.rlds.features import Feature, Steps, scalar
 from hma_data.sources.rlds.folder import Folder, Shard, episode_id, open_folder
 from hma_data.sources.rlds.tf_example import Example
 from hma_data.storage.fetch import info, mark
@@ -89,7 +84,7 @@ class RldsSource:
         folder = open_folder(as_text(uri))
         _check_keys(folder, embodiment)
         example, path = folder.example(episode_id)
-        steps = Steps(folder, example, episode_id)
+        steps = Steps(example, folder.step_features, episode_id)
         hz = embodiment.frequency_hz
         times = rate_times(steps.count, hz if isinstance(hz, float) else embodiment.rate_hz)
         return Episode(
@@ -151,7 +146,7 @@ def _steps_per_byte(folder: Folder, split: str) -> float:
             if not len(shard.framing(1)):
                 continue
             data = shard.records.read(0, name)
-            steps += Steps(folder, Example(data, name), name).count
+            steps += Steps(Example(data, name), folder.step_features, name).count
             size += len(data)
         except EpisodeError as fault:
             log.warning("%s: %s", folder.uri, fault)  # reading it fails again, and it is quarantined
@@ -231,46 +226,6 @@ def _described(feature: Feature) -> str:
 
 
 # -- one episode
-
-
-class Steps:
-    """One record and its columns over the steps.
-
-    Args:
-        folder: of the record.
-        example: the record.
-        name: the episode's id, for errors.
-    """
-
-    def __init__(self, folder: Folder, example: Example, name: str) -> None:
-        self.example, self.name = example, name
-        self.features = folder.step_features
-        self.count = step_count(example, self.features, name)
-
-    def numbers(self, key: str) -> NDArray[Any]:
-        """Return the values (T, …) of a key."""
-        return column(self.example, self.features[key], self.count, self.name)
-
-    def blobs(self, key: str) -> list[memoryview]:
-        """Return the T byte strings of a key."""
-        return column_blobs(self.example, self.features[key], self.count, self.name)
-
-    def text(self, key: str) -> str:
-        """Return the first text of a key; empty where the steps have none."""
-        name = f"{self.features[key].name}/ragged_flat_values"
-        blobs = self.example.blobs(name) if name in self.example else self.blobs(key)
-        return bytes(blobs[0]).decode(errors="replace") if blobs else ""
-
-    def decoder(self, key: str) -> Decode:
-        """Return a function that maps a step to the picture (H, W, 3) of a key."""
-        feature, where = self.features[key], f"{self.name}: {key}"
-        if feature.kind == "number" and (feature.encoding == "none" or feature.shape.count(None) > 1):
-            whole = cache(lambda: self.numbers(key))  # decoded when the first picture is asked for
-            return lambda index: whole()[index]
-        blobs = self.blobs(key)
-        if feature.kind == "number":
-            return lambda index: tensor(blobs[index], feature, feature.shape, self.name)
-        return lambda index: decode_image(np.frombuffer(blobs[index], np.uint8), f"{where}, step {index}")
 
 
 def _signals(steps: Steps, vector: Vector | None, times: Floats) -> tuple[Signal, ...]:
