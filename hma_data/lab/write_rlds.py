@@ -110,7 +110,7 @@ def _varint(number: int) -> bytes:
 
 
 def _record(data: bytes) -> bytes:
-    from hma_data.sources.rlds.tfrecord import masked_crc
+    from hma_data.sources.rlds.records import masked_crc
 
     length = struct.pack("<Q", len(data))
     return length + struct.pack("<I", masked_crc(length)) + data + struct.pack("<I", masked_crc(data))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from hma_data.sources.rlds.tfrecord import masked_crc
+from hma_data.sources.rlds.records import masked_crc
 
 
 def _example_class():

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.rlds import array_record
 from hma_data.sources.rlds.folder import open_folder
+from hma_data.sources.rlds.records import read_array_record, scan_array_record
 from tests.data import rlds_files
 from tests.data.rlds_files import encode, tensor
 
@@ -40,9 +40,9 @@ def write(path, records, options="group_size:1"):
 
 
 def read_all(path) -> list[bytes]:
-    frames = array_record.scan(FILES, str(path), path.stat().st_size)
+    frames = scan_array_record(FILES, str(path), path.stat().st_size)
     assert not frames.fault
-    return [array_record.read_record(FILES, str(path), frames, i, "e") for i in range(len(frames))]
+    return [read_array_record(FILES, str(path), frames, i, "e") for i in range(len(frames))]
 
 
 @pytest.mark.parametrize("sizes", SIZES)
@@ -129,11 +129,11 @@ def test_cut_or_flipped_anywhere_the_records_that_come_are_right(tmp_path, whole
         content = content[:at]
     path = tmp_path / "x.array_record"
     path.write_bytes(content)
-    frames = array_record.scan(FILES, str(path), len(content))
+    frames = scan_array_record(FILES, str(path), len(content))
     assert frames.fault or len(frames) == 3
     for i in range(len(frames)):
         try:
-            assert array_record.read_record(FILES, str(path), frames, i, "e") == contents([40, 300, 5])[i]
+            assert read_array_record(FILES, str(path), frames, i, "e") == contents([40, 300, 5])[i]
         except EpisodeError as fault:
             assert str(path) in str(fault)
 
@@ -150,7 +150,7 @@ def test_a_cut_file_is_quarantined_episode_by_episode(tmp_path):
 
 def test_a_record_that_is_not_what_was_indexed_is_refused(tmp_path):
     path = write(tmp_path / "x.array_record", contents([50] * 5))
-    frames = array_record.scan(FILES, str(path), path.stat().st_size)
+    frames = scan_array_record(FILES, str(path), path.stat().st_size)
     frames.checks[3] += 1
-    with pytest.raises(EpisodeError, match="record 3 of .* is not what it was"):
-        array_record.read_record(FILES, str(path), frames, 3, "e")
+    with pytest.raises(EpisodeError, match="record 3 of .* has changed since"):
+        read_array_record(FILES, str(path), frames, 3, "e")

@@ -258,7 +258,7 @@ def test_a_forked_child_reads_what_its_parent_opened(demos: Path) -> None:
     run_fresh(FORKING, demos)
 
 
-@pytest.mark.parametrize("locking", [None, True, False])
+@pytest.mark.parametrize("locking", [None, False])
 def test_a_file_held_open_by_another_with_or_without_locks_is_read(demos: Path, locking: bool | None) -> None:
     with h5py.File(demos, locking=locking) as other:
         assert len(open_source("hdf5").index(str(demos))) == len(other["data"])
@@ -354,7 +354,7 @@ def test_values_kept_in_other_files_are_refused(demos: Path, tmp_path: Path) -> 
         layout = h5py.VirtualLayout((T, 3), "f8")
         layout[:] = h5py.VirtualSource(str(secret), "actions", (T, 3))
         file["data/demo_2"].create_virtual_dataset("actions", layout)
-    assert "links to another file" in refused(demos)
+    assert "keeps its values in other files" in refused(demos)
     assert "keeps its values in other files" in refused(demos, "demo_1")
     assert "keeps its values in other files" in refused(demos, "demo_2")
 
@@ -366,14 +366,6 @@ def test_a_chunk_too_large_to_inflate_is_refused(demos: Path) -> None:
         )
     bomb = {"space": "mixed", "components": [{"key": "bomb", "dims": 1, "slice": [0, 1]}]}
     assert "too large to read" in refused(demos, action=bomb)
-
-
-def test_a_link_out_of_the_folder_is_refused(demos: Path, tmp_path: Path) -> None:
-    inside = tmp_path / "inside"
-    inside.mkdir()
-    (inside / "link.hdf5").symlink_to(demos)
-    with pytest.raises(SourceError, match=r"link\.hdf5: is a link that leaves the folder"):
-        open_source("hdf5").index(str(inside))
 
 
 def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(demos: Path, tmp_path: Path) -> None:
@@ -404,7 +396,7 @@ def test_two_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
     for name in ("a.h5", "a.hdf5"):
         with h5py.File(tmp_path / name, "w") as file:
             fill(file.create_group("data/demo_0"))
-    with pytest.raises(SourceError, match=r"has the name of a\.h5"):
+    with pytest.raises(SourceError, match=r"differs from a\.h5 in its suffix"):
         open_source("hdf5").index(str(tmp_path))
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -285,7 +284,7 @@ def test_a_soft_link_through_another_file_is_refused(tmp_path: Path) -> None:
         del file["data/demo_0/obs/agentview_image"]
         file["data/demo_0/obs/agentview_image"] = h5py.SoftLink("/away/image")
         file["data/demo_1"] = h5py.SoftLink("/away")
-    assert "links to another file" in refusal(path)
+    assert "keeps its values in other files" in refusal(path)
     assert open_source("hdf5").episode_ids(str(path)) == ["demo_0"]
 
 
@@ -310,9 +309,8 @@ def test_sizes_no_recording_has_are_refused_at_once(tmp_path: Path, shape: tuple
     with h5py.File(path, "a") as file:
         file.create_dataset("data/demo_0/bomb", shape, "u1", chunks=(1,) * len(shape))
     refusal(path)
-    wide = embodiment(action={"space": "mixed", "components": [{"key": "bomb", "dims": 1}]})
-    assert open_source("hdf5").index(str(path), wide)[0].frames <= 10**9
-    assert "too large" in refusal(path, action={"space": "mixed", "components": [{"key": "bomb", "dims": 1}]})
+    wide = {"space": "mixed", "components": [{"key": "bomb", "dims": 1}]}
+    assert "too large" in refusal(path, action=wide)
 
 
 def test_a_cell_of_a_picture_bomb_is_refused(tmp_path: Path) -> None:
@@ -354,36 +352,3 @@ def test_a_json_of_the_simulator_may_be_anything(tmp_path: Path) -> None:
             file["data"].attrs["problem_info"] = value
         assert open_source("hdf5").inspect(str(path)).episodes == 1
         assert shown(path, [0]).shape == (1, H, W, 3)
-
-
-@pytest.mark.parametrize(
-    "options", [{}, {"chunks": (4,)}, {"chunks": (4,), "compression": "gzip", "shuffle": True}]
-)
-def test_a_row_that_claims_more_bytes_than_the_file_is_refused(
-    tmp_path: Path, options: dict[str, Any]
-) -> None:
-    pngs = [np.frombuffer(cv2.imencode(".png", picture)[1].tobytes(), np.uint8) for picture in pictures()]
-    path = one(tmp_path, shape=(T,), dtype=h5py.vlen_dtype(np.uint8), **options)
-    with h5py.File(path, "a") as file:
-        stored = file["data/demo_0/obs/agentview_image"]
-        for row, png in enumerate(pngs):
-            stored[row] = png
-    assert shown(path, [0, 5, 8]).shape == (3, H, W, 3)
-    with h5py.File(path, "a") as file:
-        stored = file["data/demo_0/obs/agentview_image"].id
-        where, huge = None, (4_000_000_000).to_bytes(4, "little")
-        if options.get("compression"):
-            mask, raw = stored.read_direct_chunk((0,))
-            refs = bytearray(zlib.decompress(raw))
-            refs[32:36] = huge
-            stored.write_direct_chunk((0,), zlib.compress(bytes(refs)), mask)
-        else:
-            where = stored.get_chunk_info(0).byte_offset if options else stored.get_offset()
-    if where is not None:
-        content = bytearray(path.read_bytes())
-        content[where + 32 : where + 36] = huge
-        path.write_bytes(content)
-    robot = embodiment()
-    stream = open_source("hdf5").read(str(path), "demo_0", robot).streams["front"]
-    with pytest.raises(EpisodeError, match=r"claims 4,000,000,000 values, the file has"):
-        stream.frames([0])

@@ -289,7 +289,7 @@ def test_missing_shards_keep_the_ids_of_the_others(tmp_path, caplog):
         assert RLDS.episode_ids(str(folder)) == [f"train/{i:06d}" for i in (0, 1, 4, 5)]
     assert "1 of 3 shards of split train" in caplog.text
     assert read(folder, "train/000005").instruction == "lift é 2"
-    with pytest.raises(EpisodeError, match="lies in no shard"):
+    with pytest.raises(EpisodeError, match="is in no shard"):
         read(folder, "train/000002")
 
 
@@ -400,7 +400,7 @@ def test_depth_is_not_a_colour_picture(tmp_path):
     [
         (lambda d: (d / "features.json").unlink(), "has no features.json"),
         (lambda d: (d / "features.json").write_text("{"), "not a TFDS features.json"),
-        (lambda d: (d / "dataset_info.json").write_text("{"), "is not JSON"),
+        (lambda d: (d / "dataset_info.json").write_text("{"), "Invalid JSON"),
         (lambda d: (d / "dataset_info.json").write_text('{"fileFormat": "riegeli"}'), "'riegeli'"),
         (lambda d: next(d.glob("*.tfrecord*")).unlink(), "holds no TFRecord or ArrayRecord file"),
         (lambda d: next(d.glob("*.tfrecord*")).write_bytes(b""), "holds no readable episode"),

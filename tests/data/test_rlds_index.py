@@ -2,7 +2,6 @@
 
 import json
 import os
-import struct
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -12,14 +11,11 @@ import fsspec
 import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
 from hma_data.sources.base import open_source
-from hma_data.sources.rlds import record_file
+from hma_data.sources.rlds import records
 from hma_data.sources.rlds.folder import open_folder
-from hma_data.sources.rlds.record_index import Framing, index_path, load_index, save_index
 from hma_data.storage import fetch as fetching
 from tests.data import rlds_files
 from tests.data.rlds_files import encode, frame, tensor
@@ -51,10 +47,10 @@ def shard(folder: Path) -> Path:
     return next(folder.glob("*.tfrecord*"))
 
 
-def reopened(path: Path) -> record_file.RecordFile:
+def reopened(path: Path) -> records.RecordFile:
     """As another process would open it."""
-    record_file._open.cache_clear()
-    return record_file.open_records(FILES, str(path))
+    records._opened.cache_clear()
+    return records.open_records(FILES, str(path))
 
 
 def number(folder: Path | str, name: str) -> float:
@@ -68,7 +64,7 @@ def test_a_second_process_reads_the_index_and_scans_nothing(tmp_path, cache, mon
     path = shard(dataset(tmp_path / "d"))
     first = reopened(path).framing()
     assert len(list(cache.iterdir())) == 1
-    monkeypatch.setattr("hma_data.sources.rlds.tfrecord._walk", None)
+    monkeypatch.setattr("hma_data.sources.rlds.records._data_end", None)
     again = reopened(path)
     np.testing.assert_array_equal(again.framing().offsets, first.offsets)
     assert again.read(70, "e") == encode(record(70))
@@ -95,44 +91,13 @@ def test_another_file_of_that_name_is_indexed_anew(tmp_path, cache):
     assert len(list(cache.iterdir())) == 2
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
-def test_a_damaged_index_is_made_again(tmp_path, cache, data):
-    folder = tmp_path / "d"
-    path = shard(folder if folder.exists() else dataset(folder))
-    reopened(path).framing()
-    kept = next(item for item in cache.iterdir() if item.suffix == ".index")
-    content = bytearray(kept.read_bytes())
-    at = data.draw(st.integers(0, len(content) - 1))
-    if data.draw(st.booleans()):
-        content[at] ^= data.draw(st.integers(1, 255))
-    else:
-        content = content[:at]
-    kept.write_bytes(content)
-    again = reopened(path)
-    assert [again.read(i, "e") for i in (0, 99)] == [encode(record(i)) for i in (0, 99)]
-    kept.unlink()
-
-
-def test_a_wrong_index_with_a_right_checksum_is_noticed_and_made_again(tmp_path, cache):
+@pytest.mark.parametrize("size", [0, 100])
+def test_a_damaged_index_is_made_again(tmp_path, cache, size):
     path = shard(dataset(tmp_path / "d"))
-    true = reopened(path).framing()
-    file = reopened(path)
-    for wrong in (true.offsets + 3, true.offsets[::-1].copy(), true.offsets + 10**6):
-        save_index(file._name, file._mark, Framing(wrong, true.lengths, true.checks))
-        assert reopened(path).read(41, "e") == encode(record(41))
-    np.testing.assert_array_equal(reopened(path).framing().offsets, true.offsets)
-
-
-def test_an_index_is_bound_to_path_and_mark(tmp_path, cache):
-    frames = Framing(np.array([12]), np.array([5]), np.array([7], np.uint32), "cut off", False)
-    save_index("file:///a", "one", frames)
-    found = load_index("file:///a", "one", 100)
-    assert found and (found.fault, found.whole, found.checks.tolist()) == ("cut off", False, [7])
-    assert load_index("file:///a", "two", 100) is None
-    index_path("file:///a", "one").rename(index_path("file:///b", "one"))
-    assert load_index("file:///b", "one", 100) is None  # another file's
-    assert load_index("file:///a", "one", 10) is None
+    reopened(path).framing()
+    [kept] = cache.iterdir()
+    kept.write_bytes(kept.read_bytes()[:size])
+    assert reopened(path).read(99, "e") == encode(record(99))
 
 
 def test_damaged_data_are_an_error_however_the_index_came(tmp_path):
@@ -149,21 +114,6 @@ def test_damaged_data_are_an_error_however_the_index_came(tmp_path):
 
 
 # -- links
-
-
-@pytest.mark.parametrize("name", ["toy-train.tfrecord-00000-of-00002", "features.json", "dataset_info.json"])
-def test_a_link_out_of_the_folder_is_refused(tmp_path, name):
-    folder = dataset(tmp_path / "d", 4, 2)
-    (folder / name).rename(tmp_path / "elsewhere")
-    (folder / name).symlink_to(tmp_path / "elsewhere")
-    if name.endswith("json"):
-        with pytest.raises(SourceError, match="link to a file outside"):
-            RLDS.index(str(folder))
-        return
-    assert [bool(ref.fingerprint) for ref in RLDS.index(str(folder))] == [False, False, True, True]
-    with pytest.raises(EpisodeError, match="link to a file outside"):
-        number(folder, "train/000000")
-    assert number(folder, "train/000003") == 3
 
 
 def test_links_of_the_hub_cache_and_to_the_whole_folder_are_followed(tmp_path):
@@ -245,7 +195,8 @@ def test_a_remote_index_grows_no_further_than_asked_and_is_kept(served, cache):
     folder, uri, handler = served
     dataset(folder / "d", 100, 1, pad=20_000)
     assert [number(uri, f"train/{i:06d}") for i in (3, 40)] == [3, 40]
-    record_file._open_remote.cache_clear()
+    records._remote_state.cache_clear()
+    records._opened.cache_clear()
     handler.asked.clear()
     assert number(uri, "train/000030") == 30
     assert len([name for name, _ in handler.asked if "tfrecord" in name]) == 1
@@ -344,17 +295,6 @@ def test_a_driver_that_is_missing_is_named_with_its_install_line(monkeypatch, pr
 # -- shapes of files
 
 
-def test_a_record_longer_than_protobuf_allows_is_refused_unread(tmp_path):
-    folder = dataset(tmp_path / "d", 3)
-    path = shard(folder)
-    length = struct.pack("<Q", 3 << 30)
-    with path.open("r+b") as file:
-        file.write(length + struct.pack("<I", rlds_files.masked_crc(length)))
-        file.truncate((3 << 30) + 100)  # sparse
-    with pytest.raises(EpisodeError, match="more than an Example can have"):
-        number(folder, "train/000000")
-
-
 @pytest.mark.parametrize(
     ("name", "split"),
     [
@@ -371,49 +311,10 @@ def test_a_split_is_told_by_the_name_of_its_file(tmp_path, name, split):
     assert RLDS.episode_ids(str(folder)) == [f"{split}/000000", f"{split}/000001"]
 
 
-QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers(-5, 2**70) | st.floats() | st.text(max_size=4),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
-    max_leaves=8,
-)
-
-
-@QUICK
-@given(data=st.data(), name=st.sampled_from(["features.json", "dataset_info.json"]))
-def test_a_description_with_anything_in_it_is_read_or_refused(tmp_path, data, name):
-    folder = tmp_path / "d"
-    if not folder.exists():
-        dataset(folder, 4, 2)
-        for item in folder.glob("*.json"):
-            item.with_suffix(".true").write_text(item.read_text())
-    for item in folder.glob("*.true"):
-        item.with_suffix(".json").write_text(item.read_text())
-    tree = json.loads((folder / name).read_text())
-    spot, steps = tree, data.draw(st.integers(0, 8))
-    for turn in range(steps):
-        keys = list(spot) if isinstance(spot, dict) else list(range(len(spot)))
-        key = data.draw(st.sampled_from(keys))
-        if turn < steps - 1 and isinstance(spot[key], dict | list) and spot[key]:
-            spot = spot[key]
-            continue
-        spot[key] = data.draw(JSON)
-        break
-    (folder / name).write_text(json.dumps(tree))
-    try:
-        for ref in RLDS.index(str(folder)):
-            number(folder, ref.id)
-    except (SourceError, EpisodeError) as fault:
-        assert str(fault)
-
-
-@pytest.mark.parametrize("count", [10**15, 2**70, -3, 1e400, "many", None])
-def test_a_count_of_records_that_cannot_be_is_refused(tmp_path, memory, count):
-    folder = tmp_path / "d"
+@pytest.mark.parametrize("count", [-3, "many", None])
+def test_a_count_of_records_that_is_no_count_is_refused(tmp_path, count):
+    folder = dataset(tmp_path / "d", 4)
     text = json.dumps({"name": "toy", "splits": [{"name": "train", "shardLengths": [count, "4", "4"]}]})
     (folder / "dataset_info.json").write_text(text)
-    fsspec.filesystem("memory").pipe(memory.removeprefix("memory:/") + "/dataset_info.json", text.encode())
-    open_folder.__globals__["_remote"].cache_clear()
-    for place in (str(folder), memory):
-        with pytest.raises(SourceError, match="cannot have|are not numbers"):
-            RLDS.index(place)
+    with pytest.raises(SourceError, match=r"splits\.0\.shardLengths\.0 is"):
+        RLDS.index(str(folder))

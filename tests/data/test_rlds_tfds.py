@@ -11,8 +11,8 @@ import pytest
 from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
+from hma_data.sources.rlds.features import Steps
 from hma_data.sources.rlds.folder import open_folder
-from hma_data.sources.rlds.steps import Steps
 
 pytestmark = pytest.mark.slow
 RLDS = open_source("rlds")
@@ -55,7 +55,7 @@ def truth(toy: ModuleType, written: Path) -> dict[str, list[dict[str, Any]]]:
 
 def ours(folder: Path, name: str) -> Steps:
     found = open_folder(str(folder))
-    return Steps(found, found.example(name)[0], name)
+    return Steps(found.example(name)[0], found.step_features, name)
 
 
 def each(truth: dict[str, list[dict[str, Any]]]) -> list[tuple[str, dict[str, Any]]]:

@@ -1,15 +1,20 @@
-"""Open HDF5 files lazily in each process, read a few rows at a time, and trust none of their claims.
+"""Open HDF5 files, find the episodes in them, and read a few rows at a time.
 
-Only data in the file itself is read. Links to other files, external storage and virtual datasets are refused,
-and so are sizes that no recording has.
+A uri is a file or a folder of files. A pattern such as `data/*` names the groups that are episodes; `/` says
+that each file is one episode. Without a pattern, the file itself shows it.
+
+Files are opened lazily in each process. Only values in the file itself are read: those that it keeps in other
+files are refused, and so are sizes that no recording has.
 """
 
 import os
-import zlib
+import re
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,26 +23,31 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import EpisodeError, HMAError
+from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.sources.base import local_path
+from hma_data.sources.common.links import nothing_there
 
+SUFFIXES = (".h5", ".hdf5", ".hdf")
+WHOLE_FILE = "/"
 OPEN_FILES = 8
 CHUNK_CACHE = 16 << 20  # bytes a dataset, where its chunks are not larger
 HELD_BYTES = 512 << 20  # of decompressed chunks in memory, over all datasets of pictures
 MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
 MAX_ROW = 1 << 28  # values of a row: more than any picture has
-MAX_KEYS, MAX_DEPTH = 5_000, 16
+MAX_KEYS = 5_000  # datasets and groups of an episode that are listed
+_EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
 
 
 class OpenFiles:
-    """Keep the files open in this process; close the least recently used first. None stays open after a fork.
+    """The files open in this process; the least recently used is closed first. None stays open after a fork.
 
     Datasets of pictures stay open too, so that a chunk that several calls need is decompressed once.
     """
 
     def __init__(self) -> None:
         self._process = os.getpid()
-        self._files: OrderedDict[Path, tuple[tuple[int, int], h5py.File]] = OrderedDict()
+        self._files: OrderedDict[tuple[Path, int, int], h5py.File] = OrderedDict()
         self._held: OrderedDict[tuple[Path, str, str], tuple[int, h5py.Dataset]] = OrderedDict()
 
     def get(self, path: Path) -> h5py.File:
@@ -49,16 +59,15 @@ class OpenFiles:
         if self._process != os.getpid():
             self._files, self._held, self._process = OrderedDict(), OrderedDict(), os.getpid()
         status = path.stat()
-        state = (status.st_size, status.st_mtime_ns)
-        held = self._files.get(path)
-        if held and held[0] != state:
-            held[1].close()
-        if not held or held[0] != state:
-            self._files[path] = state, _open(path)
-        self._files.move_to_end(path)
+        state = (path, status.st_size, status.st_mtime_ns)
+        if state not in self._files:
+            for old in [held for held in self._files if held[0] == path]:
+                self._files.pop(old).close()
+            self._files[state] = _open(path)
+        self._files.move_to_end(state)
         while len(self._files) > OPEN_FILES:
-            self._files.popitem(last=False)[1][1].close()
-        return self._files[path][1]
+            self._files.popitem(last=False)[1].close()
+        return self._files[state]
 
     def cached(self, path: Path, group: h5py.Group, key: str, where: str) -> h5py.Dataset:
         """Return the dataset at `key` of a group of an open file; its cache has room for the chunks of a row.
@@ -76,10 +85,20 @@ class OpenFiles:
         return self._held[name][1]
 
 
+def _open(path: Path) -> h5py.File:
+    """Open a file with HDF5's own locking, or without on file systems that have no locks."""
+    try:
+        return h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)
+    except OSError as fault:
+        if "lock" not in str(fault):
+            raise
+    return h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE, locking=False)
+
+
 def _with_room(group: h5py.Group, key: str, where: str) -> tuple[int, h5py.Dataset]:
     """Return the bytes of the dataset's cache, and the dataset."""
     found = dataset(group, key, where)
-    room = min(max(band_bytes(found), CHUNK_CACHE), HELD_BYTES) if found.chunks else 0
+    room = min(max(_band_bytes(found), CHUNK_CACHE), HELD_BYTES) if found.chunks else 0
     if room <= CHUNK_CACHE:
         return room, found
     slots = 100 * (room // (int(np.prod(found.chunks)) * found.dtype.itemsize) + 1) + 1
@@ -89,7 +108,7 @@ def _with_room(group: h5py.Group, key: str, where: str) -> tuple[int, h5py.Datas
     return room, h5py.Dataset(h5py.h5d.open(group.id, key.strip("/").encode(), access))
 
 
-def band_bytes(found: h5py.Dataset) -> int:
+def _band_bytes(found: h5py.Dataset) -> int:
     """Return the decompressed bytes of all chunks that hold a row; 0 without chunks."""
     if not found.chunks:
         return 0
@@ -97,72 +116,196 @@ def band_bytes(found: h5py.Dataset) -> int:
     return int(found.chunks[0] * np.prod(sides, dtype=float)) * int(found.dtype.itemsize)
 
 
-def _open(path: Path) -> h5py.File:
-    """Open a file with HDF5's own locking; where that fails on locks, without them; at last with them.
-
-    A file that this process already holds open can be opened again only with the same locking.
-    """
-    for locking in (None, False):
-        try:
-            return h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE, locking=locking)
-        except OSError as fault:
-            if "lock" not in str(fault):
-                raise
-    return h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE, locking=True)
-
-
 @contextmanager
 def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[None]:
     """Raise h5py's errors on damaged files as `error`, in one line."""
     try:
         yield
-    except (
-        OSError,
-        zlib.error,
-        KeyError,
-        RuntimeError,
-        ValueError,
-        TypeError,
-        OverflowError,
-        MemoryError,
-    ) as fault:
-        lines = str(fault).splitlines() or [type(fault).__name__]
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, ArithmeticError, MemoryError) as fault:
+        said = (str(fault).splitlines() or [type(fault).__name__])[0]
         remedy = "the file may be cut off or damaged"
-        if "plugin" in lines[0] or ("filter" in lines[0] and "not registered" in lines[0]):
+        if "plugin" in said or ("filter" in said and "not registered" in said):
             remedy = (
                 "it is compressed in a way that HDF5 alone does not know; rewrite it with h5repack -f GZIP=4"
             )
-        raise error(where, f"cannot be read as HDF5: {lines[0]}", remedy) from fault
+        raise error(where, f"cannot be read as HDF5: {said}", remedy) from fault
+
+
+# -- episodes
+
+
+@dataclass(frozen=True)
+class EpisodeGroup:
+    """The place of an episode: a file and the group in it."""
+
+    file: Path
+    group: str = WHOLE_FILE
+
+    def __str__(self) -> str:
+        return str(self.file) if self.group == WHOLE_FILE else f"{self.file}:{self.group}"
+
+
+class EpisodeFinder:
+    """The episodes of recordings, by their ids; the episodes of each file are remembered."""
+
+    def __init__(self, files: OpenFiles) -> None:
+        self._files = files
+        self._stems: dict[str, dict[str, Path]] = {}
+        self._seen: dict[tuple[Path, str | None], dict[str, EpisodeGroup]] = {}
+
+    def all(self, uri: str, pattern: str | None = None) -> dict[str, EpisodeGroup]:
+        """Return every episode by its id, in natural order.
+
+        A damaged file in a folder counts as one episode, so that it is quarantined by its name.
+
+        Raises:
+            SourceError: the only file is damaged, there are no episodes, or two have one id.
+        """
+        return {name: place for _, found in self.by_file(uri, pattern) for name, place in found.items()}
+
+    def by_file(self, uri: str, pattern: str | None = None) -> Iterator[tuple[Path, dict[str, EpisodeGroup]]]:
+        """Yield each file with its episodes, while the file is open.
+
+        Opening many files a second time would take as long again.
+
+        Raises:
+            SourceError: as `all`.
+        """
+        self._seen.clear()
+        stems = self._stems[uri] = _stems(uri)
+        in_folder = local_path(uri).is_dir()
+        is_empty = True
+        for stem, file in stems.items():
+            try:
+                inside = self._inside(file, pattern)
+            except SourceError:
+                if len(stems) == 1:
+                    raise
+                inside = {"": EpisodeGroup(file)}
+            is_empty = is_empty and not inside
+            prefix = stem if in_folder else ""
+            yield file, {"/".join(filter(None, (prefix, name))) or stem: inside[name] for name in inside}
+        if is_empty:
+            raise SourceError(uri, "holds no episodes", f"looked for groups {pattern or 'data/*'}")
+
+    def find(self, uri: str, episode_id: str, pattern: str | None = None) -> EpisodeGroup:
+        """Return the place of an id; open only the file that holds it.
+
+        Raises:
+            SourceError: no such episode.
+            EpisodeError: its file is damaged.
+        """
+        stems = self._stems.get(uri) or self._stems.setdefault(uri, _stems(uri))
+        parts = episode_id.split("/")
+        if local_path(uri).is_dir():
+            candidates = [("/".join(parts[:i]), "/".join(parts[i:])) for i in range(len(parts), 0, -1)]
+        else:
+            candidates = [(stem, name) for stem in stems for name in (episode_id, "")]
+        for stem, name in candidates:
+            if stem not in stems:
+                continue
+            try:
+                inside = self._inside(stems[stem], pattern)
+            except SourceError as fault:
+                raise EpisodeError(fault.where, fault.fault, fault.remedy) from fault
+            if name in inside and (name or stem == episode_id):
+                return inside[name]
+        raise SourceError(uri, f"has no episode {episode_id!r}", "hma inspect lists what it has")
+
+    def group(self, place: EpisodeGroup) -> h5py.Group:
+        """Return the episode's group, in the open file."""
+        return member(self._files.get(place.file), place.group, str(place))
+
+    def _inside(self, file: Path, pattern: str | None) -> dict[str, EpisodeGroup]:
+        """Return the episodes of one file by name within it; the name of a whole file is empty."""
+        if (file, pattern) not in self._seen:
+            with explained(file, SourceError):
+                self._seen[file, pattern] = _episodes(self._files.get(file), file, pattern)
+        return self._seen[file, pattern]
+
+
+def _stems(uri: str) -> dict[str, Path]:
+    """Return the HDF5 files of a uri by their names without suffix, relative to the folder."""
+    path = local_path(uri)
+    if path.is_file():
+        return {_safe(path.stem): path}
+    found: dict[str, Path] = {}
+    for file in sorted(path.rglob("*"), key=lambda item: _natural(str(item.relative_to(path)))):
+        if file.suffix.lower() not in SUFFIXES or not file.is_file():
+            continue
+        stem = "/".join(map(_safe, file.relative_to(path).with_suffix("").parts))
+        if stem in found:
+            raise SourceError(file, f"differs from {found[stem].name} in its suffix only", "rename one")
+        found[stem] = file
+    if not found:
+        raise nothing_there(uri, path, "holds no HDF5 files", f"looked for {', '.join(SUFFIXES)}")
+    return found
+
+
+def _episodes(handle: h5py.File, file: Path, pattern: str | None) -> dict[str, EpisodeGroup]:
+    pattern = pattern or _guess_pattern(handle)
+    if pattern == WHOLE_FILE:
+        return {"": EpisodeGroup(file)}
+    parts = pattern.split("/")
+    fixed = next((i for i, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts) - 1)
+    found: dict[str, EpisodeGroup] = {}
+    for group in sorted(_matching(handle, parts), key=_natural):
+        name = "/".join(map(_safe, group.split("/")[fixed:]))
+        if name in found:
+            raise SourceError(file, f"two of its groups give an episode called {name!r}", "rename one")
+        found[name] = EpisodeGroup(file, group)
+    return found
+
+
+def _guess_pattern(handle: h5py.File) -> str:
+    data = handle.get("data")
+    if isinstance(data, h5py.Group) and all(isinstance(data.get(name), h5py.Group | None) for name in data):
+        return "data/*"
+    groups = [name for name in handle if isinstance(handle.get(name), h5py.Group)]
+    if groups and len(groups) == len(handle) and all(_EPISODE_NAME.fullmatch(name) for name in groups):
+        return "*"
+    return WHOLE_FILE
+
+
+def _matching(group: h5py.Group, parts: list[str]) -> list[str]:
+    """Return the paths of the groups that match a pattern, one part a level; links are not followed."""
+    found = []
+    for name in group:
+        if fnmatchcase(name, parts[0]) and isinstance(group.get(name, getlink=True), h5py.HardLink):
+            item = group[name]
+            if isinstance(item, h5py.Group):
+                below = [f"/{rest}" for rest in _matching(item, parts[1:])] if parts[1:] else [""]
+                found += [name + rest for rest in below]
+    return found
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Return a sort key that puts demo_2 before demo_10."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name)]
+
+
+def _safe(name: str) -> str:
+    return re.sub(r"[^\w.-]", "_", name).lstrip(".") or "_"
+
+
+# -- values
 
 
 def member(group: h5py.Group, key: str, where: str) -> Any:
     """Return the group or dataset at a path inside `group`.
 
     Raises:
-        EpisodeError: it is not there (the error names the nearest keys), or it lies in another file.
+        EpisodeError: it is not there; the error names the nearest keys.
     """
-    found: Any = group
-    for part in key.strip("/").split("/"):
-        link = found.get(part, getlink=True) if isinstance(found, h5py.Group) else None
-        if link is None:
-            raise EpisodeError(where, f"has no {key!r}", _nearest(group, key))
-        if isinstance(link, h5py.ExternalLink):
-            raise EpisodeError(where, f"{key!r} links to another file, {link.filename!r}", "copy it in")
-        found = found[part]
-        if _strays(found, group):  # by way of a soft link
-            raise EpisodeError(where, f"{key!r} links to another file, {found.file.filename!r}", "copy it in")
-    return found
-
-
-def child(group: h5py.Group, name: str) -> Any:
-    """Return the direct member of a name; None where there is none in this file."""
-    link = group.get(name, getlink=True)
-    found = None if link is None or isinstance(link, h5py.ExternalLink) else group.get(name)
-    return None if found is None or _strays(found, group) else found
-
-
-def _strays(found: Any, group: h5py.Group) -> bool:
-    return bool(found.file.filename != group.file.filename)
+    try:
+        return group[key.strip("/") or "/"]
+    except KeyError as fault:
+        keys = [name for name, _ in walk(group)]
+        near = get_close_matches(key.strip("/"), keys, n=3, cutoff=0.5)
+        remedy = (
+            f"did you mean {', '.join(near)}?" if near else f"it has {', '.join(keys[:8]) or 'no datasets'}"
+        )
+        raise EpisodeError(where, f"has no {key!r}", remedy) from fault
 
 
 def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
@@ -175,22 +318,28 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
     if isinstance(found, h5py.Group):
         inner = ", ".join(f"{key.strip('/')}/{name}" for name in list(found)[:8])
         raise EpisodeError(where, f"{key!r} is a group, not a dataset", f"it holds: {inner or 'nothing'}")
-    if not isinstance(found, h5py.Dataset):
-        raise EpisodeError(where, f"{key!r} is a named type, not a dataset")
-    if found.external or found.is_virtual:
+    if is_elsewhere(found, group):
         raise EpisodeError(where, f"{key!r} keeps its values in other files", "write them into this one")
     if not found.shape:
-        raise EpisodeError(where, f"{key!r} is a single value, not one a frame")
+        raise EpisodeError(where, f"{key!r} is a single value, not one value a frame")
     if not found.shape[0]:
         raise EpisodeError(where, f"{key!r} is empty")
-    if chunk_bytes(found) > MAX_BYTES:
-        raise EpisodeError(where, f"{key!r} has chunks of {found.chunks}, too large to read")
+    if not is_plausible(found):
+        raise EpisodeError(
+            where, f"{key!r} has shape {found.shape} in chunks {found.chunks}, too large to read"
+        )
     return found
 
 
-def chunk_bytes(found: h5py.Dataset) -> float:
-    """Return the decompressed bytes of a chunk; 0 without chunks."""
-    return float(np.prod(found.chunks, dtype=float) * found.dtype.itemsize) if found.chunks else 0.0
+def is_elsewhere(found: h5py.Dataset, group: h5py.Group) -> bool:
+    """Check whether a dataset lies in another file than its group, or keeps its values in one."""
+    return bool(found.file.filename != group.file.filename or found.external or found.is_virtual)
+
+
+def is_plausible(found: h5py.Dataset) -> bool:
+    """Check whether a recording can have rows and chunks of this size."""
+    chunk = np.prod(found.chunks or 0, dtype=float) * found.dtype.itemsize
+    return bool(chunk <= MAX_BYTES and np.prod(found.shape[1:], dtype=float) <= MAX_ROW)
 
 
 def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
@@ -198,82 +347,29 @@ def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
     found = dataset(group, key, where)
     if np.prod(found.shape, dtype=float) > MAX_NUMBERS:
         raise EpisodeError(where, f"{key!r} has shape {found.shape}, too large for numbers over time")
-    check_lengths(found)
     values: NDArray[Any] = found[()]
     return values
-
-
-def check_lengths(found: h5py.Dataset) -> None:
-    """Check that no row of varying length claims more bytes than its file has; HDF5 would allocate them.
-
-    Rows that are compressed by anything but gzip are not checked.
-
-    Raises:
-        OSError: a row claims more; `explained` raises that as our error.
-    """
-    if not found.dtype.hasobject or not found.size or h5py.check_ref_dtype(found.dtype):
-        return
-    size = Path(found.file.filename).stat().st_size
-    for heads in _row_heads(found):
-        longest = int(heads.max(initial=0))
-        if longest > size:
-            raise OSError(f"a row of {found.name} claims {longest:,} values, the file has {size:,} bytes")
-
-
-def _row_heads(found: h5py.Dataset) -> Iterator[NDArray[np.uint32]]:
-    """Yield the lengths stored in front of rows of varying length, chunk by chunk."""
-    width = found.id.get_type().get_size()
-    if not found.chunks:
-        offset = found.id.get_offset()
-        pieces = [] if offset is None else [(offset, found.id.get_storage_size(), 0)]
-    else:
-        infos = (found.id.get_chunk_info(i) for i in range(found.id.get_num_chunks()))
-        pieces = [(info.byte_offset, info.size, info.filter_mask) for info in infos]
-    plan = found.id.get_create_plist()
-    filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
-    with Path(found.file.filename).open("rb") as file:
-        for offset, size, skipped in pieces:
-            applied = [code for i, code in enumerate(filters) if not skipped >> i & 1]
-            if applied not in ([], [h5py.h5z.FILTER_DEFLATE]):  # a shuffle is never applied to such rows
-                return
-            file.seek(offset)
-            content = file.read(min(size, MAX_BYTES))
-            if applied:
-                content = zlib.decompressobj().decompress(content, int(np.prod(found.chunks)) * width)
-            values = np.frombuffer(content[: len(content) // width * width], np.uint8).reshape(-1, width)
-            yield np.ascontiguousarray(values[:, :4]).view("<u4")
 
 
 def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
     """Return the rows (n, …) of the given indices, in the order asked for.
 
-    Neighbours are read as one slice. Rows of one chunk that is too large for the cache are also read as one
-    slice, so that it is decompressed once.
+    Neighbours are read as one slice.
 
     Raises:
-        EpisodeError: a row or a chunk is larger than any picture.
         IndexError: an index lies outside the dataset.
     """
-    if np.prod(found.shape[1:], dtype=float) > MAX_ROW or chunk_bytes(found) > MAX_BYTES:
-        fault = f"has rows of {found.shape[1:]} in chunks of {found.chunks}, too large to read"
-        raise EpisodeError(f"{found.file.filename}:{found.name}", fault)
     wanted = np.asarray(indices, np.int64).reshape(-1)
     if not len(wanted):
         return np.zeros((0, *found.shape[1:]), found.dtype)
     if not 0 <= wanted.min() <= wanted.max() < len(found):
         raise IndexError(f"{found.name} has {len(found)} rows, asked for {wanted.min()} to {wanted.max()}")
-    check_lengths(found)
     ordered = np.unique(wanted)
-    apart = np.diff(ordered) > 1
-    if band_bytes(found) > HELD_BYTES:
-        apart &= np.diff(ordered // found.chunks[0]) > 0
     read = np.empty((len(ordered), *found.shape[1:]), found.dtype)
-    ends = [0, *(np.flatnonzero(apart) + 1), len(ordered)]
+    ends = [0, *(np.flatnonzero(np.diff(ordered) > 1) + 1), len(ordered)]
     for start, stop in pairwise(ends):
         first, last = int(ordered[start]), int(ordered[stop - 1])
-        if last - first + 1 > stop - start:
-            read[start:stop] = found[first : last + 1][ordered[start:stop] - first]
-        elif read.dtype.hasobject:
+        if read.dtype.hasobject:
             read[start:stop] = found[first : last + 1]
         else:
             found.read_direct(read, np.s_[first : last + 1], np.s_[int(start) : int(stop)])
@@ -281,15 +377,13 @@ def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDA
 
 
 def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Yield every dataset below `group` with its path; do not follow links."""
+    """Yield every dataset below `group` with its path, up to 5,000 keys; do not follow links."""
     pending: list[tuple[str, h5py.Group]] = [("", group)]
     seen = 0
-    while pending:
+    while pending and seen <= MAX_KEYS:
         prefix, current = pending.pop(0)
+        seen += len(current)
         for name in current:
-            seen += 1
-            if seen > MAX_KEYS or prefix.count("/") > MAX_DEPTH:
-                return
             if not isinstance(current.get(name, getlink=True), h5py.HardLink):
                 continue
             item = current[name]
@@ -301,18 +395,8 @@ def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
 
 def text(value: Any) -> str:
     """Return an attribute or a dataset's value as text; empty when it is not text."""
-    if isinstance(value, h5py.Empty):
-        return ""
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0] if value.size else b""
     if isinstance(value, bytes):
         value = value.decode("utf-8", errors="replace")
     return str(value).strip().strip('"').strip("\x00").strip() if isinstance(value, str) else ""
-
-
-def _nearest(group: h5py.Group, key: str) -> str:
-    keys = [name for name, _ in walk(group)]
-    near = get_close_matches(key.strip("/"), keys, n=3, cutoff=0.5)
-    if near:
-        return f"did you mean {', '.join(near)}?"
-    return f"it has {', '.join(keys[:8])}{', …' if len(keys) > 8 else ''}" if keys else "it has no datasets"

@@ -18,19 +18,19 @@ from hma_data.sources.common.findings import Finding
 from hma_data.sources.common.links import unfollowed
 from hma_data.sources.common.survey import MAX_VALUES, Survey, listed, sampled
 from hma_data.sources.hdf5.file import (
-    MAX_BYTES,
-    MAX_ROW,
+    WHOLE_FILE,
+    EpisodeFinder,
+    EpisodeGroup,
     OpenFiles,
-    child,
-    chunk_bytes,
     explained,
+    is_plausible,
     numbers,
     rows,
     text,
     walk,
 )
-from hma_data.sources.hdf5.layout import WHOLE_FILE, Place, Places
-from hma_data.sources.hdf5.source import TEXT_KEYS, as_rgb, encoded, environment, picture_kind
+from hma_data.sources.hdf5.layout import as_rgb, encoded, picture_kind
+from hma_data.sources.hdf5.source import TEXT_KEYS, json_of
 
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
@@ -50,13 +50,13 @@ class _First:
     robots: Any = None
 
 
-def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspection:
+def inspect(uri: str, finder: EpisodeFinder, files: OpenFiles, episodes: int) -> Inspection:
     """See Source.inspect.
 
     Raises:
         SourceError: nothing can be read.
     """
-    found = places.all(uri)
+    found = finder.all(uri)
     order = list(found)
     chosen = {order[i] for i in sampled(len(order), episodes)}
     survey, first = Survey(len(order)), _First()
@@ -69,7 +69,7 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
         place = found[name]
         try:
             with explained(place):
-                group = places.group(place)
+                group = finder.group(place)
                 sizes = {key: item.shape[0] for key, item in walk(group) if item.shape}
                 lengths[name] = _length(sizes)
                 if not lengths[name]:
@@ -108,19 +108,29 @@ def inspect(uri: str, places: Places, files: OpenFiles, episodes: int) -> Inspec
     )
 
 
-def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: Place) -> None:
-    said = environment(files.get(place.file))
+def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGroup) -> None:
+    said = _environment(files.get(place.file))
     first.robots = said.get("robots")
     first.keys = {info.key: info for info in _keys(group, place)}
     first.facts = _facts(group, said, place)
     first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
 
 
+def _environment(handle: h5py.File) -> dict[str, Any]:
+    """Return the simulator's facts, stated by robomimic (`env_args`) or robosuite (`env_info`)."""
+    data = handle.get("data")
+    if not isinstance(data, h5py.Group):
+        return {}
+    found = json_of(data, "env_args") or json_of(data, "env_info")
+    inner = found.get("env_kwargs")
+    return {**found, **inner} if isinstance(inner, dict) else found
+
+
 def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: int) -> None:
     """Hand one episode's numbers, times and some pictures to the survey."""
     for key, info in first.keys.items():
         item = group.get(key)
-        if not isinstance(item, h5py.Dataset) or not item.shape or not item.shape[0]:
+        if not (isinstance(item, h5py.Dataset) and item.shape and item.shape[0] and is_plausible(item)):
             continue
         where = f"{name} {key}"
         try:
@@ -166,10 +176,9 @@ def _length(sizes: dict[str, int]) -> int:
     return max(sizes.values(), key=list(sizes.values()).count, default=0)
 
 
-def _facts(group: h5py.Group, said: dict[str, Any], place: Place) -> dict[str, str]:
+def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict[str, str]:
     """Return facts about the recording: simulator, controller, layout, and the key of the instruction."""
-    data = child(group.file, "data")
-    words = (name for name in TEXT_KEYS if name in group.attrs and text(group.attrs[name]))
+    data = group.file.get("data")
     simulated = [group.attrs.get("sim"), group.file.attrs.get("sim")]
     simulator = ""
     if any(isinstance(value, bool | np.bool_) and value for value in simulated):
@@ -183,7 +192,7 @@ def _facts(group: h5py.Group, said: dict[str, Any], place: Place) -> dict[str, s
         "simulator": simulator,
         "controller": _controller(said),
         "layout": "one file an episode" if place.group == WHOLE_FILE else "",
-        "instruction": next(words, ""),
+        "instruction": next((name for name in TEXT_KEYS if text(group.attrs.get(name))), ""),
     }
 
 
@@ -237,7 +246,7 @@ def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None,
     return None, ""
 
 
-def _keys(group: h5py.Group, place: Place) -> Iterator[KeyInfo]:
+def _keys(group: h5py.Group, place: EpisodeGroup) -> Iterator[KeyInfo]:
     for key, item in walk(group):
         count = item.shape[0] if item.shape else None
         kind, shape, codec = _kind(item, f"{place} {key}")
@@ -248,14 +257,13 @@ def _keys(group: h5py.Group, place: Place) -> Iterator[KeyInfo]:
 def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | None]:
     """Return kind, shape of one sample, and codec."""
     shape = item.shape or ()
-    small = np.prod(shape[1:], dtype=float) <= MAX_ROW and chunk_bytes(item) <= MAX_BYTES
-    pictures = picture_kind(item) if shape and shape[0] and small else None
+    pictures = picture_kind(item) if shape and shape[0] and is_plausible(item) else None
     if pictures == "raw":
         shape = as_rgb(rows(item, [0])).shape[1:]
         return "camera", (*shape[:2], 1) if _is_grey(item.shape) else shape, "raw"
     if pictures == "encoded":
         first = rows(item, [0])[0]
-        start = bytes(encoded(first)[:8]) if isinstance(first, bytes | np.ndarray | np.void) else b""
+        start = bytes(encoded(first)[:8])
         codec = "jpeg" if start[:2] == b"\xff\xd8" else "png" if start[:4] == b"\x89PNG" else None
         if codec:
             shape = decode_image(encoded(first), where).shape

@@ -1,29 +1,40 @@
-"""Find the episodes of HDF5 recordings: their file, their group in it, and their id.
+"""Read pictures from HDF5 by the values of `source.layout`.
 
-A uri is a file or a folder of files. A pattern such as `data/*` names the groups that are episodes; `/` says
-that each file is one episode. Without a pattern, the file itself shows it. `Layout` holds every key that
-`source.layout` may have.
+Pictures are raw arrays of several shapes and number types, or one JPEG or PNG a row. Colour pictures of
+8 bits are read as they are, with their axes found from the shape. Other arrays are read as pictures only
+where `source.layout` says what their numbers mean:
+
+    layout: {axes: TCHW, pixels: 0-1}
+
+T frames, n of them asked for, H×W pixels, C channels.
 """
 
-import re
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from fnmatch import fnmatchcase
-from pathlib import Path
+from typing import Any
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
+from hma_data.episodes.episode import Floats
+from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import leaves, local_path
-from hma_data.sources.common.links import nothing_there
-from hma_data.sources.hdf5.file import OpenFiles, child, explained, member
+from hma_data.sources.hdf5.file import (
+    WHOLE_FILE,
+    EpisodeFinder,
+    EpisodeGroup,
+    OpenFiles,
+    dataset,
+    explained,
+    rows,
+)
 
-SUFFIXES = (".h5", ".hdf5", ".hdf")
 PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
-AXES = ("THWC", "TCHW")
-WHOLE_FILE = "/"
-_EPISODE_NAME = re.compile(r"(demo|episode|ep|traj|trajectory|rollout)[_-]?\d+")
+_ALLOWED = {"axes": ("THWC", "TCHW"), "pixels": tuple(PIXELS), "last_observation": ("drop",)}
+_CHANNELS = (1, 3, 4)
+_SLACK = 1e-3  # share of the range by which values may exceed it, as resizing can cause
 
 
 @dataclass(frozen=True)
@@ -44,116 +55,6 @@ class Layout:
     axes: str | None = None
     pixels: str | None = None
     last_observation: str | None = None
-
-
-_ALLOWED = {"axes": AXES, "pixels": tuple(PIXELS), "last_observation": ("drop",)}
-
-
-@dataclass(frozen=True)
-class Place:
-    """The place of an episode: a file and the group in it."""
-
-    file: Path
-    group: str
-
-    def __str__(self) -> str:
-        return str(self.file) if self.group == WHOLE_FILE else f"{self.file}:{self.group}"
-
-
-class Places:
-    """Find episodes, and remember the episodes of each file."""
-
-    def __init__(self, files: OpenFiles) -> None:
-        self._files = files
-        self._stems: dict[str, dict[str, Path]] = {}
-        self._seen: dict[tuple[Path, str | None], dict[str, Place]] = {}
-
-    def all(self, uri: str, pattern: str | None = None) -> dict[str, Place]:
-        """Return every episode by its id, in natural order.
-
-        A damaged file in a folder counts as one episode, so that it is quarantined by its name.
-
-        Raises:
-            SourceError: the only file is damaged, there are no episodes, or two have one id.
-        """
-        found: dict[str, Place] = {}
-        for _, places in self.by_file(uri, pattern):
-            found |= places
-        return found
-
-    def by_file(self, uri: str, pattern: str | None = None) -> Iterator[tuple[Path, dict[str, Place]]]:
-        """Yield each file with its episodes, while the file is open.
-
-        Opening many files a second time would take as long again.
-
-        Raises:
-            SourceError: as `all`.
-        """
-        self._seen.clear()
-        stems = self._stems[uri] = _stems(uri)
-        in_folder = local_path(uri).is_dir()
-        taken: set[str] = set()
-        for stem, file in stems.items():
-            found: dict[str, Place] = {}
-            try:
-                places = self._inside(file, pattern)
-            except SourceError:
-                if len(stems) == 1:
-                    raise
-                places = {"": Place(file, WHOLE_FILE)}
-            for name, place in places.items():
-                episode_id = "/".join(part for part in (stem if in_folder else "", name) if part) or stem
-                if episode_id in taken:
-                    raise SourceError(place, f"is a second episode called {episode_id!r}", "rename one")
-                taken.add(episode_id)
-                found[episode_id] = place
-            yield file, found
-        if not taken:
-            raise SourceError(uri, "holds no episodes", f"looked for groups {pattern or 'data/*'}")
-
-    def find(self, uri: str, episode_id: str, pattern: str | None = None) -> Place:
-        """Return the place of an id; open only the file that holds it.
-
-        Raises:
-            SourceError: no such episode.
-            EpisodeError: its file is damaged.
-        """
-        stems = self._stems.get(uri) or self._stems.setdefault(uri, _stems(uri))
-        parts = episode_id.split("/")
-        if local_path(uri).is_dir():
-            candidates = [("/".join(parts[:i]), "/".join(parts[i:])) for i in range(len(parts), 0, -1)]
-        else:
-            candidates = [(stem, name) for stem in stems for name in (episode_id, "")]
-        for stem, name in candidates:
-            if stem not in stems:
-                continue
-            try:
-                places = self._inside(stems[stem], pattern)
-            except SourceError as fault:
-                raise EpisodeError(fault.where, fault.fault, fault.remedy) from fault
-            if name in places and (name or stem == episode_id):
-                return places[name]
-        raise SourceError(uri, f"has no episode {episode_id!r}", "hma inspect lists what it has")
-
-    def group(self, place: Place) -> h5py.Group:
-        """Return the episode's group, in the open file."""
-        handle = self._files.get(place.file)
-        found = handle if place.group == WHOLE_FILE else member(handle, place.group, str(place))
-        if not isinstance(found, h5py.Group):
-            raise EpisodeError(place, "is not a group", "correct source.layout.episodes")
-        return found
-
-    def _inside(self, file: Path, pattern: str | None) -> dict[str, Place]:
-        """Return the episodes of one file by name within it; the name of a whole file is empty."""
-        if (file, pattern) not in self._seen:
-            with explained(file, SourceError):
-                self._seen[file, pattern] = _episodes(self._files.get(file), file, pattern)
-        return self._seen[file, pattern]
-
-
-def natural(name: str) -> list[tuple[int, int, str]]:
-    """Return a sort key that puts demo_2 before demo_10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def layout_of(embodiment: Embodiment | None) -> Layout:
@@ -177,67 +78,130 @@ def layout_of(embodiment: Embodiment | None) -> Layout:
     return replace(layout, episodes=pattern and (pattern.strip("/") or WHOLE_FILE))
 
 
-def _episodes(handle: h5py.File, file: Path, pattern: str | None) -> dict[str, Place]:
-    pattern = pattern or _guess_pattern(handle)
-    if pattern == WHOLE_FILE:
-        return {"": Place(file, WHOLE_FILE)}
-    parts = pattern.split("/")
-    fixed = next((i for i, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts) - 1)
-    found: dict[str, Place] = {}
-    for group in sorted(_matching(handle, parts), key=natural):
-        name = "/".join(map(_safe, group.split("/")[fixed:]))
-        if name in found:
-            raise SourceError(file, f"two of its groups would be called {name!r}", "rename one")
-        found[name] = Place(file, group)
-    return found
+class PictureRows:
+    """A camera's Stream: the pictures of one dataset, `rows` in all.
 
+    Args:
+        finder, files: of the source; the dataset is kept open in `files`.
+        place, key: the episode, and the dataset in it.
+        layout: of the source, from the YAML.
+        times: (T,) seconds of the frames; rows after the last one are not used.
 
-def _guess_pattern(handle: h5py.File) -> str:
-    data = child(handle, "data")
-    if isinstance(data, h5py.Group):
-        inside = [found for name in data if (found := child(data, name)) is not None]
-        if all(isinstance(found, h5py.Group) for found in inside):
-            return "data/*"
-    groups = [name for name in handle if isinstance(child(handle, name), h5py.Group)]
-    if groups and len(groups) == len(handle) and all(_EPISODE_NAME.fullmatch(name) for name in groups):
-        return "*"
-    return WHOLE_FILE
+    Raises:
+        EpisodeError: the dataset is missing, or holds no colour pictures.
+    """
 
+    def __init__(
+        self,
+        finder: EpisodeFinder,
+        files: OpenFiles,
+        place: EpisodeGroup,
+        key: str,
+        layout: Layout,
+        times: Floats,
+    ) -> None:
+        self.timestamps = times
+        self._finder, self._files, self._place = finder, files, place
+        self._key, self._layout, self._where = key, layout, f"{place} {key}"
+        found = dataset(finder.group(place), key, str(place))
+        self.rows = len(found)
+        self._kind = picture_kind(found, layout)
+        if self._kind is None:
+            fault = f"{key!r} holds {found.shape} {found.dtype}, not colour pictures"
+            raise EpisodeError(place, fault, _remedy(found, layout))
+        if self._kind == "raw":
+            _axes(found.shape, layout, self._where)
 
-def _matching(group: h5py.Group, parts: list[str]) -> list[str]:
-    """Return the paths of the groups that match a pattern, one part a level."""
-    found = []
-    for name in group:
-        if fnmatchcase(name, parts[0]) and isinstance(group.get(name, getlink=True), h5py.HardLink):
-            item = group[name]
-            if isinstance(item, h5py.Group):
-                found += (
-                    [name] if len(parts) == 1 else [f"{name}/{rest}" for rest in _matching(item, parts[1:])]
-                )
-    return found
-
-
-def _safe(name: str) -> str:
-    return re.sub(r"[^\w.-]", "_", name).lstrip(".") or "_"
-
-
-def _stems(uri: str) -> dict[str, Path]:
-    """Return the HDF5 files of a uri by their names without suffix, relative to the folder."""
-    path = local_path(uri)
-    if path.is_file():
-        return {_safe(path.stem): path}
-    found: dict[str, Path] = {}
-    for file in sorted(path.rglob("*"), key=lambda item: natural(str(item.relative_to(path)))):
-        if file.suffix.lower() not in SUFFIXES or not file.is_file():
-            continue
-        if leaves(file, path):
-            raise SourceError(
-                file, "is a link that leaves the folder", "copy the file in, or convert its folder"
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        with explained(self._place):
+            group = self._finder.group(self._place)
+            found = rows(self._files.cached(self._place.file, group, self._key, str(self._place)), indices)
+        if self._kind == "raw":
+            return as_rgb(
+                _as_bytes(found, self._layout, self._where), _axes(found.shape, self._layout, self._where)
             )
-        stem = "/".join(map(_safe, file.relative_to(path).with_suffix("").parts))
-        if stem in found:
-            raise SourceError(file, f"has the name of {found[stem].name} but for its suffix", "rename one")
-        found[stem] = file
-    if not found:
-        raise nothing_there(uri, path, "holds no HDF5 files", f"looked for {', '.join(SUFFIXES)}")
-    return found
+        if not len(found):
+            return np.zeros((0, 1, 1, 3), np.uint8)
+        pictures = [
+            decode_image(encoded(row), f"{self._where}[{index}]")
+            for row, index in zip(found, indices, strict=True)
+        ]
+        if len({picture.shape for picture in pictures}) > 1:
+            raise EpisodeError(self._place, f"{self._key!r} has pictures of several sizes")
+        return np.stack(pictures)
+
+
+def picture_kind(found: h5py.Dataset, layout: Layout | None = None) -> str | None:
+    """Return `raw` or `encoded` by dtype and shape; None where the dataset cannot hold pictures."""
+    shape: tuple[int, ...] = found.shape or ()
+    if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
+        channels_first = layout.axes == "TCHW" if layout and layout.axes else shape[1:2] in ((1,), (3,))
+        if len(shape) == 3 or (len(shape) == 4 and (shape[3] in _CHANNELS or channels_first)):
+            return "raw"
+    padded = found.dtype == np.uint8 and len(shape) == 2
+    one_a_row = len(shape) == 1 and (found.dtype.kind in "SV" or _is_bytes(found.dtype))
+    return "encoded" if padded or one_a_row else None
+
+
+def as_rgb(pictures: NDArray[np.uint8], axes: str | None = None) -> Images:
+    """Convert (n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) to (n, H, W, 3)."""
+    if pictures.ndim == 3:
+        pictures = pictures[..., None]
+    elif axes == "TCHW" or (axes is None and pictures.shape[3] not in _CHANNELS):
+        pictures = pictures.transpose(0, 2, 3, 1)
+    if pictures.shape[3] == 1:
+        pictures = np.repeat(pictures, 3, axis=3)
+    return np.ascontiguousarray(pictures[..., :3])
+
+
+def encoded(row: Any) -> NDArray[np.uint8]:
+    """Return the bytes of one encoded picture, a row of bytes; zeros after its end do no harm."""
+    if isinstance(row, np.ndarray):
+        return row.view(np.uint8).reshape(-1)
+    return np.frombuffer(row.tobytes() if isinstance(row, np.void) else row, np.uint8)
+
+
+def _axes(shape: tuple[int, ...], layout: Layout, where: str) -> str:
+    """Return THW, THWC or TCHW: from the YAML, else by the axis whose size is a number of channels."""
+    if len(shape) == 3:
+        return "THW"
+    last, first = shape[3] in _CHANNELS, shape[1] in _CHANNELS
+    if layout.axes:
+        if not (first if layout.axes == "TCHW" else last):
+            fault = f"holds pictures {shape[1:]}, source.layout.axes says {layout.axes}"
+            raise EpisodeError(where, fault, "correct source.layout.axes in the YAML")
+        return layout.axes
+    if last and first:
+        fault = f"holds pictures {shape[1:]}, whose channels may be first or last"
+        raise EpisodeError(where, fault, "set source.layout.axes to TCHW or THWC")
+    return "THWC" if last else "TCHW"
+
+
+def _as_bytes(pictures: NDArray[Any], layout: Layout, where: str) -> NDArray[np.uint8]:
+    """Convert pictures of another number type to uint8, by the range in `layout.pixels`."""
+    if pictures.dtype == np.uint8:
+        return pictures
+    highest = PIXELS[layout.pixels or "0-255"]
+    values = pictures.astype(np.float32)
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    if not (-_SLACK * highest <= low and high <= highest * (1 + _SLACK)):  # false for NaN too
+        fault = f"holds values from {low:g} to {high:g}, source.layout.pixels says {layout.pixels}"
+        raise EpisodeError(where, fault, f"set it to one of {', '.join(PIXELS)}")
+    return np.rint(np.clip(values, 0, highest) * (255 / highest)).astype(np.uint8)
+
+
+def _is_bytes(dtype: np.dtype[Any]) -> bool:
+    """Check whether rows of varying length are bytes or text, not references or other numbers."""
+    inner = h5py.check_vlen_dtype(dtype)
+    if inner is None:
+        return h5py.check_string_dtype(dtype) is not None
+    return np.dtype(inner).kind in "iu" and np.dtype(inner).itemsize == 1
+
+
+def _remedy(found: h5py.Dataset, layout: Layout) -> str:
+    shape: tuple[int, ...] = found.shape or ()
+    numbers = found.dtype.kind in "fiu" and found.dtype != np.uint8
+    if numbers and len(shape) == 4 and 3 in (shape[1], shape[3]) and not layout.pixels:
+        return f"if they are colours, set source.layout.pixels to their range: {', '.join(PIXELS)}"
+    return "expected (T, H, W, 3) uint8, or encoded pictures"

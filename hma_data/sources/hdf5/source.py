@@ -17,6 +17,7 @@ T frames of an episode.
 
 import hashlib
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,49 +25,52 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Episode, Floats, Signal, rate_times
+from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hdf5.file import (
-    MAX_NUMBERS,
+    WHOLE_FILE,
+    EpisodeFinder,
+    EpisodeGroup,
     OpenFiles,
-    check_lengths,
-    child,
     dataset,
     explained,
+    is_elsewhere,
     member,
     numbers,
     text,
     walk,
 )
-from hma_data.sources.hdf5.images import PictureRows, as_rgb, encoded, picture_kind
-from hma_data.sources.hdf5.layout import WHOLE_FILE, Layout, Place, Places, layout_of
+from hma_data.sources.hdf5.layout import Layout, PictureRows, layout_of, picture_kind
 from hma_data.storage.paths import StrPath, as_text
-
-__all__ = ["Hdf5Source", "as_rgb", "encoded", "environment", "open", "picture_kind"]
 
 TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
 _SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "val")
 
 
+def open() -> "Hdf5Source":
+    """Return the source."""
+    return Hdf5Source()
+
+
 class Hdf5Source:
-    """Read HDF5 recordings; see the module."""
+    """A reader of HDF5 recordings; see the module."""
 
     def __init__(self) -> None:
         self._files = OpenFiles()
-        self._places = Places(self._files)
+        self._finder = EpisodeFinder(self._files)
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
         from hma_data.sources.hdf5.inspect import inspect
 
-        return inspect(as_text(uri), self._places, self._files, episodes)
+        return inspect(as_text(uri), self._finder, self._files, episodes)
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """Return the episode ids, with files by name and `demo_2` before `demo_10`."""
-        return list(self._places.all(as_text(uri)))
+        return list(self._finder.all(as_text(uri)))
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """Return the episodes. A damaged file among others becomes one episode, which `read` refuses.
@@ -77,7 +81,7 @@ class Hdf5Source:
         uri, chosen = as_text(uri), embodiment.source.split if embodiment else None
         refs: list[EpisodeRef] = []
         known: set[str] = set()
-        for file, places in self._places.by_file(uri, layout_of(embodiment).episodes):
+        for file, places in self._finder.by_file(uri, layout_of(embodiment).episodes):
             fingerprint = file_fingerprint(file)
             whole = any(place.group == WHOLE_FILE for place in places.values())
             masks = {} if whole else self._masks(file)
@@ -102,26 +106,30 @@ class Hdf5Source:
             SourceError: no such episode, or no rate and no times.
         """
         layout = layout_of(embodiment)
-        place = self._places.find(as_text(uri), episode_id, layout.episodes)
+        place = self._finder.find(as_text(uri), episode_id, layout.episodes)
         where = str(place)
         with explained(where):
-            group = self._places.group(place)
+            group = self._finder.group(place)
             actions = _vector(group, embodiment.action, where)
-            series = _Series(group, embodiment, len(actions), where)
-            states = _vector(group, embodiment.state, where) if embodiment.state else None
-            if states is not None:
-                states = series.trimmed(
-                    embodiment.state.components[0].key if embodiment.state else "", states
-                )
-            streams = {
-                camera.name: self._pictures(place, group, camera.key, layout, series)
-                for camera in embodiment.cameras
-            }
+            check = partial(_check_length, layout, where, len(actions))
+            times = _times(group, embodiment, layout, len(actions), where)
+            check(layout.timestamps or "", len(times))
+            times = times[: len(actions)]
+            states: tuple[Signal, ...] = ()
+            if embodiment.state:
+                values = _vector(group, embodiment.state, where)
+                check(embodiment.state.components[0].key, len(values))
+                states = (Signal(times, values[: len(actions)]),)
+            streams: dict[str, Stream] = {}
+            for camera in embodiment.cameras:
+                pictures = self._pictures(place, group, camera.key, layout, times)
+                check(camera.key, pictures.rows)
+                streams[camera.name] = pictures
             return Episode(
                 id=episode_id,
-                streams=dict(streams),
-                actions=(Signal(series.times, actions),),
-                states=() if states is None else (Signal(series.times, states),),
+                streams=streams,
+                actions=(Signal(times, actions),),
+                states=states,
                 instruction=_instruction(group, embodiment.source.instruction, where),
                 success=_success(group),
                 source=where,
@@ -129,46 +137,38 @@ class Hdf5Source:
             )
 
     def _pictures(
-        self, place: Place, group: h5py.Group, key: str, layout: Layout, series: "_Series"
+        self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Layout, times: Floats
     ) -> PictureRows:
         try:
-            found = dataset(group, key, str(place))
+            return PictureRows(self._finder, self._files, place, key, layout, times)
         except EpisodeError as fault:
             if "states" in group and not any(picture_kind(item) for _, item in walk(group)):
                 said = "holds a simulator's states and no pictures"
                 remedy = "render them first, as robomimic's dataset_states_to_obs.py does"
                 raise EpisodeError(place, said, remedy) from fault
             raise
-        series.check(key, len(found))
-        return PictureRows(self._places, self._files, place, key, layout, series.times)
 
-    def _length(self, place: Place, embodiment: Embodiment | None) -> int:
+    def _length(self, place: EpisodeGroup, embodiment: Embodiment | None) -> int:
         """Return T, the rows of the action or else the most rows of any dataset; 0 when it cannot be read."""
         keys = [part.key for part in embodiment.action.components] if embodiment else ["actions", "action"]
         try:
             with explained(place):
-                group = self._places.group(place)
-                for key in keys:
-                    if key.strip("/") in group:
-                        found = dataset(group, key, str(place))
-                        return len(found) if len(found) <= MAX_NUMBERS else 0
-                lengths = [item.shape[0] for _, item in walk(group) if item.shape]
-                return max((length for length in lengths if length <= MAX_NUMBERS), default=0)
+                group = self._finder.group(place)
+                key = next((key for key in keys if key.strip("/") in group), None)
+                if key:
+                    return len(dataset(group, key, str(place)))
+                return max((item.shape[0] for _, item in walk(group) if item.shape), default=0)
         except HMAError:
             return 0
 
     def _masks(self, file: Path) -> dict[str, set[str]]:
         """Return robomimic's filter keys: name -> names of demos."""
         with explained(file, SourceError):
-            mask = child(self._files.get(file), "mask")
-            if not isinstance(mask, h5py.Group):
-                return {}
-            lists = {name: child(mask, name) for name in mask}
+            mask = self._files.get(file).get("mask")
+            lists = mask.items() if isinstance(mask, h5py.Group) else ()
             return {
-                name: {text(row).rsplit("/", 1)[-1] for row in numbers(mask, name, str(file))}
-                if len(found)
-                else set()
-                for name, found in lists.items()
+                name: {text(row).rsplit("/", 1)[-1] for row in found[()]}
+                for name, found in lists
                 if isinstance(found, h5py.Dataset) and found.ndim == 1
             }
 
@@ -180,72 +180,37 @@ def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
     return next((ours for mask, ours in _SPLITS.items() if demo in masks.get(mask, ())), None)
 
 
-class _Series:
-    """The lengths and times of an episode's series; its own times where the YAML names their key.
-
-    Args:
-        length: of the actions; all other series must have it too.
-    """
-
-    def __init__(self, group: h5py.Group, embodiment: Embodiment, length: int, where: str) -> None:
-        self._where, self._length = where, length
-        self._drops = layout_of(embodiment).last_observation == "drop"
-        key = layout_of(embodiment).timestamps
-        if key is None and embodiment.frequency_hz is None:
-            raise SourceError(
-                f"embodiment {embodiment.id}",
-                "frequency_hz is null, and HDF5 keeps no times of itself",
-                "set frequency_hz, or source.layout.timestamps to the key of the seconds",
-            )
-        if key is not None:
-            self.times = self.trimmed(key, _times(group, key, where))
-        else:  # With an unknown rate a recording can still be looked at; converting it is refused before.
-            hz = embodiment.frequency_hz if isinstance(embodiment.frequency_hz, float) else 1.0
-            self.times = rate_times(length, hz)
-
-    def check(self, key: str, length: int) -> None:
-        """Check that a series is as long as the actions; one row more is allowed where the last is dropped.
-
-        Raises:
-            EpisodeError: it is not.
-        """
-        if length == self._length or (self._drops and length == self._length + 1):
-            return
-        remedy = ""
-        if length == self._length + 1:
-            remedy = (
-                "if the last was observed after the last action, set source.layout.last_observation: drop"
-            )
-        raise EpisodeError(self._where, f"differ in length: actions {self._length}, {key} {length}", remedy)
-
-    def trimmed(self, key: str, values: NDArray[Any]) -> NDArray[Any]:
-        """Return (T, …) values without the observation after the last action."""
-        self.check(key, len(values))
-        return values[: self._length]
+def _check_length(layout: Layout, where: str, actions: int, key: str, length: int) -> None:
+    """Raise an EpisodeError where a series is not as long as the actions, or one row longer to be dropped."""
+    one_more = length == actions + 1
+    if length != actions and not (one_more and layout.last_observation == "drop"):
+        remedy = "if the last was observed after the last action, set source.layout.last_observation: drop"
+        fault = f"its series differ in length: actions {actions}, {key} {length}"
+        raise EpisodeError(where, fault, remedy if one_more else "")
 
 
-def _times(group: h5py.Group, key: str, where: str) -> Floats:
+def _times(group: h5py.Group, embodiment: Embodiment, layout: Layout, length: int, where: str) -> Floats:
+    """Return the seconds of the frames: the episode's own where the YAML names their key."""
+    key, hz = layout.timestamps, embodiment.frequency_hz
+    if key is None and hz is None:
+        raise SourceError(
+            f"embodiment {embodiment.id}",
+            "frequency_hz is null, and HDF5 stores no times by itself",
+            "set frequency_hz, or source.layout.timestamps to the key of the seconds",
+        )
+    if key is None:  # With an unknown rate a recording can be looked at; converting it is refused before.
+        return rate_times(length, hz if isinstance(hz, float) else 1.0)
     values = numbers(group, key, where)
     if values.dtype.kind not in "fiu" or values.size != len(values):
         raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")
     return values.reshape(-1).astype(np.float64)
 
 
-def open() -> Hdf5Source:
-    """Return the source."""
-    return Hdf5Source()
-
-
 def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32]:
-    read: dict[str, NDArray[Any]] = {}
-    for part in vector.components:
-        if part.key not in read:
-            read[part.key] = numbers(group, part.key, where)
-    lengths = {key: len(values) for key, values in read.items()}
-    if len(set(lengths.values())) > 1:
-        raise EpisodeError(
-            where, "differ in length: " + ", ".join(f"{key} {length}" for key, length in lengths.items())
-        )
+    read = {key: numbers(group, key, where) for key in dict.fromkeys(part.key for part in vector.components)}
+    if len({len(values) for values in read.values()}) > 1:
+        said = ", ".join(f"{key} {len(values)}" for key, values in read.items())
+        raise EpisodeError(where, f"its series differ in length: {said}")
     return compose(vector, [read[part.key] for part in vector.components], where)
 
 
@@ -255,31 +220,23 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
         return text(group.attrs[key])
     if key:
         found = member(group, key, where)
-        if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
+        if not isinstance(found, h5py.Dataset) or is_elsewhere(found, group):
             raise EpisodeError(where, f"{key!r} is not a text")
-        check_lengths(found)
         return text(found[()] if found.size == 1 else found[0] if found.shape else "")
     for holder in (group, group.parent, group.file):
         for name in TEXT_KEYS:
-            if name in holder.attrs and (found := text(holder.attrs[name])):
-                return found
-            if said := _text_row(holder, name):
+            if said := text(holder.attrs.get(name)) or _single_text(holder.get(name), group):
                 return said
-        said = _json(holder, "problem_info").get("language_instruction", "")
-        if said := text("".join(map(str, said)) if isinstance(said, list) else said):
+        stated = json_of(holder, "problem_info").get("language_instruction", "")
+        if said := text("".join(map(str, stated)) if isinstance(stated, list) else stated):
             return said
     return ""
 
 
-def _text_row(holder: h5py.Group, name: str) -> str:
-    """Return the text of a dataset of one value; empty where there is none."""
-    found = child(holder, name)
-    if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
-        return ""
-    if found.size != 1 or found.dtype.kind not in "OS":
-        return ""
-    check_lengths(found)
-    return text(found[()])
+def _single_text(found: Any, group: h5py.Group) -> str:
+    """Return the text of a dataset of one value; empty where it is something else."""
+    is_single = isinstance(found, h5py.Dataset) and found.size == 1 and found.dtype.kind in "OS"
+    return text(found[()]) if is_single and not is_elsewhere(found, group) else ""
 
 
 def _success(group: h5py.Group) -> bool | None:
@@ -290,7 +247,7 @@ def _success(group: h5py.Group) -> bool | None:
     if "success" in group.attrs:
         return bool(np.all(group.attrs["success"]))
     for key in ("success", "rewards", "dones"):
-        found = child(group, key)
+        found = group.get(key)
         if isinstance(found, h5py.Dataset) and found.ndim == 1 and len(found) and found.dtype.kind in "fiub":
             return bool(found[-1] > 0)
     return None
@@ -299,27 +256,17 @@ def _success(group: h5py.Group) -> bool | None:
 def _metadata(group: h5py.Group) -> dict[str, Any]:
     """Return short plain attributes of the episode; leave out models and other long texts."""
     found: dict[str, Any] = {}
-    for name in group.attrs:
-        value = group.attrs[name]
+    for name, value in group.attrs.items():
         plain = value.item() if isinstance(value, np.generic) else value
         if isinstance(plain, bool | int | float) or (isinstance(plain, str) and 0 < len(plain) <= 200):
             found[name] = plain
     return found
 
 
-def environment(handle: h5py.File) -> dict[str, Any]:
-    """Return the simulator's facts, stated by robomimic (`env_args`) or robosuite (`env_info`)."""
-    data = child(handle, "data")
-    if not isinstance(data, h5py.Group):
-        return {}
-    found = _json(data, "env_args") or _json(data, "env_info")
-    inner = found.get("env_kwargs")
-    return {**found, **inner} if isinstance(inner, dict) else found
-
-
-def _json(holder: Any, name: str) -> dict[str, Any]:
+def json_of(holder: Any, name: str) -> dict[str, Any]:
+    """Return the mapping that an attribute holds as JSON; empty where it holds none."""
     try:
-        value = json.loads(text(holder.attrs[name])) if name in holder.attrs else {}
+        value = json.loads(text(holder.attrs.get(name)))
     except (json.JSONDecodeError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}

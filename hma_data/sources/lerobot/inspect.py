@@ -4,9 +4,6 @@ All of the metadata is checked. Numbers, times and a few pictures are checked fo
 whose files are there. Nothing is fetched from the Hub for this.
 """
 
-import os
-from pathlib import Path
-
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
@@ -15,8 +12,8 @@ from hma_data.sources.common import image_checks, timestamp_checks
 from hma_data.sources.common.findings import Finding
 from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
-from hma_data.sources.lerobot.rows import Rows, StillPictures, rows_of
+from hma_data.sources.lerobot.metadata import Feature, Metadata, episode_name
+from hma_data.sources.lerobot.source import Rows, StillPictures, rows_of
 
 LENGTHS = 1_000  # most lengths in the inspection
 LOOKED_FOR = 20_000  # most episodes whose files are looked for, spread over all
@@ -39,8 +36,8 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
         frames=sum(lengths),
         lengths=tuple(lengths[:LENGTHS]),
         hz=meta.fps,
-        robot=meta.robot,
-        facts={"version": meta.version, "tasks": str(len(meta.tasks))},
+        robot=meta.info.robot_type or None,
+        facts={"version": str(meta.info.codebase_version), "tasks": str(len(meta.tasks))},
         looked_at=len(survey.looked),
         findings=survey.findings(keys),
         checks=survey.checks(),
@@ -50,9 +47,12 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
 def _totals(meta: Metadata, survey: Survey) -> None:
     survey.made.add("files")
     lengths = [row["length"] for row in meta.episodes.values()]
-    for name, actual in (("total_episodes", len(lengths)), ("total_frames", sum(lengths))):
-        stated = meta.info.get(name)
-        if isinstance(stated, int) and stated != actual:
+    info = meta.info
+    for name, stated, actual in (
+        ("total_episodes", info.total_episodes, len(lengths)),
+        ("total_frames", info.total_frames, sum(lengths)),
+    ):
+        if stated is not None and stated != actual:
             said = f"info.json says {name} {stated:,}, the episodes listed make {actual:,}"
             survey.note(Finding("files", "warn", said, numbers={"stated": stated, "listed": actual}))
 
@@ -62,17 +62,15 @@ class _Looking:
 
     def __init__(self, meta: Metadata, survey: Survey, episodes: int) -> None:
         self._meta, self._survey, self._episodes = meta, survey, episodes
-        self._there = _Files(meta.folder.root)
         self._videos = [name for name, item in meta.features.items() if item.dtype == "video"]
-        self._spans: dict[str, dict[int, Span]] = {}
         indices = list(meta.episodes)
         self._indices = [indices[i] for i in sampled(len(indices), LOOKED_FOR)]
 
     def look(self) -> None:
         """Find which files are there; then sample the episodes that have all of their files."""
-        whole = self._with_rows()
+        whole = self._present("parquet files")
         for key in self._videos:
-            whole &= self._with_video(key)
+            whole &= self._present(f"videos of {key}", key)
         order = [index for index in self._indices if index in whole]
         chosen = [order[i] for i in sampled(len(order), self._episodes)] if order else []
         pairs = max(1, image_checks.PAIRS // max(len(chosen), 1))
@@ -85,41 +83,29 @@ class _Looking:
             for index in sorted(shown):
                 self._video(key, index, pairs)
 
-    def _with_rows(self) -> set[int]:
+    def _present(self, what: str, key: str = "") -> set[int]:
+        """Return the episodes whose file is there; report the missing files as one finding."""
         paths = {}
         for index in self._indices:
             try:
-                paths[index] = self._meta.data_path(index)
+                paths[index] = self._meta.video(index, key).path if key else self._meta.data_path(index)
             except EpisodeError as fault:
                 self._survey.fault(episode_name(index), fault)
-        return self._present("parquet files", paths)
-
-    def _with_video(self, key: str) -> set[int]:
-        try:
-            self._spans[key] = {index: self._meta.video(index, key) for index in self._indices}
-        except EpisodeError as fault:
-            self._survey.note(Finding("files", "warn", str(fault), key=key))
-            return set()
-        paths = {index: span.path for index, span in self._spans[key].items()}
-        return self._present(f"videos of {key}", paths, key)
-
-    def _present(self, what: str, paths: dict[int, str], key: str = "") -> set[int]:
-        """Return the episodes whose file is there; report the missing files as one finding."""
         distinct = list(dict.fromkeys(paths.values()))
-        missing = {path for path in distinct if not self._there.has(path)}
+        missing = [path for path in distinct if not (self._meta.folder.root / path).is_file()]
         if missing:
-            first = next(path for path in distinct if path in missing)
             part = " looked for" if len(self._indices) < len(self._meta.episodes) else ""
-            said = f"{len(missing):,} of {len(distinct):,} {what}{part} are missing, {first} first"
+            said = f"{len(missing):,} of {len(distinct):,} {what}{part} are missing, {missing[0]} first"
             numbers = {"missing": len(missing), "files": len(distinct)}
             self._survey.note(Finding("files", "warn", said, key=key, numbers=numbers))
-        return {index for index, path in paths.items() if path not in missing}
+        there = set(distinct) - set(missing)
+        return {index for index, path in paths.items() if path in there}
 
     def _rows(self, index: int, pairs: int) -> None:
         """Hand one episode's numbers, times and parquet pictures to the survey."""
         meta, name = self._meta, episode_name(index)
         try:
-            rows = rows_of(meta.folder.path(meta.data_path(index)), index)
+            rows = rows_of(meta, index)
         except HMAError as fault:
             self._survey.fault(name, fault)
             return
@@ -155,15 +141,14 @@ class _Looking:
 
     def _video(self, key: str, index: int, pairs: int) -> None:
         """Compare the frames of an episode's video with its rows; hand some pictures to the survey."""
-        meta, name, span = self._meta, episode_name(index), self._spans[key][index]
+        meta, name, span = self._meta, episode_name(index), self._meta.video(index, key)
         self._survey.made.add("frames")
         try:
             file = VideoFile(meta.folder.path(span.path))
-            first, last = _part(file, span, meta.fps)
+            first, last = span.frames(file.timestamps, meta.fps)
             rows = meta.episodes[index]["length"]
             if last - first != rows:
-                part = "" if span.stop is None else f" from {span.start:.3f} to {span.stop:.3f} s"
-                said = f"{span.path} has {last - first:,} frames{part} for {rows:,} rows"
+                said = f"{span.path} has {last - first:,} frames{span} for {rows:,} rows"
                 numbers = {"frames": last - first, "rows": rows}
                 self._survey.note(Finding("frames", "warn", said, key=key, numbers=numbers))
             if last > first:
@@ -177,34 +162,6 @@ class _Looking:
             self._survey.fault(f"{name} {key}", fault)
 
 
-class _Files:
-    """The files of a folder, each directory listed once: datasets have a hundred thousand files."""
-
-    def __init__(self, root: Path) -> None:
-        self._root = root
-        self._listed: dict[str, set[str]] = {}
-
-    def has(self, relative: str) -> bool:
-        """Check whether a file is there."""
-        parent, _, name = relative.rpartition("/")
-        if parent not in self._listed:
-            try:
-                with os.scandir(self._root / parent) as entries:
-                    self._listed[parent] = {entry.name for entry in entries if entry.is_file()}
-            except OSError:
-                self._listed[parent] = set()
-        return name in self._listed[parent]
-
-
-def _part(file: VideoFile, span: Span, fps: float) -> tuple[int, int]:
-    """Return the indices [from, to) of the video's frames that belong to the episode."""
-    if span.stop is None:
-        return 0, len(file)
-    half = 0.5 / fps
-    first, last = np.searchsorted(file.timestamps, [span.start - half, span.stop - half])
-    return int(first), int(last)
-
-
 def _is_vector(feature: Feature) -> bool:
     return feature.dtype.startswith(("float", "int", "uint", "bool"))
 
@@ -214,16 +171,16 @@ def _is_vector(feature: Feature) -> bool:
 
 def _keys(meta: Metadata) -> tuple[KeyInfo, ...]:
     found = []
-    for feature in meta.features.values():
+    for name, feature in meta.features.items():
         kind = "vector" if _is_vector(feature) else "other"
-        shape, codec = feature.shape, feature.codec
+        shape, codec = feature.shape, feature.video.get("video.codec")
         if feature.is_camera:
-            kind, codec = "camera", codec or _codec(meta, feature.name)
+            kind, codec = "camera", codec or _codec(meta, name)
             if len(shape) == 3 and shape[0] in (1, 3) and shape[2] not in (1, 3):  # stated as C, H, W
                 shape = (shape[1], shape[2], shape[0])
         elif feature.dtype in ("string", "large_string"):
             kind = "text"
-        found.append(KeyInfo(feature.name, kind, shape, feature.dtype, meta.fps, feature.names, codec))
+        found.append(KeyInfo(name, kind, shape, feature.dtype, meta.fps, feature.value_names, codec))
     return tuple(found)
 
 
@@ -233,7 +190,7 @@ def _codec(meta: Metadata, key: str) -> str | None:
     try:
         if meta.features[key].dtype == "video":
             return frame_table(meta.folder.path(meta.video(index, key).path)).codec
-        rows = rows_of(meta.folder.path(meta.data_path(index)), index)
+        rows = rows_of(meta, index)
         return StillPictures(rows, key, np.zeros(len(rows)), meta.folder).codec()
     except HMAError:
         return None

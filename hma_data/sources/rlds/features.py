@@ -1,4 +1,4 @@
-"""Read features.json of a TFDS folder, and decode the columns of its records.
+"""Read features.json of a TFDS folder, and decode the columns and pictures of its records.
 
 TensorFlow Datasets joins the names of nested features with "/". A feature inside one sequence (RLDS'
 `steps`) is stored as one flat list over the steps. A feature inside two or more sequences is ragged:
@@ -6,18 +6,21 @@ TensorFlow Datasets joins the names of nested features with "/". A feature insid
 whatever their dtype, unless the tensor is encoded to bytes. (Source: tensorflow_datasets 4.9, features and
 example_serializer.)
 
-T steps of an episode.
+T steps of an episode, H×W pixels.
 """
 
 import json
 import math
 import zlib
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episodes.episode import Decode
+from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.rlds.tf_example import Example
 
@@ -25,12 +28,17 @@ Shape = tuple[int | None, ...]
 BFLOAT16 = "bfloat16"  # NumPy lacks this dtype: values become float32
 MAX_TENSOR_BYTES = 1 << 28  # most bytes of one value, against decompression bombs and errors
 
-# Content keys of a feature in features.json -> the class that wrote it; legacy files name the class only.
+# Content keys of a feature in features.json -> the class that wrote it; files before TFDS 4.6 name the class.
 CONTENT = {
     "featuresDict": "FeaturesDict", "sequence": "Sequence", "tensor": "Tensor", "image": "Image",
     "video": "Video", "text": "Text", "classLabel": "ClassLabel", "boundingBox": "BBoxFeature",
     "audio": "Audio", "translation": "Translation", "jsonFeature": "Json",
 }  # fmt: skip
+FIXED: dict[str, tuple[str, Shape, str]] = {  # class -> kind, shape and dtype
+    "Text": ("text", (), "string"),
+    "ClassLabel": ("number", (), "int64"),
+    "BBoxFeature": ("number", (4,), "float32"),
+}
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,7 @@ class Feature:
         return None if None in sizes else math.prod(size for size in sizes if size is not None)
 
 
-def read_features(text: str, where: str) -> dict[str, Feature]:
+def read_features(text: bytes, where: str) -> dict[str, Feature]:
     """Return the leaves of a features.json by name, in its order.
 
     Raises:
@@ -70,7 +78,7 @@ def read_features(text: str, where: str) -> dict[str, Feature]:
     """
     try:
         return {leaf.name: leaf for leaf in _leaves(json.loads(text), "", ())}
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as fault:
+    except (ValueError, KeyError, TypeError, AttributeError) as fault:
         raise SourceError(
             where, f"is not a TFDS features.json: {fault!r}", "write it again with tensorflow_datasets"
         ) from fault
@@ -96,12 +104,8 @@ def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
 
 def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feature:
     shape, dtype = _shape(content.get("shape")), str(content.get("dtype") or "")
-    if kind == "Text":
-        return Feature(name, "text", (), "string", nesting)
-    if kind == "ClassLabel":
-        return Feature(name, "number", (), "int64", nesting)
-    if kind == "BBoxFeature":
-        return Feature(name, "number", (4,), "float32", nesting)
+    if kind in FIXED:
+        return Feature(name, *FIXED[kind], nesting)
     if kind in ("Image", "LabeledImage", "Video"):
         if kind == "Video":
             nesting = (*nesting, shape[0] if shape else None)
@@ -132,13 +136,10 @@ def _content(node: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         if isinstance(content, str):
             content = json.loads(content)
         return kind, content
-    kind = str(node.get("pythonClassName") or node.get("python_class_name") or "").rsplit(".", 1)[-1]
-    for key, general in CONTENT.items():
-        snake = "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in key)
-        content = node.get(key, node.get(snake))
-        if content is not None:
-            return general, content
-    return kind, {}
+    for key, kind in CONTENT.items():
+        if node.get(key) is not None:
+            return kind, node[key]
+    return str(node.get("pythonClassName") or "").rsplit(".", 1)[-1], {}
 
 
 def _shape(value: Any) -> Shape:
@@ -151,72 +152,118 @@ def _size(value: Any) -> int | None:
     return None if value is None or int(value) < 0 else int(value)
 
 
-# -- columns
+# -- records
 
 
-def step_count(example: Example, features: dict[str, Feature], where: str) -> int:
-    """Return T, from the first feature that tells it.
+class Steps:
+    """One record and its columns over the steps.
 
     Args:
-        features: those inside steps.
+        example: the record.
+        features: those over the steps, by their path in a step.
+        name: the episode's id, for errors.
 
     Raises:
-        EpisodeError: no feature tells it, or there are no steps.
+        EpisodeError: (here and in every method) there are no steps, or a feature is missing, of another
+            kind, ragged, or has not T rows.
     """
-    for feature in sorted(features.values(), key=lambda item: item.width or 0):
-        steps = _rows(example, feature)
-        if steps is not None:
-            if not steps:
-                raise EpisodeError(where, "has no steps")
-            return steps
-    raise EpisodeError(where, "holds none of the features that features.json names")
 
+    def __init__(self, example: Example, features: dict[str, Feature], name: str) -> None:
+        self.example, self.features, self.name = example, features, name
+        counts = map(self._rows, sorted(features.values(), key=lambda item: item.width or 0))
+        count = next((count for count in counts if count is not None), None)
+        if count is None:
+            raise EpisodeError(name, "holds none of the features that features.json names")
+        if not count:
+            raise EpisodeError(name, "has no steps")
+        self.count = count
 
-def _rows(example: Example, feature: Feature) -> int | None:
-    """Return the number of steps of a feature, if it can be known without the other features."""
-    lengths = f"{feature.name}/ragged_row_lengths_0"
-    if lengths in example:
-        return len(example.ints(lengths))
-    if feature.name not in example:
-        return None
-    if feature.kind in ("picture", "text") or feature.encoding != "none":
-        count = example.count(feature.name)
-        return count // feature.width if feature.kind == "text" and feature.width else count
-    return len(example.numbers(feature.name)) // feature.width if feature.width else None
+    def numbers(self, key: str) -> NDArray[Any]:
+        """Return a feature of numbers over the steps: (T, …) in its dtype."""
+        feature = self.features[key]
+        name, sizes = self._stored(feature)
+        inner = feature.shape
+        if feature.encoding != "none":
+            values = self._decoded(feature, name)
+            inner = values.shape[1:]
+        else:
+            values = self.example.numbers(name).astype(_given(feature), copy=False)
+        try:
+            return values.reshape([*sizes, *(-1 if size is None else size for size in inner)])
+        except ValueError as fault:
+            said = f"{name} has {values.size} values, {self.count} steps of {_printed(feature)} are expected"
+            raise EpisodeError(self.name, said) from fault
 
+    def blobs(self, key: str) -> list[memoryview]:
+        """Return a feature of byte strings over the steps: T views."""
+        name, _ = self._stored(self.features[key])
+        blobs = self.example.blobs(name)
+        if len(blobs) != self.count:
+            raise EpisodeError(self.name, f"{name} has {len(blobs)} entries for {self.count} steps")
+        return blobs
 
-def column(example: Example, feature: Feature, steps: int, where: str) -> NDArray[Any]:
-    """Return a feature of numbers over the steps: (T, …) in its dtype.
+    def text(self, key: str) -> str:
+        """Return the first text of a key; empty where the steps have none."""
+        name = f"{self.features[key].name}/ragged_flat_values"
+        blobs = self.example.blobs(name) if name in self.example else self.blobs(key)
+        return bytes(blobs[0]).decode(errors="replace") if blobs else ""
 
-    Raises:
-        EpisodeError: the feature is missing, of another kind, ragged, or has not T rows.
-    """
-    name, sizes = _stored(example, feature, steps, where)
-    if feature.encoding != "none":
-        values = _decoded(example, feature, name, where)
-    else:
-        values = example.numbers(name).astype(_given(feature), copy=False)
-    inner = values.shape[1:] if feature.encoding != "none" else feature.shape
-    shape = [*sizes, *(-1 if size is None else size for size in inner)]
-    try:
-        return values.reshape(shape)
-    except ValueError as fault:
-        raise EpisodeError(
-            where, f"{name} has {values.size} values, {steps} steps of {_printed(feature)} are expected"
-        ) from fault
+    def decoder(self, key: str) -> Decode:
+        """Return a function that maps a step to the picture (H, W, 3) of a key."""
+        feature, where = self.features[key], f"{self.name}: {key}"
+        if feature.kind == "number" and (feature.encoding == "none" or feature.shape.count(None) > 1):
+            whole = cache(lambda: self.numbers(key))  # decoded when the first picture is asked for
+            return lambda index: whole()[index]
+        blobs = self.blobs(key)
+        if feature.kind == "number":
+            return lambda index: _tensor_of(blobs[index], feature, feature.shape, self.name)
+        return lambda index: decode_image(np.frombuffer(blobs[index], np.uint8), f"{where}, step {index}")
 
+    def _rows(self, feature: Feature) -> int | None:
+        """Return the number of steps of a feature, if it can be known without the other features."""
+        lengths = f"{feature.name}/ragged_row_lengths_0"
+        if lengths in self.example:
+            return len(self.example.ints(lengths))
+        if feature.name not in self.example:
+            return None
+        if feature.kind in ("picture", "text") or feature.encoding != "none":
+            count = self.example.count(feature.name)
+            return count // feature.width if feature.kind == "text" and feature.width else count
+        return len(self.example.numbers(feature.name)) // feature.width if feature.width else None
 
-def column_blobs(example: Example, feature: Feature, steps: int, where: str) -> list[memoryview]:
-    """Return a feature of byte strings over the steps: T views.
+    def _stored(self, feature: Feature) -> tuple[str, list[int]]:
+        """Return (name that holds the values, sizes of the sequences around each value, T first)."""
+        if f"{feature.name}/ragged_flat_values" not in self.example:
+            inner = [-1 if size is None else size for size in feature.nesting[1:]]
+            dynamic = f"{feature.name}/value"  # a tensor of several unknown sizes keeps its shape beside it
+            return dynamic if dynamic in self.example else feature.name, [self.count, *inner]
+        sizes = [self.count]
+        for level in range(len(feature.nesting) - 1):
+            lengths = self.example.ints(f"{feature.name}/ragged_row_lengths_{level}")
+            if len(lengths) != math.prod(sizes):
+                raise EpisodeError(
+                    self.name, f"{feature.name} has {len(lengths)} rows for {math.prod(sizes)}"
+                )
+            if len(lengths) and (lengths != lengths[0]).any():
+                said = f"{feature.name} varies from {lengths.min()} to {lengths.max()} entries a step"
+                raise EpisodeError(self.name, said)
+            sizes.append(int(lengths[0]) if len(lengths) else 0)
+        return f"{feature.name}/ragged_flat_values", sizes
 
-    Raises:
-        EpisodeError: the feature is missing, of another kind, or has not one string a step.
-    """
-    name, _ = _stored(example, feature, steps, where)
-    blobs = example.blobs(name)
-    if len(blobs) != steps:
-        raise EpisodeError(where, f"{name} has {len(blobs)} entries for {steps} steps")
-    return blobs
+    def _decoded(self, feature: Feature, name: str) -> NDArray[Any]:
+        """Decode the tensors that are stored as bytes or zlib; return (n, …)."""
+        blobs = self.example.blobs(name)
+        shapes: Any = [feature.shape] * len(blobs)
+        if name.endswith("/value"):
+            shapes = self.example.ints(f"{feature.name}/shape")
+            if len(shapes) != len(blobs) * len(feature.shape):
+                said = f"{feature.name} has {len(shapes)} sizes for {len(blobs)} tensors"
+                raise EpisodeError(self.name, said)
+            shapes = shapes.reshape(len(blobs), -1)
+        values = [_tensor_of(blob, feature, shape, self.name) for blob, shape in zip(blobs, shapes)]
+        if len({value.shape for value in values}) > 1:
+            raise EpisodeError(self.name, f"{feature.name} changes shape from step to step")
+        return np.stack(values) if values else np.zeros((0, 0), _given(feature))
 
 
 def scalar(example: Example, feature: Feature) -> Any:
@@ -230,67 +277,26 @@ def scalar(example: Example, feature: Feature) -> Any:
     return np.asarray(values).astype(_given(feature))[0].item() if len(values) == 1 else None
 
 
-def _stored(example: Example, feature: Feature, steps: int, where: str) -> tuple[str, list[int]]:
-    """Return (name that holds the values, sizes of the sequences around each value, T first)."""
-    if f"{feature.name}/ragged_flat_values" not in example:
-        inner = [-1 if size is None else size for size in feature.nesting[1:]]
-        dynamic = f"{feature.name}/value"  # a tensor of several unknown sizes keeps its shape beside it
-        return dynamic if dynamic in example else feature.name, [steps, *inner]
-    sizes = [steps]
-    for level in range(len(feature.nesting) - 1):
-        lengths = example.ints(f"{feature.name}/ragged_row_lengths_{level}")
-        if len(lengths) != math.prod(sizes):
-            raise EpisodeError(where, f"{feature.name} has {len(lengths)} rows for {math.prod(sizes)}")
-        if len(lengths) and (lengths != lengths[0]).any():
-            raise EpisodeError(
-                where, f"{feature.name} varies from {lengths.min()} to {lengths.max()} entries a step"
-            )
-        sizes.append(int(lengths[0]) if len(lengths) else 0)
-    return f"{feature.name}/ragged_flat_values", sizes
-
-
-def _given(feature: Feature) -> np.dtype:
-    """Return the dtype in which the values are returned."""
-    return np.dtype(np.float32 if feature.dtype == BFLOAT16 else feature.dtype)
-
-
-def _decoded(example: Example, feature: Feature, name: str, where: str) -> NDArray[Any]:
-    """Decode the tensors that are stored as bytes or zlib; return (n, …)."""
-    blobs = example.blobs(name)
-    shapes: Any = [feature.shape] * len(blobs)
-    if name.endswith("/value"):
-        shapes = example.ints(f"{feature.name}/shape")
-        if len(shapes) != len(blobs) * len(feature.shape):
-            raise EpisodeError(where, f"{feature.name} has {len(shapes)} sizes for {len(blobs)} tensors")
-        shapes = shapes.reshape(len(blobs), -1)
-    values = [tensor(blob, feature, shape, where) for blob, shape in zip(blobs, shapes)]
-    if len({value.shape for value in values}) > 1:
-        raise EpisodeError(where, f"{feature.name} changes shape from step to step")
-    return np.stack(values) if values else np.zeros((0, 0), _given(feature))
-
-
-def tensor(blob: memoryview, feature: Feature, shape: Any, where: str) -> NDArray[Any]:
-    """Decode one tensor that is encoded to bytes.
-
-    Args:
-        shape: its sizes, at most one of them None.
-
-    Raises:
-        EpisodeError: the bytes do not decompress, or do not fill the shape.
-    """
+def _tensor_of(blob: memoryview, feature: Feature, shape: Any, where: str) -> NDArray[Any]:
+    """Decode one tensor that is encoded to bytes; at most one of the sizes of `shape` is None."""
     sizes = [-1 if size is None else int(size) for size in shape]
     dtype = np.dtype(np.uint16 if feature.dtype == BFLOAT16 else feature.dtype)
     limit = MAX_TENSOR_BYTES if -1 in sizes else math.prod(sizes) * dtype.itemsize + 1
     try:
         data: Any = blob
         if feature.encoding == "zlib":
-            data = zlib.decompressobj().decompress(blob, min(max(limit, 1), MAX_TENSOR_BYTES))
+            data = zlib.decompressobj().decompress(blob, min(limit, MAX_TENSOR_BYTES))
         values = np.frombuffer(data, dtype).reshape(sizes)
     except (zlib.error, ValueError) as fault:
         raise EpisodeError(where, f"{feature.name} is not {_printed(feature)}: {fault}") from fault
     if feature.dtype == BFLOAT16:
         return (values.astype(np.uint32) << 16).view(np.float32)
     return values
+
+
+def _given(feature: Feature) -> np.dtype:
+    """Return the dtype of the values that are handed out."""
+    return np.dtype(np.float32 if feature.dtype == BFLOAT16 else feature.dtype)
 
 
 def _printed(feature: Feature) -> str:

@@ -1,31 +1,125 @@
 """Open a TFDS folder: its version, its splits, its shards, and the place of each episode in them.
 
-`dataset_info.json` gives the number of records of each shard of a split, so an episode is found without
-opening the other shards. Shards that it does not list are found by name and counted. Paths are of an fsspec
-file system, which is local unless the URI names another.
+`dataset_info.json` names the shards of each split by a template and gives the number of records of each, so
+an episode is found without opening the other shards. Shards that it does not list are found by name and
+counted. Paths are of an fsspec file system, which is local unless the URI names another.
 """
 
-import json
 import os
+import re
 from bisect import bisect_right
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import fsspec
+from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
+from pydantic.alias_generators import to_camel
 
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.base import leaves
+from hma_data.sources.base import local_path
 from hma_data.sources.rlds.features import Feature, read_features
-from hma_data.sources.rlds.record_file import RecordFile, is_array_record, open_records
-from hma_data.sources.rlds.record_index import EMPTY, Framing
-from hma_data.sources.rlds.shard_files import FORMATS, Shard, named_shards, stated_shards
+from hma_data.sources.rlds.records import Framing, RecordFile, is_array_record, open_records
 from hma_data.sources.rlds.tf_example import Example
 from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
 
-LISTED = 10_000  # most missing records of a shard that are listed and quarantined one by one
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
+TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
+NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
+NAMED = (  # forms of file names: the suffix after the number, or before it as TFDS writes it
+    re.compile(rf"(?P<stem>.+?)[-_]{NUMBER[1:]}\.(?:tfrecord|array_record)"),
+    re.compile(rf"(?P<stem>.+)\.(?:tfrecord|array_record)(?:{NUMBER})?"),
+)
+
+
+class _StatedSplit(BaseModel):
+    """One split in dataset_info.json."""
+
+    model_config = ConfigDict(alias_generator=to_camel)
+
+    name: str = ""
+    filepath_template: str = TEMPLATE
+    shard_lengths: tuple[NonNegativeInt, ...] = ()
+
+
+class _DatasetInfo(BaseModel):
+    """The part of dataset_info.json that is used."""
+
+    model_config = ConfigDict(alias_generator=to_camel)
+
+    name: str = ""
+    version: str = ""
+    file_format: Literal["tfrecord", "array_record"] = "tfrecord"
+    splits: tuple[_StatedSplit, ...] = ()
+
+    def shard_path(self, split: _StatedSplit, number: int) -> str:
+        """Return the path of a split's shard, relative to the folder."""
+        shards = len(split.shard_lengths)
+        digits = max(5, len(str(shards)))
+        place, total = f"{number:0{digits}d}", f"{shards:0{digits}d}"
+        values = {
+            "DATASET": self.name,
+            "SPLIT": split.name,
+            "FILEFORMAT": self.file_format,
+            "SHARD_INDEX": place,
+            "NUM_SHARDS": total,
+            "SHARD_X_OF_Y": f"{place}-of-{total}",
+        }
+        template = split.filepath_template.split("%")[0]
+        return re.sub(r"\{(\w+)\}", lambda match: values.get(match[1], match[0]), template)
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One TFRecord or ArrayRecord file of a split.
+
+    Attributes:
+        files: fsspec file system of the path.
+        path: on it.
+        number: its place in the split.
+        stated: how many records dataset_info.json states; None where it states none.
+        first: index within the split of its first record.
+    """
+
+    files: Any
+    path: str
+    number: int
+    stated: int | None
+    first: int = 0
+
+    @property
+    def records(self) -> RecordFile:
+        """Return the shard's file.
+
+        Raises:
+            SourceError: it is not there, or the file system does not answer.
+        """
+        return open_records(self.files, self.path)
+
+    def framing(self, limit: int = -1) -> Framing:
+        """Return where the shard's records lie; see `RecordFile.framing`.
+
+        Raises:
+            SourceError: it cannot be read, or has more records than dataset_info.json says.
+        """
+        frames = self.records.framing(limit)
+        if self.stated is not None and len(frames) > self.stated:
+            raise SourceError(
+                self.path,
+                f"has {len(frames)} records, dataset_info.json says {self.stated}",
+                "write dataset_info.json again, or remove it: then the records are counted",
+            )
+        return frames
+
+    def count(self) -> int:
+        """Count the episodes that the shard should have; a record cut off at the end counts."""
+        if self.stated is not None:
+            return self.stated
+        frames = self.framing()
+        return len(frames) + bool(frames.fault)
 
 
 @dataclass(frozen=True)
@@ -34,22 +128,20 @@ class Folder:
 
     Attributes:
         uri: as given.
-        files: fsspec file system of the paths.
-        root: the folder, on it.
         features: leaves of features.json by name.
         splits: name -> the shards that are there, in order.
+        remote: whether every read of a file is a request over the network.
         name, version: of the dataset; empty when not stated.
         problems: contradictions in the dataset, one sentence each.
     """
 
     uri: str
-    files: Any
-    root: str
     features: dict[str, Feature]
     splits: dict[str, tuple[Shard, ...]]
-    name: str = ""
-    version: str = ""
-    problems: tuple[str, ...] = ()
+    remote: bool
+    name: str
+    version: str
+    problems: tuple[str, ...]
 
     @cached_property
     def step_features(self) -> dict[str, Feature]:
@@ -60,54 +152,6 @@ class Folder:
             if name.startswith("steps/")
         }
         return inside or {name: leaf for name, leaf in self.features.items() if leaf.nesting}
-
-    @property
-    def remote(self) -> bool:
-        """Check whether every read of a file is a request over the network."""
-        return not is_local(self.files)
-
-    def framing(self, shard: Shard, limit: int = -1) -> Framing:
-        """Return where the shard's records lie; for a remote shard at least the first `limit`, -1 for all.
-
-        Raises:
-            SourceError: it cannot be read, or has more records than dataset_info.json says.
-        """
-        if self.leaves(shard):
-            return replace(EMPTY, fault="is a link to a file outside the dataset's folder", whole=True)
-        frames = self.records(shard).framing(limit)
-        if shard.records is not None and len(frames) > shard.records:
-            raise SourceError(
-                shard.path,
-                f"has {len(frames)} records, dataset_info.json says {shard.records}",
-                "write dataset_info.json again, or remove it: the records are then counted",
-            )
-        self.believe(shard, LISTED * (len(frames) + 1))
-        return frames
-
-    def believe(self, shard: Shard, most: int) -> None:
-        """Refuse a record count in dataset_info.json that is too high for the shard.
-
-        Raises:
-            SourceError: it states more than `most` records, and more than 10,000.
-        """
-        if shard.records is not None and shard.records > max(most, LISTED):
-            raise SourceError(
-                shard.path,
-                f"cannot have the {shard.records:,} records that dataset_info.json says",
-                "write dataset_info.json again, or remove it: the records are then counted",
-            )
-
-    def records(self, shard: Shard) -> RecordFile:
-        """Return the shard's file.
-
-        Raises:
-            SourceError: it is not there, or the file system does not answer.
-        """
-        return open_records(self.files, shard.path)
-
-    def leaves(self, shard: Shard) -> bool:
-        """Check whether the shard is a link to a file outside the dataset's folder."""
-        return not self.remote and leaves(Path(shard.path), Path(self.root))
 
     def example(self, episode_id: str) -> tuple[Example, str]:
         """Return an episode's parsed record and the path of its shard.
@@ -123,20 +167,9 @@ class Folder:
             )
         shard = shards[max(0, bisect_right([item.first for item in shards], int(index)) - 1)]
         position = int(index) - shard.first
-        if not 0 <= position < self.counted(shard):
-            raise EpisodeError(episode_id, f"lies in no shard of {self.uri}")
-        frames = self.framing(shard, position + 1)
-        if position >= len(frames):
-            fault = frames.fault or f"ends after {len(frames)} of {shard.records} records"
-            raise EpisodeError(episode_id, f"{shard.path}: {fault}")
-        return Example(self.records(shard).read(position, episode_id), episode_id), shard.path
-
-    def counted(self, shard: Shard) -> int:
-        """Count the episodes that the shard should have; a record cut off at the end counts."""
-        if shard.records is not None:
-            return shard.records
-        frames = self.framing(shard)
-        return len(frames) + bool(frames.fault)
+        if not 0 <= position < shard.count():
+            raise EpisodeError(episode_id, f"is in no shard of {self.uri}")
+        return Example(shard.records.read(position, episode_id), episode_id), shard.path
 
 
 def episode_id(split: str, index: int) -> str:
@@ -154,170 +187,166 @@ def open_folder(uri: str) -> Folder:
         SourceError: there is none, or its description cannot be read.
         MissingDependencyError: the URI's file system needs a package that is not installed.
     """
-    remote = "://" in uri and not uri.startswith("file://")
-    return _remote(uri, os.getpid()) if remote else _find(uri)
+    if "://" in uri and not uri.startswith("file://"):
+        return _open_remote(uri, os.getpid())
+    files, path = fsspec.filesystem("file"), local_path(uri).absolute()
+    root = _version_folder(uri, files, str(path.parent if path.is_file() else path))
+    described = [Path(root, name) for name in ("", "features.json", "dataset_info.json")]
+    changed = tuple(item.stat().st_mtime_ns if item.exists() else 0 for item in described)
+    return _open(uri, files, root, str(path) if path.is_file() else "", changed)
 
 
 @lru_cache(maxsize=64)
-def _remote(uri: str, pid: int) -> Folder:
-    return _find(uri)
-
-
-def _find(uri: str) -> Folder:
-    files, path = _file_system(uri)
-    is_file = not is_listless(files) and attempt(files, uri, lambda: files.isfile(path))
-    only = path if is_file else ""
-    above = files._parent(path) if only else path
-    root = attempt(files, uri, lambda: _version_folder(uri, files, above))
-    stamps = [_stamp(files, f"{root}/{name}") for name in ("", "features.json", "dataset_info.json")]
-    return _open(uri, files, root, only, tuple(stamps), os.getpid())
-
-
-def _file_system(uri: str) -> tuple[Any, str]:
-    if "://" not in uri:  # a plain path, even where it contains fsspec's signs for chained file systems
-        return fsspec.filesystem("file"), str(Path(uri).expanduser().absolute())
+def _open_remote(uri: str, pid: int) -> Folder:
     try:
         files, path = file_system(uri)
     except ValueError as fault:
         raise SourceError(uri, str(fault), "give a path or an fsspec URI such as gs://bucket/path") from fault
-    return files, path.rstrip("/")
-
-
-def _stamp(files: Any, path: str) -> str:
-    """Return a text that changes when a local file or folder does; empty for a remote one."""
-    try:
-        return str(Path(path).stat().st_mtime_ns) if is_local(files) else ""
-    except FileNotFoundError:
-        return "none"
+    path = path.rstrip("/")
+    is_file = not is_listless(files) and attempt(files, uri, lambda: files.isfile(path))
+    above = files._parent(path) if is_file else path
+    root = attempt(files, uri, lambda: _version_folder(uri, files, above))
+    return _open(uri, files, root, path if is_file else "", ())
 
 
 def _version_folder(uri: str, files: Any, path: str) -> str:
-    """Return the folder with features.json, at most two levels below `path` (configuration and version)."""
-    if _is_described(files, path):
+    """Return the folder with features.json: `path`, or one at most two levels below it."""
+    if is_listless(files) or files.isfile(f"{path}/features.json"):
         return path
-    if not files.exists(path) and not is_listless(files):
+    if not files.exists(path):
         raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
-    found = _described(files, path)
-    if len(found) == 1:
-        return files._parent(found[0])
-    if found:
-        names = ", ".join(sorted(files._parent(item)[len(path) + 1 :] for item in found))
+    found: list[Any] = []
+    for pattern in ("*/features.json", "*/*/features.json"):
+        if is_local(files):  # its name may contain the wildcards of patterns
+            found += sorted(Path(path).glob(pattern))
+        else:
+            found += files.glob(f"{path}/{pattern}")
+    folders = [files._parent(str(item)) for item in found]
+    if len(folders) > 1:
+        names = ", ".join(sorted(folder[len(path) + 1 :] for folder in folders))
         raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
-    raise SourceError(
-        uri,
-        "has no features.json",
-        "records cannot be understood without; copy it from where they are from, or write it with TFDS",
-    )
-
-
-def _is_described(files: Any, path: str) -> bool:
-    if not is_listless(files):
-        return bool(files.isfile(f"{path}/features.json"))
-    try:  # on a web server, isfile() reports a lost connection as a missing file
-        files.cat_file(f"{path}/features.json", start=0, end=1)
-    except FileNotFoundError:
-        return False
-    return True
-
-
-def _described(files: Any, path: str) -> list[str]:
-    """Return the paths of all features.json one or two folders below `path`."""
-    patterns = ("*/features.json", "*/*/features.json")
-    if is_listless(files):
-        return []
-    if is_local(files):  # its name may contain the wildcards of patterns
-        return [str(found) for pattern in patterns for found in sorted(Path(path).glob(pattern))]
-    return [str(found) for pattern in patterns for found in files.glob(f"{path}/{pattern}")]
+    return folders[0] if folders else path
 
 
 @lru_cache(maxsize=64)
-def _open(uri: str, files: Any, root: str, only: str, stamps: tuple[str, ...], pid: int) -> Folder:
-    """Make the folder of `open_folder`; the cache holds while the folder is unchanged, not across a fork."""
-    described = _text(files, root, "features.json")
+def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) -> Folder:
+    """Make the folder of `open_folder`; `only` is the path of the one shard that the user chose, or empty."""
+    described = fetch_whole(files, f"{root}/features.json", LONGEST_JSON)
     if described is None:
-        raise SourceError(uri, "has no features.json", "copy it from where the records are from")
-    features = read_features(described, f"{root}/features.json")
-    info = _info(files, root)
-    listing = (
-        None if is_listless(files) else attempt(files, uri, lambda: sorted(files.find(root, maxdepth=2)))
-    )
-    if only:
-        listing = [only]
-    shards, problems = stated_shards(root, info, listing)
+        raise SourceError(
+            uri,
+            "has no features.json, without which its records cannot be understood",
+            "copy it from where the records are from, or write it with TFDS",
+        )
+    info = _dataset_info(files, f"{root}/dataset_info.json")
+    listing = [only] if only else None
+    if not only and not is_listless(files):
+        listing = attempt(files, uri, lambda: sorted(files.find(root, maxdepth=2)))
+    shards, problems = _stated_shards(files, root, info, listing)
     if not shards:
-        shards, more = named_shards(root, listing or [], info)
+        shards, more = _named_shards(files, root, info, listing or [])
         problems += more
+    if not shards:
+        fault = "holds no TFRecord or ArrayRecord file"
+        raise SourceError(uri, fault, "names are like name-train.tfrecord-00000-of-00001")
     paths = [shard.path for items in shards.values() for shard in items]
     if not is_local(files) and any(map(is_array_record, paths)):
-        raise SourceError(
-            uri, "holds ArrayRecord files, which are read from this machine's disks only", "copy it here"
-        )
-    if only:  # the user chose one shard: the others are not missing
-        problems = []
-    folder = Folder(
-        uri,
-        files,
-        root,
-        features,
-        {},
-        str(info.get("name", "")),
-        str(info.get("version", "")),
-        tuple(problems),
+        fault = "holds ArrayRecord files, which are read from this machine's disks only"
+        raise SourceError(uri, fault, "copy it here")
+    return Folder(
+        uri=uri,
+        features=read_features(described, f"{root}/features.json"),
+        splits={split: _counted(items) for split, items in shards.items()},
+        remote=not is_local(files),
+        name=info.name,
+        version=info.version,
+        problems=() if only else tuple(problems),  # the user chose one shard: the others are not missing
     )
-    splits = {split: _placed(folder, items) for split, items in shards.items()}
-    if not any(splits.values()):
-        raise SourceError(
-            uri, "holds no TFRecord or ArrayRecord file", "names are like name-train.tfrecord-00000-of-00001"
-        )
-    return replace(folder, splits={split: items for split, items in splits.items() if items})
 
 
-def _text(files: Any, root: str, name: str) -> str | None:
-    """Return the text of a description in the folder; None where there is no such file."""
-    path = f"{root}/{name}"
-    if is_local(files) and leaves(Path(path), Path(root)):
-        raise SourceError(path, "is a link to a file outside its folder", "copy the file in")
+def _dataset_info(files: Any, path: str) -> _DatasetInfo:
+    """Return the content of dataset_info.json; all defaults where there is none."""
     data = fetch_whole(files, path, LONGEST_JSON)
     try:
-        return None if data is None else data.decode()
-    except UnicodeDecodeError as fault:
-        raise SourceError(path, f"is not text: {fault}", "copy it again") from fault
+        return _DatasetInfo() if data is None else _DatasetInfo.model_validate_json(data)
+    except ValidationError as fault:
+        first = fault.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        said = f"{key} is {first['input']!r}: {first['msg']}" if key else first["msg"]
+        raise SourceError(path, said, "write it again with tensorflow_datasets, or remove it") from fault
 
 
-def _info(files: Any, root: str) -> dict[str, Any]:
-    """Return the content of dataset_info.json; empty where there is none."""
-    path = f"{root}/dataset_info.json"
-    text = _text(files, root, "dataset_info.json")
-    try:
-        info = {} if text is None else json.loads(text)
-    except (ValueError, RecursionError) as fault:
-        raise SourceError(path, f"is not JSON: {fault}", "write it again, or remove it") from fault
-    if not isinstance(info, dict) or not _are_splits(info.get("splits", [])):
-        raise SourceError(path, "is not what TFDS writes", "write it again, or remove it")
-    form = info.get("fileFormat") or info.get("file_format") or FORMATS[0]
-    if form not in FORMATS:
-        raise SourceError(
-            path, f"states the file format {form!r}", "convert it to tfrecord with tensorflow_datasets"
-        )
-    return info
+def _counted(shards: list[Shard]) -> tuple[Shard, ...]:
+    """Return the shards with `first` set; count the records where dataset_info.json does not state them."""
+    if all(shard.stated is not None for shard in shards):
+        return tuple(shards)
+    firsts = accumulate((shard.count() for shard in shards), initial=0)
+    return tuple(replace(shard, first=first) for shard, first in zip(shards, firsts))
 
 
-def _are_splits(splits: Any) -> bool:
-    """Check whether the splits have the form that TFDS writes; their values are not checked."""
-    return isinstance(splits, list) and all(
-        isinstance(split, dict)
-        and isinstance(split.get("filepathTemplate") or split.get("filepath_template") or "", str)
-        and isinstance(split.get("shardLengths") or split.get("shard_lengths") or [], list)
-        for split in splits
+def _stated_shards(
+    files: Any, root: str, info: _DatasetInfo, listing: list[str] | None
+) -> tuple[dict[str, list[Shard]], list[str]]:
+    """Return the existing shards that dataset_info.json names, and what is missing."""
+    there = None if listing is None else set(listing)
+    shards: dict[str, list[Shard]] = {}
+    problems, absent = [], []
+    for split in info.splits:
+        counts = split.shard_lengths
+        firsts = accumulate(counts, initial=0)
+        items = [
+            Shard(files, f"{root}/{info.shard_path(split, number)}", number, records, first)
+            for number, (records, first) in enumerate(zip(counts, firsts))
+        ]
+        present = [item for item in items if there is None or item.path in there]
+        if present:
+            shards[split.name] = present
+            problems += _missing(split.name, len(present), len(items))
+        elif sum(counts):
+            absent.append(f"split {split.name} of {sum(counts):,} episodes is not there")
+    return shards, problems + absent if shards else problems
+
+
+def _named_shards(
+    files: Any, root: str, info: _DatasetInfo, listing: Iterable[str]
+) -> tuple[dict[str, list[Shard]], list[str]]:
+    """Return the shards found by their names alone, and what is missing.
+
+    This serves a renamed dataset, or one without dataset_info.json.
+    """
+    stated = {split.name: split.shard_lengths for split in info.splits}
+    shards: dict[str, list[Shard]] = {}
+    totals: dict[str, int] = {}
+    for path in listing:
+        inside = path[len(root) + 1 :]
+        match = next((found for form in NAMED if (found := form.fullmatch(inside.rsplit("/", 1)[-1]))), None)
+        if not match:
+            continue
+        split = inside.rsplit("/", 1)[0] if "/" in inside else _split_of(match["stem"], info.name, stated)
+        parts = match.groupdict()
+        number = int(parts["shard"] or len(shards.get(split, ())))
+        totals[split] = max(totals.get(split, 0), int(parts["shards"] or 0))
+        counts = stated.get(split, ())
+        records = counts[number] if number < len(counts) else None
+        shards.setdefault(split, []).append(Shard(files, path, number, records, sum(counts[:number])))
+    problems = []
+    for split, items in shards.items():
+        items.sort(key=lambda item: item.number)
+        problems += _missing(split, len(items), totals[split])
+    return shards, problems
+
+
+def _missing(split: str, present: int, shards: int) -> list[str]:
+    return (
+        [f"{shards - present} of {shards} shards of split {split} are not there"] if present < shards else []
     )
 
 
-def _placed(folder: Folder, shards: list[Shard]) -> tuple[Shard, ...]:
-    """Return the shards with `first` set; count the records where dataset_info.json does not state them."""
-    if all(shard.records is not None for shard in shards):
-        return tuple(shards)
-    placed, first = [], 0
-    for shard in shards:
-        placed.append(replace(shard, first=first))
-        first += folder.counted(shard)
-    return tuple(placed)
+def _split_of(stem: str, dataset: str, stated: Iterable[str]) -> str:
+    """Return the split in a file's name, e.g. train of toy-train; a split's name may have hyphens itself."""
+    for split in sorted(stated, key=len, reverse=True):
+        if stem == split or stem.endswith(f"-{split}"):
+            return split
+    if dataset and stem.startswith(f"{dataset}-"):
+        return stem[len(dataset) + 1 :]
+    return stem.rsplit("-", 1)[-1]

@@ -8,8 +8,9 @@ from hma_data.sources.common import image_checks
 from hma_data.sources.common.dtype_hints import is_times, seconds_of
 from hma_data.sources.common.findings import Finding
 from hma_data.sources.common.survey import Survey, sampled
+from hma_data.sources.rlds.features import Steps
 from hma_data.sources.rlds.folder import Folder, open_folder
-from hma_data.sources.rlds.steps import MAX_VECTOR, Steps, is_camera
+from hma_data.sources.rlds.source import MAX_VECTOR, is_camera
 
 INSPECTED_EPISODES, INSPECTED_BYTES = 1000, 256 << 20  # most episodes and bytes read for their lengths
 
@@ -37,7 +38,7 @@ def inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
         keys=keys,
         frames=sum(lengths) if len(lengths) == len(refs) else None,
         lengths=lengths,
-        facts=facts(folder),
+        facts=_facts(folder),
         looked_at=len(survey.looked),
         findings=survey.findings(keys),
         checks=survey.checks(),
@@ -61,7 +62,7 @@ def _survey(
             break
         name = refs[i].id
         try:
-            steps = Steps(folder, folder.example(name)[0], name)
+            steps = Steps(folder.example(name)[0], folder.step_features, name)
         except EpisodeError as fault:
             survey.fault(name, fault)
             continue
@@ -71,8 +72,6 @@ def _survey(
         if i in wanted:
             survey.episode(name)
             _look(steps, survey, pairs)
-    if budget < 0:
-        lengths = {i: lengths[i] for i in sorted(lengths)}
     return tuple(lengths[i] for i in sorted(lengths)), first
 
 
@@ -101,19 +100,20 @@ def _pictures(steps: Steps, key: str, survey: Survey, pairs: int) -> None:
 
 def _why(survey: Survey, folder: Folder) -> str:
     found = survey.findings(())
-    of_files = [str(one) for one in found if one.check == "files"]
-    said = of_files[-1:] or [str(one) for one in found[:1]]
-    return said[0] if said else f"{folder.uri} is empty"
+    of_files = [one for one in found if one.check == "files"]
+    said = of_files[-1:] or found[:1]
+    return str(said[0]) if said else f"{folder.uri} is empty"
 
 
-def facts(folder: Folder) -> dict[str, str]:
+def _facts(folder: Folder) -> dict[str, str]:
     """Return facts about the dataset: name, version, splits, and the keys outside the steps."""
-    found = {"dataset": folder.name, "version": folder.version}
-    found["splits"] = ", ".join(
-        f"{name} {sum(folder.counted(shard) for shard in shards)}" for name, shards in folder.splits.items()
-    )
-    outside = [name for name in folder.features if not name.startswith("steps/")]
-    found["episode keys"] = ", ".join(outside)
+    splits = [f"{name} {sum(shard.count() for shard in shards)}" for name, shards in folder.splits.items()]
+    found = {
+        "dataset": folder.name,
+        "version": folder.version,
+        "splits": ", ".join(splits),
+        "episode keys": ", ".join(name for name in folder.features if not name.startswith("steps/")),
+    }
     return {name: value for name, value in found.items() if value}
 
 

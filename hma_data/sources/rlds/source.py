@@ -4,35 +4,29 @@ An episode is one record, a tf.train.Example whose `steps/…` features run over
 embodiment are paths inside a step (`observation/image`, `action/world_vector`). An episode's id is its split
 and its index in the split (`train/000012`). Numbers are decoded when an episode is read, pictures on demand.
 
-T steps, H×W pixels.
+T steps.
 """
 
 import hashlib
 import logging
 import math
+from difflib import get_close_matches
+from typing import Any
 
 from hma_data.episodes.episode import Episode, Floats, Pictures, Signal, rate_times
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Component, Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
+from hma_data.sources.rlds.features import Feature, Steps, scalar
 from hma_data.sources.rlds.folder import Folder, Shard, episode_id, open_folder
-from hma_data.sources.rlds.steps import (
-    Steps,
-    described,
-    instruction,
-    is_camera,
-    listed,
-    metadata,
-    step_feature,
-    success,
-    text_feature,
-)
 from hma_data.sources.rlds.tf_example import Example
 from hma_data.storage.fetch import info, mark
 from hma_data.storage.paths import StrPath, as_text
 
 SAMPLED_SHARDS, SAMPLED_REMOTE = 16, 2  # shards whose first record is read to estimate lengths
+INSTRUCTIONS = ("language_instruction", "natural_language_instruction")
+MAX_VECTOR = 4096  # most values of an action or a state
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +37,7 @@ def open() -> "RldsSource":
 
 
 class RldsSource:
-    """Read TFDS folders in the RLDS form."""
+    """A reader of TFDS folders in the RLDS form."""
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """See Source."""
@@ -62,7 +56,7 @@ class RldsSource:
         folder = open_folder(uri)
         wanted = embodiment.source.split if embodiment else None
         if embodiment:
-            check_keys(folder, embodiment)
+            _check_keys(folder, embodiment)
         if wanted and wanted not in folder.splits:
             raise SourceError(uri, f"has no split {wanted!r}", f"its splits: {', '.join(folder.splits)}")
         for problem in folder.problems:
@@ -71,9 +65,9 @@ class RldsSource:
         refs = []
         for name in names:
             own = None if len(names) == 1 else "train" if name == "train" else "val"
-            rate = steps_per_byte(folder, name)
+            rate = _steps_per_byte(folder, name)
             for shard in folder.splits[name]:
-                refs += _refs(folder, name, shard, own, rate)
+                refs += (_remote_refs if folder.remote and shard.stated else _refs)(name, shard, own, rate)
         if not any(ref.fingerprint for ref in refs):
             raise SourceError(
                 uri, "holds no readable episode", "its files are empty or damaged; copy them again"
@@ -88,9 +82,9 @@ class RldsSource:
             EpisodeError: this episode is damaged, or not as features.json says.
         """
         folder = open_folder(as_text(uri))
-        check_keys(folder, embodiment)
+        _check_keys(folder, embodiment)
         example, path = folder.example(episode_id)
-        steps = Steps(folder, example, episode_id)
+        steps = Steps(example, folder.step_features, episode_id)
         hz = embodiment.frequency_hz
         times = rate_times(steps.count, hz if isinstance(hz, float) else embodiment.rate_hz)
         return Episode(
@@ -100,10 +94,10 @@ class RldsSource:
             },
             actions=_signals(steps, embodiment.action, times),
             states=_signals(steps, embodiment.state, times),
-            instruction=instruction(folder, steps, embodiment.source.instruction),
-            success=success(folder, steps),
+            instruction=_instruction(folder, steps, embodiment.source.instruction),
+            success=_success(folder, steps),
             source=path,
-            metadata=metadata(folder, example),
+            metadata=_metadata(folder, example),
         )
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
@@ -117,13 +111,11 @@ class RldsSource:
         return inspect(as_text(uri), self.index(uri), episodes)
 
 
-def _refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
+def _refs(split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
     """Return the episodes of a shard; an episode that is cut off or missing has no fingerprint."""
-    if folder.remote and shard.records:
-        return _remote_refs(folder, split, shard, own, rate)
-    frames = folder.framing(shard)
+    frames = shard.framing()
     refs = []
-    for position in range(folder.counted(shard)):
+    for position in range(shard.count()):
         there = position < len(frames)
         estimate = round(rate * int(frames.lengths[position])) if there else 1
         fingerprint = frames.fingerprint(position) if there else ""
@@ -131,12 +123,11 @@ def _refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float
     return refs
 
 
-def _remote_refs(folder: Folder, split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
+def _remote_refs(split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
     """Return the episodes of a remote shard from its size and mark alone; no record is read."""
-    found = info(folder.files, shard.path)
-    folder.believe(shard, found["size"])
+    found = info(shard.files, shard.path)
     fingerprint = hashlib.sha256(mark(found).encode()).hexdigest()[:24]
-    records = shard.records or 1
+    records = shard.stated or 1
     frames = max(1, round(rate * found["size"] / records))
     return [
         EpisodeRef(episode_id(split, shard.first + position), frames, own, fingerprint)
@@ -144,7 +135,7 @@ def _remote_refs(folder: Folder, split: str, shard: Shard, own: str | None, rate
     ]
 
 
-def steps_per_byte(folder: Folder, split: str) -> float:
+def _steps_per_byte(folder: Folder, split: str) -> float:
     """Return steps a byte, from the first record of some of a split's shards; 0 when none can be read."""
     shards = folder.splits[split]
     steps = size = 0
@@ -152,10 +143,10 @@ def steps_per_byte(folder: Folder, split: str) -> float:
     for shard in shards[:: math.ceil(len(shards) / sampled)]:
         name = episode_id(split, shard.first)
         try:
-            if not len(folder.framing(shard, 1)):
+            if not len(shard.framing(1)):
                 continue
-            data = folder.records(shard).read(0, name)
-            steps += Steps(folder, Example(data, name), name).count
+            data = shard.records.read(0, name)
+            steps += Steps(Example(data, name), folder.step_features, name).count
             size += len(data)
         except EpisodeError as fault:
             log.warning("%s: %s", folder.uri, fault)  # reading it fails again, and it is quarantined
@@ -165,32 +156,36 @@ def steps_per_byte(folder: Folder, split: str) -> float:
 # -- the embodiment's keys
 
 
-def check_keys(folder: Folder, embodiment: Embodiment) -> None:
-    """Check that features.json has the embodiment's keys, with the stated widths.
+def is_camera(feature: Feature) -> bool:
+    """Check whether a feature holds a colour picture a step, encoded or as a tensor."""
+    if feature.dtype != "uint8" or len(feature.nesting) != 1:
+        return False
+    return feature.kind == "picture" or (
+        feature.kind == "number" and len(feature.shape) == 3 and feature.shape[2] == 3
+    )
 
-    Raises:
-        SourceError: a key is missing, of another kind, or of another width.
-    """
-    pictures = [key for key, feature in folder.step_features.items() if is_camera(feature)]
+
+def _check_keys(folder: Folder, embodiment: Embodiment) -> None:
+    """Raise a SourceError where features.json lacks a key of the embodiment, or has it with another width."""
     for camera in embodiment.cameras:
-        feature = step_feature(folder, camera.key)
-        if camera.key not in pictures:
+        feature = _step_feature(folder, camera.key)
+        if not is_camera(feature):
+            pictures = [key for key, found in folder.step_features.items() if is_camera(found)]
             raise SourceError(
                 folder.uri,
-                f"{camera.key} is {described(feature)} of {feature.dtype}, not a colour picture",
-                f"its pictures: {listed(pictures)}",
+                f"{camera.key} is {_described(feature)} of {feature.dtype}, not a colour picture",
+                f"its pictures: {', '.join(pictures) or 'none'}",
             )
-    parts = embodiment.action.components + (embodiment.state.components if embodiment.state else ())
-    for part in parts:
+    for part in embodiment.action.components + (embodiment.state.components if embodiment.state else ()):
         _check_component(folder, part)
     if embodiment.source.instruction:
-        text_feature(folder, embodiment.source.instruction)
+        _text_feature(folder, embodiment.source.instruction)
 
 
 def _check_component(folder: Folder, part: Component) -> None:
-    feature = step_feature(folder, part.key)
+    feature = _step_feature(folder, part.key)
     if feature.kind != "number":
-        raise SourceError(folder.uri, f"{part.key} is {described(feature)} of {feature.dtype}, not numbers")
+        raise SourceError(folder.uri, f"{part.key} is {_described(feature)} of {feature.dtype}, not numbers")
     wanted = part.slice[1] if part.slice else part.dims
     if feature.width is not None and (feature.width < wanted or (not part.slice and feature.width > wanted)):
         raise SourceError(
@@ -200,9 +195,85 @@ def _check_component(folder: Folder, part: Component) -> None:
         )
 
 
+def _step_feature(folder: Folder, key: str) -> Feature:
+    """Return the feature at a path inside a step; name the nearest keys where there is none."""
+    found = folder.step_features
+    if key in found:
+        return found[key]
+    near = get_close_matches(key, found, n=3) or [name for name in found if name.endswith("/" + key)]
+    raise SourceError(
+        folder.uri,
+        f"has no key {key!r} in its steps",
+        f"did you mean {', '.join(near)}?" if near else f"its keys: {', '.join(found) or 'none'}",
+    )
+
+
+def _text_feature(folder: Folder, key: str) -> Feature:
+    """Return the feature of the instruction, from inside the steps or from the whole episode."""
+    inside = key in folder.step_features or key not in folder.features
+    feature = _step_feature(folder, key) if inside else folder.features[key]
+    if feature.kind == "text":
+        return feature
+    if inside and feature.kind == "number" and feature.dtype.startswith(("int", "uint")):  # codes of letters
+        return feature
+    raise SourceError(folder.uri, f"source.instruction: {key} is {_described(feature)}, not text")
+
+
+def _described(feature: Feature) -> str:
+    if feature.kind == "picture":
+        return "a sequence of pictures a step" if len(feature.nesting) > 1 else "a picture"
+    return {"number": "a tensor", "text": "text"}.get(feature.kind, "a feature")
+
+
+# -- one episode
+
+
 def _signals(steps: Steps, vector: Vector | None, times: Floats) -> tuple[Signal, ...]:
     if vector is None:
         return ()
     found = {key: steps.numbers(key) for key in dict.fromkeys(part.key for part in vector.components)}
     pieces = [found[part.key] for part in vector.components]
     return (Signal(times, compose(vector, pieces, steps.name)),)
+
+
+def _instruction(folder: Folder, steps: Steps, key: str | None) -> str:
+    """Return the instruction of the first step."""
+    if key is None:
+        places = [f"{place}{name}" for place in ("", "observation/") for name in INSTRUCTIONS]
+        outside = [f"episode_metadata/{name}" for name in INSTRUCTIONS]
+        key = next((place for place in places if place in folder.step_features), None)
+        key = key or next((place for place in outside + places if place in folder.features), None)
+    if key is None:
+        return ""
+    feature = _text_feature(folder, key)
+    if key not in folder.step_features:
+        return str(scalar(steps.example, feature) or "")
+    if feature.kind == "text":
+        return steps.text(key)
+    codes = steps.numbers(key)[0].ravel()  # language_table: bytes of UTF-8, padded with zeros
+    return bytes(int(code) & 0xFF for code in codes if code).decode(errors="replace")
+
+
+def _success(folder: Folder, steps: Steps) -> bool | None:
+    """Return whether the episode succeeded, as it states itself; None where it is unknown.
+
+    Without a statement, an episode succeeds where its last step is terminal and has a positive reward.
+    """
+    stated = folder.features.get("episode_metadata/success")
+    if stated:
+        value = scalar(steps.example, stated)
+        return bool(value) if isinstance(value, bool | int) else None
+    if any(key not in steps.features for key in ("reward", "is_terminal")):
+        return None
+    ends = [steps.numbers(key)[-1] for key in ("reward", "is_terminal")]
+    return True if all(end.size == 1 and end > 0 for end in ends) else None
+
+
+def _metadata(folder: Folder, example: Example) -> dict[str, Any]:
+    """Return the single values outside the steps."""
+    found = {
+        name.removeprefix("episode_metadata/"): scalar(example, feature)
+        for name, feature in folder.features.items()
+        if not name.startswith("steps/")
+    }
+    return {name: value for name, value in found.items() if value is not None}

@@ -5,7 +5,7 @@ decodes the numbers, and byte strings stay views into the record, so a feature t
 (Format: protobuf encoding; messages Example, Features, Feature of TensorFlow.)
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,6 @@ from hma_data.errors import EpisodeError
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 KINDS = {1: "bytes", 2: "float", 3: "int"}  # field numbers of Feature's lists
 Span = tuple[int, int]
-
-
-class WireError(ValueError):
-    """Raised where bytes are not the protobuf message they should be."""
 
 
 class Example:
@@ -37,7 +33,7 @@ class Example:
         self._data, self._where = data, where
         try:
             self._lists = dict(_features(data))
-        except (WireError, UnicodeDecodeError) as fault:
+        except ValueError as fault:
             raise EpisodeError(where, f"is not a tf.train.Example: {fault}") from fault
 
     def __contains__(self, name: str) -> bool:
@@ -54,8 +50,7 @@ class Example:
 
     def blobs(self, name: str) -> list[memoryview]:
         """Return the byte strings of a feature, as views into the record."""
-        view = memoryview(self._data)
-        return [view[start:stop] for _, (start, stop) in self._items(name, "bytes")]
+        return self._items(name, "bytes")
 
     def count(self, name: str) -> int:
         """Count the byte strings of a feature."""
@@ -64,64 +59,55 @@ class Example:
     def numbers(self, name: str) -> NDArray[np.float32] | NDArray[np.int64]:
         """Return the (n,) numbers of a feature, float32 or int64 as stored."""
         if self._list(name)[0] == "float":
-            return self._joined(name, "float", FIXED32, np.dtype("<f4"))
+            return self._joined(name, "float", _floats)
         return self.ints(name)
 
     def ints(self, name: str) -> NDArray[np.int64]:
         """Return the (n,) integers of a feature."""
-        return self._joined(name, "int", VARINT, np.dtype(np.int64))
+        return self._joined(name, "int", varints)
 
-    def _joined(self, name: str, kind: str, single: int, dtype: np.dtype) -> NDArray:
-        parts = []
-        for wire, (start, stop) in self._items(name, kind):
-            if wire not in (single, BYTES):
-                raise EpisodeError(self._where, f"{name} has an entry of wire type {wire}")
-            if kind == "int":
-                parts.append(self._varints(name, start, stop))
-            elif (stop - start) % 4:
-                raise EpisodeError(self._where, f"{name} has {stop - start} bytes of float32")
-            else:
-                parts.append(np.frombuffer(self._data, dtype, (stop - start) // 4, start))
-        if len(parts) == 1:
-            return parts[0]
-        return np.concatenate(parts) if parts else np.zeros(0, dtype)
-
-    def _varints(self, name: str, start: int, stop: int) -> NDArray[np.int64]:
+    def _joined(self, name: str, kind: str, parse: Callable[[NDArray[np.uint8]], NDArray]) -> NDArray:
         try:
-            return varints(np.frombuffer(self._data, np.uint8, stop - start, start))
-        except WireError as fault:
+            parts = [parse(np.frombuffer(item, np.uint8)) for item in self._items(name, kind)]
+        except ValueError as fault:
             raise EpisodeError(self._where, f"{name}: {fault}") from fault
+        return parts[0] if len(parts) == 1 else np.concatenate([parse(np.zeros(0, np.uint8)), *parts])
 
     def _list(self, name: str) -> tuple[str, Span]:
         if name not in self._lists:
             raise EpisodeError(self._where, f"has no feature {name!r}")
         return self._lists[name]
 
-    def _items(self, name: str, kind: str) -> list[tuple[int, Span]]:
+    def _items(self, name: str, kind: str) -> list[memoryview]:
         found, (start, stop) = self._list(name)
         if found not in (kind, "empty"):
             raise EpisodeError(self._where, f"{name} is a list of {found}, not of {kind}")
+        view = memoryview(self._data)
         try:
-            return [(wire, span) for number, wire, span in fields(self._data, start, stop) if number == 1]
-        except WireError as fault:
+            return [view[slice(*span)] for number, _, span in fields(self._data, start, stop) if number == 1]
+        except ValueError as fault:
             raise EpisodeError(self._where, f"{name}: {fault}") from fault
+
+
+def _floats(data: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return data.view("<f4")
 
 
 def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Decode packed varints to int64, without a loop over them.
 
     Raises:
-        WireError: the last is cut off, or one is longer than ten bytes.
+        ValueError: the last is cut off, or one is longer than ten bytes.
     """
     last = np.flatnonzero(data < 0x80)
     if len(last) == len(data):
         return data.astype(np.int64)
     if not len(last) or last[-1] != len(data) - 1:
-        raise WireError("its last varint is cut off")
+        raise ValueError("its last varint is cut off")
     first = np.concatenate([[0], last[:-1] + 1])
     lengths = last - first + 1
     if lengths.max() > 10:
-        raise WireError("a varint is longer than ten bytes")
+        raise ValueError("a varint is longer than ten bytes")
     values = np.zeros(len(last), np.uint64)
     for place in range(int(lengths.max())):
         longer = np.flatnonzero(lengths > place)
@@ -157,7 +143,7 @@ def fields(data: bytes, position: int, end: int) -> Iterator[tuple[int, int, Spa
     """Yield (field number, wire type, span of its payload) of each field of a message.
 
     Raises:
-        WireError: it is no message.
+        ValueError: it is no message.
     """
     while position < end:
         tag, position = varint(data, position, end)
@@ -170,9 +156,9 @@ def fields(data: bytes, position: int, end: int) -> Iterator[tuple[int, int, Spa
         elif wire in (FIXED32, FIXED64):
             position += 4 if wire == FIXED32 else 8
         else:
-            raise WireError(f"wire type {wire} at byte {start}")
+            raise ValueError(f"wire type {wire} at byte {start}")
         if position > end:
-            raise WireError(f"the field at byte {start} reaches beyond its message")
+            raise ValueError(f"the field at byte {start} reaches beyond its message")
         yield tag >> 3, wire, (start, position)
 
 
@@ -180,7 +166,7 @@ def varint(data: bytes, position: int, end: int) -> tuple[int, int]:
     """Return (value, position after it).
 
     Raises:
-        WireError: it is cut off, or longer than ten bytes.
+        ValueError: it is cut off, or longer than ten bytes.
     """
     value = shift = 0
     while position < end and shift < 70:
@@ -190,4 +176,4 @@ def varint(data: bytes, position: int, end: int) -> tuple[int, int]:
         if byte < 0x80:
             return value, position
         shift += 7
-    raise WireError(f"no varint at byte {position}")
+    raise ValueError(f"no varint at byte {position}")
