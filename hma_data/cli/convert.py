@@ -218,8 +218,8 @@ def _shared(
 def _planned(
     job: "ConversionJob", json: bool, *, extend: bool, overwrite: bool, share: "Share | None"
 ) -> bool:
-    from hma_data.conversion.estimate import estimate
     from hma_data.conversion.job import plan_conversion
+    from hma_data.conversion.plan import estimate
     from hma_data.storage.remote import place
     from hma_data.tokenizers.base import get_tokenizer
 

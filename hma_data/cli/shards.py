@@ -45,7 +45,7 @@ def shards_info(folder: Annotated[Path, typer.Argument(help="A shard set.")], js
 
     Example: hma shards info shards/my_arm
     """
-    from hma_data.shards.info import describe
+    from hma_data.shards.preview import describe
 
     facts = describe(folder)
     if json:
@@ -219,7 +219,7 @@ def shards_restat(
 
     Example: hma shards restat shards/my_arm
     """
-    from hma_data.conversion.restat import restat
+    from hma_data.conversion.rewrite import restat
 
     with progress("restat", unit="MB") as update:
         manifest = restat(folder, workers=workers, on_progress=_in(update, 1e6))

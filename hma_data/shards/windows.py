@@ -163,15 +163,12 @@ def _first_rows(shards: ShardSet, split: str, episodes: EpisodeIndex) -> Ints:
     sizes = np.array([sum(groups) for groups in shards.row_groups(split)], np.int64)
     if not len(episodes.shard):
         return np.zeros(0, np.int64)
-    known = (episodes.shard >= 0) & (episodes.shard < len(sizes))
-    rows = np.append(sizes, 0)[np.where(known, episodes.shard, -1)]
-    wrong = ~known | (episodes.start < 0) | (episodes.length < 1) | (episodes.start + episodes.length > rows)
+    rows = np.append(sizes, 0)[episodes.shard]  # 0 for a shard that is not in the manifest
+    wrong = (episodes.start < 0) | (episodes.length < 1) | (episodes.start + episodes.length > rows)
     if wrong.any():
         i = int(np.argmax(wrong))
-        raise ShardError(
-            shards.folder,
-            f"{EPISODES} puts episode {episodes.episode_index[i]} at rows {episodes.start[i]:,} to "
-            f"{episodes.start[i] + episodes.length[i]:,} of a shard that has {rows[i]:,}",
-            f"hma shards restat {shards.folder} writes it anew from the shards",
-        )
+        start, end = episodes.start[i], episodes.start[i] + episodes.length[i]
+        fault = f"{EPISODES} puts episode {episodes.episode_index[i]} at rows {start:,} to {end:,}"
+        remedy = f"hma shards restat {shards.folder} writes it anew from the shards"
+        raise ShardError(shards.folder, f"{fault} of a shard that has {rows[i]:,}", remedy)
     return (np.cumsum(sizes) - sizes)[episodes.shard] + episodes.start

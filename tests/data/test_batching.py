@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hma_data.conversion.batching import Batches
+from hma_data.conversion.worker import Batches
 
 
 def frames(episode: int, start: int, count: int) -> NDArray[np.uint8]:

@@ -250,7 +250,7 @@ def mask_some(folder: Path) -> None:
     names = [shard.path for shard in manifest.shards]
     for name in names:
         path = folder / name
-        said, _ = read_footer(path, name)
+        said, _ = read_footer(path)
         table = pq.read_table(path)
         unknown = table["frame_index"].to_numpy() == 3
         actions = to_numpy(table["action"]).copy()
