@@ -55,11 +55,7 @@ def ways(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def extended(
-    out: Path,
-    base: Manifest,
-    plan: Plan,
-    shard_frames: int | None,
-    content: Callable[[EpisodeRef], str],
+    out: Path, base: Manifest, plan: Plan, shard_frames: int | None, content: Callable[[EpisodeRef], str]
 ) -> Plan:
     """Return the plan of `base` with the episodes that are new in `plan`.
 

@@ -271,11 +271,7 @@ class _Conversion:
         return plan, base
 
     def make(
-        self,
-        plan: Plan,
-        base: Manifest | None,
-        share: Share | None,
-        on_progress: Callable[[Progress], None],
+        self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: Callable[[Progress], None]
     ) -> tuple[int, int]:
         """Make the shards that are missing; return how many shards were kept and how many were made."""
         mine = plan.units[share.index :: share.count] if share else plan.units

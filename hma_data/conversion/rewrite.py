@@ -326,10 +326,7 @@ def _refused(shards: ShardSet) -> Iterator[Refused]:
 
 
 def restat(
-    folder: StrPath,
-    *,
-    workers: int | None = None,
-    on_progress: OnProgress = lambda done, total: None,
+    folder: StrPath, *, workers: int | None = None, on_progress: OnProgress = lambda done, total: None
 ) -> Manifest:
     """Write the manifest and the other derived files from the shards; do not change the shards.
 

@@ -10,13 +10,13 @@ import json
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from queue import Queue
 from threading import Event, Thread
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,39 +154,31 @@ def _signs_of_life(report: Report) -> Iterator[None]:
         thread.join()
 
 
-@dataclass
-class _Begin:
+@dataclass(eq=False)
+class _Episode:
+    """An episode on its way from the recording to the shard.
+
+    Attributes:
+        content: hash over what was read of it.
+        read: whether all its pictures are in the queue, or encoded.
+        waiting: frames that are in the queue.
+        tokens: camera -> tokens of the frames that are encoded.
+    """
+
     index: int
     ref: EpisodeRef
     clip: Clip
-    content: Content  # complete at the _End
+    content: Content
+    read: bool = False
+    waiting: int = 0
+    tokens: defaultdict[str, list[NDArray[Any]]] = field(default_factory=lambda: defaultdict(list))
 
 
-@dataclass
-class _Frames:
-    camera: str
-    frames: Frames
-
-
-@dataclass
-class _End:
-    """The end of the episode that was begun."""
-
-
-@dataclass
-class _Whole:
-    index: int
-    ref: EpisodeRef
-    clip: Clip
-    content: str
-    tokens: dict[str, NDArray[Any]]
-
-
-Decoded = _Begin | _Frames | _End | Refused
+Decoded = _Episode | tuple[str, Frames] | Refused | None  # None ends the episode that was begun
 
 
 def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Iterator[Decoded]:
-    """Yield for each episode a _Begin, its pictures in batches, and an _End; or a Refused.
+    """Yield each episode, its pictures in batches with their camera, and None; or a Refused.
 
     This runs ahead in a thread. An episode may begin again, or be refused, after some of its pictures; its
     earlier items are then void.
@@ -205,9 +197,8 @@ def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Ite
                 raise
             except Exception as fault:  # no fault of a decoder on one recording may end the job
                 if disk_is_full(fault):
-                    raise OutputError(
-                        ref.id, f"there is no space to unpack it: {fault}", "free space"
-                    ) from fault
+                    text = f"there is no space to unpack it: {fault}"
+                    raise OutputError(ref.id, text, "free space") from fault
                 if wait_s is not None and worth_another_try(fault):
                     time.sleep(wait_s)
                     continue
@@ -225,56 +216,51 @@ def _episode(job: Job, source: Source, index: int, ref: EpisodeRef) -> Iterator[
     clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
     kept = kept_frames(clip, layout)
     content = Content(clip, kept)
-    yield _Begin(index, ref, clip, content)
+    yield _Episode(index, ref, clip, content)
     for name in layout.cameras:
         camera, stream = job.embodiment.camera(name), clip.episode.streams[name]
         for start in range(0, len(kept), BATCH):
             indices = clip.frame_indices[name][kept[start : start + BATCH]]
             frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
             content.add(start, frames)
-            yield _Frames(name, frames)
-    yield _End()
+            yield name, frames
+    yield None
 
 
-def _tokenized(items: Iterator[Decoded], tokenizer: Tokenizer, report: Report) -> Iterator[_Whole | Refused]:
+def _tokenized(
+    items: Iterator[Decoded], tokenizer: Tokenizer, report: Report
+) -> Iterator[_Episode | Refused]:
     """Yield whole and refused episodes in order; a batch may hold frames of several episodes."""
     batches = Batches(tokenizer.encode, BATCH)
-    waiting: deque[_Begin | Refused] = deque()
-    begun: _Begin | None = None
+    unfinished: deque[_Episode | Refused] = deque()
+    begun: _Episode | None = None
 
-    def ready() -> Iterator[_Whole | Refused]:
-        while waiting:
-            first = waiting[0]
-            if isinstance(first, _Begin):
-                if first is begun or not batches.whole(first.index):
-                    return
-                tokens = batches.take(first.index)
-                yield _Whole(first.index, first.ref, first.clip, first.content.text(), tokens)
-            else:
-                yield first
-            waiting.popleft()
+    def ready() -> Iterator[_Episode | Refused]:
+        while unfinished:
+            first = unfinished[0]
+            if isinstance(first, _Episode) and (first.waiting or not first.read):
+                return
+            yield unfinished.popleft()
 
     for item in items:
-        if begun and isinstance(item, _Begin | Refused):  # its earlier items are void
-            batches.drop(begun.index)
-            waiting.pop()
-            begun = None
-        if isinstance(item, Refused):
-            waiting.append(item)
-        elif isinstance(item, _Begin):
-            begun = item
-            waiting.append(item)
-        elif isinstance(item, _Frames):
-            assert begun is not None
-            report(Tick(frames=batches.add(begun.index, item.camera, item.frames)))
-        else:
-            begun = None
+        if begun is not None:
+            if isinstance(item, tuple):
+                report(Tick(frames=batches.add(begun, *item)))
+            elif item is None:
+                begun.read, begun = True, None
+            else:  # its earlier items are void
+                batches.drop(begun)
+                unfinished.pop()
+                begun = None
+        if isinstance(item, _Episode | Refused):
+            unfinished.append(item)
+            begun = item if isinstance(item, _Episode) else None
         yield from ready()
     report(Tick(frames=batches.flush()))
     yield from ready()
 
 
-def _cut(item: _Whole, layout: RowLayout) -> Iterator[EpisodeRows]:
+def _cut(item: _Episode, layout: RowLayout) -> Iterator[EpisodeRows]:
     """Yield the episode's rows, camera after camera; strided rows hold the whole chunk of actions."""
     clip, kept = item.clip, layout.kept(len(item.clip))
     steps = len(kept) * layout.frame_stride
@@ -287,7 +273,7 @@ def _cut(item: _Whole, layout: RowLayout) -> Iterator[EpisodeRows]:
         yield EpisodeRows(
             episode_index=item.index,
             timestamps=clip.timestamps[kept],
-            tokens=item.tokens[camera],
+            tokens=np.concatenate(item.tokens[camera]),
             actions=actions,
             states=None if clip.states is None else clip.states[kept],
             camera=camera,
@@ -296,7 +282,7 @@ def _cut(item: _Whole, layout: RowLayout) -> Iterator[EpisodeRows]:
         )
 
 
-def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> EpisodeRow:
+def _row(item: _Episode, unit: ShardUnit, start: int, rows: int, cameras: int) -> EpisodeRow:
     clip = item.clip
     skew = {name: [float(v) for v in np.percentile(ms, [50, 95, 100])] for name, ms in clip.skew_ms.items()}
     worst = max(skew.values(), key=lambda values: values[2], default=[0.0, 0.0, 0.0])
@@ -318,7 +304,7 @@ def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> 
         trimmed=clip.trimmed,
         flags=flags_text(clip.trimmed, clip.flags),
         group=item.ref.group,
-        content=item.content,
+        content=item.content.text(),
     )
 
 
@@ -332,18 +318,14 @@ class Batches:
 
     def __init__(self, encode: Callable[[Frames], NDArray[Any]], size: int) -> None:
         self._encode, self._size = encode, size
-        self._queue: deque[tuple[int, str, Frames]] = deque()
+        self._queue: deque[tuple[_Episode, str, Frames]] = deque()
         self._queued = 0
-        self._waiting: defaultdict[int, int] = defaultdict(int)
-        self._tokens: defaultdict[int, defaultdict[str, list[NDArray[Any]]]] = defaultdict(
-            lambda: defaultdict(list)
-        )
 
-    def add(self, episode: int, camera: str, frames: Frames) -> int:
+    def add(self, episode: _Episode, camera: str, frames: Frames) -> int:
         """Queue the next frames of an episode's camera; return how many frames were encoded by this call."""
         self._queue.append((episode, camera, frames))
         self._queued += len(frames)
-        self._waiting[episode] += len(frames)
+        episode.waiting += len(frames)
         encoded = 0
         while self._queued >= self._size:
             encoded += self._next(self._size)
@@ -353,23 +335,13 @@ class Batches:
         """Encode the frames that are left; return their number."""
         return self._next(self._queued) if self._queued else 0
 
-    def drop(self, episode: int) -> None:
-        """Forget an episode."""
-        self._queue = deque(item for item in self._queue if item[0] != episode)
-        self._queued -= self._waiting.pop(episode, 0)
-        self._tokens.pop(episode, None)
-
-    def whole(self, episode: int) -> bool:
-        """Check whether all frames added for an episode are encoded."""
-        return not self._waiting[episode]
-
-    def take(self, episode: int) -> dict[str, NDArray[Any]]:
-        """Return camera -> tokens of a whole episode, and forget the episode."""
-        self._waiting.pop(episode, None)
-        return {camera: np.concatenate(parts) for camera, parts in self._tokens.pop(episode).items()}
+    def drop(self, episode: _Episode) -> None:
+        """Forget the frames of an episode."""
+        self._queue = deque(item for item in self._queue if item[0] is not episode)
+        self._queued -= episode.waiting
 
     def _next(self, count: int) -> int:
-        owners: list[tuple[int, str, int]] = []
+        owners: list[tuple[_Episode, str, int]] = []
         pieces: list[Frames] = []
         left = count
         while left:
@@ -384,48 +356,23 @@ class Batches:
         self._queued -= count
         at = 0
         for episode, camera, length in owners:
-            self._tokens[episode][camera].append(tokens[at : at + length])
-            self._waiting[episode] -= length
+            episode.tokens[camera].append(tokens[at : at + length])
+            episode.waiting -= length
             at += length
         return count
 
 
-def prefetch[T](items: Iterable[T], depth: int = 2) -> Iterator[T]:
-    """Yield the same items in the same order, read ahead by a thread.
+def prefetch[T](items: Iterator[T], depth: int = 3) -> Iterator[T]:
+    """Yield the same items in the same order; a thread reads up to `depth` of them ahead.
 
     An error of `items` is raised in the place of the item.
-
-    Args:
-        items: used in the thread only.
-        depth: how many items may wait.
     """
-    queue: Queue[tuple[str, T | BaseException | None]] = Queue(maxsize=depth)
-    stop = Event()
-
-    def produce() -> None:
-        try:
-            for item in items:
-                queue.put(("item", item))
-                if stop.is_set():
-                    return
-            queue.put(("end", None))
-        except BaseException as fault:  # the reader raises it
-            queue.put(("fault", fault))
-
-    thread = Thread(target=produce, daemon=True)
-    thread.start()
+    end = object()
+    pool = ThreadPoolExecutor(1)
     try:
-        while True:
-            kind, value = queue.get()
-            if kind == "end":
-                return
-            if kind == "fault":
-                assert isinstance(value, BaseException)
-                raise value
-            yield value  # type: ignore[misc]
+        ahead = deque(pool.submit(next, items, end) for _ in range(depth))
+        while (item := ahead.popleft().result()) is not end:
+            ahead.append(pool.submit(next, items, end))
+            yield cast(T, item)
     finally:
-        stop.set()
-        while thread.is_alive():  # the thread may be waiting to put one more
-            while not queue.empty():
-                queue.get_nowait()
-            thread.join(timeout=0.05)
+        pool.shutdown(cancel_futures=True)

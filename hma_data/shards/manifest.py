@@ -203,7 +203,7 @@ def shard_sizes(folder: Path) -> dict[str, int]:
     if isinstance(folder, RemotePath):
         listed = folder.listing()
     else:
-        paths = [path for split in SPLITS for path in folder.glob(f"{split}/*")]
+        paths = [path for split in SPLITS for path in folder.glob(f"{split}/[!.]*")]
         listed = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
     return {name: size for name, size in listed.items() if re.match(r"(train|val)/[^.]", name)}
 

@@ -48,7 +48,7 @@ class EpisodeRow:
         group: shared by the episodes of one recording, which belong in one split; empty for an episode
             that has a recording of its own.
         source: source of the episode if it differs from the set's.
-        content: hash over what was read of it, see `hma_data.conversion.episode_hash`; empty if it was not
+        content: hash over what was read of it, see `hma_data.conversion.extend`; empty if it was not
             recorded.
     """
 
@@ -143,9 +143,8 @@ class Footer:
                 stats={name: Stats.from_json(stats) for name, stats in values["stats"].items()},
             )
         except MALFORMED as fault:
-            raise ShardError(
-                where, f"has a damaged footer: {fault!r}", "delete it and convert again"
-            ) from fault
+            text = f"has a damaged footer: {fault!r}"
+            raise ShardError(where, text, "delete it and convert again") from fault
 
 
 def check_version(values: dict[str, Any], where: object) -> None:

@@ -56,12 +56,7 @@ class WindowIndex:
 
     @classmethod
     def of(
-        cls,
-        shards: ShardSet,
-        split: str,
-        frames: int,
-        row_stride: int | None = None,
-        short: Short = "drop",
+        cls, shards: ShardSet, split: str, frames: int, row_stride: int | None = None, short: Short = "drop"
     ) -> "WindowIndex":
         """Return the index of a split.
 

@@ -81,7 +81,7 @@ def opened(tmp_path: Path, request: pytest.FixtureRequest) -> Worker:
 
 def made(request: pytest.FixtureRequest, make_work: Callable[[int], Work], answer_s: float = 0.2) -> Worker:
     worker = Worker(make_work, 1, 6, answer_s)
-    request.addfinalizer(lambda: worker._process and worker._process.end())
+    request.addfinalizer(worker.pool.close)
     return worker
 
 
@@ -124,9 +124,9 @@ def test_how_a_process_was_lost_is_told_with_its_step_and_the_next_unit_is_done(
 
 def test_a_process_that_is_killed_between_units_costs_nothing(opened: Worker) -> None:
     do(opened, PLAIN[0])
-    assert opened._process is not None
-    os.kill(opened._process.process.pid or 0, signal.SIGKILL)
-    opened._process.process.join()
+    (process,) = opened.pool.processes
+    os.kill(process.process.pid or 0, signal.SIGKILL)
+    process.process.join()
     assert do(opened, PLAIN[1])[1] == Done(("u1", ["a", "b"]))
 
 

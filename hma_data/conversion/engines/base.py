@@ -6,9 +6,9 @@ known. The Ledger decides when a unit is tried again; its rules are the same for
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from hma_data.errors import HMAError
 
@@ -63,21 +63,6 @@ class Limits:
 
 
 LIMITS = Limits()
-
-
-class Engine(Protocol):
-    """A function that runs units, on this machine or elsewhere."""
-
-    def __call__(
-        self,
-        units: Sequence[Any],
-        make_work: Callable[[int], Work],
-        workers: int,
-        on_event: OnEvent,
-        limits: Limits,
-    ) -> Iterator[Any]:
-        """Yield each unit's result when it is ready; call on_event(index of the unit, what it reported)."""
-        ...
 
 
 class Ledger:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from typing import Any, Protocol
 
 from hma_data.conversion.engines.base import (
     FIRST,
@@ -40,9 +40,10 @@ def run(
     on_event: OnEvent,
     limits: Limits = LIMITS,
 ) -> Iterator[Any]:
-    """Run every unit and yield each result when it is ready; see engines.base.Engine.
+    """Run every unit and yield each result when it is ready.
 
     Args:
+        on_event: called with (index of a unit, what it reported).
         workers: number of processes; 0 works in this one, which does not survive a crash or a hang.
 
     Raises:
@@ -54,9 +55,11 @@ def run(
             yield work(unit, _reporter(on_event, number), FIRST)
         return
     ledger = Ledger(units, limits, on_event)
-    pool = _Pool(make_work, min(workers, len(ledger.units)), ledger, on_event)
+    count = min(workers, len(ledger.units))
+    pool = Pool(lambda: WorkerProcess(make_work, count), count, ledger, on_event)
     try:
         while ledger.open:
+            pool.fill()
             yield from pool.turn()
         ledger.raise_failures()
     finally:
@@ -131,45 +134,68 @@ class WorkerProcess:
         return "killed", f"ended by {name}"
 
 
-def start_failed(how: str) -> HMAError:
-    """Return the error for workers that end again and again before they are ready."""
-    remedy = "try fewer --workers; the machine may be short of memory"
-    return HMAError("a worker", f"cannot start; the last one {how}", remedy)
+class Units(Protocol):
+    """The units of a pool: the Ledger, or the one unit of an actor."""
+
+    limits: Limits
+
+    def take(self) -> tuple[int, Any, Attempt] | None:
+        """Return the next unit to start; None if none may start now."""
+        ...
+
+    def finished(self, number: int) -> None:
+        """Record that the unit is done."""
+        ...
+
+    def lost(self, number: int, cause: Cause, step: str, how: str) -> None:
+        """Record that a unit lost its process."""
+        ...
 
 
-class _Pool:
-    """The processes of one run."""
+class Pool:
+    """The processes of one run.
+
+    Args:
+        start: starts a process.
+        count: number of processes.
+        units: hands out the units, and records how they end.
+        on_event: called with (number of a unit, what it reported).
+    """
 
     def __init__(
-        self, make_work: Callable[[int], Work], count: int, ledger: Ledger, on_event: OnEvent
+        self, start: Callable[[], WorkerProcess], count: int, units: Units, on_event: OnEvent
     ) -> None:
-        self._make_work, self._count, self._ledger, self._on_event = make_work, count, ledger, on_event
+        self._start, self._count, self._units, self._on_event = start, count, units, on_event
         self._start_failures = 0
-        self._workers: list[WorkerProcess] = []
+        self.processes: list[WorkerProcess] = []
+
+    def fill(self) -> None:
+        """Start the processes that are missing."""
+        while len(self.processes) < self._count:
+            self.processes.append(self._start())
 
     def turn(self) -> Iterator[Any]:
-        """Hand out units, then process the messages of the workers; yield results."""
-        while len(self._workers) < self._count:
-            self._workers.append(WorkerProcess(self._make_work, self._count))
-        for worker in self._workers:
-            if worker.ready and worker.unit is None and (taken := self._ledger.take()):
-                worker.start_unit(*taken)
-        pipes = {worker.pipe: worker for worker in self._workers}
-        ends = {worker.process.sentinel: worker for worker in self._workers}
+        """Hand out units, then handle the messages of the processes; yield results."""
+        for process in self.processes:
+            free = process.ready and process.unit is None and process.process.is_alive()
+            if free and (taken := self._units.take()):
+                process.start_unit(*taken)
+        pipes = {process.pipe: process for process in self.processes}
+        ends = {process.process.sentinel: process for process in self.processes}
         heard = wait([*pipes, *ends], timeout=TICK_S)
         for pipe in heard:
             if isinstance(pipe, Connection):
                 yield from self._listen(pipes[pipe])
-        for worker in [ends[end] for end in heard if end in ends]:
-            yield from self._listen(worker)  # its messages from before it died
-            self._bury(worker)
-        quiet_s = self._ledger.limits.quiet_s
-        for worker in [worker for worker in self._workers if worker.hangs(quiet_s)]:
-            self._bury(worker, hung=True)
+        for process in [ends[end] for end in heard if end in ends]:
+            yield from self._listen(process)  # its messages from before it died
+            self._bury(process)
+        for process in list(self.processes):
+            if process.hangs(self._units.limits.quiet_s):
+                self._bury(process, hung=True)
 
-    def _listen(self, worker: WorkerProcess) -> Iterator[Any]:
-        for kind, value in worker.messages():
-            number = worker.unit
+    def _listen(self, process: WorkerProcess) -> Iterator[Any]:
+        for kind, value in process.messages():
+            number = process.unit
             if kind == "failed":
                 raise value
             if kind == "ready":
@@ -177,31 +203,32 @@ class _Pool:
             elif number is None:
                 continue
             elif kind == "short of memory":
-                worker.unit = None
-                self._ledger.lost(number, "killed", worker.step, "ran out of memory")
+                process.unit = None
+                self._units.lost(number, "killed", process.step, "ran out of memory")
             elif kind == "done":
-                worker.unit = None
-                self._ledger.finished(number)
+                process.unit = None
+                self._units.finished(number)
                 yield value
             else:
                 self._on_event(number, value)
 
-    def _bury(self, worker: WorkerProcess, hung: bool = False) -> None:
-        self._workers.remove(worker)
-        cause, how = worker.end()
+    def _bury(self, process: WorkerProcess, hung: bool = False) -> None:
+        self.processes.remove(process)
+        cause, how = process.end()
         if hung:
-            cause, how = "hung", f"made no progress for {self._ledger.limits.quiet_s:g} s"
-        if not worker.ready:
+            cause, how = "hung", f"made no progress for {self._units.limits.quiet_s:g} s"
+        if not process.ready:
             self._start_failures += 1
             if self._start_failures >= START_FAILURES:
-                raise start_failed(how)
-        if worker.unit is not None:
-            self._ledger.lost(worker.unit, cause, worker.step, how)
+                remedy = "try fewer --workers; the machine may be short of memory"
+                raise HMAError("a worker", f"cannot start; the last one {how}", remedy)
+        if process.unit is not None:
+            self._units.lost(process.unit, cause, process.step, how)
 
     def close(self) -> None:
         """End every process."""
-        for worker in self._workers:
-            worker.end()
+        for process in self.processes:
+            process.end()
 
 
 # -- in the worker

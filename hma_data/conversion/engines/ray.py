@@ -15,12 +15,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from multiprocessing.connection import wait
 from types import ModuleType
 from typing import Any
 
 from hma_data.conversion.engines.base import LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Work
-from hma_data.conversion.engines.local import START_FAILURES, WorkerProcess, start_failed
+from hma_data.conversion.engines.local import Pool, WorkerProcess
 from hma_data.errors import HMAError, MissingDependencyError
 
 TICK_S = 0.5
@@ -40,7 +39,7 @@ def run(
     limits: Limits = LIMITS,
     gpus: float = 0.0,
 ) -> Iterator[Any]:
-    """Run every unit and yield each result when it is ready; see engines.base.Engine.
+    """Run every unit and yield each result when it is ready; see engines.local.run.
 
     Args:
         workers: number of actors.
@@ -132,7 +131,8 @@ class Answer:
 class Worker:
     """An actor that keeps a worker process, hands it units and passes on its messages.
 
-    The driver calls `open` or `do`, then `go_on` until an answer carries an end.
+    The driver calls `open` or `do`, then `go_on` until an answer carries an end. To the pool of its one
+    process the actor is what the Ledger is to a local pool.
 
     Args:
         make_work: called in the process.
@@ -144,74 +144,55 @@ class Worker:
     def __init__(
         self, make_work: Callable[[int], Work], workers: int, quiet_s: float | None, answer_s: float
     ) -> None:
-        self._make_work, self._workers, self._quiet_s, self._answer_s = make_work, workers, quiet_s, answer_s
-        self._process: WorkerProcess | None = None
-        self._unit: tuple[Any, Attempt] | None = None
-        self._start_failures = 0
+        self.limits = Limits(quiet_s)
+        self.pool = Pool(lambda: WorkerProcess(make_work, workers), 1, self, self._add_event)
+        self._answer_s = answer_s
+        self._unit: tuple[int, Any, Attempt] | None = None
+        self._opening = False
+        self._events: list[Any] = []
+        self._end: End | None = None
 
     def open(self) -> Answer:
         """Start the process; its last answer carries Opened."""
+        self._opening = True
         return self.go_on()
 
     def do(self, unit: Any, attempt: Attempt) -> Answer:
         """Start a unit."""
-        self._unit = unit, attempt
-        if self._process is not None and not self._process.process.is_alive():
-            self._process.end()
-            self._process = None
-        if self._process is not None:
-            self._process.start_unit(0, unit, attempt)
+        self._unit = 0, unit, attempt
         return self.go_on()
 
     def go_on(self) -> Answer:
         """Listen for `answer_s` seconds, or until the end."""
-        events: list[Any] = []
         until = time.monotonic() + self._answer_s
-        while (left := until - time.monotonic()) > 0:
-            end = self._listen(min(left, TICK_S), events)
-            if end is not None:
-                return Answer(tuple(events), end)
-        return Answer(tuple(events))
-
-    def _listen(self, seconds: float, events: list[Any]) -> End | None:
-        if self._process is None:
+        while self._end is None and time.monotonic() < until:
             with _no_script():
-                self._process = WorkerProcess(self._make_work, self._workers)
-        process = self._process
-        over = process.process.sentinel in wait([process.pipe, process.process.sentinel], timeout=seconds)
-        for kind, value in process.messages():
-            end = self._take_in(process, kind, value, events)
-            if end is not None:
-                return end
-        hung = process.hangs(self._quiet_s)
-        return self._ended(process, hung) if over or hung else None
+                self.pool.fill()
+            try:
+                for result in self.pool.turn():
+                    self._end = Done(result)
+            except HMAError as fault:
+                self._end = Failed(fault)
+            if self._opening and any(process.ready for process in self.pool.processes):
+                self._opening, self._end = False, Opened()
+        answer = Answer(tuple(self._events), self._end)
+        self._events, self._end = [], None
+        return answer
 
-    def _take_in(self, process: WorkerProcess, kind: str, value: Any, events: list[Any]) -> End | None:
-        if kind == "ready":
-            self._start_failures = 0
-            if self._unit is None:
-                return Opened()
-            process.start_unit(0, *self._unit)
-        elif kind == "failed":
-            return Failed(value)
-        elif kind == "event":
-            events.append(value)
-        else:
-            self._unit = process.unit = None
-            return Done(value) if kind == "done" else Lost("killed", process.step, "ran out of memory")
-        return None
+    def _add_event(self, number: int, event: Any) -> None:
+        self._events.append(event)
 
-    def _ended(self, process: WorkerProcess, hung: bool) -> End | None:
-        """Return what the end of the process means for the unit; `_listen` starts the next process."""
-        self._process = None
-        cause, how = process.end()
-        if hung:
-            cause, how = "hung", f"made no progress for {self._quiet_s:g} s"
-        if process.ready:
-            self._unit = None
-            return Lost(cause, process.step, how)
-        self._start_failures += 1
-        return Failed(start_failed(how)) if self._start_failures >= START_FAILURES else None
+    def take(self) -> tuple[int, Any, Attempt] | None:
+        """Return the unit if it has not been started."""
+        unit, self._unit = self._unit, None
+        return unit
+
+    def finished(self, number: int) -> None:
+        """Do nothing; the pool yields the result."""
+
+    def lost(self, number: int, cause: Cause, step: str, how: str) -> None:
+        """Tell the driver that the unit lost its process."""
+        self._end = Lost(cause, step, how)
 
 
 @contextmanager
