@@ -6,7 +6,6 @@ is complete or absent, and the manifest is written last. To continue after an in
 T frames of an episode, A values of an action.
 """
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +27,6 @@ from hma_data.shards.manifest import (
     EMBODIMENT,
     EPISODES,
     MANIFEST,
-    QUARANTINE,
     SPLITS,
     Gathered,
     Manifest,
@@ -44,7 +42,6 @@ from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, read_
 from hma_data.shards.verify import REMAKE, check_rows
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
-from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import parquet_input, place
 from hma_data.tokenizers.base import TokenizerSpec
@@ -344,9 +341,12 @@ def restat(
         raise ShardError(folder, "is not a folder", "name the --out folder of an hma convert")
     with locked(folder):
         known = _whole_manifest(folder)
-        names, plan, source, embodiment = _as_stated(folder, known) if known else _as_found(folder)
+        sha256 = {shard.path: shard.sha256 for shard in known.shards} if known else {}
+        names, plan, source, embodiment = (
+            (list(sha256), known.plan, known.source, known.embodiment) if known else _as_found(folder)
+        )
         spec = TokenizerSpec.from_json(plan["tokenizer"])
-        derived = derive(folder, names, embodiment, spec, plan, source)
+        derived = derive(folder, names, embodiment, spec, plan, source, sha256)
         manifest = derived.manifest
         problems, rows = check_rows(folder, manifest, workers, on_progress)
         if problems:
@@ -358,9 +358,6 @@ def restat(
         return derived.write(folder)
 
 
-Found = tuple[list[str], dict[str, Any], str, Embodiment]
-
-
 def _whole_manifest(folder: Path) -> Manifest | None:
     with suppress(HMAError, OSError):
         if not seal_problem((folder / MANIFEST).read_bytes()):
@@ -368,18 +365,8 @@ def _whole_manifest(folder: Path) -> Manifest | None:
     return None
 
 
-def _as_stated(folder: Path, manifest: Manifest) -> Found:
-    for shard in manifest.shards:
-        path = folder / shard.path
-        if not path.is_file():
-            raise ShardError(path, "is missing", AGAIN)
-        if file_sha256(path) != shard.sha256:
-            raise ShardError(path, "its bytes changed since the manifest was written", REMAKE)
-    return [shard.path for shard in manifest.shards], manifest.plan, manifest.source, manifest.embodiment
-
-
-def _as_found(folder: Path) -> Found:
-    """Return what the shards state if there is no manifest to trust."""
+def _as_found(folder: Path) -> tuple[list[str], dict[str, Any], str, Embodiment]:
+    """Return shards, plan, source and embodiment of a set without a manifest to trust."""
     names = sorted(shard_sizes(folder))
     if not names:
         raise ShardError(folder, "holds no shards", "name the --out folder of an hma convert")
@@ -412,13 +399,11 @@ def _lists(folder: Path, gathered: Gathered) -> bool:
 
 
 def _source(folder: Path, footers: list[Footer]) -> str:
-    """Return the URI the recordings came from, read from files beside the shards; shards do not state it."""
+    """Return the URI the recordings came from, read from episodes.parquet; shards do not state it."""
     own = {row.episode_index for footer in footers for row in footer.episodes if not row.source}
     with suppress(OSError, pa.ArrowException):
         table = pq.read_table(parquet_input(folder / EPISODES), columns=["episode_index", "source"])
         for row in table.to_pylist():
             if row["episode_index"] in own:
                 return str(row["source"])
-    with suppress(OSError, ValueError, KeyError, StopIteration):
-        return str(json.loads(next(iter((folder / QUARANTINE).read_text("utf-8").splitlines())))["uri"])
     return "unknown"

@@ -120,9 +120,8 @@ class Decoder:
         _check_stride(shards)
         self.index = WindowIndex.of(shards, split, frames, stride, short)
         name, width = token_column(shards.spec)
-        strided = shards.manifest.plan.get("frames") == "strided"
         robot = shards.embodiment
-        self._widths = {name: width, "action": robot.chunk_dim if strided else robot.action_dim}
+        self._widths = {name: width, "action": robot.action_dim * shards.manifest.frame_stride}
         self._columns = [name, "action", "episode_index", "frame_index"]
         self._columns += [mask for mask in mask_columns(robot) if mask == "action_known"]
         self._names = shards.shards(split)

@@ -3,7 +3,6 @@
 N rows, S tokens a frame, A values of an action.
 """
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -127,9 +126,9 @@ class ShardSet:
         """Return the rows of each row group of each shard of a split."""
         return [shard.row_groups for shard in self.manifest.shards if shard.split == split]
 
-    def index(self, split: str, cameras: int | None = None) -> EpisodeIndex:
+    def index(self, split: str) -> EpisodeIndex:
         """Return the split's episodes, in row order; an episode with several cameras counts once for each."""
-        cameras = cameras or len(self.manifest.cameras)
+        cameras = len(self.manifest.cameras)
         columns = ["episode_index", "split", "shard", "row_start", "length"]
         table = self._episodes(columns, read_dictionary=["split", "shard"])
         splits, names = _words(table["split"]), _words(table["shard"])
@@ -139,8 +138,7 @@ class ShardSet:
         start, length, index = (
             to_numpy(table[name]).astype(np.int64)[mine] for name in ("row_start", "length", "episode_index")
         )
-        offsets = np.arange(cameras)
-        starts = (start[:, None] + offsets * length[:, None]).ravel()
+        starts = (start[:, None] + np.arange(cameras) * length[:, None]).ravel()
         index, shard, length = (np.repeat(values, cameras) for values in (index, shard, length))
         return EpisodeIndex(index, shard, starts, length)
 
@@ -210,23 +208,20 @@ class EpisodeReader:
     Reading episodes in their order decodes every row group once.
     """
 
-    def __init__(self, shards: ShardSet, columns: Sequence[str], kept: int = 2) -> None:
-        self._set, self._columns, self._kept = shards, list(columns), kept
+    def __init__(self, shards: ShardSet, columns: Sequence[str]) -> None:
+        self._set, self._columns = shards, list(columns)
+        self._group = lru_cache(2)(lambda shard, group: shards.read(shard, [group], self._columns))
         self._edges = {
             shard.path: np.cumsum([0, *shard.row_groups], dtype=np.int64) for shard in shards.manifest.shards
         }
-        self._groups: OrderedDict[tuple[str, int], dict[str, NDArray[Any]]] = OrderedDict()
 
     def rows(self, shard: str, row_start: int, rows: int) -> dict[str, NDArray[Any]]:
         """Read columns of `rows` rows of a shard from `row_start` on, (rows,) or (rows, width) each.
 
         Raises:
-            ShardError: the shard has no such rows, is missing or damaged.
+            ShardError: the shard is missing or damaged.
         """
         edges = self._edges[shard]
-        if row_start < 0 or rows < 1 or row_start + rows > edges[-1]:
-            fault = f"has {edges[-1]:,} rows, and {EPISODES} names {row_start:,} to {row_start + rows:,}"
-            raise ShardError(self._set.folder / shard, fault, "hma shards verify tells what is damaged")
         first = int(np.searchsorted(edges, row_start, side="right")) - 1
         last = int(np.searchsorted(edges, row_start + rows, side="left"))
         parts = []
@@ -237,15 +232,6 @@ class EpisodeReader:
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in self._columns}
-
-    def _group(self, shard: str, group: int) -> dict[str, NDArray[Any]]:
-        key = (shard, group)
-        if key not in self._groups:
-            while len(self._groups) >= self._kept:
-                self._groups.popitem(last=False)
-            self._groups[key] = self._set.read(shard, [group], self._columns)
-        self._groups.move_to_end(key)
-        return self._groups[key]
 
 
 def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:

@@ -15,8 +15,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import ShardError
-from hma_data.shards.manifest import EPISODES
 from hma_data.shards.reader import EpisodeIndex, ShardSet
 
 Ints = NDArray[np.int64]
@@ -65,9 +63,6 @@ class WindowIndex:
             row_stride: rows between frames; None takes the embodiment's.
             short: "drop" or "pad" for episodes shorter than a window; an episode of a single frame is always
                 dropped.
-
-        Raises:
-            ShardError: episodes.parquet names rows that the shards do not have.
         """
         stride = row_stride or shards.row_stride
         span = frames * stride
@@ -156,14 +151,4 @@ def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
 def _first_rows(shards: ShardSet, split: str, episodes: EpisodeIndex) -> Ints:
     """Return the first row of each episode, counted through all shards of the split."""
     sizes = np.array([sum(groups) for groups in shards.row_groups(split)], np.int64)
-    if not len(episodes.shard):
-        return np.zeros(0, np.int64)
-    rows = np.append(sizes, 0)[episodes.shard]  # 0 for a shard that is not in the manifest
-    wrong = (episodes.start < 0) | (episodes.length < 1) | (episodes.start + episodes.length > rows)
-    if wrong.any():
-        i = int(np.argmax(wrong))
-        start, end = episodes.start[i], episodes.start[i] + episodes.length[i]
-        fault = f"{EPISODES} puts episode {episodes.episode_index[i]} at rows {start:,} to {end:,}"
-        remedy = f"hma shards restat {shards.folder} writes it anew from the shards"
-        raise ShardError(shards.folder, f"{fault} of a shard that has {rows[i]:,}", remedy)
     return (np.cumsum(sizes) - sizes)[episodes.shard] + episodes.start

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -25,7 +25,6 @@ from hma_data.errors import HMAError, MissingDependencyError
 TICK_S = 0.5
 ANSWER_S = 1.0  # seconds for which an actor collects events before it answers
 ANSWERS_A_S = 100.0  # largest number of answers a second that the driver processes
-SILENT_S = 60.0  # beyond a unit's quiet time; an actor always answers, whatever its unit does
 NO_ROOM_S = 900.0  # seconds without any actor that could be placed
 LOST_STARTS = 4  # limit of actors in a row, for each worker and one more, that end before they are ready
 INSTALLED = "install hma-toolkit and what it needs on every node; see Ray's logs"
@@ -217,7 +216,6 @@ class _Slot:
     answer: Any
     ready: bool = False
     unit: int | None = None
-    heard: float = field(default_factory=time.monotonic)
 
 
 class _Actors:
@@ -237,13 +235,6 @@ class _Actors:
         self._arguments = ray.put(make_work), count, ledger.limits.quiet_s, answer_s
         # no task events: for its dashboard, Ray keeps a record of each call in three processes
         self._class = ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, enable_task_events=False)(Worker)
-        self._gone = (
-            ray.exceptions.RayActorError,
-            ray.exceptions.WorkerCrashedError,
-            ray.exceptions.OutOfMemoryError,
-            ray.exceptions.ObjectLostError,
-            ray.exceptions.NodeDiedError,
-        )
         self._slots: list[_Slot] = []
         self._lost_starts = 0
         self._placed = time.monotonic()
@@ -256,7 +247,6 @@ class _Actors:
         for slot in self._slots:
             if slot.ready and slot.unit is None and (taken := self._ledger.take()):
                 slot.unit, unit, attempt = taken
-                slot.heard = time.monotonic()
                 slot.answer = slot.actor.do.remote(unit, attempt)
         waiting = {slot.answer: slot for slot in self._slots if slot.answer is not None}
         refs = list(waiting)
@@ -264,18 +254,16 @@ class _Actors:
         heard, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
         for ref in heard:
             yield from self._listen(waiting[ref])
-        self._end_the_silent()
         self._check_room()
 
     def _listen(self, slot: _Slot) -> Iterator[Any]:
         try:
             answer: Answer = self._ray.get(slot.answer)
-        except self._gone as fault:
+        except self._ray.exceptions.RayTaskError as fault:
+            raise HMAError("the Ray cluster", f"cannot work: {_first_line(fault)}", INSTALLED) from fault
+        except self._ray.exceptions.RayError as fault:
             self._bury(slot, "was lost: " + _first_line(fault))
             return
-        except self._ray.exceptions.RayError as fault:
-            raise HMAError("the Ray cluster", f"cannot work: {_first_line(fault)}", INSTALLED) from fault
-        slot.heard = time.monotonic()
         for event in answer.events:
             assert slot.unit is not None
             self._on_event(slot.unit, event)
@@ -304,13 +292,6 @@ class _Actors:
             if self._lost_starts >= LOST_STARTS * (self._count + 1):
                 fault = f"lost {self._lost_starts} workers in a row at their start; the last {how}"
                 raise HMAError("the Ray cluster", fault, INSTALLED)
-
-    def _end_the_silent(self) -> None:
-        """End actors that do not answer; an actor itself ends a unit that is quiet."""
-        quiet = self._ledger.limits.quiet_s
-        for slot in list(self._slots):
-            if quiet and slot.unit is not None and time.monotonic() - slot.heard > quiet + SILENT_S:
-                self._bury(slot, f"was lost: no answer for {quiet + SILENT_S:g} s")
 
     def _check_room(self) -> None:
         if any(slot.ready for slot in self._slots):
