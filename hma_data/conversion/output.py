@@ -65,7 +65,7 @@ def locked(out: Path, share: Share | None = None) -> Iterator[None]:
     if isinstance(out, RemotePath):
         if out.scheme == "hf":
             remedy = "write a folder, then upload it"
-            raise OutputError(out, "a repository of the hub takes whole conversions only", remedy)
+            raise OutputError(out, "is a repository of the hub, which takes whole conversions only", remedy)
         yield
         return
     with ExitStack() as held:
@@ -181,11 +181,9 @@ def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
     except FileNotFoundError:
         return
     if theirs["hash"] != plan.facts["hash"]:
-        raise OutputError(
-            out,
-            f"another conversion is being written there; different: {differences(plan.facts, theirs)}",
-            f"wait for it, or choose another --out; where no such job runs any more, delete {out / PLAN}",
-        )
+        fault = f"another conversion is being written there; different: {differences(plan.facts, theirs)}"
+        remedy = f"wait for it, or choose another --out; if no such job runs any more, delete {out / PLAN}"
+        raise OutputError(out, fault, remedy)
 
 
 def _footers(out: Path, names: list[str]) -> Iterator[tuple[str, Footer]]:

@@ -342,9 +342,10 @@ def restat(
     with locked(folder):
         known = _whole_manifest(folder)
         sha256 = {shard.path: shard.sha256 for shard in known.shards} if known else {}
-        names, plan, source, embodiment = (
-            (list(sha256), known.plan, known.source, known.embodiment) if known else _as_found(folder)
-        )
+        if known:
+            names, plan, source, embodiment = list(sha256), known.plan, known.source, known.embodiment
+        else:
+            names, plan, source, embodiment = _as_found(folder)
         spec = TokenizerSpec.from_json(plan["tokenizer"])
         derived = derive(folder, names, embodiment, spec, plan, source, sha256)
         manifest = derived.manifest
