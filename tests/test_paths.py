@@ -14,13 +14,11 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.conversion.estimate import estimate
 from hma_data.conversion.job import convert, convert_share, plan_conversion
 from hma_data.conversion.output import Share
-from hma_data.conversion.plan import Settings
+from hma_data.conversion.plan import Settings, estimate
 from hma_data.conversion.recipe import load_jobs
-from hma_data.conversion.restat import restat
-from hma_data.conversion.rewrite import merge, split
+from hma_data.conversion.rewrite import merge, restat, split
 from hma_data.errors import HMAError, UsageError
 from hma_data.inspection.doctor import examine
 from hma_data.inspection.infer import infer
@@ -29,10 +27,9 @@ from hma_data.lab import record
 from hma_data.loading import dataset as loader
 from hma_data.registry import catalog as registry
 from hma_data.registry.embodiment import Embodiment, find
-from hma_data.shards.info import describe
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.memmap import export
-from hma_data.shards.preview import preview, tokenizer_of
+from hma_data.shards.preview import describe, preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import detect, open_source
@@ -386,11 +383,11 @@ def test_home_is_meant_by_a_tilde_in_any_form(tmp_path: Path, monkeypatch: pytes
 # -- the annotations of what is public
 
 PUBLIC = (
-    "hma_data.conversion.estimate", "hma_data.conversion.job", "hma_data.conversion.recipe",
-    "hma_data.conversion.restat", "hma_data.conversion.rewrite", "hma_data.inspection.doctor",
+    "hma_data.conversion.job", "hma_data.conversion.recipe",
+    "hma_data.conversion.plan", "hma_data.conversion.rewrite", "hma_data.inspection.doctor",
     "hma_data.inspection.infer", "hma_data.inspection.inspect", "hma_data.lab", "hma_data.loading.dataset",
     "hma_data.loading.mixture", "hma_data.registry.catalog", "hma_data.registry.embodiment",
-    "hma_data.shards.info", "hma_data.shards.manifest", "hma_data.shards.memmap", "hma_data.shards.preview",
+    "hma_data.shards.manifest", "hma_data.shards.memmap", "hma_data.shards.preview",
     "hma_data.shards.reader", "hma_data.shards.verify", "hma_data.sources.bags.source",
     "hma_data.sources.base", "hma_data.sources.hands.models", "hma_data.sources.hands.preview",
     "hma_data.sources.hands.scan", "hma_data.sources.hands.source", "hma_data.sources.hdf5.source",
@@ -406,10 +403,12 @@ PUBLIC = (
 )  # fmt: skip
 INNER = {  # take what a public function has made of a path already
     "hma_data.registry.embodiment": {"todos"},
+    "hma_data.conversion.plan": {"make_plan"},
     "hma_data.lab": {"written_beside"},
     "hma_data.registry.catalog": {"file_id"},
     "hma_data.shards.manifest": {
         "damaged_files",
+        "shard_sizes",
         "stored_embodiment",
         "derive",
         "finish",

@@ -69,7 +69,7 @@ def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
     each = max(1, settings["shard_frames"] // settings["episode"])
     first = folder / _name(0)
     _write_shard(first, robot, spec, plan, min(each, episodes), settings["episode"], number)
-    footer, row_groups = read_footer(first, str(first))
+    footer, row_groups = read_footer(first)
     sha256, size = file_sha256(first), first.stat().st_size
     gathered, files = Gathered("generated"), []
     for shard in range(-(-episodes // each)):

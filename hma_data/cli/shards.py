@@ -34,7 +34,7 @@ def shards_info(folder: Folder, json: Json = False) -> None:
 
     Example: hma shards info shards/my_arm
     """
-    from hma_data.shards.info import describe
+    from hma_data.shards.preview import describe
 
     facts = describe(folder)
     if json:
@@ -196,7 +196,7 @@ def shards_restat(folder: Folder, workers: Workers = None, json: Json = False) -
 
     Example: hma shards restat shards/my_arm
     """
-    from hma_data.conversion.restat import restat
+    from hma_data.conversion.rewrite import restat
 
     with progress("restat", unit="MB") as update:
         manifest = restat(folder, workers=workers, on_progress=_in(update, 1e6))

@@ -2,19 +2,40 @@
 
 The extended plan lists the hashes of the plans before it (`extends`). New shards carry the hash of the
 extended plan.
+
+A file that holds several episodes changes when one is added. That does not tell whether the other episodes
+changed; the hash of each episode's content does. A worker notes it before it tokenizes the episode. It covers
+all numbers, times and texts, and three pictures a camera.
 """
 
+import hashlib
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hma_data.conversion.plan import Plan, ShardUnit, differences, digest, pack, shard_size
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.conversion.plan import Plan, ShardUnit, differences, pack, shard_size
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.episode import Clip
+from hma_data.episodes.images import prepared
 from hma_data.errors import EpisodeError, OutputError
-from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest, damaged_files
-from hma_data.sources.base import EpisodeRef
-from hma_data.storage.remote import RemotePath, parquet_file
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import (
+    EPISODES,
+    QUARANTINE,
+    SPLITS,
+    Manifest,
+    damaged_files,
+    digest,
+    shard_sizes,
+)
+from hma_data.shards.schema import RowLayout
+from hma_data.sources.base import EpisodeRef, Source
+from hma_data.storage.remote import parquet_file
 
 log = logging.getLogger(__name__)
 
@@ -26,12 +47,15 @@ def hashes(facts: dict[str, Any]) -> set[str]:
     return {facts["hash"], *facts.get("extends", ())}
 
 
+def ways(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the facts that a set and its extension must share; --limit and --shard-frames may differ."""
+    ways = {key: value for key, value in facts.items() if key not in _OF_THE_CUT}
+    free = ("limit", "shard_frames")
+    return ways | {"settings": {key: value for key, value in ways["settings"].items() if key not in free}}
+
+
 def extended(
-    out: Path,
-    base: Manifest,
-    plan: Plan,
-    shard_frames: int | None,
-    content: Callable[[EpisodeRef], str],
+    out: Path, base: Manifest, plan: Plan, shard_frames: int | None, content: Callable[[EpisodeRef], str]
 ) -> Plan:
     """Return the plan of `base` with the episodes that are new in `plan`.
 
@@ -40,9 +64,8 @@ def extended(
         base: its manifest.
         plan: of the recordings as they are now, made as for an empty folder.
         shard_frames: frames a shard, about.
-        content: returns the hash of an episode as it is recorded now; see
-            `hma_data.conversion.episode_hash`. It is called where the fingerprint differs, as when a
-            file has grown.
+        content: returns the hash of an episode as it is recorded now, see `content_of`. It is called where
+            the fingerprint differs, as when a file has grown.
 
     Returns:
         a plan whose units are the new shards alone; where there are none, its facts are those of `base`.
@@ -51,14 +74,12 @@ def extended(
         OutputError: the set was made in another way or lacks something, or one of its episodes has changed.
     """
     _refuse_damaged(out, base)
-    here, there = ways(plan.facts), ways(base.plan)
-    if here != there:
-        raise OutputError(
-            out,
-            f"cannot be extended; different: {differences(plan.facts, base.plan)}",
-            "convert with the same settings, or choose another --out",
-        )
-    fingerprints, contents = _known(out)
+    if ways(plan.facts) != ways(base.plan):
+        fault = f"cannot be extended; different: {differences(plan.facts, base.plan)}"
+        raise OutputError(out, fault, "convert with the same settings, or choose another --out")
+    known = parquet_file(out / EPISODES).read(columns=["id", "fingerprint", "content"]).to_pydict()
+    fingerprints = dict(zip(known["id"], known["fingerprint"]))
+    contents = dict(zip(known["id"], known.get("content", ())))  # sets of older releases have none
     refused = {json.loads(line)["id"] for line in (out / QUARANTINE).read_text("utf-8").splitlines()}
     placed = ((index, ref, unit.split) for unit in plan.units for index, ref in unit.episodes)
     now = [(ref, split) for _, ref, split in sorted(placed, key=lambda item: item[0])]
@@ -72,68 +93,41 @@ def extended(
 
 def _refuse_damaged(out: Path, base: Manifest) -> None:
     """Raise OutputError unless all shards have their size and the derived files have their bytes."""
-    sizes = out.listing() if isinstance(out, RemotePath) else None
+    sizes = shard_sizes(out)
     for shard in base.shards:
-        path = out / shard.path
-        size = _size(path) if sizes is None else sizes.get(shard.path, -1)
-        if size != shard.bytes:
-            fault = "is missing" if size < 0 else f"has {size:,} bytes, the manifest says {shard.bytes:,}"
-            remedy = "without --extend it is made again, if it is deleted and the recordings are as they were"
-            if "extends" in base.plan:
-                remedy = "put back a copy of it, or --overwrite to start anew"
-            raise OutputError(path, fault, remedy)
-    damaged = damaged_files(out, base)
-    if damaged:
+        if sizes.get(shard.path) != shard.bytes:
+            fault = f"is missing, or has other than the {shard.bytes:,} bytes of the manifest"
+            raise OutputError(out / shard.path, fault, "put back a copy of it, or --overwrite to start anew")
+    if damaged := damaged_files(out, base):
         remedy = f"hma shards restat {out} writes it anew from the shards"
         raise OutputError(damaged[0], "is missing, or changed since the manifest was written", remedy)
 
 
-def _size(path: Path) -> int:
-    """Return the bytes of a local file; -1 where there is none."""
-    return path.stat().st_size if path.is_file() else -1
-
-
-def _known(out: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Return id -> fingerprint and id -> content of a set's episodes; older sets state no contents."""
-    file = parquet_file(out / EPISODES)
-    names = [name for name in ("id", "fingerprint", "content") if name in file.schema_arrow.names]
-    known = file.read(columns=names).to_pydict()
-    fingerprints = dict(zip(known["id"], known["fingerprint"], strict=True))
-    return fingerprints, dict(zip(known["id"], known.get("content", ())))
-
-
 def _refuse_changed(
-    out: Path, refs: Sequence[EpisodeRef], contents: dict[str, str], content: Callable[[EpisodeRef], str]
+    out: Path, refs: list[EpisodeRef], contents: dict[str, str], content: Callable[[EpisodeRef], str]
 ) -> None:
     """Raise OutputError unless all episodes whose files have changed still have the same content."""
 
     def is_changed(ref: EpisodeRef) -> bool:
         try:
-            return content(ref) != contents[ref.id]
+            return not contents.get(ref.id) or content(ref) != contents[ref.id]
         except EpisodeError as fault:
             log.info("%s", fault)
             return True
 
-    unknown = [ref.id for ref in refs if not contents.get(ref.id)]
-    if refs and not unknown:
-        log.info("%s: a file has changed; %s known episodes are looked at", out, f"{len(refs):,}")
-    changed = unknown or [ref.id for ref in refs if is_changed(ref)]
-    if changed:
-        what = "of its episodes were recorded anew"
-        if unknown:
-            what = "of its episodes lie in files that have changed, and it does not say what they held"
-        raise OutputError(
-            out,
-            f"cannot be extended: {len(changed):,} {what}, first {changed[0]!r}",
-            "--overwrite to start anew, or give the new episodes other names",
-        )
+    if refs:
+        log.info("%s: a file has changed; %s known episodes are read again", out, f"{len(refs):,}")
+    if changed := [ref.id for ref in refs if is_changed(ref)]:
+        what = "were recorded anew" if contents.get(changed[0]) else "cannot be compared with changed files"
+        fault = f"cannot be extended: {len(changed):,} of its episodes {what}, first {changed[0]!r}"
+        raise OutputError(out, fault, "--overwrite to start anew, or give the new episodes other names")
 
 
 def _with(base: Manifest, new: list[tuple[EpisodeRef, str]], first: int, shard_frames: int | None) -> Plan:
     target = shard_frames or shard_size(sum(ref.frames for ref, _ in new))
     numbered = [(first + i, ref, split) for i, (ref, split) in enumerate(new)]
     units: list[ShardUnit] = []
-    for split in ("train", "val"):
+    for split in SPLITS:
         begun = sum(shard.split == split for shard in base.shards)
         mine = [(i, ref) for i, ref, its in numbered if its == split]
         units += pack(split, mine, target, begun)
@@ -143,12 +137,80 @@ def _with(base: Manifest, new: list[tuple[EpisodeRef, str]], first: int, shard_f
         "recording": digest([base.plan["recording"], [(ref.id, ref.fingerprint) for ref, _ in new]]),
         "shards": digest([base.plan["shards"], [(u.name, [i for i, _ in u.episodes]) for u in units]]),
     }
-    return Plan(tuple(units), {**facts, "hash": digest(facts)})
+    return Plan.of(units, facts)
 
 
-def ways(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the facts that a set and its extension must share; --limit and --shard-frames may differ."""
-    ways = {key: value for key, value in facts.items() if key not in _OF_THE_CUT}
-    settings = ways["settings"]
-    free = ("limit", "shard_frames")
-    return ways | {"settings": {key: value for key, value in settings.items() if key not in free}}
+# -- the hash of an episode
+
+
+class Content:
+    """The hash of an episode; the caller adds pictures camera after camera, in their order.
+
+    Args:
+        kept: (N,) frames of the clip that become rows of a camera.
+    """
+
+    def __init__(self, clip: Clip, kept: NDArray[np.int64]) -> None:
+        self._digest = hashlib.sha256(f"{clip.episode.instruction}\n{clip.episode.success}".encode())
+        for numbers in (clip.timestamps, clip.actions, clip.states, clip.action_known, clip.state_known):
+            self._add(numbers)
+        self._looked_at = looked_at(len(kept))
+
+    def add(self, start: int, frames: NDArray[np.uint8]) -> None:
+        """Add the next pictures (n, H, W, 3) of a camera; the first of them is its row `start`."""
+        for row in self._looked_at:
+            if start <= row < start + len(frames):
+                self._add(frames[row - start])
+
+    def text(self) -> str:
+        """Return the hash as sixteen hex digits."""
+        return self._digest.hexdigest()[:16]
+
+    def _add(self, numbers: NDArray[Any] | None) -> None:
+        if numbers is None:
+            self._digest.update(b"none")
+        else:
+            self._digest.update(f"{numbers.dtype} {numbers.shape}".encode())
+            self._digest.update(np.ascontiguousarray(numbers).data)
+
+
+def looked_at(rows: int) -> list[int]:
+    """Return the rows of a camera whose pictures are hashed: the first, the middle and the last."""
+    return sorted({0, rows // 2, rows - 1})
+
+
+def kept_frames(clip: Clip, layout: RowLayout) -> NDArray[np.int64]:
+    """Return the frames (N,) of the clip that become rows of a camera.
+
+    Raises:
+        EpisodeError: the clip is shorter than a stride.
+    """
+    kept = layout.kept(len(clip))
+    if not len(kept):
+        fault = f"has {len(clip)} frames, fewer than one stride of {layout.frame_stride}"
+        raise EpisodeError(clip.episode.id, fault)
+    return kept
+
+
+def content_of(
+    source: Source, uri: str, episode_id: str, embodiment: Embodiment, facts: dict[str, Any]
+) -> str:
+    """Return the hash of an episode as it is recorded now; see `Content`.
+
+    Args:
+        facts: of the plan: which cameras and frames, and the tokenizer's spec.
+
+    Raises:
+        EpisodeError: the episode cannot be read any more.
+    """
+    layout = RowLayout.of_plan(facts, embodiment)
+    spec = layout.tokenizer
+    clip = to_clip(source.read(uri, episode_id, embodiment), embodiment)
+    kept = kept_frames(clip, layout)
+    content = Content(clip, kept)
+    for name in layout.cameras:
+        for row in looked_at(len(kept)):
+            indices = clip.frame_indices[name][kept[row : row + 1]]
+            camera, stream = embodiment.camera(name), clip.episode.streams[name]
+            content.add(row, prepared(stream, indices, camera, spec.image_size, spec.resize_filter))
+    return content.text()

@@ -6,23 +6,17 @@ manifest from the footers at the end. An episode that cannot be used goes to qua
 the job goes on.
 """
 
-import json
 import re
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import pyarrow.parquet as pq
-
 from hma_data.conversion.engines.base import LIMITS, Limits, Retry
 from hma_data.conversion.engines.local import run as run_local
-from hma_data.conversion.episode_hash import content_of
-from hma_data.conversion.extend import extended
-from hma_data.conversion.hub_output import HubOutput
+from hma_data.conversion.extend import content_of, extended
 from hma_data.conversion.output import (
     Journal,
     Made,
@@ -32,19 +26,21 @@ from hma_data.conversion.output import (
     finished_shards,
     known_hashes,
     locked,
+    refuse_other,
     remove_notes,
-    shard_names,
 )
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
+from hma_data.conversion.publish import HubOutput
 from hma_data.conversion.worker import Job, MakeWork, Tick
 from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, damaged_files, finish
-from hma_data.shards.schema import flag_counts
+from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.schema import flag_totals
 from hma_data.sources.base import EpisodeRef, of_another_format, open_source
 from hma_data.storage.files import remove_parts
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.remote import parquet_input, place
+from hma_data.storage.remote import parquet_file, place
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 
@@ -168,22 +164,21 @@ def convert(
         folder,
         settings or Settings(),
         workers,
-        engine,
         weights,
         device,
         limits,
+        engine,
     )
     with locked(folder):
         if overwrite:
             clear(folder)
         plan, base = conversion.plan(extend)
-        if hub:
-            hub.prepare()
-            if not overwrite:
-                hub.refuse_other(plan.facts)
+        if hub and hub.prepare() and not overwrite:
+            refuse_other(out, plan)
         done, made = conversion.make(plan, base, None, on_progress)
         manifest = conversion.finish(plan, base, bool(made))
-        reasons, flags = _reasons(folder), _flags(folder)
+        flags = flag_totals(parquet_file(folder / EPISODES).read(columns=["flags"])["flags"])
+        reasons = _reasons(folder)
         if not any(split["episodes"] for split in manifest.splits.values()):
             clear(folder)
             worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
@@ -218,12 +213,12 @@ def convert_share(
     """
     begun, out = time.monotonic(), place(out)
     conversion = _Conversion(
-        embodiment, source, tokenizer, out, settings or Settings(), workers, "local", weights, device, limits
+        embodiment, source, tokenizer, out, settings or Settings(), workers, weights, device, limits
     )
     with locked(out, share):
         plan, base = conversion.plan(extend)
         done, made = conversion.make(plan, base, share, on_progress)
-    missing = len({unit.name for unit in plan.units} - shard_names(out))
+    missing = len({unit.name for unit in plan.units} - shard_sizes(out).keys())
     if not missing:
         with suppress(OutputError), locked(out):  # others are still writing: the last of them finishes
             missing = len(plan.units) - len(finished_shards(out, plan, base, shared=False))
@@ -232,66 +227,55 @@ def convert_share(
     return Shared(out, done, made, missing, time.monotonic() - begun)
 
 
+@dataclass
 class _Conversion:
     """The common part of `convert` and `convert_share`."""
 
-    def __init__(
-        self,
-        embodiment: Embodiment,
-        source: StrPath | None,
-        tokenizer: str | Tokenizer,
-        out: Path,
-        settings: Settings,
-        workers: int,
-        engine: str,
-        weights: StrPath | None,
-        device: str,
-        limits: Limits,
-    ) -> None:
-        self._embodiment, self._out, self._settings = embodiment, out, settings
-        self._named = isinstance(tokenizer, str)
-        alone = not self._named or str(out).startswith("memory:")  # no other process sees them
-        self._workers, self._engine, self._limits = 0 if alone else workers, engine, limits
-        self._weights, self._device = None if weights is None else as_text(weights), device
-        self._tokenizer = (
-            get_tokenizer(tokenizer, weights=weights, device=device)
-            if isinstance(tokenizer, str)
-            else tokenizer
-        )
-        self._whole, self.uri = plan_conversion(embodiment, source, self._tokenizer, settings)
+    embodiment: Embodiment
+    source: StrPath | None
+    tokenizer: str | Tokenizer
+    out: Path
+    settings: Settings
+    workers: int
+    weights: StrPath | None
+    device: str
+    limits: Limits
+    engine: str = "local"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.tokenizer, str):
+            self._opened = get_tokenizer(self.tokenizer, weights=self.weights, device=self.device)
+        else:
+            self._opened = self.tokenizer
+        if self._opened is self.tokenizer or str(self.out).startswith("memory:"):
+            self.workers = 0  # no other process sees them
+        self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._opened, self.settings)
 
     def plan(self, extend: bool) -> tuple[Plan, Manifest | None]:
         """Return the plan, and the manifest it extends or None.
 
         A set that was extended before can be continued without `extend`.
         """
-        base = base_manifest(self._out)
+        base = base_manifest(self.out)
         if base is None or not (extend or "extends" in base.plan):
             return self._whole, None
-        source = open_source(self._embodiment.source.format)
+        source = open_source(self.embodiment.source.format)
 
         def content(ref: EpisodeRef) -> str:
-            return content_of(source, self.uri, ref.id, self._embodiment, self._whole.facts)
+            return content_of(source, self.uri, ref.id, self.embodiment, self._whole.facts)
 
-        plan = extended(self._out, base, self._whole, self._settings.shard_frames, content)
+        plan = extended(self.out, base, self._whole, self.settings.shard_frames, content)
         if plan.units and not extend:
-            raise OutputError(
-                self._out,
-                f"lacks {plan.episodes:,} episodes that the recording has now",
-                "--extend adds them",
-            )
+            fault = f"lacks {plan.episodes:,} episodes that the recording has now"
+            raise OutputError(self.out, fault, "--extend adds them")
         return plan, base
 
     def make(
-        self,
-        plan: Plan,
-        base: Manifest | None,
-        share: Share | None,
-        on_progress: Callable[[Progress], None],
+        self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: Callable[[Progress], None]
     ) -> tuple[int, int]:
         """Make the shards that are missing; return how many shards were kept and how many were made."""
         mine = plan.units[share.index :: share.count] if share else plan.units
-        there = finished_shards(self._out, plan, base, share is not None)
+        there = finished_shards(self.out, plan, base, share is not None)
         todo = [unit for unit in mine if unit.name not in there]
         kept = [unit for unit in mine if unit.name in there]
         progress = Progress(
@@ -303,28 +287,33 @@ class _Conversion:
         )
         on_progress(progress)
         if todo:
-            with Journal(self._out, share) as journal:
+            with Journal(self.out, share) as journal:
                 for made in self._run(todo, plan, _Counter(progress, on_progress)):
                     journal.add(made)
                     on_progress(progress)
         return progress.kept_shards, len(todo)
 
     def _run(self, todo: list[ShardUnit], plan: Plan, on_event: "_Counter") -> Iterator[Made]:
-        name = self._tokenizer.spec.name
         job = Job(
-            self.uri, self._embodiment, name, self._weights, self._device, self._out.absolute(), plan.facts
+            self.uri,
+            self.embodiment,
+            self._opened.spec.name,
+            None if self.weights is None else as_text(self.weights),
+            self.device,
+            self.out.absolute(),
+            plan.facts,
         )
-        if self._engine == "ray":
+        if self.engine == "ray":
             from hma_data.conversion.engines.ray import run as run_ray
 
-            gpus = 1.0 if self._device.startswith("cuda") else 0.0
-            return run_ray(todo, MakeWork(job), self._workers, on_event, self._limits, gpus)
-        make_work = MakeWork(job, None if self._workers else self._tokenizer)
-        return run_local(todo, make_work, self._workers, on_event, self._limits)
+            gpus = 1.0 if self.device.startswith("cuda") else 0.0
+            return run_ray(todo, MakeWork(job), self.workers, on_event, self.limits, gpus)
+        make_work = MakeWork(job, None if self.workers else self._opened)
+        return run_local(todo, make_work, self.workers, on_event, self.limits)
 
     def finish(self, plan: Plan, base: Manifest | None, changed: bool) -> Manifest:
         """Return the manifest; write it and the other files derived from footers, unless nothing changed."""
-        out = self._out
+        out = self.out
         remove_parts(out)  # of workers that died
         if not changed and (out / MANIFEST).is_file():
             manifest = Manifest.load(out)
@@ -336,8 +325,8 @@ class _Conversion:
         manifest = finish(
             out,
             names,
-            self._embodiment,
-            self._tokenizer.spec,
+            self.embodiment,
+            self._opened.spec,
             plan.facts,
             self.uri,
             hashes={**{shard.path: shard.sha256 for shard in kept}, **known_hashes(out)},
@@ -349,8 +338,7 @@ class _Conversion:
 def _reasons(out: Path) -> dict[str, int]:
     """Return reason -> number of refused episodes; reasons that differ in the episode's id alone are one."""
     told: dict[str, list[str]] = {}
-    for line in (out / QUARANTINE).read_text(encoding="utf-8").splitlines():
-        item = json.loads(line)
+    for item in ShardSet(out).refused():
         text = plain = f"{item['type']}: {item['message']}"
         if any(letter.isdigit() for letter in item["id"]):  # a numbered id would keep equal reasons apart
             text = re.sub(rf"(?<!\w){re.escape(item['id'])}(?!\w)", "<episode>", text)
@@ -358,35 +346,21 @@ def _reasons(out: Path) -> dict[str, int]:
     return {text if len(plain) > 1 else plain[0]: len(plain) for text, plain in told.items()}
 
 
-def _flags(out: Path) -> dict[str, int]:
-    """Return the counts of all episodes' flags, added up."""
-    totals: Counter[str] = Counter()
-    for item in (
-        pq.read_table(parquet_input(out / EPISODES), columns=["flags"])["flags"].value_counts().to_pylist()
-    ):
-        for name, count in flag_counts(item["values"] or "").items():
-            totals[name] += count * item["counts"]
-    return dict(sorted(totals.items()))
-
-
-_COUNTED = ("frames", "episodes", "quarantined", "bytes")
-
-
 class _Counter:
     """A counter of what units report; when a unit is retried, its earlier counts are taken back."""
 
     def __init__(self, progress: Progress, on_progress: Callable[[Progress], None]) -> None:
         self._progress, self._on_progress = progress, on_progress
-        self._by_unit: dict[int, list[int]] = {}
+        self._by_unit: dict[int, dict[str, int]] = {}
 
     def __call__(self, unit: int, event: Tick | Retry) -> None:
-        mine = self._by_unit.setdefault(unit, [0] * len(_COUNTED))
+        counts = self._by_unit.setdefault(unit, dict.fromkeys(vars(Tick()), 0))
         if isinstance(event, Retry):
             self._progress.retries.append(event.reason)
-            change = [-count for count in mine]
+            change = {name: -count for name, count in counts.items()}
         else:
-            change = [getattr(event, name) for name in _COUNTED]
-        for i, name in enumerate(_COUNTED):
-            mine[i] += change[i]
-            setattr(self._progress, name, getattr(self._progress, name) + change[i])
+            change = vars(event)
+        for name, count in change.items():
+            counts[name] += count
+            setattr(self._progress, name, getattr(self._progress, name) + count)
         self._on_progress(self._progress)

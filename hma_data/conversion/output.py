@@ -3,10 +3,8 @@
 The folder is locked while the conversion runs. A folder of a store is claimed for the plan instead.
 """
 
-import errno
 import fcntl
 import json
-import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -19,14 +17,23 @@ from typing import Any
 from hma_data.conversion.extend import hashes, ways
 from hma_data.conversion.plan import Plan, differences
 from hma_data.errors import HMAError, OutputError, StorageAwayError
-from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SPLITS, WORKING, Manifest
+from hma_data.shards.manifest import (
+    EMBODIMENT,
+    EPISODES,
+    MANIFEST,
+    QUARANTINE,
+    SPLITS,
+    WORKING,
+    Manifest,
+    shard_sizes,
+)
 from hma_data.shards.schema import Footer, read_footer
 from hma_data.storage.files import PART, remove_parts
 from hma_data.storage.remote import RemotePath, create_bytes, is_remote, put_bytes
 
 LOCK, JOURNAL, PLAN = WORKING
 READERS, JOURNAL_S = 16, 20.0  # in a store: footers read at a time, seconds between writes of a journal
-OURS = {"train", "val", MANIFEST, EPISODES, EMBODIMENT, QUARANTINE}
+OURS = {*SPLITS, MANIFEST, EPISODES, EMBODIMENT, QUARANTINE}
 
 
 @dataclass(frozen=True)
@@ -55,22 +62,12 @@ def locked(out: Path, share: Share | None = None) -> Iterator[None]:
     Raises:
         OutputError: another job is writing, or the folder cannot be written.
     """
-    if not isinstance(out, RemotePath):
-        with _locked_here(out, share):
-            yield
+    if isinstance(out, RemotePath):
+        if out.scheme == "hf":
+            remedy = "write a folder, then upload it"
+            raise OutputError(out, "is a repository of the hub, which takes whole conversions only", remedy)
+        yield
         return
-    if out.scheme == "hf":
-        raise OutputError(
-            out,
-            "a hub's repository is written by one whole hma convert only",
-            "write a folder, then upload it",
-        )
-    yield
-
-
-@contextmanager
-def _locked_here(out: Path, share: Share | None) -> Iterator[None]:
-    made = False
     with ExitStack() as held:
         try:
             made = not out.exists()
@@ -78,14 +75,13 @@ def _locked_here(out: Path, share: Share | None) -> Iterator[None]:
             held.enter_context(_lock(out / LOCK, fcntl.LOCK_SH if share else fcntl.LOCK_EX))
             if share:
                 held.enter_context(_lock(out / f"{LOCK}-{share.name}", fcntl.LOCK_EX))
-        except OSError as fault:
-            if fault.errno not in (errno.EACCES, errno.EAGAIN) or not (out / LOCK).exists():
-                reason = fault.strerror or str(fault)
-                raise OutputError(out, f"cannot be written: {reason}", "choose another --out") from fault
+        except BlockingIOError as fault:
             what = f"share {share.name} of it" if share else "it"
-            raise OutputError(
-                out, f"another job is writing {what}", "wait for it, or choose another --out"
-            ) from fault
+            remedy = "wait for it, or choose another --out"
+            raise OutputError(out, f"another job is writing {what}", remedy) from fault
+        except OSError as fault:
+            reason = fault.strerror or str(fault)
+            raise OutputError(out, f"cannot be written: {reason}", "choose another --out") from fault
         try:
             yield
         finally:
@@ -95,26 +91,15 @@ def _locked_here(out: Path, share: Share | None) -> Iterator[None]:
 
 @contextmanager
 def _lock(path: Path, kind: int) -> Iterator[None]:
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+    with path.open("a") as file:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
         if not path.exists():  # its last owner deleted it between the two calls above
-            raise OSError(errno.EAGAIN, "")
+            raise BlockingIOError
         try:
             yield
         finally:
-            if kind == fcntl.LOCK_EX or _nobody_else(handle):
+            if kind == fcntl.LOCK_EX:
                 path.unlink(missing_ok=True)
-    finally:
-        os.close(handle)
-
-
-def _nobody_else(handle: int) -> bool:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 # -- what is there
@@ -136,17 +121,11 @@ def clear(out: Path) -> None:
 
 
 def _refuse_foreign(out: Path) -> None:
-    foreign = [item.name for item in out.iterdir() if item.name not in OURS and not _working(item.name)]
+    names = {item.name for item in out.iterdir()} - OURS
+    foreign = sorted(name for name in names if not (name.endswith(PART) or name.startswith(WORKING)))
     if foreign:
-        raise OutputError(
-            out,
-            f"is not a shard set: it holds {', '.join(sorted(foreign)[:3])}",
-            "choose an empty or new --out",
-        )
-
-
-def _working(name: str) -> bool:
-    return name.endswith(PART) or name.startswith(WORKING)
+        fault = f"is not a shard set: it holds {', '.join(foreign[:3])}"
+        raise OutputError(out, fault, "choose an empty or new --out")
 
 
 def base_manifest(out: Path) -> Manifest | None:
@@ -173,21 +152,26 @@ def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) 
     kept = {shard.path for shard in base.shards} if base else set()
     planned = {unit.name for unit in plan.units}
     done: set[str] = set()
-    for name, footer in _footers(out, sorted(shard_names(out) - kept)):
+    for name, footer in _footers(out, sorted(shard_sizes(out).keys() - kept)):
         if footer.plan["hash"] == plan.facts["hash"] and name in planned:
             done.add(name)
         elif base and footer.plan.get("extends") and hashes(base.plan) & hashes(footer.plan):
             (out / name).unlink()  # of an unfinished extension that differs from this one
         else:
-            raise _other(out, plan, footer.plan)
+            raise other_plan(out, plan.facts, footer.plan)
     if not done and base is None and (out / MANIFEST).is_file():
-        theirs = Manifest.load(out).plan
-        if theirs["hash"] != plan.facts["hash"]:
-            raise _other(out, plan, theirs)
+        refuse_other(out, plan)
     if isinstance(out, RemotePath) and done != planned:
         create_bytes(json.dumps(plan.facts).encode(), out / PLAN)
         _refuse_claimed(out, plan)  # two jobs may have come at once
     return done
+
+
+def refuse_other(out: Path, plan: Plan) -> None:
+    """Raise OutputError unless the set in a folder is of this plan, or of one that it extends."""
+    theirs = Manifest.load(out).plan
+    if theirs["hash"] not in hashes(plan.facts):
+        raise other_plan(out, plan.facts, theirs)
 
 
 def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
@@ -197,16 +181,9 @@ def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
     except FileNotFoundError:
         return
     if theirs["hash"] != plan.facts["hash"]:
-        raise OutputError(
-            out,
-            f"another conversion is being written there; different: {differences(plan.facts, theirs)}",
-            f"wait for it, or choose another --out; where no such job runs any more, delete {out / PLAN}",
-        )
-
-
-def shard_names(out: Path) -> set[str]:
-    """Return the names of the files in the folders of the splits."""
-    return {path.relative_to(out).as_posix() for split in SPLITS for path in out.glob(f"{split}/[!.]*")}
+        fault = f"another conversion is being written there; different: {differences(plan.facts, theirs)}"
+        remedy = f"wait for it, or choose another --out; if no such job runs any more, delete {out / PLAN}"
+        raise OutputError(out, fault, remedy)
 
 
 def _footers(out: Path, names: list[str]) -> Iterator[tuple[str, Footer]]:
@@ -215,15 +192,16 @@ def _footers(out: Path, names: list[str]) -> Iterator[tuple[str, Footer]]:
     with ThreadPoolExecutor(readers) as pool:
         for start in range(0, len(names), 4 * readers):
             some = names[start : start + 4 * readers]
-            yield from zip(some, pool.map(lambda name: read_footer(out / name, str(out / name))[0], some))
+            yield from zip(some, pool.map(lambda name: read_footer(out / name)[0], some))
 
 
-def _other(out: Path, plan: Plan, theirs: dict[str, Any]) -> OutputError:
-    words = differences(plan.facts, theirs)
+def other_plan(out: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> OutputError:
+    """Return the error for a folder that holds the set of another plan."""
     remedy = "choose another --out, or --overwrite to start anew"
-    if ways(plan.facts) == ways(theirs):
+    if ways(ours) == ways(theirs):
         remedy = "--extend adds the episodes that are new, --overwrite starts anew"
-    return OutputError(out, f"belongs to another conversion; different: {words}", remedy)
+    fault = f"belongs to another conversion; different: {differences(ours, theirs)}"
+    return OutputError(out, fault, remedy)
 
 
 # -- the journal
@@ -280,13 +258,12 @@ class Journal:
 def known_hashes(out: Path) -> dict[str, str]:
     """Return shard -> sha256 for the shards in all journals whose size is unchanged; others must be read."""
     found: dict[str, str] = {}
-    sizes = out.listing() if isinstance(out, RemotePath) else None
+    sizes = shard_sizes(out)
     for path in sorted(out.glob(f"{JOURNAL}*")):
         for line in path.read_text(encoding="utf-8").splitlines():
-            with suppress(ValueError, TypeError, OSError):  # a line cut short by a kill
+            with suppress(ValueError, TypeError):  # a line cut short by a kill
                 made = Made(**json.loads(line))
-                size = (out / made.name).stat().st_size if sizes is None else sizes.get(made.name)
-                if size == made.bytes:
+                if sizes.get(made.name) == made.bytes:
                     found[made.name] = made.sha256
     return found
 

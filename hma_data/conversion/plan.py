@@ -1,20 +1,32 @@
 """Plan which episode goes into which shard, before anything is decoded.
 
 The plan depends on the recording, the embodiment, the tokenizer and the settings alone, never
-on the number of workers, so that every run and every machine makes the same files.
+on the number of workers, so that every run and every machine makes the same files. `estimate` says what the
+work will cost.
 """
 
 import hashlib
 import json
+import math
+import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from hma_data.errors import SourceError, UsageError
-from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import EpisodeRef
-from hma_data.tokenizers.base import TokenizerSpec
+import numpy as np
 
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.images import prepare
+from hma_data.errors import HMAError, SourceError, UsageError
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import digest, plan_hash
+from hma_data.shards.schema import RowLayout
+from hma_data.sources.base import EpisodeRef, open_source
+from hma_data.storage.paths import StrPath
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
+
+FRAMES, TRIED = 64, 5  # of an estimate: pictures tokenized, episodes tried
 SMALLEST_SHARD, LARGEST_SHARD, SHARDS_WANTED = 4_096, 170_000, 32  # frames; 170,000 are about 100 MB
 
 
@@ -46,6 +58,10 @@ class Settings:
         if self.shard_frames is not None and self.shard_frames < 1:
             raise UsageError("--shard-frames", f"must be at least 1, is {self.shard_frames}")
 
+    def frame_stride(self, embodiment: Embodiment) -> int:
+        """Return the recorded steps a row; the plan, and with it every shard, states this number."""
+        return embodiment.stride if self.frames == "strided" else 1
+
 
 @dataclass(frozen=True)
 class ShardUnit:
@@ -67,6 +83,12 @@ class Plan:
 
     units: tuple[ShardUnit, ...]
     facts: dict[str, Any]
+
+    @classmethod
+    def of(cls, units: Sequence[ShardUnit], facts: dict[str, Any]) -> "Plan":
+        """Return the plan of these units; its facts get their hash."""
+        plain = json.loads(json.dumps(facts))  # as a footer gives them back
+        return cls(tuple(units), {**plain, "hash": plan_hash(plain)})
 
     @property
     def episodes(self) -> int:
@@ -99,11 +121,9 @@ def make_plan(
     if not refs:
         raise SourceError(source, "has no episodes")
     refs = list(refs)[: settings.limit]
-    seen: set[str] = set()
-    for ref in refs:
-        if ref.id in seen:
-            raise SourceError(source, f"has two episodes with id {ref.id!r}")
-        seen.add(ref.id)
+    ((name, count),) = Counter(ref.id for ref in refs).most_common(1)
+    if count > 1:
+        raise SourceError(source, f"has two episodes with id {name!r}")
     cameras = [embodiment.camera(name).name for name in settings.cameras] or [embodiment.primary_camera.name]
 
     splits = choose_splits(refs, settings.val_fraction, settings.seed)
@@ -119,13 +139,12 @@ def make_plan(
         "tokenizer": tokenizer.to_json(),
         "cameras": cameras,
         "frames": settings.frames,
-        "frame_stride": embodiment.stride if settings.frames == "strided" else 1,
+        "frame_stride": settings.frame_stride(embodiment),
         "settings": {**asdict(settings), "cameras": cameras},
         "recording": digest([(ref.id, ref.fingerprint) for ref in refs]),
         "shards": digest([(unit.name, [i for i, _ in unit.episodes]) for unit in units]),
     }
-    facts = json.loads(json.dumps(facts))  # the plain form, as a footer gives it back
-    return Plan(tuple(units), {**facts, "hash": digest(facts)})
+    return Plan.of(units, facts)
 
 
 def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float, seed: int) -> list[str]:
@@ -170,11 +189,6 @@ def _unit_interval(text: str) -> float:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") / 2**64
 
 
-def digest(value: Any) -> str:
-    """Return a hash of plain values as sixteen hex digits."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
-
-
 def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
     """Return the differences of two plans in words."""
     words = {
@@ -198,3 +212,62 @@ def _short(value: Any) -> str:
     if isinstance(value, dict):
         return f"{value['name']} {value.get('weights_sha256', '')[:8]}".strip() if "name" in value else ""
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+# -- the cost
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The estimated size and time of a conversion.
+
+    Attributes:
+        bytes: of all shards.
+        frames_per_second: of one worker, decoding included; None when no episode could be read.
+        seconds: in all, with the requested number of workers; None when no episode could be read.
+        fault: why no episode could be read.
+    """
+
+    bytes: int
+    frames_per_second: float | None
+    seconds: float | None
+    fault: str = ""
+
+
+def estimate(
+    plan: Plan, uri: StrPath, embodiment: Embodiment, tokenizer: Tokenizer, workers: int
+) -> Estimate:
+    """Estimate a conversion: tokenize some frames of the first readable episode, and scale up."""
+    layout = RowLayout.of_plan(plan.facts, embodiment)
+    rows = plan.frames // layout.frame_stride * len(layout.cameras)
+    size = int(rows * bytes_a_row(layout))
+    source = open_source(embodiment.source.format)
+    fault = ""
+    for _, ref in [item for unit in plan.units for item in unit.episodes][:TRIED]:
+        try:
+            begun = time.monotonic()
+            clip = to_clip(source.read(uri, ref.id, embodiment), embodiment)
+            camera = embodiment.camera(layout.cameras[0])
+            kept = layout.kept(len(clip))[:FRAMES]
+            raw = clip.frames_at(camera.name, kept)
+            tokenizer.encode(prepare(raw, camera, tokenizer.spec.image_size, tokenizer.spec.resize_filter))
+            rate = len(kept) / (time.monotonic() - begun)
+            return Estimate(size, rate, rows / rate / max(workers, 1))
+        except HMAError as refused:
+            fault = str(refused)
+    return Estimate(size, None, None, fault)
+
+
+def bytes_a_row(layout: RowLayout) -> float:
+    """Return the bytes of one row.
+
+    Tokens count with log2 of the vocabulary's size, latents and pixels with the size of their dtype, and
+    numbers with 4 bytes each.
+    """
+    spec = layout.tokenizer
+    h, w = spec.grid
+    if spec.kind == "discrete":
+        picture = h * w * math.ceil(math.log2(spec.vocab_size or 2)) / 8
+    else:
+        picture = h * w * (spec.channels or 1) * np.dtype(spec.dtype).itemsize
+    return picture + 4 * (layout.frame_stride * layout.widths["action"] + layout.widths.get("state", 0))

@@ -8,7 +8,6 @@
 The keys are the options of `hma convert`, with `_` for `-`.
 """
 
-from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
@@ -52,6 +51,14 @@ class ConversionJob(BaseModel):
         )
 
 
+class _Recipe(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    description: str = ""
+    defaults: dict[str, Any] = {}
+    jobs: list[dict[str, Any]] = Field(min_length=1)
+
+
 def job_of_options(**values: Any) -> ConversionJob:
     """Return the conversion that the command's options state.
 
@@ -76,41 +83,27 @@ def load_jobs(path: StrPath) -> list[ConversionJob]:
         RecipeError: it has an unknown key, a value of another type, or two jobs with one `out`.
     """
     path = as_path(path)
-    values = read_yaml(path, RecipeError)
-    if not isinstance(values, dict) or not isinstance(values.get("jobs"), list) or not values["jobs"]:
-        raise RecipeError(path, "holds no jobs", "expected `jobs:` with a list, see recipes/convert")
-    unknown = sorted(set(values) - {"defaults", "jobs", "description"})
-    if unknown:
-        raise RecipeError(path, f"unknown key {unknown[0]!r}", "allowed: defaults, jobs, description")
-    defaults = values.get("defaults") or {}
-    if not isinstance(defaults, dict):
-        raise RecipeError(path, "defaults must be a mapping of a job's keys")
-    jobs = [_job(defaults, item, f"{path}: jobs[{i}]") for i, item in enumerate(values["jobs"])]
-    _refuse_repeated([job.out for job in jobs], path)
+    recipe = _valid(_Recipe, read_yaml(path, RecipeError), str(path))
+    jobs: list[ConversionJob] = []
+    for number, item in enumerate(recipe.jobs):
+        job = _valid(ConversionJob, {**recipe.defaults, **item}, f"{path}: jobs[{number}]")
+        if any(job.out.absolute() == other.out.absolute() for other in jobs):
+            raise RecipeError(path, f"two jobs write {job.out}", "give each an out of its own")
+        jobs.append(job)
     return jobs
 
 
-def _job(defaults: dict[str, Any], item: Any, where: str) -> ConversionJob:
-    if not isinstance(item, dict):
-        raise RecipeError(where, f"must be a mapping, is {item!r}")
+def _valid[T: BaseModel](model: type[T], values: Any, where: str) -> T:
     try:
-        return ConversionJob.model_validate({**defaults, **item})
+        return model.model_validate(values)
     except ValidationError as fault:
         first = fault.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        known = list(ConversionJob.model_fields)
+        key, known = ".".join(map(str, first["loc"])) or "the recipe", list(model.model_fields)
+        remedy = f"the keys are {', '.join(known)}; see recipes/convert"
         if first["type"] == "extra_forbidden":
             near = get_close_matches(key, known, n=1)
             hint = f", did you mean {near[0]!r}?" if near else ""
-            raise RecipeError(where, f"unknown key {key!r}{hint}", f"known: {', '.join(known)}") from fault
+            raise RecipeError(where, f"has the unknown key {key!r}{hint}", remedy) from fault
         if first["type"] == "missing":
-            raise RecipeError(where, f"lacks {key}") from fault
-        raise RecipeError(where, f"{key} is {first['input']!r}: {first['msg'].lower()}") from fault
-
-
-def _refuse_repeated(outs: Sequence[Path], path: Path) -> None:
-    seen: set[Path] = set()
-    for out in outs:
-        if out.absolute() in seen:
-            raise RecipeError(path, f"two jobs write {out}", "give each an out of its own")
-        seen.add(out.absolute())
+            raise RecipeError(where, f"lacks {key}", remedy) from fault
+        raise RecipeError(where, f"{key} is {first['input']!r}: {first['msg'].lower()}", remedy) from fault

@@ -1,4 +1,4 @@
-"""Make a shard set from episodes that are already tokenized: merge sets, or divide a set anew.
+"""Make a shard set of shards that exist: merge sets, divide a set anew, write a lost manifest anew.
 
 The plan is made as in a conversion, so the result depends only on the episodes and the settings. A shard
 is complete or absent, and the manifest is written last. To continue after an interruption, run it again.
@@ -6,197 +6,176 @@ is complete or absent, and the manifest is written last. To continue after an in
 T frames of an episode, A values of an action.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from hma_data.conversion.extend import hashes
 from hma_data.conversion.output import finished_shards, locked, remove_notes
-from hma_data.conversion.plan import Plan, Settings, ShardUnit, digest, make_plan
-from hma_data.errors import ShardError, UsageError
+from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
+from hma_data.errors import HMAError, ShardError, UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, finish
-from hma_data.shards.reader import EpisodeReader, ShardSet
-from hma_data.shards.schema import (
-    EpisodeRow,
-    Footer,
-    Refused,
-    arrow_schema,
-    mask_columns,
-    token_column,
+from hma_data.shards.manifest import (
+    EMBODIMENT,
+    EPISODES,
+    MANIFEST,
+    SPLITS,
+    Gathered,
+    Manifest,
+    derive,
+    digest,
+    finish,
+    seal_problem,
+    shard_sizes,
+    stored_embodiment,
 )
-from hma_data.shards.stats import Stats
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, read_footer, token_column
+from hma_data.shards.verify import REMAKE, check_rows
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.paths import StrPath
-from hma_data.storage.remote import place
+from hma_data.storage.remote import parquet_input, place
 from hma_data.tokenizers.base import TokenizerSpec
 
 OnProgress = Callable[[int, int], None]
-Read = Callable[["Ready"], dict[str, NDArray[Any]]]
+AGAIN = "run the same hma convert again"
 
 
 @dataclass(frozen=True)
-class Ready:
-    """An episode whose tokens exist.
+class _Episode:
+    """An episode of the new set.
 
     Attributes:
         row: its row of episodes.parquet. A split in it is kept; its shard and its place there are set anew.
-        key: value by which the function of `Job.open` finds it.
+        number: which of the sets holds it.
+        old: its row there.
         together: episodes that share this text go into one split; empty means the episode's own id.
     """
 
     row: EpisodeRow
-    key: Any
+    number: int
+    old: EpisodeRow
     together: str = ""
 
 
 @dataclass(frozen=True)
-class Job:
-    """The description of a shard set to make.
+class _Job:
+    """The description of a shard set to make of others, which share embodiment, tokenizer and row layout.
 
     Attributes:
         episodes: in the order of their new numbers.
-        open: called once for each shard; returns a function that maps an episode to its columns, (N,) or
-            (N, width).
         refused: the episodes that its quarantine lists.
         made_by: the operation that made the set, recorded in the plan; empty if a conversion could have
             made the same set.
     """
 
-    embodiment: Embodiment
-    tokenizer: TokenizerSpec
+    sets: Sequence[ShardSet]
     settings: Settings
-    episodes: Sequence[Ready]
-    open: Callable[[], Read]
+    episodes: Sequence[_Episode]
     source: str
-    refused: Sequence[Refused] = ()
-    made_by: Mapping[str, Any] = field(default_factory=dict)
+    refused: Sequence[Refused]
+    made_by: Mapping[str, Any]
 
-    @property
-    def cameras(self) -> list[str]:
-        """Return the names of the cameras, in row order within an episode."""
-        return list(self.settings.cameras) or [self.embodiment.primary_camera.name]
+    def plan(self) -> Plan:
+        first = self.sets[0]
+        stride = first.manifest.frame_stride
+        refs = [
+            EpisodeRef(
+                item.row.id,
+                item.row.length * stride,
+                item.row.split or None,
+                item.row.fingerprint,
+                item.together,
+            )
+            for item in self.episodes
+        ]
+        plan = make_plan(refs, first.embodiment, first.spec, self.settings, self.source)
+        if not self.made_by:
+            return plan
+        facts = {key: value for key, value in plan.facts.items() if key != "hash"}
+        return Plan.of(plan.units, facts | {"made_by": dict(self.made_by)})
 
-    @property
-    def frame_stride(self) -> int:
-        """Return the number of recorded steps a row."""
-        return self.embodiment.stride if self.settings.frames == "strided" else 1
+    def run(self, out: StrPath, workers: int, on_progress: OnProgress) -> Manifest:
+        """Write the set; keep shards that are already there."""
+        plan, out, first = self.plan(), place(out), self.sets[0]
+        with locked(out):
+            done = finished_shards(out, plan, None, False)
+            todo = [unit for unit in plan.units if unit.name not in done]
+            if not todo and (out / MANIFEST).is_file() and (out / EPISODES).is_file():
+                return Manifest.load(out)
+            written = plan.frames - sum(unit.frames for unit in todo)
 
+            def make(unit: ShardUnit) -> int:
+                refused = self.refused if unit is plan.units[0] else ()
+                _make_shard(self, plan, out, unit, refused)
+                return unit.frames
 
-def remake(
-    job: Job, out: StrPath, workers: int = 1, on_progress: OnProgress = lambda done, total: None
-) -> Manifest:
-    """Write the set; keep shards that are already there.
-
-    Args:
-        out: str or path of the new set, or its URI.
-        workers: threads, each of which writes its own shard.
-        on_progress: called with (frames written, frames in all) after each shard.
-
-    Raises:
-        OutputError: `out` holds something else, or another job is writing it.
-        ShardError: an input is damaged.
-    """
-    plan, out = _plan(job), place(out)
-    with locked(out):
-        done = finished_shards(out, plan, None, False)
-        todo = [unit for unit in plan.units if unit.name not in done]
-        if not todo and (out / MANIFEST).is_file() and (out / EPISODES).is_file():
-            return Manifest.load(out)
-        written = plan.frames - sum(unit.frames for unit in todo)
-        first = plan.units[0].name
-
-        def make(unit: ShardUnit) -> int:
-            _make_shard(job, plan, out, unit, job.refused if unit.name == first else ())
-            return unit.frames
-
-        with ThreadPoolExecutor(workers) as pool:
-            for frames in pool.map(make, todo):
-                written += frames
-                on_progress(written, plan.frames)
-        names = [unit.name for unit in plan.units]
-        manifest = finish(out, names, job.embodiment, job.tokenizer, plan.facts, job.source)
-        remove_notes(out)
-        return manifest
+            with ThreadPoolExecutor(workers) as pool:
+                for frames in pool.map(make, todo):
+                    written += frames
+                    on_progress(written, plan.frames)
+            names = [unit.name for unit in plan.units]
+            manifest = finish(out, names, first.embodiment, first.spec, plan.facts, self.source)
+            remove_notes(out)
+            return manifest
 
 
-def _plan(job: Job) -> Plan:
-    refs = [
-        EpisodeRef(
-            item.row.id,
-            item.row.length * job.frame_stride,
-            item.row.split or None,
-            item.row.fingerprint,
-            item.together,
-        )
-        for item in job.episodes
-    ]
-    plan = make_plan(refs, job.embodiment, job.tokenizer, job.settings, job.source)
-    if not job.made_by:
-        return plan
-    facts = {key: value for key, value in plan.facts.items() if key != "hash"} | {
-        "made_by": dict(job.made_by)
-    }
-    return Plan(plan.units, {**facts, "hash": digest(facts)})
-
-
-def _make_shard(job: Job, plan: Plan, out: Path, unit: ShardUnit, refused: Sequence[Refused]) -> None:
-    embodiment, cameras, read = job.embodiment, job.cameras, job.open()
-    state_width = embodiment.state.dims if embodiment.state else 0
-    width = embodiment.action_dim * job.frame_stride
-    schema = arrow_schema(job.tokenizer, width, state_width, len(cameras), mask_columns(embodiment))
-    stats = {"action": Stats.empty(embodiment.action_dim)}
-    if state_width:
-        stats["state"] = Stats.empty(state_width)
+def _make_shard(job: _Job, plan: Plan, out: Path, unit: ShardUnit, refused: Sequence[Refused]) -> None:
+    layout = job.sets[0].manifest.layout
+    readers = [EpisodeReader(shards, shards.columns()) for shards in job.sets]
+    stats = layout.empty_stats()
     rows: list[EpisodeRow] = []
-    with ShardWriter(out / unit.name, schema, job.tokenizer) as writer:
+    with ShardWriter(out / unit.name, layout.schema, layout.tokenizer) as writer:
         for index, _ in unit.episodes:
             item, start = job.episodes[index], writer.rows
-            columns = read(item)
-            for piece in _pieces(index, columns, cameras, token_column(job.tokenizer)[0]):
+            row, old = item.row, item.old
+            columns = readers[item.number].rows(old.shard, old.row_start, old.rows)
+            if (columns.pop("episode_index") != old.episode_index).any():
+                fault = f"its rows from {old.row_start} on are not episode {old.episode_index}"
+                remedy = "hma shards verify tells what is damaged"
+                raise ShardError(job.sets[item.number].folder / old.shard, fault, remedy)
+            for piece in _pieces(index, columns, old.length, layout):
                 writer.add(piece)
-            count = writer.rows - start
-            for name, merged in stats.items():
-                merged.merge(_stats(columns, name, count // len(cameras), len(merged.mean)))
-            place: dict[str, Any] = {
-                "episode_index": index,
-                "split": unit.split,
-                "shard": unit.name,
-                "row_start": start,
-            }
-            own = "" if item.row.source == job.source else item.row.source
-            rows.append(replace(item.row, **place, rows=count, length=count // len(cameras), source=own))
+            for name, own in layout.stats(columns, slice(old.length)).items():
+                stats[name].merge(own)
+            source = "" if row.source == job.source else row.source
+            rows.append(
+                replace(
+                    row,
+                    episode_index=index,
+                    split=unit.split,
+                    shard=unit.name,
+                    row_start=start,
+                    source=source,
+                )
+            )
         writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
 
 
 def _pieces(
-    index: int, columns: dict[str, NDArray[Any]], cameras: list[str], tokens: str
+    index: int, columns: dict[str, NDArray[Any]], length: int, layout: RowLayout
 ) -> Iterator[EpisodeRows]:
-    length = len(columns["timestamp"]) // len(cameras)
-    for number, camera in enumerate(cameras):
+    for number, camera in enumerate(layout.cameras):
         own = {name: values[number * length : (number + 1) * length] for name, values in columns.items()}
         yield EpisodeRows(
             episode_index=index,
             timestamps=own["timestamp"],
-            tokens=own[tokens],
+            tokens=own[token_column(layout.tokenizer)[0]],
             actions=own["action"],
             states=own.get("state"),
             camera=camera,
             action_known=own.get("action_known"),
             state_known=own.get("state_known"),
         )
-
-
-def _stats(columns: dict[str, NDArray[Any]], name: str, length: int, width: int) -> Stats:
-    values, known = columns[name][:length], columns.get(f"{name}_known")
-    if known is not None:
-        values = values[known[:length]]
-    return Stats.of(values.reshape(-1, width))
 
 
 # -- from shard sets
@@ -218,17 +197,17 @@ def merge(
 
     Raises:
         ShardError: the sets cannot be merged.
-        OutputError: see `remake`.
+        OutputError: `out` holds something else, or another job is writing it.
     """
     sets = [ShardSet(folder) for folder in folders]
     _check_out(out, folders)
     first = sets[0]
     for other in sets[1:]:
         _check_alike(first, other)
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for shards in sets:
-        for name in [*shards.episodes["id"].to_pylist(), *(item["id"] for item in shards.refused())]:
-            counts[name] = counts.get(name, 0) + 1
+        counts.update(shards.episodes["id"].to_pylist())
+        counts.update(item["id"] for item in shards.refused())
 
     def unique(number: int, name: str) -> str:
         return f"{number + 1}/{name}" if counts[name] > 1 else name
@@ -238,15 +217,14 @@ def merge(
         for row in _rows(shards):
             group = f"{number + 1}/{row.group}" if row.group and len(sets) > 1 else row.group
             changed = replace(row, id=unique(number, row.id), group=group)
-            episodes.append(Ready(changed, (number, row)))
+            episodes.append(_Episode(changed, number, row))
         refused += [replace(item, id=unique(number, item.id)) for item in _refused(shards)]
-    _check_unique([item.row.id for item in episodes])
     made_by = {"merge": [shards.manifest.plan["hash"] for shards in sets]}
     sources = list(dict.fromkeys(shards.manifest.source for shards in sets))
     source = sources[0] if len(sources) == 1 else f"merged of {len(sources)} recordings, first {sources[0]}"
     settings = replace(_settings(first), limit=None)
-    job = Job(first.embodiment, first.spec, settings, episodes, _opener(sets), source, refused, made_by)
-    return remake(job, out, workers, on_progress)
+    job = _Job(sets, settings, episodes, source, refused, made_by)
+    return job.run(out, workers, on_progress)
 
 
 def split(
@@ -268,7 +246,7 @@ def split(
 
     Raises:
         UsageError: a fraction or `by` is not allowed.
-        OutputError: see `remake`.
+        OutputError: `out` holds something else, or another job is writing it.
     """
     shards = ShardSet(folder)
     _check_out(out, [folder])
@@ -279,20 +257,10 @@ def split(
     if settings.limit is not None and settings.limit < len(rows):
         settings = replace(settings, limit=None)  # the set was extended beyond its limit
     together = [row.group for row in rows] if by == "episode" else _together(rows, by)
-    episodes = [Ready(row, (0, old), key) for row, old, key in zip(rows, _rows(shards), together)]
+    episodes = [_Episode(row, 0, old, key) for row, old, key in zip(rows, _rows(shards), together)]
     made_by = {} if by == "episode" else {"split_by": by}
-    source = shards.manifest.source
-    job = Job(
-        shards.embodiment,
-        shards.spec,
-        settings,
-        episodes,
-        _opener([shards]),
-        source,
-        list(_refused(shards)),
-        made_by,
-    )
-    return remake(job, out, workers, on_progress)
+    job = _Job([shards], settings, episodes, shards.manifest.source, list(_refused(shards)), made_by)
+    return job.run(out, workers, on_progress)
 
 
 def _together(rows: Sequence[EpisodeRow], by: str) -> list[str]:
@@ -316,9 +284,8 @@ def _check_out(out: StrPath, folders: Sequence[StrPath]) -> None:
     for folder in folders:
         mine, theirs = place(out).resolve(), place(folder).resolve()
         if mine == theirs or mine in theirs.parents or theirs in mine.parents:
-            raise UsageError(
-                "--out", f"{out} and the shard set {folder} lie in each other", "give a new folder"
-            )
+            fault = f"is {out}, which holds the shard set {folder} or lies in it"
+            raise UsageError("--out", fault, "give a new folder")
 
 
 def _check_alike(first: ShardSet, other: ShardSet) -> None:
@@ -328,7 +295,7 @@ def _check_alike(first: ShardSet, other: ShardSet) -> None:
         "stride": (first.embodiment.stride, other.embodiment.stride),
         "tokenizer": (f"{first.spec.name} {first.spec.digest}", f"{other.spec.name} {other.spec.digest}"),
         "cameras": (first.manifest.cameras, other.manifest.cameras),
-        "--frames": (_settings(first).frames, _settings(other).frames),
+        "frame stride": (first.manifest.frame_stride, other.manifest.frame_stride),
     }
     for what, (mine, theirs) in pairs.items():
         if mine != theirs:
@@ -336,20 +303,10 @@ def _check_alike(first: ShardSet, other: ShardSet) -> None:
             raise ShardError(other.folder, fault, "merge sets of one embodiment and one tokenizer")
 
 
-def _check_unique(ids: Sequence[str]) -> None:
-    seen: set[str] = set()
-    for name in ids:
-        if name in seen:
-            raise ShardError("merge", f"two episodes would be called {name!r}", "merge fewer sets at a time")
-        seen.add(name)
-
-
 def _settings(shards: ShardSet) -> Settings:
     """Return the settings that the set was made with."""
-    plan = shards.manifest.plan
-    said = plan.get("settings", {})
-    known = {key: said[key] for key in ("val_fraction", "seed", "limit", "shard_frames") if key in said}
-    return Settings(frames=plan.get("frames", "all"), cameras=tuple(shards.manifest.cameras), **known)
+    said = shards.manifest.plan.get("settings", {})
+    return Settings(**{**said, "cameras": tuple(shards.manifest.cameras)})
 
 
 def _rows(shards: ShardSet) -> list[EpisodeRow]:
@@ -362,21 +319,92 @@ def _refused(shards: ShardSet) -> Iterator[Refused]:
         yield Refused(**{key: value for key, value in item.items() if key != "uri"})
 
 
-def _opener(sets: Sequence[ShardSet]) -> Callable[[], Read]:
-    """Return a function that opens a reader of episodes of several sets, called once for each shard."""
+# -- a manifest anew
 
-    def open_sets() -> Read:
-        readers = [EpisodeReader(shards, shards.columns()) for shards in sets]
 
-        def read(item: Ready) -> dict[str, NDArray[Any]]:
-            number, row = item.key
-            columns = readers[number].rows(row.shard, row.row_start, row.rows)
-            if not np.array_equal(columns.pop("episode_index"), np.full(row.rows, row.episode_index)):
-                where = sets[number].folder / row.shard
-                fault = f"its rows from {row.row_start} on are not episode {row.episode_index}"
-                raise ShardError(where, fault, "hma shards verify tells what is damaged")
-            return columns
+def restat(
+    folder: StrPath, *, workers: int | None = None, on_progress: OnProgress = lambda done, total: None
+) -> Manifest:
+    """Write the manifest and the other derived files from the shards; do not change the shards.
 
-        return read
+    An undamaged manifest states which shards belong to the set and their hashes. Without one, the shards
+    themselves must show that none is missing. Statistics are computed anew from the rows.
 
-    return open_sets
+    Args:
+        folder: str or path of the set, or its URI.
+
+    Raises:
+        ShardError: a shard is missing or damaged, or nothing shows whether all are there; nothing is written.
+    """
+    folder = place(folder)
+    if not folder.is_dir():
+        raise ShardError(folder, "is not a folder", "name the --out folder of an hma convert")
+    with locked(folder):
+        known = _whole_manifest(folder)
+        sha256 = {shard.path: shard.sha256 for shard in known.shards} if known else {}
+        if known:
+            names, plan, source, embodiment = list(sha256), known.plan, known.source, known.embodiment
+        else:
+            names, plan, source, embodiment = _as_found(folder)
+        spec = TokenizerSpec.from_json(plan["tokenizer"])
+        derived = derive(folder, names, embodiment, spec, plan, source, sha256)
+        manifest = derived.manifest
+        problems, rows = check_rows(folder, manifest, workers, on_progress)
+        if problems:
+            more = f", and {len(problems) - 1} more problems" if len(problems) > 1 else ""
+            raise ShardError("", problems[0] + more)
+        if not manifest.layout.strided:  # footers of strided sets also count steps that are not rows
+            stats = {name: merged.summary() for name, merged in rows.items()}
+            derived = replace(derived, manifest=replace(manifest, stats=stats or manifest.stats))
+        return derived.write(folder)
+
+
+def _whole_manifest(folder: Path) -> Manifest | None:
+    with suppress(HMAError, OSError):
+        if not seal_problem((folder / MANIFEST).read_bytes()):
+            return Manifest.load(folder)
+    return None
+
+
+def _as_found(folder: Path) -> tuple[list[str], dict[str, Any], str, Embodiment]:
+    """Return shards, plan, source and embodiment of a set without a manifest to trust."""
+    names = sorted(shard_sizes(folder))
+    if not names:
+        raise ShardError(folder, "holds no shards", "name the --out folder of an hma convert")
+    footers = [read_footer(folder / name)[0] for name in names]
+    plan = max((footer.plan for footer in footers), key=lambda plan: len(plan.get("extends", ())))
+    for name, footer in zip(names, footers):
+        if footer.plan["hash"] not in hashes(plan) or footer.name != name:
+            raise ShardError(folder / name, "is of another conversion than the shards beside it", REMAKE)
+    gathered = Gathered(_source(folder, footers))
+    for footer in footers:
+        gathered.add(footer)
+    counts = Counter(footer.split for footer in footers)
+    gapless = names == [f"{split}/shard-{i:05d}.parquet" for split in SPLITS for i in range(counts[split])]
+    # the plan's digest holds unless an episode is in quarantine
+    cut = [(name, [row.episode_index for row in footer.episodes]) for name, footer in zip(names, footers)]
+    if not gapless or not (plan["shards"] == digest(cut) or _lists(folder, gathered)):
+        raise ShardError(folder, "cannot tell from its files whether all its shards are there", AGAIN)
+    embodiment = stored_embodiment(folder)
+    if embodiment.digest != plan["embodiment_hash"]:
+        raise ShardError(folder / EMBODIMENT, "is not the embodiment the shards were made with", AGAIN)
+    return names, plan, gathered.source, embodiment
+
+
+def _lists(folder: Path, gathered: Gathered) -> bool:
+    """Check whether episodes.parquet lists the episodes of these footers and no others."""
+    try:
+        return bool(pq.read_table(parquet_input(folder / EPISODES)).equals(gathered.episodes()))
+    except (OSError, pa.ArrowException):
+        return False
+
+
+def _source(folder: Path, footers: list[Footer]) -> str:
+    """Return the URI the recordings came from, read from episodes.parquet; shards do not state it."""
+    own = {row.episode_index for footer in footers for row in footer.episodes if not row.source}
+    with suppress(OSError, pa.ArrowException):
+        table = pq.read_table(parquet_input(folder / EPISODES), columns=["episode_index", "source"])
+        for row in table.to_pylist():
+            if row["episode_index"] in own:
+                return str(row["source"])
+    return "unknown"

@@ -2,27 +2,27 @@
 
 An episode that cannot be used is listed with its reason in the shard's footer. The shard is whole or
 absent. Its bytes do not depend on the engine that runs the work.
+
+n frames of a camera, S×S pixels.
 """
 
 import json
 import sys
-import threading
 import time
-from collections import deque
-from collections.abc import Iterable, Iterator
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from queue import Queue
 from threading import Event, Thread
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.conversion.batching import Batches
 from hma_data.conversion.engines.base import FIRST, Attempt, Report, Step, Work
-from hma_data.conversion.episode_hash import Content, rows_kept
+from hma_data.conversion.extend import Content, kept_frames
 from hma_data.conversion.output import Made
 from hma_data.conversion.plan import ShardUnit
 from hma_data.episodes.align import to_clip
@@ -37,23 +37,19 @@ from hma_data.errors import (
     TokenizerError,
 )
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.schema import EpisodeRow, Footer, Refused, arrow_schema, flags_text, mask_columns
+from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
 from hma_data.shards.stats import Stats
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef, Source, open_source
 from hma_data.storage.retry import WAITS_S, disk_is_full, storage_is_away, worth_another_try
 from hma_data.threads import usable_cores
-from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 BATCH = 32  # frames decoded and tokenized together
 BEAT_S = 20.0
-FATAL = (
-    TokenizerError,
-    OutputError,
-    ShardError,
-    RegistryError,
-    MissingDependencyError,
-)  # not the fault of one episode
+FATAL = TokenizerError, OutputError, ShardError, RegistryError, MissingDependencyError  # no episode's fault
+
+Frames = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -67,6 +63,11 @@ class Job:
     device: str
     out: Path
     facts: dict[str, Any]
+
+    @property
+    def layout(self) -> RowLayout:
+        """Return which frames become rows, and in which columns."""
+        return RowLayout.of_plan(self.facts, self.embodiment)
 
 
 @dataclass(frozen=True)
@@ -108,20 +109,14 @@ def make_shard(
     job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt = FIRST
 ) -> Made:
     """Read, align, tokenize and write the episodes of one shard."""
-    embodiment, strided = job.embodiment, job.facts["frames"] == "strided"
-    cameras: list[str] = job.facts["cameras"]
-    width = embodiment.chunk_dim if strided else embodiment.action_dim
-    state_width = embodiment.state.dims if embodiment.state else 0
-    schema = arrow_schema(tokenizer.spec, width, state_width, len(cameras), mask_columns(embodiment))
+    layout = job.layout
     rows: list[EpisodeRow] = []
     refused: list[Refused] = []
-    stats = {"action": Stats.empty(embodiment.action_dim)}
-    if state_width:
-        stats["state"] = Stats.empty(state_width)
+    stats = layout.empty_stats()
 
     with ExitStack() as committing:
-        writer = committing.enter_context(ShardWriter(job.out / unit.name, schema, tokenizer.spec))
-        decoded = _decoded(job, unit, tokenizer, report, attempt)
+        writer = committing.enter_context(ShardWriter(job.out / unit.name, layout.schema, tokenizer.spec))
+        decoded = _decoded(job, unit, report, attempt)
         ahead = prefetch(decoded) if not attempt.number else decoded  # one at a time: shows whose fault it is
         for item in _tokenized(ahead, tokenizer, report):
             if isinstance(item, Refused):
@@ -129,12 +124,12 @@ def make_shard(
                 report(Tick(episodes=1, quarantined=1))
                 continue
             start = writer.rows
-            for piece in _cut(item, cameras, embodiment.stride if strided else 1):
+            for piece in _cut(item, layout):
                 writer.add(piece)
             stats["action"].merge(Stats.of(item.clip.known_actions))
             if item.clip.known_states is not None:
                 stats["state"].merge(Stats.of(item.clip.known_states))
-            rows.append(_row(item, unit, start, writer.rows - start, len(cameras)))
+            rows.append(_row(item, unit, start, writer.rows - start, len(layout.cameras)))
             report(Tick(episodes=1))
         writer.close(Footer(job.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
         with _signs_of_life(report):  # an upload may take longer than the limit for a hanging worker
@@ -144,13 +139,13 @@ def make_shard(
 
 @contextmanager
 def _signs_of_life(report: Report) -> Iterator[None]:
-    over = threading.Event()
+    over = Event()
 
     def beat() -> None:
         while not over.wait(BEAT_S):
             report(Tick())
 
-    thread = threading.Thread(target=beat, daemon=True)
+    thread = Thread(target=beat, daemon=True)
     thread.start()
     try:
         yield
@@ -159,41 +154,31 @@ def _signs_of_life(report: Report) -> Iterator[None]:
         thread.join()
 
 
-@dataclass
-class _Begin:
+@dataclass(eq=False)
+class _Episode:
+    """An episode on its way from the recording to the shard.
+
+    Attributes:
+        content: hash over what was read of it.
+        read: whether all its pictures are in the queue, or encoded.
+        waiting: frames that are in the queue.
+        tokens: camera -> tokens of the frames that are encoded.
+    """
+
     index: int
     ref: EpisodeRef
     clip: Clip
-    content: Content  # complete at the _End
+    content: Content
+    read: bool = False
+    waiting: int = 0
+    tokens: defaultdict[str, list[NDArray[Any]]] = field(default_factory=lambda: defaultdict(list))
 
 
-@dataclass
-class _Frames:
-    camera: str
-    frames: NDArray[np.uint8]
+Decoded = _Episode | tuple[str, Frames] | Refused | None  # None ends the episode that was begun
 
 
-@dataclass
-class _End:
-    """The end of the episode that was begun."""
-
-
-@dataclass
-class _Whole:
-    index: int
-    ref: EpisodeRef
-    clip: Clip
-    content: str
-    tokens: dict[str, NDArray[Any]]
-
-
-Decoded = _Begin | _Frames | _End | Refused
-
-
-def _decoded(
-    job: Job, unit: ShardUnit, tokenizer: Tokenizer, report: Report, attempt: Attempt
-) -> Iterator[Decoded]:
-    """Yield for each episode a _Begin, its pictures in batches, and an _End; or a Refused.
+def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Iterator[Decoded]:
+    """Yield each episode, its pictures in batches with their camera, and None; or a Refused.
 
     This runs ahead in a thread. An episode may begin again, or be refused, after some of its pictures; its
     earlier items are then void.
@@ -206,15 +191,14 @@ def _decoded(
         report(Step(ref.id))
         for wait_s in (*WAITS_S, None):
             try:
-                yield from _episode(job, source, tokenizer.spec, index, ref)
+                yield from _episode(job, source, index, ref)
                 break
             except (*FATAL, MemoryError):
                 raise
             except Exception as fault:  # no fault of a decoder on one recording may end the job
                 if disk_is_full(fault):
-                    raise OutputError(
-                        ref.id, f"there is no space to unpack it: {fault}", "free space"
-                    ) from fault
+                    text = f"there is no space to unpack it: {fault}"
+                    raise OutputError(ref.id, text, "free space") from fault
                 if wait_s is not None and worth_another_try(fault):
                     time.sleep(wait_s)
                     continue
@@ -226,83 +210,79 @@ def _decoded(
                 break
 
 
-def _episode(job: Job, source: Source, spec: TokenizerSpec, index: int, ref: EpisodeRef) -> Iterator[Decoded]:
+def _episode(job: Job, source: Source, index: int, ref: EpisodeRef) -> Iterator[Decoded]:
+    layout = job.layout
+    spec = layout.tokenizer
     clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
-    kept = rows_kept(clip, job.embodiment, job.facts["frames"])
+    kept = kept_frames(clip, layout)
     content = Content(clip, kept)
-    yield _Begin(index, ref, clip, content)
-    for name in job.facts["cameras"]:
-        camera = job.embodiment.camera(name)
+    yield _Episode(index, ref, clip, content)
+    for name in layout.cameras:
+        camera, stream = job.embodiment.camera(name), clip.episode.streams[name]
         for start in range(0, len(kept), BATCH):
             indices = clip.frame_indices[name][kept[start : start + BATCH]]
-            stream = clip.episode.streams[name]
             frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
             content.add(start, frames)
-            yield _Frames(name, frames)
-    yield _End()
+            yield name, frames
+    yield None
 
 
-def _tokenized(items: Iterator[Decoded], tokenizer: Tokenizer, report: Report) -> Iterator[_Whole | Refused]:
+def _tokenized(
+    items: Iterator[Decoded], tokenizer: Tokenizer, report: Report
+) -> Iterator[_Episode | Refused]:
     """Yield whole and refused episodes in order; a batch may hold frames of several episodes."""
     batches = Batches(tokenizer.encode, BATCH)
-    waiting: deque[_Begin | Refused] = deque()
-    begun: _Begin | None = None
+    unfinished: deque[_Episode | Refused] = deque()
+    begun: _Episode | None = None
 
-    def ready() -> Iterator[_Whole | Refused]:
-        while waiting:
-            first = waiting[0]
-            if isinstance(first, _Begin):
-                if first is begun or not batches.whole(first.index):
-                    return
-                tokens = batches.take(first.index)
-                yield _Whole(first.index, first.ref, first.clip, first.content.text(), tokens)
-            else:
-                yield first
-            waiting.popleft()
+    def ready() -> Iterator[_Episode | Refused]:
+        while unfinished:
+            first = unfinished[0]
+            if isinstance(first, _Episode) and (first.waiting or not first.read):
+                return
+            yield unfinished.popleft()
 
     for item in items:
-        if begun and isinstance(item, _Begin | Refused):  # its earlier items are void
-            batches.drop(begun.index)
-            waiting.pop()
-            begun = None
-        if isinstance(item, Refused):
-            waiting.append(item)
-        elif isinstance(item, _Begin):
-            begun = item
-            waiting.append(item)
-        elif isinstance(item, _Frames):
-            assert begun is not None
-            report(Tick(frames=batches.add(begun.index, item.camera, item.frames)))
-        else:
-            begun = None
+        if begun is not None:
+            if isinstance(item, tuple):
+                report(Tick(frames=batches.add(begun, *item)))
+            elif item is None:
+                begun.read, begun = True, None
+            else:  # its earlier items are void
+                batches.drop(begun)
+                unfinished.pop()
+                begun = None
+        if isinstance(item, _Episode | Refused):
+            unfinished.append(item)
+            begun = item if isinstance(item, _Episode) else None
         yield from ready()
     report(Tick(frames=batches.flush()))
     yield from ready()
 
 
-def _cut(item: _Whole, cameras: list[str], stride: int) -> Iterator[EpisodeRows]:
+def _cut(item: _Episode, layout: RowLayout) -> Iterator[EpisodeRows]:
     """Yield the episode's rows, camera after camera; strided rows hold the whole chunk of actions."""
-    clip = item.clip
-    kept = len(clip) // stride
-    actions: NDArray[np.float32] = clip.actions[: kept * stride].reshape(kept, -1)
-    known, state_known = clip.action_known, clip.state_known
+    clip, kept = item.clip, layout.kept(len(item.clip))
+    steps = len(kept) * layout.frame_stride
+    actions: NDArray[np.float32] = clip.actions[:steps].reshape(len(kept), -1)
+    known = clip.action_known
     if known is not None:
-        known = np.all(known[: kept * stride].reshape(kept, -1), axis=1)
+        known = np.all(known[:steps].reshape(len(kept), -1), axis=1)
         actions = np.where(known[:, None], actions, np.float32(0))
-    for camera in cameras:
+    for camera in layout.cameras:
         yield EpisodeRows(
             episode_index=item.index,
-            timestamps=clip.timestamps[: kept * stride : stride],
-            tokens=item.tokens[camera],
+            timestamps=clip.timestamps[kept],
+            tokens=np.concatenate(item.tokens[camera]),
             actions=actions,
-            states=None if clip.states is None else clip.states[: kept * stride : stride],
+            states=None if clip.states is None else clip.states[kept],
             camera=camera,
             action_known=known,
-            state_known=None if state_known is None else state_known[: kept * stride : stride],
+            state_known=None if clip.state_known is None else clip.state_known[kept],
         )
 
 
-def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> EpisodeRow:
+def _row(item: _Episode, unit: ShardUnit, start: int, rows: int, cameras: int) -> EpisodeRow:
     clip = item.clip
     skew = {name: [float(v) for v in np.percentile(ms, [50, 95, 100])] for name, ms in clip.skew_ms.items()}
     worst = max(skew.values(), key=lambda values: values[2], default=[0.0, 0.0, 0.0])
@@ -324,46 +304,75 @@ def _row(item: _Whole, unit: ShardUnit, start: int, rows: int, cameras: int) -> 
         trimmed=clip.trimmed,
         flags=flags_text(clip.trimmed, clip.flags),
         group=item.ref.group,
-        content=item.content,
+        content=item.content.text(),
     )
 
 
-def prefetch[T](items: Iterable[T], depth: int = 2) -> Iterator[T]:
-    """Yield the same items in the same order, read ahead by a thread.
-
-    An error of `items` is raised in the place of the item.
+class Batches:
+    """A queue of frames for `encode`, which gets `size` frames at a time whatever the episodes' lengths.
 
     Args:
-        items: used in the thread only.
-        depth: how many items may wait.
+        encode: frames (n, S, S, 3) -> tokens (n, …); a frame's tokens do not depend on the other frames.
+        size: frames a call; only `flush` makes a smaller call.
     """
-    queue: Queue[tuple[str, T | BaseException | None]] = Queue(maxsize=depth)
-    stop = Event()
 
-    def produce() -> None:
-        try:
-            for item in items:
-                queue.put(("item", item))
-                if stop.is_set():
-                    return
-            queue.put(("end", None))
-        except BaseException as fault:  # the reader raises it
-            queue.put(("fault", fault))
+    def __init__(self, encode: Callable[[Frames], NDArray[Any]], size: int) -> None:
+        self._encode, self._size = encode, size
+        self._queue: deque[tuple[_Episode, str, Frames]] = deque()
+        self._queued = 0
 
-    thread = Thread(target=produce, daemon=True)
-    thread.start()
+    def add(self, episode: _Episode, camera: str, frames: Frames) -> int:
+        """Queue the next frames of an episode's camera; return how many frames were encoded by this call."""
+        self._queue.append((episode, camera, frames))
+        self._queued += len(frames)
+        episode.waiting += len(frames)
+        encoded = 0
+        while self._queued >= self._size:
+            encoded += self._next(self._size)
+        return encoded
+
+    def flush(self) -> int:
+        """Encode the frames that are left; return their number."""
+        return self._next(self._queued) if self._queued else 0
+
+    def drop(self, episode: _Episode) -> None:
+        """Forget the frames of an episode."""
+        self._queue = deque(item for item in self._queue if item[0] is not episode)
+        self._queued -= episode.waiting
+
+    def _next(self, count: int) -> int:
+        owners: list[tuple[_Episode, str, int]] = []
+        pieces: list[Frames] = []
+        left = count
+        while left:
+            episode, camera, frames = self._queue.popleft()
+            if len(frames) > left:
+                self._queue.appendleft((episode, camera, frames[left:]))
+                frames = frames[:left]
+            owners.append((episode, camera, len(frames)))
+            pieces.append(frames)
+            left -= len(frames)
+        tokens = self._encode(pieces[0] if len(pieces) == 1 else np.concatenate(pieces))
+        self._queued -= count
+        at = 0
+        for episode, camera, length in owners:
+            episode.tokens[camera].append(tokens[at : at + length])
+            episode.waiting -= length
+            at += length
+        return count
+
+
+def prefetch[T](items: Iterator[T], depth: int = 3) -> Iterator[T]:
+    """Yield the same items in the same order; a thread reads up to `depth` of them ahead.
+
+    An error of `items` is raised in the place of the item.
+    """
+    end = object()
+    pool = ThreadPoolExecutor(1)
     try:
-        while True:
-            kind, value = queue.get()
-            if kind == "end":
-                return
-            if kind == "fault":
-                assert isinstance(value, BaseException)
-                raise value
-            yield value  # type: ignore[misc]
+        ahead = deque(pool.submit(next, items, end) for _ in range(depth))
+        while (item := ahead.popleft().result()) is not end:
+            ahead.append(pool.submit(next, items, end))
+            yield cast(T, item)
     finally:
-        stop.set()
-        while thread.is_alive():  # the thread may be waiting to put one more
-            while not queue.empty():
-                queue.get_nowait()
-            thread.join(timeout=0.05)
+        pool.shutdown(cancel_futures=True)

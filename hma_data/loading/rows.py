@@ -125,9 +125,8 @@ class Decoder:
         _check_stride(shards)
         self.index = WindowIndex.of(shards, split, frames, stride, short)
         tokens, width = token_column(shards.spec)
-        strided = shards.manifest.plan.get("frames") == "strided"
         robot = shards.embodiment
-        action_width = robot.chunk_dim if strided else robot.action_dim
+        action_width = robot.action_dim * shards.manifest.frame_stride
         self._row_bytes = width * np.dtype(shards.spec.dtype).itemsize + action_width * 4 + 9
         self._columns = [tokens, "action", "episode_index", "frame_index"]
         self._columns += [mask for mask in mask_columns(robot) if mask == "action_known"]

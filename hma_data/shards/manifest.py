@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +19,26 @@ import pyarrow.parquet as pq
 
 from hma_data.errors import ShardError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.schema import SCHEMA_VERSION, EpisodeRow, Footer, Refused, read_footer
+from hma_data.shards.schema import (
+    MALFORMED,
+    SCHEMA_VERSION,
+    EpisodeRow,
+    Footer,
+    Refused,
+    RowLayout,
+    check_version,
+    read_footer,
+)
 from hma_data.shards.stats import Stats
-from hma_data.shards.wellformed import check_plan, check_spec, check_splits, check_stats, is_count
 from hma_data.storage.files import atomic_path, file_sha256, write_atomic
 from hma_data.storage.json_io import parse_json
 from hma_data.storage.paths import StrPath
-from hma_data.storage.remote import is_remote, place
-from hma_data.storage.yaml_io import decode_yaml, parse_yaml
+from hma_data.storage.remote import RemotePath, place
+from hma_data.storage.yaml_io import parse_yaml
 from hma_data.tokenizers.base import TokenizerSpec
 
-MANIFEST, EPISODES, QUARANTINE, EMBODIMENT = (
-    "manifest.json",
-    "episodes.parquet",
-    "quarantine.jsonl",
-    "embodiment.yaml",
-)
+MANIFEST, EPISODES = "manifest.json", "episodes.parquet"
+QUARANTINE, EMBODIMENT = "quarantine.jsonl", "embodiment.yaml"
 SPLITS = ("train", "val")
 WORKING = (".lock", ".journal", ".plan")  # names of what a conversion keeps in the folder begin with these
 HASHERS = 4  # threads; hashing releases the interpreter lock
@@ -41,29 +46,18 @@ SHARD_NAME = re.compile(r"(train|val)/shard-([0-9]{5,9})\.parquet")
 _SEAL = re.compile(rb'"manifest_sha256": "([0-9a-f]{64})"')
 _UNSEALED = "0" * 64
 
-_EPISODE_SCHEMA = pa.schema(
-    [
-        ("episode_index", pa.int32()),
-        ("id", pa.string()),
-        ("split", pa.string()),
-        ("shard", pa.string()),
-        ("row_start", pa.int64()),
-        ("rows", pa.int64()),
-        ("length", pa.int64()),
-        ("instruction", pa.string()),
-        ("success", pa.bool_()),
-        ("source", pa.string()),
-        ("fingerprint", pa.string()),
-        ("skew_p50_ms", pa.float64()),
-        ("skew_p95_ms", pa.float64()),
-        ("skew_max_ms", pa.float64()),
-        ("skew", pa.string()),
-        ("trimmed", pa.int64()),
-        ("flags", pa.string()),
-        ("group", pa.string()),
-        ("content", pa.string()),
-    ]
-)
+_NUMBERS = {
+    "episode_index": pa.int32(),
+    **dict.fromkeys(("row_start", "rows", "length", "trimmed"), pa.int64()),
+    **dict.fromkeys(("skew_p50_ms", "skew_p95_ms", "skew_max_ms"), pa.float64()),
+    "success": pa.bool_(),
+}
+_EPISODE_COLUMNS = (
+    "episode_index", "id", "split", "shard", "row_start", "rows", "length", "instruction", "success",
+    "source", "fingerprint", "skew_p50_ms", "skew_p95_ms", "skew_max_ms", "skew", "trimmed", "flags",
+    "group", "content",
+)  # fmt: skip
+_EPISODE_SCHEMA = pa.schema([(name, _NUMBERS.get(name, pa.string())) for name in _EPISODE_COLUMNS])
 
 
 @dataclass(frozen=True)
@@ -86,8 +80,6 @@ class ShardFile:
         named = SHARD_NAME.fullmatch(self.path)  # keeps paths inside the folder, even in a forged manifest
         if not named or named[1] != self.split:
             raise ValueError(f"{self.path!r} is not the name of a shard of split {self.split!r}")
-        if not all(map(is_count, (self.rows, self.episodes, self.bytes, *self.row_groups))):
-            raise ValueError(f"{self.path} has counts that are not whole numbers")
 
 
 @dataclass(frozen=True)
@@ -114,21 +106,20 @@ class Manifest:
     source: str
     files: dict[str, str] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        check_spec(self.tokenizer)
-        check_plan(self.plan)
-        check_splits(self.splits)
-        check_stats(self.stats, self.embodiment)
+    @cached_property
+    def layout(self) -> RowLayout:
+        """Return which recorded frames the rows hold, and in which columns."""
+        return RowLayout.of_plan(self.plan, self.embodiment)
 
     @property
     def frame_stride(self) -> int:
         """Return the recorded steps a row: 1, or the embodiment's stride if only grid frames are kept."""
-        return int(self.plan["frame_stride"])
+        return self.layout.frame_stride
 
     @property
     def cameras(self) -> list[str]:
         """Return the cameras in the shards, in row order within an episode."""
-        return list(self.plan["cameras"])
+        return list(self.layout.cameras)
 
     def to_json(self) -> dict[str, Any]:
         """Return the plain values of manifest.json."""
@@ -171,22 +162,14 @@ class Manifest:
         """
         folder = place(folder)
         path = folder / MANIFEST
+        restat = f"hma shards restat {folder} writes it anew from the shards"
         if not path.is_file():
-            raise ShardError(
-                folder,
-                f"has no {MANIFEST}",
-                "its conversion has not finished: run the same hma convert again; if the manifest was lost, "
-                "hma shards restat writes it anew from the shards",
-            )
+            remedy = f"run the same hma convert again to finish it; if the manifest was lost, {restat}"
+            raise ShardError(folder, f"has no {MANIFEST}: its conversion has not finished", remedy)
         try:
             values = parse_json(path.read_bytes())
-            if values["schema_version"] != SCHEMA_VERSION:
-                raise ShardError(
-                    path,
-                    f"has schema version {values['schema_version']}, this release reads {SCHEMA_VERSION}",
-                    "read it with the release that wrote it",
-                )
-            return cls(
+            check_version(values, path)
+            manifest = cls(
                 plan=values["plan"],
                 embodiment=Embodiment.from_values(values["embodiment"], str(path)),
                 tokenizer=TokenizerSpec.from_json(values["tokenizer"]),
@@ -199,11 +182,11 @@ class Manifest:
                 source=str(values["source"]),
                 files=dict(values.get("files", {})),
             )
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as fault:
-            said = f"no {fault}" if isinstance(fault, KeyError) else str(fault)
-            raise ShardError(
-                path, f"is damaged: {said}", f"hma shards restat {folder} writes it anew from the shards"
-            ) from fault
+            _ = manifest.layout  # raises if the plan lacks it
+            return manifest
+        except MALFORMED as fault:
+            said = f"it lacks {fault}" if isinstance(fault, KeyError) else str(fault)
+            raise ShardError(path, f"is damaged: {said}", restat) from fault
 
 
 def damaged_files(folder: Path, manifest: Manifest) -> list[Path]:
@@ -215,6 +198,16 @@ def damaged_files(folder: Path, manifest: Manifest) -> list[Path]:
     return [path for name in (EPISODES, QUARANTINE, EMBODIMENT) if not is_whole(path := folder / name)]
 
 
+def shard_sizes(folder: Path) -> dict[str, int]:
+    """Return the bytes of each file in the folders of the splits, by name; leave out unfinished files."""
+    if isinstance(folder, RemotePath):
+        listed = folder.listing()
+    else:
+        paths = [path for split in SPLITS for path in folder.glob(f"{split}/[!.]*")]
+        listed = {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
+    return {name: size for name, size in listed.items() if re.match(r"(train|val)/[^.]", name)}
+
+
 def stored_embodiment(folder: Path) -> Embodiment:
     """Read the embodiment.yaml of a shard set.
 
@@ -222,9 +215,7 @@ def stored_embodiment(folder: Path) -> Embodiment:
         RegistryError: it is damaged.
     """
     path = folder / EMBODIMENT
-    if not is_remote(path):
-        return Embodiment.load(path)
-    text = decode_yaml(path.read_bytes(), path)
+    text = path.read_text(encoding="utf-8", errors="replace")
     return Embodiment.from_values(parse_yaml(text, str(path)), str(path))
 
 
@@ -232,7 +223,7 @@ def seal_problem(text: bytes) -> str:
     """Return what is wrong with the seal of a manifest's bytes; empty if the seal is right."""
     found = _SEAL.search(text)
     if not found:
-        return "carries no manifest_sha256"
+        return "it carries no manifest_sha256"
     start, end = found.span(1)
     unsealed = text[:start] + _UNSEALED.encode() + text[end:]
     if hashlib.sha256(unsealed).hexdigest().encode() != found[1]:
@@ -240,10 +231,14 @@ def seal_problem(text: bytes) -> str:
     return ""
 
 
+def digest(value: Any) -> str:
+    """Return sixteen hex digits of the SHA-256 of plain values."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
+
+
 def plan_hash(plan: dict[str, Any]) -> str:
-    """Return sixteen hex digits of the SHA-256 over everything in a plan except its hash."""
-    facts = {key: value for key, value in plan.items() if key != "hash"}
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+    """Return the digest of everything in a plan except its hash."""
+    return digest({key: value for key, value in plan.items() if key != "hash"})
 
 
 class Gathered:
@@ -335,11 +330,9 @@ def derive(
     plans = {plan["hash"], *plan.get("extends", ())}
     for file, footer in _described(folder, names, hashes or {}):
         if footer.plan["hash"] not in plans:
-            raise ShardError(
-                folder / file.path,
-                f"is of the plan {footer.plan['hash']}, the set of {plan['hash']}: two jobs wrote here",
-                "start one of them anew with --overwrite, the other with another --out",
-            )
+            fault = f"is of the plan {footer.plan['hash']}, the set of {plan['hash']}: two jobs wrote here"
+            remedy = "start one of them anew with --overwrite, the other with another --out"
+            raise ShardError(folder / file.path, fault, remedy)
         files.append(file)
         gathered.add(footer)
     episodes = gathered.episodes()
@@ -376,7 +369,7 @@ def _described(
 
     def describe(name: str) -> tuple[ShardFile, Footer]:
         path = folder / name
-        footer, row_groups = read_footer(path, str(path))
+        footer, row_groups = read_footer(path)
         file = ShardFile(
             path=name,
             split=footer.split,
@@ -405,8 +398,6 @@ def split_totals(episodes: pa.Table, files: Sequence[ShardFile], split: str) -> 
 
 
 def _episode_table(rows: Sequence[EpisodeRow], source: str) -> pa.Table:
-    columns = {
-        name: [getattr(row, name) for row in rows] for name in _EPISODE_SCHEMA.names if name != "source"
-    }
+    columns = {name: [getattr(row, name) for row in rows] for name in _EPISODE_COLUMNS}
     columns["source"] = [row.source or source for row in rows]
     return pa.table(columns, schema=_EPISODE_SCHEMA)

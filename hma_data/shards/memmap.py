@@ -12,20 +12,20 @@ N rows of a split; all numbers little-endian.
 """
 
 import json
-import shutil
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from hma_data.errors import OutputError, UsageError
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import token_column
-from hma_data.storage.files import sync_folder, write_atomic
+from hma_data.storage.files import write_atomic
+from hma_data.storage.folders import new_folder
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 
@@ -35,17 +35,13 @@ EXTRA_DTYPES = {"timestamp": "<f8", "state": "<f4", "action_known": "|b1", "stat
 OnProgress = Callable[[int, int], None]
 
 
-def quiet(done: int, total: int) -> None:
-    """Show no progress."""
-
-
 def export(
     folder: StrPath,
     out: StrPath,
     *,
     split: str | None = None,
     camera: str | None = None,
-    on_progress: OnProgress = quiet,
+    on_progress: OnProgress = lambda done, total: None,
 ) -> list[Path]:
     """Write the splits of a shard set as flat files; each folder appears when it is complete.
 
@@ -64,11 +60,7 @@ def export(
         OutputError: a folder is already there, or cannot be written.
     """
     shards, out = ShardSet(folder), as_path(out)
-    cameras = shards.manifest.cameras
-    if camera is not None and camera not in cameras:
-        raise UsageError(
-            "--camera", f"{camera!r} is not in {shards.folder}", f"its cameras: {', '.join(cameras)}"
-        )
+    number = shards.camera_index(camera)
     have = [name for name, counts in shards.manifest.splits.items() if counts["episodes"]]
     if split is not None and split not in have:
         raise UsageError("--split", f"{shards.folder} has no {split!r}", f"its splits: {', '.join(have)}")
@@ -79,31 +71,20 @@ def export(
     total = sum(shards.manifest.splits[name]["frames"] for name in places)
     done = 0
     for name, place in places.items():
-        for rows in _export_split(shards, name, place, cameras.index(camera) if camera else 0):
+        for rows in _export_split(shards, name, place, number):
             done += rows
             on_progress(done, total)
     return list(places.values())
 
 
 def _export_split(shards: ShardSet, split: str, place: Path, camera: int) -> Iterator[int]:
-    """Write to a folder beside the final one, then rename it; yield the number of rows of each episode."""
-    part = place.with_name(f".{place.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
+    """Write one split; yield the number of rows of each episode."""
     try:
-        (part / "actions").mkdir(parents=True)
-        (part / EXTRA).mkdir()
-        yield from _write_rows(shards, split, part, camera)
-        sync_folder(part)
-        if place.exists():
-            place.rmdir()  # empty, as checked before
-        part.rename(place)
+        with new_folder(place) as part:
+            yield from _write_rows(shards, split, part, camera)
     except OSError as fault:
-        reason = fault.strerror or str(fault)
-        raise OutputError(
-            place, f"cannot be written: {reason}", "free space or choose another --out"
-        ) from fault
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        remedy = "free space or choose another --out"
+        raise OutputError(place, f"cannot be written: {fault.strerror or fault}", remedy) from fault
 
 
 def _write_rows(shards: ShardSet, split: str, part: Path, camera: int) -> Iterator[int]:
@@ -113,22 +94,21 @@ def _write_rows(shards: ShardSet, split: str, part: Path, camera: int) -> Iterat
     reader = EpisodeReader(shards, columns)
     dtypes = {tokens: video_dtype(spec), "action": "<f4", **EXTRA_DTYPES}
     paths = {tokens: VIDEO, "action": ACTIONS} | {name: f"{EXTRA}/{name}.bin" for name in EXTRA_DTYPES}
-    files = {name: (part / paths[name]).open("wb") for name in columns}
     segments: list[int] = []
-    try:
+    (part / "actions").mkdir()
+    (part / EXTRA).mkdir()
+    with ExitStack() as opened:
+        files = {name: opened.enter_context((part / paths[name]).open("wb")) for name in columns}
         for row in table.to_pylist():
             length = row["length"]
             values = reader.rows(row["shard"], row["row_start"] + camera * length, length)
+            values[tokens] = shards.tokens(values[tokens])
+            if spec.dtype == "uint8":
+                values[tokens] = values[tokens].transpose(0, 2, 3, 1)  # pixels are (N, H, W, 3) there
             for name in columns:
-                stored = values[name]
-                if name == tokens:
-                    stored = _as_video(stored, spec)
-                files[name].write(np.ascontiguousarray(stored, dtypes[name]).tobytes())
+                files[name].write(np.ascontiguousarray(values[name], dtypes[name]).tobytes())
             segments.append(length)
             yield length
-    finally:
-        for file in files.values():
-            file.close()
     ids = np.repeat(np.arange(len(segments)), segments).astype("<i4")
     (part / SEGMENTS).write_bytes(ids.tobytes())
     pq.write_table(table, part / EXTRA / "episodes.parquet")
@@ -144,28 +124,19 @@ def video_dtype(spec: TokenizerSpec) -> str:
     return "|u1" if spec.dtype == "uint8" else "<f2"
 
 
-def _as_video(rows: NDArray[Any], spec: TokenizerSpec) -> NDArray[Any]:
-    """Reshape (N, width) rows to (N, h, w) ids or (N, c, h, w) latents; pixels to (N, H, W, 3)."""
-    h, w = spec.grid
-    if spec.kind == "discrete":
-        return rows.reshape(-1, h, w)
-    frames = rows.reshape(-1, spec.channels or 1, h, w)
-    return frames.transpose(0, 2, 3, 1) if spec.dtype == "uint8" else frames
-
-
 def _metadata(shards: ShardSet, rows: int, camera: int) -> dict[str, Any]:
     """Return the values of metadata.json: the paper's fields, then ours."""
-    spec, embodiment, plan = shards.spec, shards.embodiment, shards.manifest.plan
+    spec, embodiment, manifest = shards.spec, shards.embodiment, shards.manifest
     h, w = spec.grid
     discrete = spec.kind == "discrete"
     return {
         "token_dtype": str(np.dtype(video_dtype(spec))),
-        "action_dim": embodiment.action_dim * shards.manifest.frame_stride,
+        "action_dim": embodiment.action_dim * manifest.frame_stride,
         "s": h,
         "h": h,
         "w": w,
         "vocab_size": spec.vocab_size,
-        "hz": embodiment.rate_hz / shards.manifest.frame_stride,
+        "hz": embodiment.rate_hz / manifest.frame_stride,
         "encoder_name_or_path": spec.name,
         "encoder_type": "magvit" if discrete else "temporalvae",
         "num_images": rows,
@@ -173,8 +144,8 @@ def _metadata(shards: ShardSet, rows: int, camera: int) -> dict[str, Any]:
         "latent_channels": None if discrete else spec.channels,
         "quantized": discrete,
         "stride": shards.row_stride,
-        "camera": shards.manifest.cameras[camera],
-        "frames": plan.get("frames", "all"),
-        "source": shards.manifest.source,
+        "camera": manifest.cameras[camera],
+        "frames": manifest.plan.get("frames", "all"),
+        "source": manifest.source,
         "tokenizer": spec.to_json(),
     }

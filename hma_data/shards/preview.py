@@ -1,24 +1,184 @@
-"""Show a shard set: decode pictures from its tokens and draw the actions as curves."""
+"""Show a shard set: in figures, and as pictures decoded from its tokens with the actions drawn as curves.
 
+`describe` needs the manifest and episodes.parquet alone. T rows of an episode, A values of an action.
+"""
+
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import opencv
 from hma_data.episodes.sheets import INK, PAPER, Images, write_mp4, write_png, write_text
-from hma_data.errors import ShardError, TokenizerError, UsageError
-from hma_data.shards.curves import Curves
+from hma_data.errors import ShardError, TokenizerError
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.schema import mask_columns, token_column
+from hma_data.shards.schema import flag_totals, mask_columns, token_column
+from hma_data.shards.windows import WindowIndex
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 THUMB, GAP, LABEL, STRIPS, FILM = 144, 4, 18, 22, 256  # pixels; STRIPS is the height of a strip in the sheet
 DECODED = 16  # frames decoded at a time
+LINE, CURSOR, ZERO, UNKNOWN = (0, 114, 178), (213, 94, 0), (200, 200, 200), (225, 225, 225)
+MOST = 16  # strips; of further values only the number is shown
+LABELS, FOOT = 136, 16  # pixels left of the strips and below them
+WINDOW = 12  # frames of the model's window
+
+
+# -- in figures
+
+
+def describe(folder: StrPath) -> dict[str, Any]:
+    """Return plain values for `hma shards info --json`.
+
+    Args:
+        folder: str or path of the set, or its URI.
+
+    Raises:
+        ShardError: the manifest or episodes.parquet is missing or damaged.
+    """
+    shards = ShardSet(folder)
+    manifest, robot = shards.manifest, shards.embodiment
+    values = manifest.to_json()
+    totals = values["totals"]
+    rows = sum(split["rows"] for split in manifest.splits.values())
+    row_hz = robot.rate_hz / manifest.frame_stride
+    return {
+        "folder": str(shards.folder),
+        "embodiment": {
+            "id": robot.id,
+            "robot": robot.robot,
+            "action_dim": robot.action_dim,
+            "state_dim": robot.state.dims if robot.state else 0,
+            "stride": robot.stride,
+            "rows_hz": row_hz,
+            "effective_hz": robot.effective_hz,
+            "cameras": manifest.cameras,
+        },
+        "tokenizer": values["tokenizer"],
+        "source": manifest.source,
+        "totals": totals | {"hours": totals["frames"] / row_hz / 3600},
+        "bytes_per_frame": totals["bytes"] / max(rows, 1),
+        "shards": len(manifest.shards),
+        "splits": manifest.splits,
+        "windows": {
+            split: {"windows": index.count, "short_episodes": index.short_episodes}
+            for split in manifest.splits
+            for index in [WindowIndex.of(shards, split, WINDOW)]
+        },
+        "episodes": _episodes(shards),
+        "names": {"action": robot.action.names(), "state": robot.state.names() if robot.state else []},
+        "stats": manifest.stats,
+        "plan": manifest.plan,
+    }
+
+
+def _episodes(shards: ShardSet) -> dict[str, Any]:
+    table = shards.episodes
+    lengths = np.sort(table["length"].to_numpy())
+    told = pc.value_counts(table["success"].combine_chunks()).to_pylist()
+    success = {item["values"]: item["counts"] for item in told}
+    return {
+        "shortest": int(lengths[0]) if len(lengths) else 0,
+        "median": float(np.median(lengths)) if len(lengths) else 0.0,
+        "longest": int(lengths[-1]) if len(lengths) else 0,
+        "instructions": len(set(table["instruction"].to_pylist()) - {"", None}),
+        "success": success.get(True, 0),
+        "failure": success.get(False, 0),
+        "not_told": success.get(None, 0),
+        "worst_skew_ms": pc.max(table["skew_max_ms"]).as_py() or 0.0,
+        "flags": flag_totals(table["flags"]),
+        "quarantine": dict(Counter(str(item.get("type")) for item in shards.refused())),
+    }
+
+
+# -- actions as curves
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The actions of one episode, and how to draw them.
+
+    Attributes:
+        values: (T, A).
+        known: (T,) bool, or None.
+        low, high: (A,) range of each value, over the whole set.
+        names: A names.
+        seconds: time from the first row to the last.
+        width, height: size of the picture in pixels.
+    """
+
+    values: NDArray[np.float32]
+    known: NDArray[np.bool_] | None
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    names: list[str]
+    seconds: float
+    width: int
+    height: int
+
+    @cached_property
+    def panel(self) -> Images:
+        """Draw all curves without a cursor; (height, width, 3)."""
+        picture = np.full((self.height, self.width, 3), PAPER, np.uint8)
+        shown = min(self.values.shape[1], MOST)
+        rest = self.values.shape[1] - shown
+        tall = (self.height - FOOT) // max(shown, 1)
+        for dim in range(shown):
+            self._strip(picture, dim, dim * tall, tall)
+        text = f"0 to {self.seconds:.1f} s" + (f", {rest} more values" if rest else "")
+        write_text(picture, text, (LABELS, self.height - 4), 0.36)
+        return picture
+
+    def at(self, row: int) -> Images:
+        """Return the panel with a cursor at a row."""
+        picture = self.panel.copy()
+        x = self._x(np.array([row]))[0]
+        picture[: self.height - FOOT, max(x - 1, 0) : x + 1] = CURSOR
+        return picture
+
+    def marked(self, rows: NDArray[np.int64]) -> Images:
+        """Return the panel with a tick below each of these rows."""
+        picture = self.panel.copy()
+        for x in self._x(rows):
+            picture[self.height - FOOT - 2 : self.height - FOOT + 3, x - 1 : x + 2] = CURSOR
+        return picture
+
+    def _x(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        last = max(len(self.values) - 1, 1)
+        return (LABELS + rows / last * (self.width - LABELS - 6)).round().astype(np.int64)
+
+    def _strip(self, picture: Images, dim: int, top: int, tall: int) -> None:
+        cv2 = opencv()
+        inner = max(tall - 5, 3)
+        span = self.high[dim] - self.low[dim]
+        scale = 1 / span if span > 0 else 0.0
+
+        def y(values: NDArray[np.floating]) -> NDArray[np.int64]:
+            share = np.clip((values - self.low[dim]) * scale, 0, 1) if span > 0 else np.full(len(values), 0.5)
+            return (top + 2 + (1 - share) * inner).round().astype(np.int64)
+
+        x = self._x(np.arange(len(self.values)))
+        if self.known is not None:
+            for at in x[~self.known]:
+                picture[top + 2 : top + 3 + inner, max(at - 1, 0) : at + 2] = UNKNOWN
+        if self.low[dim] <= 0 <= self.high[dim]:
+            picture[y(np.zeros(1))[0], LABELS : self.width - 6] = ZERO
+        points = np.stack([x, y(self.values[:, dim])], axis=1).astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(picture, [points], False, LINE, 1, cv2.LINE_AA)
+        picture[top + 2 : top + 3 + inner, LABELS - 1] = INK
+        if tall >= 10:
+            write_text(picture, self.names[dim][:10], (4, top + tall // 2 + 4), 0.36)
+            write_text(picture, f"{self.low[dim]:.2g}..{self.high[dim]:.2g}", (66, top + tall // 2 + 4), 0.26)
+
+
+# -- in pictures
 
 
 @dataclass(frozen=True)
@@ -41,12 +201,9 @@ def tokenizer_of(shards: ShardSet, weights: StrPath | None = None, device: str =
     """
     tokenizer = get_tokenizer(shards.spec.name, weights=weights, device=device)
     if tokenizer.spec != shards.spec:
-        raise TokenizerError(
-            shards.folder,
-            f"was made by {shards.spec.name} with weights {shards.spec.weights_sha256[:12]}, here are "
-            f"{tokenizer.spec.weights_sha256[:12]}",
-            "give the weights it was made with, or convert again",
-        )
+        made, here = shards.spec.weights_sha256[:12], tokenizer.spec.weights_sha256[:12]
+        fault = f"was made by {shards.spec.name} with weights {made}, and the weights here are {here}"
+        raise TokenizerError(shards.folder, fault, "give the weights it was made with, or convert again")
     return tokenizer
 
 
@@ -78,15 +235,13 @@ def preview(
         UsageError: there is no such camera.
     """
     shards, out = ShardSet(folder), as_path(out)
-    if camera is not None and camera not in shards.manifest.cameras:
-        known = ", ".join(shards.manifest.cameras)
-        raise UsageError("--camera", f"{camera!r} is not in {shards.folder}", f"its cameras: {known}")
+    number = shards.camera_index(camera)
     if not len(shards.episodes):
         raise ShardError(shards.folder, "holds no episodes", "its quarantine.jsonl says why")
     opened = tokenizer or tokenizer_of(shards, weights)
     picks = np.unique(np.linspace(0, len(shards.episodes) - 1, episodes).round().astype(int))
     rows = shards.episodes.take(picks).to_pylist()
-    seen = [_Seen(shards, opened, row, camera) for row in rows]
+    seen = [_Seen(shards, opened, row, number) for row in rows]
     out.mkdir(parents=True, exist_ok=True)
     sheet, video = out / "sheet.png", out / "preview.mp4"
     write_png(sheet, np.concatenate([one.sheet(columns) for one in seen]))
@@ -98,12 +253,9 @@ def preview(
 class _Seen:
     """One episode as one camera recorded it; tokens are decoded when they are drawn."""
 
-    def __init__(
-        self, shards: ShardSet, tokenizer: Tokenizer, row: dict[str, Any], camera: str | None
-    ) -> None:
+    def __init__(self, shards: ShardSet, tokenizer: Tokenizer, row: dict[str, Any], camera: int) -> None:
         self._shards, self._tokenizer = shards, tokenizer
-        number = shards.manifest.cameras.index(camera) if camera else 0
-        own = slice(number * row["length"], (number + 1) * row["length"])
+        own = slice(camera * row["length"], (camera + 1) * row["length"])
         masks = [name for name in mask_columns(shards.embodiment) if name == "action_known"]
         names = [token_column(shards.spec)[0], "action", "timestamp", *masks]
         values = shards.episode_rows(row["episode_index"], names)
@@ -111,14 +263,9 @@ class _Seen:
         self._actions = values["action"][own, : shards.embodiment.action_dim]  # the first command of a chunk
         self._known = values["action_known"][own] if masks else None
         self._seconds = float(values["timestamp"][own][-1])
-        words = [
-            row["id"],
-            row["split"],
-            f"{row['length']} frames, {self._seconds:.1f} s",
-            row["instruction"],
-        ]
-        if row["success"] is not None:
-            words.append("success" if row["success"] else "failure")
+        success = {True: "success", False: "failure", None: ""}[row["success"]]
+        length = f"{row['length']} frames, {self._seconds:.1f} s"
+        words = [row["id"], row["split"], length, row["instruction"], success]
         self.label = "   ".join(word for word in words if word)
 
     def _pictures(self, rows: NDArray[np.int64]) -> Images:

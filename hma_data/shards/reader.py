@@ -3,7 +3,6 @@
 N rows, S tokens a frame, A values of an action.
 """
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -15,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from hma_data.errors import ShardError
+from hma_data.errors import ShardError, UsageError
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
 from hma_data.shards.schema import mask_columns, to_numpy, token_column
 from hma_data.storage.cache import kept_shard, limit_bytes
@@ -61,7 +60,7 @@ class ShardSet:
     def __init__(self, folder: StrPath, cache: bool = True) -> None:
         self.folder = place(folder)
         if not (self.folder / MANIFEST).is_file() and not self.folder.is_dir():
-            raise ShardError(self.folder, "is not a folder", "give the --out of an hma convert")
+            raise ShardError(self.folder, "is not a folder", "name the --out folder of an hma convert")
         self._cache = cache
         self.manifest = Manifest.load(self.folder)
         self.embodiment = self.manifest.embodiment
@@ -81,15 +80,12 @@ class ShardSet:
         """
         return self._episodes()
 
-    def _episodes(self, columns: list[str] | None = None) -> pa.Table:
+    def _episodes(self, columns: list[str] | None = None, **options: Any) -> pa.Table:
         path = self.folder / EPISODES
         try:
-            if columns is None:
-                with parquet_file(path) as file:
-                    return file.read()
-            with parquet_file(path, read_dictionary=["split", "shard"]) as file:
-                return file.read(columns=columns).select(columns)
-        except (OSError, KeyError, pa.ArrowException) as fault:
+            with parquet_file(path, **options) as file:
+                return file.read(columns=columns)
+        except (OSError, pa.ArrowException) as fault:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
 
     def refused(self) -> list[dict[str, Any]]:
@@ -102,9 +98,20 @@ class ShardSet:
         try:
             return [dict(parse_json(line)) for line in path.read_text(encoding="utf-8").splitlines()]
         except (OSError, ValueError, TypeError) as fault:
-            raise ShardError(
-                path, f"cannot be read: {fault}", f"hma shards restat {self.folder} writes it anew"
-            ) from fault
+            remedy = f"hma shards restat {self.folder} writes it anew"
+            raise ShardError(path, f"cannot be read: {fault}", remedy) from fault
+
+    def camera_index(self, camera: str | None) -> int:
+        """Return the place of a camera among those of the set; None means the first.
+
+        Raises:
+            UsageError: there is no such camera.
+        """
+        cameras = self.manifest.cameras
+        if camera is not None and camera not in cameras:
+            remedy = f"its cameras are {', '.join(cameras)}"
+            raise UsageError("--camera", f"{camera!r} is not a camera of {self.folder}", remedy)
+        return cameras.index(camera) if camera else 0
 
     def columns(self) -> list[str]:
         """Return the columns to `read`, without `camera` and `frame_index`, which follow from the others."""
@@ -119,10 +126,11 @@ class ShardSet:
         """Return the rows of each row group of each shard of a split."""
         return [shard.row_groups for shard in self.manifest.shards if shard.split == split]
 
-    def index(self, split: str, cameras: int | None = None) -> EpisodeIndex:
+    def index(self, split: str) -> EpisodeIndex:
         """Return the split's episodes, in row order; an episode with several cameras counts once for each."""
-        cameras = cameras or len(self.manifest.cameras)
-        table = self._episodes(["episode_index", "split", "shard", "row_start", "length"])
+        cameras = len(self.manifest.cameras)
+        columns = ["episode_index", "split", "shard", "row_start", "length"]
+        table = self._episodes(columns, read_dictionary=["split", "shard"])
         splits, names = _words(table["split"]), _words(table["shard"])
         mine = np.array([word == split for word in splits[1]], np.bool_)[splits[0]]
         order = {name: i for i, name in enumerate(self.shards(split))}
@@ -130,10 +138,9 @@ class ShardSet:
         start, length, index = (
             to_numpy(table[name]).astype(np.int64)[mine] for name in ("row_start", "length", "episode_index")
         )
-        offsets = np.arange(cameras)
-        starts = (start[:, None] + offsets * length[:, None]).ravel()
-        repeat = lambda values: np.repeat(values, cameras)  # noqa: E731
-        return EpisodeIndex(repeat(index), repeat(shard), starts, repeat(length))
+        starts = (start[:, None] + np.arange(cameras) * length[:, None]).ravel()
+        index, shard, length = (np.repeat(values, cameras) for values in (index, shard, length))
+        return EpisodeIndex(index, shard, starts, length)
 
     def read(self, shard: str, row_groups: Sequence[int], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Read columns of some row groups of a shard, (N,) or (N, width) each.
@@ -146,26 +153,20 @@ class ShardSet:
             with self._opened(shard) as file:
                 table = file.read_row_groups(list(row_groups), columns=list(columns), use_threads=False)
         except (OSError, pa.ArrowException) as fault:
-            raise ShardError(
-                path, f"cannot be read: {fault}", "hma shards verify tells what is damaged"
-            ) from fault
+            remedy = "hma shards verify tells what is damaged"
+            raise ShardError(path, f"cannot be read: {fault}", remedy) from fault
         return {name: to_numpy(table[name]) for name in columns}
 
     def _opened(self, shard: str) -> pq.ParquetFile:
         path = self.folder / shard
         if not isinstance(path, RemotePath):
             return pq.ParquetFile(path, pre_buffer=False)
-        listed = self._listed.get(shard)
-        if listed is None:
-            raise ShardError(path, "is not in the manifest", "hma shards verify tells what is damaged")
+        listed = self._listed[shard]
         whole = sum(item.bytes for item in self._listed.values())
         if self._cache and whole <= limit_bytes() and (kept := kept_shard(path, listed.sha256, listed.bytes)):
             return pq.ParquetFile(kept, pre_buffer=False)
-        return pq.ParquetFile(
-            RangeFile(path, listed.bytes),
-            pre_buffer=True,
-            metadata=_footer(path, listed.bytes, listed.sha256),
-        )
+        metadata = _footer(path, listed.bytes, listed.sha256)
+        return pq.ParquetFile(RangeFile(path, listed.bytes), pre_buffer=True, metadata=metadata)
 
     @cached_property
     def _listed(self) -> dict[str, ShardFile]:
@@ -190,11 +191,9 @@ class ShardSet:
     def tokens(self, rows: NDArray[Any]) -> NDArray[Any]:
         """Reshape (N, width) values of the token column to (N, h, w) or (N, c, h, w)."""
         h, w = self.spec.grid
-        return (
-            rows.reshape(-1, h, w)
-            if self.spec.kind == "discrete"
-            else rows.reshape(-1, self.spec.channels or 1, h, w)
-        )
+        if self.spec.kind == "discrete":
+            return rows.reshape(-1, h, w)
+        return rows.reshape(-1, self.spec.channels or 1, h, w)
 
 
 @lru_cache(maxsize=64)
@@ -209,26 +208,20 @@ class EpisodeReader:
     Reading episodes in their order decodes every row group once.
     """
 
-    def __init__(self, shards: ShardSet, columns: Sequence[str], kept: int = 2) -> None:
-        self._set, self._columns, self._kept = shards, list(columns), kept
+    def __init__(self, shards: ShardSet, columns: Sequence[str]) -> None:
+        self._set, self._columns = shards, list(columns)
+        self._group = lru_cache(2)(lambda shard, group: shards.read(shard, [group], self._columns))
         self._edges = {
             shard.path: np.cumsum([0, *shard.row_groups], dtype=np.int64) for shard in shards.manifest.shards
         }
-        self._groups: OrderedDict[tuple[str, int], dict[str, NDArray[Any]]] = OrderedDict()
 
     def rows(self, shard: str, row_start: int, rows: int) -> dict[str, NDArray[Any]]:
         """Read columns of `rows` rows of a shard from `row_start` on, (rows,) or (rows, width) each.
 
         Raises:
-            ShardError: the shard has no such rows, is missing or damaged.
+            ShardError: the shard is missing or damaged.
         """
-        edges = self._edges.get(shard, np.zeros(1, np.int64))
-        if row_start < 0 or rows < 1 or row_start + rows > edges[-1]:
-            raise ShardError(
-                self._set.folder / shard,
-                f"has {edges[-1]:,} rows, {EPISODES} names {row_start:,} to {row_start + rows:,}",
-                "hma shards verify tells what is damaged",
-            )
+        edges = self._edges[shard]
         first = int(np.searchsorted(edges, row_start, side="right")) - 1
         last = int(np.searchsorted(edges, row_start + rows, side="left"))
         parts = []
@@ -239,34 +232,6 @@ class EpisodeReader:
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in self._columns}
-
-    def _group(self, shard: str, group: int) -> dict[str, NDArray[Any]]:
-        key = (shard, group)
-        if key not in self._groups:
-            while len(self._groups) >= self._kept:
-                self._groups.popitem(last=False)
-            self._groups[key] = self._set.read(shard, [group], self._columns)
-        self._groups.move_to_end(key)
-        return self._groups[key]
-
-
-class RowGroupCache:
-    """The last row groups that were read, decoded; shared by all readers of one shard set in this process."""
-
-    def __init__(self, shards: ShardSet, split: str, columns: Sequence[str], size: int) -> None:
-        self._set, self._split, self._columns, self._size = shards, split, list(columns), size
-        self._kept: OrderedDict[tuple[int, int], dict[str, NDArray[Any]]] = OrderedDict()
-        self._names = shards.shards(split)
-
-    def get(self, shard: int, row_group: int) -> dict[str, NDArray[Any]]:
-        """Return the columns of one row group."""
-        key = (shard, row_group)
-        if key not in self._kept:
-            self._kept[key] = self._set.read(self._names[shard], [row_group], self._columns)
-            while len(self._kept) > self._size:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
 
 
 def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:

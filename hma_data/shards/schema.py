@@ -4,8 +4,10 @@ S = h·w tokens a frame, c channels, A values of an action. docs/format.md speci
 """
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +18,14 @@ from numpy.typing import NDArray
 from hma_data.errors import ShardError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.stats import Stats
-from hma_data.shards.wellformed import check_fields, check_numbers, check_plan
 from hma_data.storage.json_io import parse_json
 from hma_data.storage.remote import parquet_input
 from hma_data.tokenizers.base import TokenizerSpec
 
 SCHEMA_VERSION = 1
 ROW_GROUP = 2048
-GROUP_VALUES = (
-    1 << 24
-)  # values of a row group's tokens; Parquet's writer holds small integers in four bytes each
+GROUP_VALUES = 1 << 24  # tokens of a row group; Parquet's writer holds small integers in four bytes each
+MALFORMED = (KeyError, TypeError, ValueError, AttributeError, RecursionError)  # what wrong JSON raises
 _FOOTER = b"hma"
 
 
@@ -48,7 +48,7 @@ class EpisodeRow:
         group: shared by the episodes of one recording, which belong in one split; empty for an episode
             that has a recording of its own.
         source: source of the episode if it differs from the set's.
-        content: hash over what was read of it, see `hma_data.conversion.episode_hash`; empty if it was not
+        content: hash over what was read of it, see `hma_data.conversion.extend`; empty if it was not
             recorded.
     """
 
@@ -87,7 +87,7 @@ class Footer:
     """The facts that a shard states about itself; the manifest is derived from the footers alone.
 
     Attributes:
-        plan: what the shard was made from, see `hma_data.conversion.job.Plan.facts`.
+        plan: what the shard was made from, see `hma_data.conversion.plan.Plan.facts`.
         name: its path below the shard set.
         split: train or val.
         episodes: its episodes, in row order.
@@ -127,22 +127,14 @@ class Footer:
         """Read the footer of a shard from the metadata of its file.
 
         Raises:
-            ShardError: the file is parquet but not a shard, has a version that this release does not read, or
-                has a damaged footer.
+            ShardError: the file is no shard, its version is not read here, or its footer is damaged.
         """
         if not metadata or _FOOTER not in metadata:
-            raise ShardError(where, "is parquet but not a shard: its footer has no 'hma' entry")
+            raise ShardError(where, "is a parquet file but not a shard: its footer has no 'hma' entry")
         try:
             values = parse_json(metadata[_FOOTER])
-            if values["schema_version"] != SCHEMA_VERSION:
-                raise ShardError(
-                    where,
-                    f"has schema version {values['schema_version']}, this release reads {SCHEMA_VERSION}",
-                )
-            check_plan(values["plan"])
-            for stats in values["stats"].values():
-                check_numbers(stats)
-            footer = cls(
+            check_version(values, where)
+            return cls(
                 plan=values["plan"],
                 name=values["name"],
                 split=values["split"],
@@ -150,13 +142,16 @@ class Footer:
                 quarantine=tuple(Refused(**item) for item in values["quarantine"]),
                 stats={name: Stats.from_json(stats) for name, stats in values["stats"].items()},
             )
-            for item in (*footer.episodes, *footer.quarantine):
-                check_fields(item)
-            return footer
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as fault:
-            raise ShardError(
-                where, f"has a damaged footer: {fault}", "delete it and convert again"
-            ) from fault
+        except MALFORMED as fault:
+            text = f"has a damaged footer: {fault!r}"
+            raise ShardError(where, text, "delete it and convert again") from fault
+
+
+def check_version(values: dict[str, Any], where: object) -> None:
+    """Raise ShardError unless a footer or manifest has the schema version that this release reads."""
+    if values["schema_version"] != SCHEMA_VERSION:
+        fault = f"has schema version {values['schema_version']}, and this release reads {SCHEMA_VERSION}"
+        raise ShardError(where, fault, "read it with the release that wrote it")
 
 
 def flags_text(trimmed: int, counts: Mapping[str, int]) -> str:
@@ -169,6 +164,15 @@ def flag_counts(flags: str) -> dict[str, int]:
     """Return the counts that `flags_text` wrote; leave out words without a count."""
     pairs = (word.partition("=") for word in flags.split(","))
     return {name.strip(): int(count) for name, _, count in pairs if count.strip().isdecimal()}
+
+
+def flag_totals(flags: pa.ChunkedArray) -> dict[str, int]:
+    """Return name -> count over all episodes, from the column `flags`."""
+    totals: Counter[str] = Counter()
+    for item in flags.value_counts().to_pylist():
+        for name, count in flag_counts(item["values"] or "").items():
+            totals[name] += count * item["counts"]
+    return dict(sorted(totals.items()))
 
 
 def token_column(spec: TokenizerSpec) -> tuple[str, int]:
@@ -202,19 +206,77 @@ def arrow_schema(
 ) -> pa.Schema:
     """Return the columns of a shard; no value is ever null. `masks`: see `mask_columns`."""
     name, width = token_column(spec)
-    columns: list[tuple[str, pa.DataType]] = [
-        ("episode_index", pa.int32()),
-        ("frame_index", pa.int32()),
-        ("timestamp", pa.float64()),
-    ]
-    if cameras > 1:
-        columns.append(("camera", pa.string()))
-    columns.append((name, _vector(_STORED[spec.dtype], width)))
-    columns.append(("action", _vector(pa.float32(), action_width)))
-    if state_width:
-        columns.append(("state", _vector(pa.float32(), state_width)))
-    columns += [(mask, pa.bool_()) for mask in masks]
-    return pa.schema([pa.field(column, kind, nullable=False) for column, kind in columns])
+    columns = {
+        "episode_index": pa.int32(),
+        "frame_index": pa.int32(),
+        "timestamp": pa.float64(),
+        "camera": pa.string() if cameras > 1 else None,
+        name: _vector(_STORED[spec.dtype], width),
+        "action": _vector(pa.float32(), action_width),
+        "state": _vector(pa.float32(), state_width) if state_width else None,
+        **{mask: pa.bool_() for mask in masks},
+    }
+    return pa.schema([pa.field(column, kind, nullable=False) for column, kind in columns.items() if kind])
+
+
+@dataclass(frozen=True)
+class RowLayout:
+    """The layout of a shard set's rows: which recorded frames become rows, and which columns hold them.
+
+    Attributes:
+        embodiment, tokenizer: what the set was made with.
+        cameras: names, in row order within an episode.
+        frame_stride: recorded steps a row: 1, or the embodiment's stride where only the model's grid is kept.
+    """
+
+    embodiment: Embodiment
+    tokenizer: TokenizerSpec
+    cameras: tuple[str, ...]
+    frame_stride: int
+
+    @classmethod
+    def of_plan(cls, plan: dict[str, Any], embodiment: Embodiment) -> "RowLayout":
+        """Return the layout that the facts of a plan state."""
+        tokenizer = TokenizerSpec.from_json(plan["tokenizer"])
+        return cls(embodiment, tokenizer, tuple(plan["cameras"]), int(plan["frame_stride"]))
+
+    @property
+    def strided(self) -> bool:
+        """Check whether rows leave out recorded steps, and an action holds several commands."""
+        return self.frame_stride > 1
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Return "action" and, if there is one, "state" -> values of one recorded step."""
+        state = self.embodiment.state
+        return {"action": self.embodiment.action_dim} | ({"state": state.dims} if state else {})
+
+    @property
+    def schema(self) -> pa.Schema:
+        """Return the columns of a shard."""
+        return arrow_schema(
+            self.tokenizer,
+            self.widths["action"] * self.frame_stride,
+            self.widths.get("state", 0),
+            len(self.cameras),
+            mask_columns(self.embodiment),
+        )
+
+    def kept(self, length: int) -> NDArray[np.int64]:
+        """Return the frames (N,) of a clip of `length` frames that become rows of a camera."""
+        return np.arange(0, length // self.frame_stride * self.frame_stride, self.frame_stride)
+
+    def empty_stats(self) -> dict[str, Stats]:
+        """Return the statistics of no rows, by vector."""
+        return {name: Stats.empty(width) for name, width in self.widths.items()}
+
+    def stats(self, columns: Mapping[str, NDArray[Any]], rows: slice) -> dict[str, Stats]:
+        """Return the statistics of some rows of the columns (N, width), by vector; skip unknown values."""
+        found = {}
+        for name, width in self.widths.items():
+            values, known = columns[name][rows], columns.get(f"{name}_known")
+            found[name] = Stats.of((values if known is None else values[known[rows]]).reshape(-1, width))
+        return found
 
 
 def encodings(schema: pa.Schema) -> dict[str, str]:
@@ -251,10 +313,7 @@ _NUMPY = {"halffloat": "float16", "float": "float32", "double": "float64"}  # wh
 
 
 def _flat(array: pa.Array) -> NDArray[Any]:
-    """Convert as array.to_numpy does, but avoid its import of pandas for plain numbers and bools.
-
-    If pandas is installed, that import takes a second, and 50 MB in each worker.
-    """
+    """Convert like array.to_numpy, without its import of pandas, which takes a second and 50 MB a worker."""
     name = str(array.type)
     plain = pa.types.is_integer(array.type) or pa.types.is_floating(array.type)
     if array.null_count or not len(array) or not (plain or name == "bool"):
@@ -267,7 +326,7 @@ def _flat(array: pa.Array) -> NDArray[Any]:
     return bits[array.offset : array.offset + len(array)].astype(np.bool_)
 
 
-def read_footer(path: Any, where: str) -> tuple[Footer, list[int]]:
+def read_footer(path: Path) -> tuple[Footer, list[int]]:
     """Return the footer and the number of rows of each row group of a shard.
 
     Raises:
@@ -276,8 +335,7 @@ def read_footer(path: Any, where: str) -> tuple[Footer, list[int]]:
     try:
         metadata = pq.read_metadata(parquet_input(path))
     except (pa.ArrowInvalid, OSError) as fault:
-        raise ShardError(
-            where, f"is not a whole parquet file: {fault}", "delete it and convert again"
-        ) from fault
-    footer = Footer.from_metadata(metadata.metadata, where)
+        remedy = "delete it and convert again"
+        raise ShardError(path, f"is not a whole parquet file: {fault}", remedy) from fault
+    footer = Footer.from_metadata(metadata.metadata, str(path))
     return footer, [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]

@@ -67,9 +67,8 @@ class QuantileSketch:
         values = np.concatenate(self.levels)
         weights = np.concatenate([np.full(len(v), 2.0**level) for level, v in enumerate(self.levels)])
         order = np.argsort(values, axis=0, kind="stable")
-        reach = (
-            np.cumsum(weights[order], axis=0) - weights[order] / 2
-        )  # a value stands for the ranks around it
+        # a value stands for the ranks around it
+        reach = np.cumsum(weights[order], axis=0) - weights[order] / 2
         index = np.minimum((reach < q * weights.sum()).sum(axis=0), len(values) - 1)
         return np.take_along_axis(values, np.take_along_axis(order, index[None], 0), 0)[0].astype(np.float64)
 
@@ -96,9 +95,10 @@ class QuantileSketch:
             raise ValueError(f"a sketch of {values['rows']} rows holds other than {size} bytes")
         flat = np.frombuffer(packed, "<f4")
         parts = np.split(flat, np.cumsum([n * values["width"] for n in values["rows"]])[:-1])
-        return cls(
-            [part.reshape(-1, values["width"]).astype(np.float32) for part in parts], list(values["odd"])
-        )
+        levels: list[NDArray[np.float32]] = [
+            part.reshape(-1, values["width"]).astype(np.float32) for part in parts
+        ]
+        return cls(levels, list(values["odd"]))
 
 
 @dataclass
@@ -157,9 +157,9 @@ class Stats:
 
     def quantile(self, q: float) -> Array:
         """Return (A,) the value below which a fraction q of the rows lies; see QuantileSketch."""
-        return (
-            np.clip(self.sketch.quantile(q), self.min, self.max) if self.count else np.zeros_like(self.mean)
-        )
+        if not self.count:
+            return np.zeros_like(self.mean)
+        return np.clip(self.sketch.quantile(q), self.min, self.max)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values from which `from_json` makes the same object."""

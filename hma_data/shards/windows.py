@@ -15,8 +15,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import ShardError
-from hma_data.shards.manifest import EPISODES
 from hma_data.shards.reader import EpisodeIndex, ShardSet
 
 Ints = NDArray[np.int64]
@@ -56,12 +54,7 @@ class WindowIndex:
 
     @classmethod
     def of(
-        cls,
-        shards: ShardSet,
-        split: str,
-        frames: int,
-        row_stride: int | None = None,
-        short: Short = "drop",
+        cls, shards: ShardSet, split: str, frames: int, row_stride: int | None = None, short: Short = "drop"
     ) -> "WindowIndex":
         """Return the index of a split.
 
@@ -70,9 +63,6 @@ class WindowIndex:
             row_stride: rows between frames; None takes the embodiment's.
             short: "drop" or "pad" for episodes shorter than a window; an episode of a single frame is always
                 dropped.
-
-        Raises:
-            ShardError: episodes.parquet names rows that the shards do not have.
         """
         stride = row_stride or shards.row_stride
         span = frames * stride
@@ -161,17 +151,4 @@ def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
 def _first_rows(shards: ShardSet, split: str, episodes: EpisodeIndex) -> Ints:
     """Return the first row of each episode, counted through all shards of the split."""
     sizes = np.array([sum(groups) for groups in shards.row_groups(split)], np.int64)
-    if not len(episodes.shard):
-        return np.zeros(0, np.int64)
-    known = (episodes.shard >= 0) & (episodes.shard < len(sizes))
-    rows = np.append(sizes, 0)[np.where(known, episodes.shard, -1)]
-    wrong = ~known | (episodes.start < 0) | (episodes.length < 1) | (episodes.start + episodes.length > rows)
-    if wrong.any():
-        i = int(np.argmax(wrong))
-        raise ShardError(
-            shards.folder,
-            f"{EPISODES} puts episode {episodes.episode_index[i]} at rows {episodes.start[i]:,} to "
-            f"{episodes.start[i] + episodes.length[i]:,} of a shard that has {rows[i]:,}",
-            f"hma shards restat {shards.folder} writes it anew from the shards",
-        )
     return (np.cumsum(sizes) - sizes)[episodes.shard] + episodes.start

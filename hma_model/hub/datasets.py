@@ -7,9 +7,9 @@ import tempfile
 from pathlib import Path
 from typing import Protocol
 
+from hma_data.conversion.publish import SMALL, Place, publish
 from hma_data.errors import HubError, ShardError
 from hma_data.shards.manifest import MANIFEST, SHARD_NAME, Manifest, seal_problem
-from hma_data.shards.publish import SMALL, Place, publish
 from hma_data.storage.files import file_sha256, write_atomic
 from hma_data.storage.paths import StrPath, as_address, as_path
 from hma_model.checkpoint.io import README

@@ -1,5 +1,6 @@
 """Full batches across episodes: every frame comes back to its own episode, in its place."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hma_data.conversion.batching import Batches
+from hma_data.conversion.worker import Batches
 
 
 def frames(episode: int, start: int, count: int) -> NDArray[np.uint8]:
@@ -32,24 +33,25 @@ def test_batches_are_full_and_tokens_come_back_to_their_frames(
         return batch[:, 0, 0, :2].astype(np.uint32)
 
     batches = Batches(encode, size)
+    episodes = [SimpleNamespace(waiting=0, tokens={"front": []}) for _ in pieces]
     added = encoded = 0
-    for episode, counts in enumerate(pieces):
+    for number, (episode, counts) in enumerate(zip(episodes, pieces)):
         at = 0
         for count in counts:
-            encoded += batches.add(episode, "front", frames(episode, at, count))
+            encoded += batches.add(episode, "front", frames(number, at, count))
             at += count
         added += at
-        if episode in dropped:
+        if number in dropped:
             batches.drop(episode)
     assert all(count == size for count in seen)
     encoded += batches.flush()
     assert all(count == size for count in seen[:-1])
-    for episode, counts in enumerate(pieces):
-        if episode in dropped:
+    for number, (episode, counts) in enumerate(zip(episodes, pieces)):
+        if number in dropped:
             continue
-        assert batches.whole(episode)
-        tokens = batches.take(episode)["front"]
-        np.testing.assert_array_equal(tokens[:, 0], episode)
+        assert not episode.waiting
+        tokens = np.concatenate(episode.tokens["front"])
+        np.testing.assert_array_equal(tokens[:, 0], number)
         np.testing.assert_array_equal(tokens[:, 1], np.arange(sum(counts)))
     if not dropped:
         assert encoded == added

@@ -86,8 +86,8 @@ def test_workers_that_cannot_be_made_are_one_error(
 ) -> None:
     from hma_data.conversion.engines import ray as engine
 
-    monkeypatch.setattr(engine, "LOST_STARTS", (1, 1))
-    with pytest.raises(HMAError, match=r"the Ray cluster: .*installed on every node"):
+    monkeypatch.setattr(engine, "LOST_STARTS", 1)
+    with pytest.raises(HMAError, match=r"the Ray cluster: .*on every node"):
         list(engine.run(PLAIN, Unreadable(), 1, lambda number, event: None, LIMITS))
 
 

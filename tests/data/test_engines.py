@@ -210,7 +210,7 @@ def test_a_worker_that_nobody_hears_any_more_ends_without_a_word() -> None:
 
 
 def test_the_ledger_leaves_a_unit_that_was_killed_twice_for_when_nothing_else_runs() -> None:
-    ledger = Ledger(["x", "y"], Limits(kills=5))
+    ledger = Ledger(["x", "y"], Limits(kills=5), print_nothing)
     first, second = ledger.take(), ledger.take()
     assert first and second
     ledger.lost(0, "killed", "", "ended by SIGKILL")

@@ -425,8 +425,8 @@ def test_a_recipe_holds_several_conversions_with_common_defaults(tmp_path: Path)
         ("jobs: [{embodiment: a}]", r"jobs\[0\]: lacks out"),
         ("jobs: [{embodiment: a, out: x, limit: none}]", "limit is 'none'"),
         ("jobs: [{embodiment: a, out: x}, {embodiment: b, out: ./x}]", "two jobs write"),
-        ("job: []", "holds no jobs"),
-        ("jobs: [a]", r"jobs\[0\]: must be a mapping"),
+        ("job: []", "lacks jobs"),
+        ("jobs: [a]", "jobs.0 is 'a'"),
         ("{jobs: [{embodiment: a, out: x}], default: {}}", "unknown key 'default'"),
     ],
 )

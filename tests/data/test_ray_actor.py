@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from hma_data.conversion.engines.base import FIRST, Attempt, Report, Step, Work
-from hma_data.conversion.engines.ray_actor import Answer, Done, End, Failed, Lost, Opened, Worker
+from hma_data.conversion.engines.ray import Answer, Done, End, Failed, Lost, Opened, Worker
 from hma_data.errors import TokenizerError
 from tests.data.test_engines import PLAIN, MakeWork, Unit
 
@@ -81,7 +81,7 @@ def opened(tmp_path: Path, request: pytest.FixtureRequest) -> Worker:
 
 def made(request: pytest.FixtureRequest, make_work: Callable[[int], Work], answer_s: float = 0.2) -> Worker:
     worker = Worker(make_work, 1, 6, answer_s)
-    request.addfinalizer(lambda: worker._process and worker._end())
+    request.addfinalizer(worker.pool.close)
     return worker
 
 
@@ -124,8 +124,9 @@ def test_how_a_process_was_lost_is_told_with_its_step_and_the_next_unit_is_done(
 
 def test_a_process_that_is_killed_between_units_costs_nothing(opened: Worker) -> None:
     do(opened, PLAIN[0])
-    os.kill(opened._process.pid, signal.SIGKILL)
-    opened._process.join()
+    (process,) = opened.pool.processes
+    os.kill(process.process.pid or 0, signal.SIGKILL)
+    process.process.join()
     assert do(opened, PLAIN[1])[1] == Done(("u1", ["a", "b"]))
 
 
@@ -162,7 +163,8 @@ def test_a_process_that_is_killed_at_its_start_is_started_again(
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"), [("SIGSEGV", "ended at its start, by SIGSEGV"), ("error", "weights: are wrong")]
+    ("kind", "said"),
+    [("SIGSEGV", "cannot start; the last one ended the process by SIGSEGV"), ("error", "weights: are wrong")],
 )
 def test_work_that_cannot_start_is_one_error(
     kind: str, said: str, tmp_path: Path, request: pytest.FixtureRequest
@@ -176,7 +178,7 @@ PARENT = """
 from pathlib import Path
 Path({started!r}).open("a").write("started\\n")
 from hma_data.conversion.engines.base import FIRST
-from hma_data.conversion.engines.ray_actor import Worker
+from hma_data.conversion.engines.ray import Worker
 from tests.data.test_engines import MakeWork, Unit
 worker = Worker(MakeWork(Path({notes!r})), 1, None, 0.2)
 worker.open()

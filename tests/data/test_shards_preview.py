@@ -11,8 +11,7 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.curves import CURSOR, UNKNOWN, Curves
-from hma_data.shards.preview import preview
+from hma_data.shards.preview import CURSOR, UNKNOWN, Curves, preview
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 

@@ -14,12 +14,11 @@ from hypothesis import strategies as st
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
-from hma_data.conversion.restat import restat
+from hma_data.conversion.rewrite import restat
 from hma_data.errors import ShardError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest, finish, plan_hash, seal_problem
 from hma_data.shards.verify import verify
-from hma_data.storage.files import file_sha256
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)
@@ -161,8 +160,7 @@ def test_a_manifest_of_another_run_is_found(sound: Path, tmp_path: Path, toy_arm
     write_toy(tmp_path / "other.hdf5", [14, 15, 16, 17, 20])
     convert(toy_arm, str(tmp_path / "other.hdf5"), block_tokenizer, tmp_path / "other", settings=SMALL)
     (sound / MANIFEST).write_bytes((tmp_path / "other" / MANIFEST).read_bytes())
-    problems = verify(sound)
-    assert any("another plan" in problem for problem in problems)
+    assert any("shard-00000.parquet" in problem for problem in verify(sound))
     assert not verify(tmp_path / "other")
 
 
@@ -315,71 +313,3 @@ def test_a_damaged_page_is_known_where_the_manifest_is_lost(sound: Path) -> None
     with pytest.raises(ShardError, match="shard-00001"):
         restat(sound)
     assert not (sound / MANIFEST).exists()
-
-
-# -- hostile
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers(-5, 10**20) | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=4,
-)
-
-
-def places(values: object, path: tuple = ()) -> list[tuple]:
-    """Paths to all keys and items."""
-    found = []
-    items = (
-        values.items() if isinstance(values, dict) else enumerate(values if isinstance(values, list) else [])
-    )
-    for key, value in items:
-        found += [(*path, key), *places(value, (*path, key))]
-    return found
-
-
-@given(st.data())
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_value_anywhere_in_a_sealed_manifest_ends_in_clear_lines(made: Path, data: st.DataObject) -> None:
-    path = made / MANIFEST
-    whole = path.read_bytes()
-    values = json.loads(whole)
-    *way, last = data.draw(st.sampled_from(places(values)))
-    holder = values
-    for key in way:
-        holder = holder[key]
-    was, holder[last] = holder[last], data.draw(JSON)
-    try:
-        reseal(made, lambda manifest: (manifest.clear(), manifest.update(values)))
-        problems = verify(made)
-        assert all("\n" not in problem and len(problem) < 1500 for problem in problems)
-        free = way[:1] == ["totals"] or last in ("totals", "bytes", "manifest_sha256", "source")
-        assert problems or holder[last] == was or free, (way, last, was, holder[last])
-    finally:
-        path.write_bytes(whole)
-
-
-@given(st.data())
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_value_anywhere_in_a_hashed_footer_ends_in_clear_lines(made: Path, data: st.DataObject) -> None:
-    path, manifest = made / "val" / "shard-00000.parquet", made / MANIFEST
-    whole, stated = path.read_bytes(), manifest.read_bytes()
-    metadata = footer(path)
-    values = json.loads(metadata[b"hma"])
-    *way, last = data.draw(st.sampled_from(places(values)))
-    holder = values
-    for key in way:
-        holder = holder[key]
-    holder[last] = data.draw(JSON)
-    try:
-        write(path, pq.read_table(path), metadata | {b"hma": json.dumps(values).encode()})
-
-        def describe(facts: dict) -> None:
-            shard = next(item for item in facts["shards"] if item["split"] == "val")
-            shard |= {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
-
-        reseal(made, describe)
-        assert all("\n" not in problem and len(problem) < 1500 for problem in verify(made))
-    finally:
-        path.write_bytes(whole)
-        manifest.write_bytes(stated)

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hma_data.conversion.hub_output import HubOutput
+from hma_data.conversion import publish
 from hma_data.conversion.job import convert, convert_share
 from hma_data.conversion.output import Share
 from hma_data.conversion.plan import Settings
+from hma_data.conversion.publish import HubOutput
 from hma_data.errors import HubError, OutputError, ShardError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards import publish
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.storage import remote as store
@@ -145,7 +145,7 @@ def test_a_branch_gets_the_set_and_main_none_of_it(toy_arm, toy_recording, hub, 
     run(toy_arm, toy_recording, out=out)
     assert len(dataset(hub).commits) == before
     with pytest.raises(OutputError, match=r"@dev/sets/one: belongs to another conversion"):
-        HubOutput.of(place(out)).refuse_other({**ShardSet(out).manifest.plan, "hash": "0" * 16})
+        run(toy_arm, toy_recording, replace(SMALL, seed=3), out=out)
 
 
 def test_a_file_that_a_gitignore_leaves_out_stops_the_upload(toy_arm, toy_recording, hub) -> None:
@@ -256,27 +256,8 @@ def test_two_jobs_of_one_conversion_at_once_make_it_together(
     assert len(dataset(hub).commits) == 1 + (sum("shard-" in name for name in whole) + 1) // 2
 
 
-def test_of_two_conversions_at_once_one_is_whole_and_the_other_is_told(
-    toy_arm, toy_recording, hub, whole, monkeypatch, tmp_path
-) -> None:
-    def other() -> None:
-        other_machine(monkeypatch, tmp_path)
-        with pytest.raises(OutputError, match=f"{OUT}: another conversion is writing there"):
-            run(toy_arm, toy_recording, replace(SMALL, seed=3))
-        monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma"))
-
-    def first() -> None:
-        hub.before_commit = [lambda: dataset(hub).commit({f"sets/one/{name}": whole[name]})]
-        other()
-
-    name = next(name for name in sorted(whole, reverse=True) if "shard-" in name)
-    hub.before_commit = [lambda: None, first]
-    run(toy_arm, toy_recording)
-    assert published(hub) == whole
-
-
 def test_what_a_hub_cannot_take_is_told(toy_arm, toy_recording, hub) -> None:
     with pytest.raises(OutputError, match="names no dataset of the hub"):
         run(toy_arm, toy_recording, out="hf://team/arm")
-    with pytest.raises(OutputError, match="one whole hma convert only"):
+    with pytest.raises(OutputError, match="takes whole conversions only"):
         convert_share(toy_arm, str(toy_recording), BlockTokenizer(), Path(OUT), Share(0, 2), settings=SMALL)

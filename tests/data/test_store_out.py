@@ -15,8 +15,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from hma_data.conversion.job import Shared, convert, convert_share
 from hma_data.conversion.output import PLAN, Share
 from hma_data.conversion.plan import Settings
-from hma_data.conversion.restat import restat
-from hma_data.conversion.rewrite import merge
+from hma_data.conversion.rewrite import merge, restat
 from hma_data.errors import MissingDependencyError, OutputError, ShardError, StorageAwayError, StorageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.verify import verify

@@ -4,11 +4,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.errors import ShardError
 from hma_data.shards.reader import EpisodeIndex
 from hma_data.shards.windows import WindowIndex
 
@@ -88,17 +86,6 @@ def test_a_padded_episode_gives_one_window_from_its_first_row(
     assert list(rows) == expected
     assert index.short_episodes == sum(n < frames * stride and n <= stride for n in lengths)
     assert index.padded_episodes == sum(stride < n < frames * stride for n in lengths)
-
-
-@pytest.mark.parametrize(
-    ("entry", "value"),
-    [("start", 30), ("length", 99), ("length", 0), ("start", -1), ("shard", 3), ("shard", -1)],
-)
-def test_an_episode_outside_its_shard_is_refused(entry: str, value: int) -> None:
-    broken = fake([20, 15, 9])
-    getattr(broken.index("train"), entry)[1] = value
-    with pytest.raises(ShardError, match="puts episode 1 at rows"):
-        WindowIndex.of(broken, "train", 4)
 
 
 def test_a_split_without_shards_has_no_windows() -> None:

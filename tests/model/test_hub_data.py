@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
+from hma_data.conversion import publish
 from hma_data.errors import HubError, ShardError
-from hma_data.shards import publish
 from hma_data.shards.reader import ShardSet
 from hma_model.hub.datasets import pull_data, push_data
 from tests.hub_server import Hub
@@ -58,7 +58,7 @@ def test_a_published_set_is_read_in_place_by_its_uri(server, shards):
 def test_empty_files_that_a_hub_does_not_send_are_there(server, shards, tmp_path):
     from huggingface_hub import HfFileSystem
 
-    from hma_data.shards.info import describe
+    from hma_data.shards.preview import describe
 
     server.habits.empty = False
     push_data(shards, REPO)

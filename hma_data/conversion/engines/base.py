@@ -6,9 +6,9 @@ known. The Ledger decides when a unit is tried again; its rules are the same for
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from hma_data.errors import HMAError
 
@@ -65,21 +65,6 @@ class Limits:
 LIMITS = Limits()
 
 
-class Engine(Protocol):
-    """A function that runs units, on this machine or elsewhere."""
-
-    def __call__(
-        self,
-        units: Sequence[Any],
-        make_work: Callable[[int], Work],
-        workers: int,
-        on_event: OnEvent,
-        limits: Limits,
-    ) -> Iterator[Any]:
-        """Yield each unit's result when it is ready; call on_event(index of the unit, what it reported)."""
-        ...
-
-
 class Ledger:
     """The units that wait, run, or have failed, and the rules for trying again.
 
@@ -88,9 +73,10 @@ class Ledger:
     `limits.kills` kills; after the second kill it waits until no other unit is running.
     """
 
-    def __init__(self, units: Iterable[Any], limits: Limits) -> None:
+    def __init__(self, units: Iterable[Any], limits: Limits, on_event: OnEvent) -> None:
         self.units = list(units)
         self.limits = limits
+        self._on_event = on_event
         self.running: set[int] = set()
         self.failures: list[HMAError] = []
         self._waiting = deque(range(len(self.units)))
@@ -113,18 +99,15 @@ class Ledger:
         else:
             return None
         self.running.add(number)
-        return (
-            number,
-            self.units[number],
-            Attempt(self._attempts[number], dict(self._refused.get(number, {}))),
-        )
+        attempt = Attempt(self._attempts[number], dict(self._refused.get(number, {})))
+        return number, self.units[number], attempt
 
     def finished(self, number: int) -> None:
         """Record that the unit is done."""
         self.running.discard(number)
 
-    def lost(self, number: int, cause: Cause, step: str, how: str) -> Retry | None:
-        """Record that a unit lost its process, and schedule it again; return None if the unit is given up.
+    def lost(self, number: int, cause: Cause, step: str, how: str) -> None:
+        """Record that a unit lost its process; schedule it again and report a Retry, or give it up.
 
         Args:
             step: the last step it reported; empty if it reported none.
@@ -136,24 +119,20 @@ class Ledger:
             self._kills[number] += 1
             if self._kills[number] >= self.limits.kills:
                 self._give_up(number, f"its worker was lost {self._kills[number]} times, last {how}", step)
-                return None
+                return
         elif self._attempts[number] > 1:
             if not step:
                 self._give_up(number, f"its worker {how} before any step", step)
-                return None
+                return
             self._refused.setdefault(number, {})[step] = how
         (self._alone if self._kills[number] >= 2 else self._waiting).append(number)
-        return Retry(f"{how} at {step}" if step else how)
+        self._on_event(number, Retry(f"{how} at {step}" if step else how))
 
     def _give_up(self, number: int, what: str, step: str) -> None:
+        where = getattr(self.units[number], "name", f"unit {number}")
         at = f", at {step}" if step else ""
-        self.failures.append(
-            HMAError(
-                getattr(self.units[number], "name", f"unit {number}"),
-                f"{what}{at}; perhaps the machine is short of memory",
-                "everything finished is kept: run the same command again, with fewer --workers",
-            )
-        )
+        remedy = "everything finished is kept: run the same command again, with fewer --workers"
+        self.failures.append(HMAError(where, f"{what}{at}; the machine may be short of memory", remedy))
 
     def raise_failures(self) -> None:
         """Raise the error of the first unit that was given up, when all other units are done."""

@@ -11,18 +11,26 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from typing import Any, Protocol
 
-from hma_data.conversion.engines.base import FIRST, LIMITS, Cause, Ledger, Limits, OnEvent, Step, Work
+from hma_data.conversion.engines.base import (
+    FIRST,
+    LIMITS,
+    Attempt,
+    Cause,
+    Ledger,
+    Limits,
+    OnEvent,
+    Step,
+    Work,
+)
 from hma_data.errors import HMAError
 from hma_data.priority import take_ordinary_priority
 
 CRASHES = {"SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGSYS"}  # signals of a process's own faults
 TICK_S = 0.5
-# Limit of failed starts in a row. A kill from outside counts 1, any other failure counts 10.
-START_FAILURES, KILLS_A_FAILURE = 30, 10
+START_FAILURES = 10  # limit of processes in a row that end before they are ready
 
 
 def run(
@@ -32,9 +40,10 @@ def run(
     on_event: OnEvent,
     limits: Limits = LIMITS,
 ) -> Iterator[Any]:
-    """Run every unit and yield each result when it is ready; see engines.base.Engine.
+    """Run every unit and yield each result when it is ready.
 
     Args:
+        on_event: called with (index of a unit, what it reported).
         workers: number of processes; 0 works in this one, which does not survive a crash or a hang.
 
     Raises:
@@ -45,10 +54,12 @@ def run(
         for number, unit in enumerate(units):
             yield work(unit, _reporter(on_event, number), FIRST)
         return
-    ledger = Ledger(units, limits)
-    pool = _Pool(make_work, min(workers, len(ledger.units)), ledger, on_event)
+    ledger = Ledger(units, limits, on_event)
+    count = min(workers, len(ledger.units))
+    pool = Pool(lambda: WorkerProcess(make_work, count), count, ledger, on_event)
     try:
         while ledger.open:
+            pool.fill()
             yield from pool.turn()
         ledger.raise_failures()
     finally:
@@ -63,143 +74,161 @@ def _reporter(on_event: OnEvent, number: int) -> Callable[[Any], None]:
     return report
 
 
-@dataclass
-class _Worker:
-    """A process, and the unit and step it is at."""
+class WorkerProcess:
+    """A spawned process that runs one unit after the other.
 
-    process: Any
-    pipe: Connection
-    ready: bool = False
-    unit: int | None = None
-    step: str = ""
-    heard: float = 0.0
-    hung: bool = False
+    Attributes:
+        ready: whether it can take a unit.
+        unit: the number of the unit it is at; None if it has none.
+        step: the last step that the unit reported.
+    """
+
+    def __init__(self, make_work: Callable[[int], Work], workers: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(
+            target=serve, args=(theirs, make_work, workers), daemon=True, name="hma-worker"
+        )
+        self.process.start()
+        theirs.close()
+        self.ready = False
+        self.unit: int | None = None
+        self.step, self._heard = "", time.monotonic()
+
+    def start_unit(self, number: int, unit: Any, attempt: Attempt) -> None:
+        """Hand a unit to the process."""
+        self.unit, self.step, self._heard = number, "", time.monotonic()
+        with suppress(OSError):  # it died just now; its end will be noticed
+            self.pipe.send((unit, attempt))
+
+    def messages(self) -> Iterator[tuple[str, Any]]:
+        """Yield (kind, value) of what the process has sent, without steps; see `serve`."""
+        try:
+            while self.pipe.poll():
+                kind, value = self.pipe.recv()
+                self._heard = time.monotonic()
+                if isinstance(value, Step):
+                    self.step = value.name
+                    continue
+                self.ready = self.ready or kind == "ready"
+                yield kind, value
+        except (EOFError, OSError):
+            return  # its end will be noticed
+
+    def hangs(self, quiet_s: float | None) -> bool:
+        """Check whether its unit has reported nothing for `quiet_s` seconds."""
+        waited = time.monotonic() - self._heard
+        return quiet_s is not None and self.unit is not None and self.ready and waited > quiet_s
+
+    def end(self) -> tuple[Cause, str]:
+        """End the process if it still runs; return the cause of its end, and how it ended in words."""
+        self.pipe.close()
+        self.process.kill()
+        self.process.join()
+        code = self.process.exitcode
+        if code is None:  # the settings of a cluster may hide it
+            return "killed", "ended by an unknown cause"
+        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        if name in CRASHES:
+            return "crashed", f"ended the process by {name}"
+        return "killed", f"ended by {name}"
 
 
-class _Pool:
-    """The processes of one run."""
+class Units(Protocol):
+    """The units of a pool: the Ledger, or the one unit of an actor."""
+
+    limits: Limits
+
+    def take(self) -> tuple[int, Any, Attempt] | None:
+        """Return the next unit to start; None if none may start now."""
+        ...
+
+    def finished(self, number: int) -> None:
+        """Record that the unit is done."""
+        ...
+
+    def lost(self, number: int, cause: Cause, step: str, how: str) -> None:
+        """Record that a unit lost its process."""
+        ...
+
+
+class Pool:
+    """The processes of one run.
+
+    Args:
+        start: starts a process.
+        count: number of processes.
+        units: hands out the units, and records how they end.
+        on_event: called with (number of a unit, what it reported).
+    """
 
     def __init__(
-        self, make_work: Callable[[int], Work], count: int, ledger: Ledger, on_event: OnEvent
+        self, start: Callable[[], WorkerProcess], count: int, units: Units, on_event: OnEvent
     ) -> None:
-        self._make_work, self._count, self._ledger, self._on_event = make_work, count, ledger, on_event
-        self._context = multiprocessing.get_context("spawn")
+        self._start, self._count, self._units, self._on_event = start, count, units, on_event
         self._start_failures = 0
-        self._workers: list[_Worker] = []
+        self.processes: list[WorkerProcess] = []
+
+    def fill(self) -> None:
+        """Start the processes that are missing."""
+        while len(self.processes) < self._count:
+            self.processes.append(self._start())
 
     def turn(self) -> Iterator[Any]:
-        """Hand out units, then process the messages of the workers; yield results."""
-        while len(self._workers) < self._count:
-            self._workers.append(self._start())
-        for worker in self._workers:
-            self._hand_out(worker)
-        pipes = {worker.pipe: worker for worker in self._workers}
-        ends = {worker.process.sentinel: worker for worker in self._workers}
+        """Hand out units, then handle the messages of the processes; yield results."""
+        for process in self.processes:
+            free = process.ready and process.unit is None and process.process.is_alive()
+            if free and (taken := self._units.take()):
+                process.start_unit(*taken)
+        pipes = {process.pipe: process for process in self.processes}
+        ends = {process.process.sentinel: process for process in self.processes}
         heard = wait([*pipes, *ends], timeout=TICK_S)
         for pipe in heard:
             if isinstance(pipe, Connection):
                 yield from self._listen(pipes[pipe])
-        for worker in [ends[end] for end in heard if end in ends]:
-            yield from self._listen(worker)  # its messages from before it died
-            self._bury(worker)
-        self._stop_the_hung()
+        for process in [ends[end] for end in heard if end in ends]:
+            yield from self._listen(process)  # its messages from before it died
+            self._bury(process)
+        for process in list(self.processes):
+            if process.hangs(self._units.limits.quiet_s):
+                self._bury(process, hung=True)
 
-    def _start(self) -> _Worker:
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(
-            target=serve, args=(theirs, self._make_work, self._count), daemon=True, name="hma-worker"
-        )
-        process.start()
-        theirs.close()
-        return _Worker(process, ours, heard=time.monotonic())
+    def _listen(self, process: WorkerProcess) -> Iterator[Any]:
+        for kind, value in process.messages():
+            number = process.unit
+            if kind == "failed":
+                raise value
+            if kind == "ready":
+                self._start_failures = 0
+            elif number is None:
+                continue
+            elif kind == "short of memory":
+                process.unit = None
+                self._units.lost(number, "killed", process.step, "ran out of memory")
+            elif kind == "done":
+                process.unit = None
+                self._units.finished(number)
+                yield value
+            else:
+                self._on_event(number, value)
 
-    def _hand_out(self, worker: _Worker) -> None:
-        if not worker.ready or worker.unit is not None or worker.process.exitcode is not None:
-            return
-        taken = self._ledger.take()
-        if taken is None:
-            return
-        number, unit, attempt = taken
-        worker.unit, worker.step, worker.heard = number, "", time.monotonic()
-        with suppress(OSError):  # it died just now; `turn` removes it and the unit is retried
-            worker.pipe.send((unit, attempt))
-
-    def _listen(self, worker: _Worker) -> Iterator[Any]:
-        try:
-            while worker.pipe.poll():
-                kind, value = worker.pipe.recv()
-                worker.heard = time.monotonic()
-                if kind == "ready":
-                    worker.ready, self._start_failures = True, 0
-                elif kind == "failed":
-                    raise value
-                elif kind == "short of memory":
-                    self._lost(worker, "killed", "ran out of memory")
-                elif kind == "done":
-                    assert worker.unit is not None
-                    self._ledger.finished(worker.unit)
-                    worker.unit = None
-                    yield value
-                elif isinstance(value, Step):
-                    worker.step = value.name
-                elif worker.unit is not None:
-                    self._on_event(worker.unit, value)
-        except (EOFError, OSError):
-            return  # `turn` notices its end
-
-    def _bury(self, worker: _Worker) -> None:
-        worker.process.join()
-        self._workers.remove(worker)
-        worker.pipe.close()
-        code = worker.process.exitcode or 0
-        name = signal_name(-code) if code < 0 else f"exit code {code}"
-        if not worker.ready:
-            self._start_failures += 1 if code < 0 and name not in CRASHES else KILLS_A_FAILURE
+    def _bury(self, process: WorkerProcess, hung: bool = False) -> None:
+        self.processes.remove(process)
+        cause, how = process.end()
+        if hung:
+            cause, how = "hung", f"made no progress for {self._units.limits.quiet_s:g} s"
+        if not process.ready:
+            self._start_failures += 1
             if self._start_failures >= START_FAILURES:
-                raise HMAError(
-                    "a worker", f"ended at its start, by {name}", "try --workers 1, or more memory"
-                )
-        if worker.unit is None:
-            return
-        if worker.hung:
-            self._lost(worker, "hung", f"made no progress for {self._ledger.limits.quiet_s:g} s")
-        elif name in CRASHES:
-            self._lost(worker, "crashed", f"ended the process by {name}")
-        else:
-            self._lost(worker, "killed", f"ended by {name}")
-
-    def _lost(self, worker: _Worker, cause: Cause, how: str) -> None:
-        number, worker.unit = worker.unit, None
-        assert number is not None
-        retry = self._ledger.lost(number, cause, worker.step, how)
-        if retry:
-            self._on_event(number, retry)
-
-    def _stop_the_hung(self) -> None:
-        quiet = self._ledger.limits.quiet_s
-        for worker in self._workers:
-            if quiet and worker.unit is not None and time.monotonic() - worker.heard > quiet:
-                worker.hung = True
-                worker.process.kill()
+                remedy = "try fewer --workers; the machine may be short of memory"
+                raise HMAError("a worker", f"cannot start; the last one {how}", remedy)
+        if process.unit is not None:
+            self._units.lost(process.unit, cause, process.step, how)
 
     def close(self) -> None:
         """End every process."""
-        for worker in self._workers:
-            worker.process.terminate()
-        for worker in self._workers:
-            worker.process.join(timeout=5)
-            if worker.process.exitcode is None:
-                worker.process.kill()
-                worker.process.join()
-            worker.pipe.close()
-
-
-def signal_name(number: int) -> str:
-    """Return the name of a signal: SIGKILL for 9."""
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
+        for process in self.processes:
+            process.end()
 
 
 # -- in the worker
@@ -228,27 +257,21 @@ def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> N
 
     try:
         work = make_work(workers)
+        send("ready")
+        while True:
+            try:
+                unit, attempt = pipe.recv()
+            except EOFError:
+                return
+            try:
+                send("done", work(unit, lambda event: send("event", event), attempt))
+            except MemoryError:
+                send("short of memory")
+    except HMAError as fault:
+        send("failed", fault)
     except Exception as fault:
-        send("failed", _as_ours(fault))
-        return
-    send("ready")
-    while True:
-        try:
-            unit, attempt = pipe.recv()
-        except EOFError:
-            return
-        try:
-            send("done", work(unit, lambda event: send("event", event), attempt))
-        except MemoryError:
-            send("short of memory")
-        except Exception as fault:
-            send("failed", _as_ours(fault))
-
-
-def _as_ours(fault: Exception) -> HMAError:
-    if isinstance(fault, HMAError):
-        return fault
-    return HMAError("a worker", f"{type(fault).__name__}: {fault}", "this should have been a clearer error")
+        text = f"stopped with {type(fault).__name__}: {fault}"
+        send("failed", HMAError("a worker", text, "report this as a bug; --debug --workers 0 shows where"))
 
 
 def _end_with_parent() -> None:

@@ -1,28 +1,33 @@
 """Run work units on a Ray cluster, one actor a worker, with the tokenizer on the actor's GPU if it has one.
 
-Units and output bytes are the same as with the local engine; only the machine differs. ray_actor.py defines
-the actor. The output folder must be one that every node sees. When a node is lost, its actors are lost too,
-and their units are done again elsewhere. `RAY_ADDRESS` names the cluster; without it, Ray starts on this
-machine.
+Units and output bytes are the same as with the local engine; only the machine differs. The output folder
+must be one that every node sees. When a node is lost, its actors are lost too, and their units are done again
+elsewhere. `RAY_ADDRESS` names the cluster; without it, Ray starts on this machine.
+
+An actor keeps one worker process of the local engine. So the threads and buffers of Ray are in another
+process than the tokenizer, and the exit code of the process is known. The actor collects events, so that the
+driver gets an answer about once a second, not at every step.
 """
 
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
-from hma_data.conversion.engines.base import LIMITS, Cause, Ledger, Limits, OnEvent, Work
-from hma_data.conversion.engines.ray_actor import Answer, End, Failed, Lost, Opened, Worker
+from hma_data.conversion.engines.base import LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Work
+from hma_data.conversion.engines.local import Pool, WorkerProcess
 from hma_data.errors import HMAError, MissingDependencyError
 
 TICK_S = 0.5
 ANSWER_S = 1.0  # seconds for which an actor collects events before it answers
 ANSWERS_A_S = 100.0  # largest number of answers a second that the driver processes
-SILENT_S = 60.0  # beyond a unit's quiet time; an actor always answers, whatever its unit does
 NO_ROOM_S = 900.0  # seconds without any actor that could be placed
-LOST_STARTS = 5, 3  # limit of actors in a row that end before they are ready: 5, and 3 for each worker
-INSTALLED = "hma-toolkit and what it needs must be installed on every node; see Ray's logs"
+LOST_STARTS = 4  # limit of actors in a row, for each worker and one more, that end before they are ready
+INSTALLED = "install hma-toolkit and what it needs on every node; see Ray's logs"
 
 
 def run(
@@ -33,7 +38,7 @@ def run(
     limits: Limits = LIMITS,
     gpus: float = 0.0,
 ) -> Iterator[Any]:
-    """Run every unit and yield each result when it is ready; see engines.base.Engine.
+    """Run every unit and yield each result when it is ready; see engines.local.run.
 
     Args:
         workers: number of actors.
@@ -48,7 +53,7 @@ def run(
     ours = not ray.is_initialized()
     if ours:
         _join(ray)
-    ledger = Ledger(units, limits)
+    ledger = Ledger(units, limits, on_event)
     actors = _Actors(ray, make_work, min(max(workers, 1), max(len(ledger.units), 1)), gpus, ledger, on_event)
     try:
         while ledger.open:
@@ -64,9 +69,8 @@ def _ray() -> Any:
     try:
         import ray
     except ImportError as fault:
-        raise MissingDependencyError(
-            "--engine ray", "Ray is not installed", "pip install 'hma-toolkit[ray]'"
-        ) from fault
+        remedy = "pip install 'hma-toolkit[ray]'"
+        raise MissingDependencyError("--engine ray", "Ray is not installed", remedy) from fault
     return ray
 
 
@@ -76,11 +80,132 @@ def _join(ray: Any) -> None:
     except Exception as fault:  # Ray raises some errors of this class here
         ray.shutdown()
         address = os.environ.get("RAY_ADDRESS")
-        raise HMAError(
-            f"the Ray cluster at {address}" if address else "Ray on this machine",
-            f"cannot be {'joined' if address else 'started'}: {_first_line(fault)}",
-            "see `ray status` there" if address else "see its logs in /tmp/ray, or leave out --engine ray",
-        ) from fault
+        where = f"the Ray cluster at {address}" if address else "Ray on this machine"
+        what = f"cannot be {'joined' if address else 'started'}: {_first_line(fault)}"
+        raise HMAError(where, what, "see `ray status`, or leave out --engine ray") from fault
+
+
+# -- in an actor
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The process is ready for its first unit."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """A unit is done, with this result."""
+
+    result: Any
+
+
+@dataclass(frozen=True)
+class Lost:
+    """The unit's process is gone or ran out of memory; see engines.base.Ledger.lost."""
+
+    cause: Cause
+    step: str
+    how: str
+
+
+@dataclass(frozen=True)
+class Failed:
+    """An error that ends the job."""
+
+    fault: HMAError
+
+
+End = Opened | Done | Lost | Failed
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The events of a unit since the last answer, without its steps; and its end, if it is over."""
+
+    events: tuple[Any, ...]
+    end: End | None = None
+
+
+class Worker:
+    """An actor that keeps a worker process, hands it units and passes on its messages.
+
+    The driver calls `open` or `do`, then `go_on` until an answer carries an end. To the pool of its one
+    process the actor is what the Ledger is to a local pool.
+
+    Args:
+        make_work: called in the process.
+        workers: number of workers of the whole run.
+        quiet_s: see engines.base.Limits.
+        answer_s: seconds for which events are collected, unless the unit ends before.
+    """
+
+    def __init__(
+        self, make_work: Callable[[int], Work], workers: int, quiet_s: float | None, answer_s: float
+    ) -> None:
+        self.limits = Limits(quiet_s)
+        self.pool = Pool(lambda: WorkerProcess(make_work, workers), 1, self, self._add_event)
+        self._answer_s = answer_s
+        self._unit: tuple[int, Any, Attempt] | None = None
+        self._opening = False
+        self._events: list[Any] = []
+        self._end: End | None = None
+
+    def open(self) -> Answer:
+        """Start the process; its last answer carries Opened."""
+        self._opening = True
+        return self.go_on()
+
+    def do(self, unit: Any, attempt: Attempt) -> Answer:
+        """Start a unit."""
+        self._unit = 0, unit, attempt
+        return self.go_on()
+
+    def go_on(self) -> Answer:
+        """Listen for `answer_s` seconds, or until the end."""
+        until = time.monotonic() + self._answer_s
+        while self._end is None and time.monotonic() < until:
+            with _no_script():
+                self.pool.fill()
+            try:
+                for result in self.pool.turn():
+                    self._end = Done(result)
+            except HMAError as fault:
+                self._end = Failed(fault)
+            if self._opening and any(process.ready for process in self.pool.processes):
+                self._opening, self._end = False, Opened()
+        answer = Answer(tuple(self._events), self._end)
+        self._events, self._end = [], None
+        return answer
+
+    def _add_event(self, number: int, event: Any) -> None:
+        self._events.append(event)
+
+    def take(self) -> tuple[int, Any, Attempt] | None:
+        """Return the unit if it has not been started."""
+        unit, self._unit = self._unit, None
+        return unit
+
+    def finished(self, number: int) -> None:
+        """Do nothing; the pool yields the result."""
+
+    def lost(self, number: int, cause: Cause, step: str, how: str) -> None:
+        """Tell the driver that the unit lost its process."""
+        self._end = Lost(cause, step, how)
+
+
+@contextmanager
+def _no_script() -> Iterator[None]:
+    """Replace the main module for a moment; a spawned process would run it, and here it is Ray's own."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+
+
+# -- in the driver
 
 
 @dataclass
@@ -91,7 +216,6 @@ class _Slot:
     answer: Any
     ready: bool = False
     unit: int | None = None
-    heard: float = field(default_factory=time.monotonic)
 
 
 class _Actors:
@@ -107,21 +231,10 @@ class _Actors:
         on_event: OnEvent,
     ) -> None:
         self._ray, self._ledger, self._on_event, self._count = ray, ledger, on_event, count
-        self._arguments = (
-            ray.put(make_work),
-            count,
-            ledger.limits.quiet_s,
-            max(ANSWER_S, count / ANSWERS_A_S),
-        )
+        answer_s = max(ANSWER_S, count / ANSWERS_A_S)
+        self._arguments = ray.put(make_work), count, ledger.limits.quiet_s, answer_s
         # no task events: for its dashboard, Ray keeps a record of each call in three processes
         self._class = ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, enable_task_events=False)(Worker)
-        self._gone = (
-            ray.exceptions.RayActorError,
-            ray.exceptions.WorkerCrashedError,
-            ray.exceptions.OutOfMemoryError,
-            ray.exceptions.ObjectLostError,
-            ray.exceptions.NodeDiedError,
-        )
         self._slots: list[_Slot] = []
         self._lost_starts = 0
         self._placed = time.monotonic()
@@ -132,89 +245,60 @@ class _Actors:
             actor = self._class.remote(*self._arguments)
             self._slots.append(_Slot(actor, actor.open.remote()))
         for slot in self._slots:
-            self._hand_out(slot)
+            if slot.ready and slot.unit is None and (taken := self._ledger.take()):
+                slot.unit, unit, attempt = taken
+                slot.answer = slot.actor.do.remote(unit, attempt)
         waiting = {slot.answer: slot for slot in self._slots if slot.answer is not None}
         refs = list(waiting)
         self._ray.wait(refs, num_returns=1, timeout=TICK_S)
         heard, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
         for ref in heard:
             yield from self._listen(waiting[ref])
-        self._end_the_silent()
         self._check_room()
-
-    def _hand_out(self, slot: _Slot) -> None:
-        if not slot.ready or slot.unit is not None:
-            return
-        taken = self._ledger.take()
-        if taken is not None:
-            slot.unit, unit, attempt = taken
-            slot.heard = time.monotonic()
-            slot.answer = slot.actor.do.remote(unit, attempt)
 
     def _listen(self, slot: _Slot) -> Iterator[Any]:
         try:
             answer: Answer = self._ray.get(slot.answer)
-        except self._gone as fault:
+        except self._ray.exceptions.RayTaskError as fault:
+            raise HMAError("the Ray cluster", f"cannot work: {_first_line(fault)}", INSTALLED) from fault
+        except self._ray.exceptions.RayError as fault:
             self._bury(slot, "was lost: " + _first_line(fault))
             return
-        except self._ray.exceptions.RayError as fault:
-            raise HMAError("the Ray cluster", f"cannot work: {_first_line(fault)}", INSTALLED) from fault
-        slot.heard = time.monotonic()
         for event in answer.events:
             assert slot.unit is not None
             self._on_event(slot.unit, event)
-        yield from self._take_in(slot, answer.end)
-
-    def _take_in(self, slot: _Slot, end: End | None) -> Iterator[Any]:
-        if end is None:
-            slot.answer = slot.actor.go_on.remote()
-            return
-        slot.answer = None
+        end = answer.end
+        slot.answer = slot.actor.go_on.remote() if end is None else None
         if isinstance(end, Failed):
             raise end.fault
         if isinstance(end, Opened):
-            slot.ready, self._lost_starts, self._placed = True, 0, time.monotonic()
-            return
-        number, slot.unit = slot.unit, None
-        assert number is not None
-        if isinstance(end, Lost):
-            self._lost(number, end.step, end.cause, end.how)
-        else:
-            self._ledger.finished(number)
-            yield end.result
+            slot.ready, self._lost_starts = True, 0
+        elif end is not None:
+            number, slot.unit = slot.unit, None
+            assert number is not None
+            if isinstance(end, Lost):
+                self._ledger.lost(number, end.cause, end.step, end.how)
+            else:
+                self._ledger.finished(number)
+                yield end.result
 
     def _bury(self, slot: _Slot, how: str) -> None:
         self._slots.remove(slot)
         self._ray.kill(slot.actor)  # an actor that is only out of reach would go on
         if slot.unit is not None:
-            self._lost(slot.unit, "", "killed", how)
+            self._ledger.lost(slot.unit, "killed", "", how)
         elif not slot.ready:
             self._lost_starts += 1
-            if self._lost_starts >= LOST_STARTS[0] + LOST_STARTS[1] * self._count:
+            if self._lost_starts >= LOST_STARTS * (self._count + 1):
                 fault = f"lost {self._lost_starts} workers in a row at their start; the last {how}"
                 raise HMAError("the Ray cluster", fault, INSTALLED)
-
-    def _lost(self, number: int, step: str, cause: Cause, how: str) -> None:
-        retry = self._ledger.lost(number, cause, step, how)
-        if retry:
-            self._on_event(number, retry)
-
-    def _end_the_silent(self) -> None:
-        """End actors that do not answer; an actor itself ends a unit that is quiet."""
-        quiet = self._ledger.limits.quiet_s
-        for slot in list(self._slots):
-            if quiet and slot.unit is not None and time.monotonic() - slot.heard > quiet + SILENT_S:
-                self._bury(slot, f"was lost: no answer for {quiet + SILENT_S:g} s")
 
     def _check_room(self) -> None:
         if any(slot.ready for slot in self._slots):
             self._placed = time.monotonic()
         elif time.monotonic() - self._placed > NO_ROOM_S:
-            raise HMAError(
-                "the Ray cluster",
-                f"has had no room for a worker for {NO_ROOM_S:g} s",
-                "see `ray status`; every worker needs a CPU, and a GPU with --device cuda",
-            )
+            remedy = "see `ray status`; every worker needs a CPU, and a GPU with --device cuda"
+            raise HMAError("the Ray cluster", f"has had no room for a worker for {NO_ROOM_S:g} s", remedy)
 
     def close(self) -> None:
         """End every actor; its process ends with it."""

@@ -2,17 +2,29 @@
 
 A place without a manifest holds no shard set. Files that are already there with the same content are left
 out, so the same call continues an upload that was interrupted.
+
+`hma convert --out hf://datasets/org/name[@branch]/path` makes the set in a staging folder of this machine
+($HMA_CACHE/staging), where it can be resumed like any other. Then it is published: a repository takes few
+commits, not files one by one.
 """
 
+import hashlib
+import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Protocol
 
+from hma_data.errors import OutputError
+from hma_data.hub.repository import Repository
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SHARD_NAME, Manifest
+from hma_data.storage.files import cache_folder
+from hma_data.storage.remote import RemotePath
 
 FILES, BYTES = 50, 5 * 10**9  # largest numbers of files and bytes in a commit
 SMALL = (EMBODIMENT, EPISODES, QUARANTINE)
+_URI = re.compile(r"hf://datasets/([^/@]+/[^/@]+)(?:@([^/]+))?(?:/(.+))?")
 
 
 class Place(Protocol):
@@ -89,3 +101,63 @@ def _batches(sizes: Sequence[tuple[str, int]]) -> list[list[str]]:
         groups[-1].append(name)
         total += size
     return groups
+
+
+@dataclass(frozen=True)
+class HubOutput:
+    """The place of a conversion's shard set in a dataset repository.
+
+    Attributes:
+        uri: as the user gave it.
+        repo: organisation/name of the dataset.
+        branch: None for the main one.
+        folder: in the repository; empty for its root.
+    """
+
+    uri: str
+    repo: str
+    branch: str | None
+    folder: str
+
+    @classmethod
+    def of(cls, out: Path) -> "HubOutput | None":
+        """Return the output of an `hf://` path; None for any other path.
+
+        Raises:
+            OutputError: it names no dataset repository.
+        """
+        if not isinstance(out, RemotePath) or out.scheme != "hf":
+            return None
+        found = _URI.fullmatch(str(out))
+        if not found:
+            raise OutputError(out, "names no dataset of the hub", "write hf://datasets/ORGANISATION/NAME")
+        return cls(str(out), found[1], found[2], found[3] or "")
+
+    @property
+    def staging(self) -> Path:
+        """Return the folder of this machine from which the set is uploaded."""
+        mark = hashlib.sha256(self.uri.encode()).hexdigest()[:8]
+        return cache_folder() / "staging" / f"{self.repo.replace('/', '--')}-{mark}"
+
+    def prepare(self) -> bool:
+        """Create the repository and the branch where they are missing; check whether a set is there.
+
+        Raises:
+            HubError: there is no token, or it may not write there, or the hub cannot be reached.
+        """
+        manifest = f"{self.folder}/{MANIFEST}" if self.folder else MANIFEST
+        self._repository.prepare(manifest)
+        return manifest in self._repository.files()
+
+    def upload(self) -> None:
+        """Upload the staging folder's shard set.
+
+        Raises:
+            HubError: the hub refuses it, or does not answer.
+        """
+        self._repository.files()
+        publish(self._repository, self.staging, self._repository.files, self.folder)
+
+    @cached_property
+    def _repository(self) -> Repository:
+        return Repository(self.repo, self.branch, write=True, kind="dataset", name=self.uri)
