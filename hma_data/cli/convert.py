@@ -159,8 +159,8 @@ def _convert(job: "ConversionJob", json: bool, extend: bool, overwrite: bool, sh
 
 
 def _plan(job: "ConversionJob", json: bool) -> bool:
-    from hma_data.conversion.plan import estimate
     from hma_data.conversion.job import plan_conversion
+    from hma_data.conversion.plan import estimate
     from hma_data.storage.remote import place
     from hma_data.tokenizers.base import get_tokenizer
 
