@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.bench.scenes import encoded, scene
+from hma_data.cpu import ordinary_priority
 from hma_data.episodes.images import Images
-from hma_data.priority import ordinary_priority
 from hma_data.registry.embodiment import Embodiment
 
 A, HZ = 7, 30

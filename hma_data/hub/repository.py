@@ -1,9 +1,12 @@
 """List, pull and push a repository of the Hugging Face Hub at one commit.
 
 A push is one commit on top of the commit it was prepared for. If somebody else has committed in between, the
-push is prepared again. Pulled files are in the cache of the hub's client, which works offline.
+push is prepared again. Pulled files are in the cache of the hub's client, which works offline. The client
+compares no digests, so this module does: a file that differs from the listing is downloaded once more.
 """
 
+import hashlib
+import io
 import logging
 import random
 import re
@@ -11,26 +14,88 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
 from itertools import batched
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
 from hma_data.errors import HubError
-from hma_data.hub.download import Entry, fetch
-from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, waiting
-from hma_data.hub.partial import beside, remove_abandoned_folders
+from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, upload_by_lfs, waiting
+from hma_data.storage.files import PART
+from hma_data.storage.paths import StrPath, as_address
 
 ATTEMPTS = 8  # attempts to commit; half as many for any other call
 LISTING_S, SILENCE_S = 30.0, 300.0  # seconds; the hub needs minutes for a commit of many files
 AT_ONCE = 4  # downloads at a time
+LARGE = 1_000_000  # bytes of a file; from here on a bar shows the progress
 MOST_READ = 16_000_000  # largest size in bytes of a file that `read` takes
 CARD = "README.md"
+REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
 _ABSENT = object()
 _CONFLICTS = (409, 412)
 _COMMIT = re.compile(r"[0-9a-f]{40}|[0-9a-f]{64}")
 
 log = logging.getLogger(__name__)
+
+
+def is_repository(address: StrPath) -> bool:
+    """Check whether an address is a repository: hf://org/name, or org/name unless it is a local folder.
+
+    Raises:
+        HubError: it begins with hf:// and names no model repository.
+    """
+    place = as_address(address)
+    if isinstance(place, Path):
+        return False
+    if place.startswith("hf://"):
+        if not REPOSITORY.fullmatch(place.removeprefix("hf://")):
+            raise HubError(place, "is not hf://ORGANISATION/NAME", "name a model repository")
+        return True
+    return REPOSITORY.fullmatch(place) is not None and not Path(place).is_dir()
+
+
+def addressed[Address: str | Path](
+    address: Address, revision: str | None = None
+) -> tuple[Address | str, str | None]:
+    """Split `org/name@revision` into repository and revision; return any other address unchanged."""
+    repository, _, named = str(address).partition("@")
+    if revision is None and named and not Path(address).exists() and is_repository(repository):
+        return repository, named
+    return address, revision
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file of a repository, as a listing states it.
+
+    Attributes:
+        name: path in the repository.
+        size: bytes.
+        sha256: SHA-256 of a file that the hub keeps by LFS; None for any other file.
+        blob_id: git's name of its content, if `sha256` is None; empty if the hub does not state it.
+    """
+
+    name: str
+    size: int
+    sha256: str | None
+    blob_id: str
+
+    def states(self, content: Path | bytes) -> bool:
+        """Check whether a file or bytes have this entry's content; False if there is no such file."""
+        if isinstance(content, Path) and not content.is_file():
+            return False
+        with io.BytesIO(content) if isinstance(content, bytes) else content.open("rb") as file:
+            if file.seek(0, io.SEEK_END) != self.size:
+                return False
+            file.seek(0)
+            if self.sha256:
+                return hashlib.file_digest(file, "sha256").hexdigest() == self.sha256
+            if not _COMMIT.fullmatch(self.blob_id):
+                return True
+            begun = hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
+            return hashlib.file_digest(file, lambda: begun).hexdigest() == self.blob_id
 
 
 class Repository:
@@ -195,20 +260,15 @@ class Repository:
         known = self._known()
         if self.from_cache:
             raise HubError(self.name, "is out of reach", "go online and pull again")
-        with explained(self.name):
-            out.mkdir(parents=True, exist_ok=True)
-            remove_abandoned_folders(out)
-        staging = beside(out / "pull")
+        staging = out / f".pull{PART}"
 
         def bring(name: str) -> None:
-            path = fetch(self.repo, self.kind, str(self._commit), known[name], staging)
+            path = self._fetch(known[name], staging)
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             path.replace(out / name)
 
-        try:
-            self._each(bring, [name for name in names if name in known])
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
+        self._each(bring, [name for name in names if name in known])
+        shutil.rmtree(staging, ignore_errors=True)
 
     def _known(self) -> dict[str, Entry]:
         if self._entries is None:
@@ -223,22 +283,45 @@ class Repository:
                 fault = f"is out of reach, and {missing[0]} is not in the cache"
                 raise HubError(self.name, fault, "go online and pull again")
             return [folder / name for name in names]
-        commit = str(self._commit)
-        paths = self._each(lambda name: fetch(self.repo, self.kind, commit, known[name]), names)
+        paths = self._each(lambda name: self._fetch(known[name]), names)
         if paths:
             self._remember(_snapshot(paths[0], names[0]))
         return paths
 
+    def _fetch(self, entry: Entry, folder: Path | None = None) -> Path:
+        """Download a file to a folder or to the client's cache, unless it is there; return its path."""
+        from huggingface_hub import hf_hub_download
+
+        if folder is not None and entry.size == 0:  # some hubs do not send empty files
+            path = folder / entry.name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+            return path
+        for anew in (False, True):
+            path = Path(
+                hf_hub_download(
+                    self.repo,
+                    entry.name,
+                    repo_type=self.kind,
+                    revision=self._commit,
+                    local_dir=folder,
+                    force_download=anew,
+                    library_name="hma-toolkit",
+                    tqdm_class=None if entry.size >= LARGE else _no_bar(),
+                )
+            )
+            if entry.states(path):
+                return path
+        remedy = f"pull again; if it stays so, delete {path}, or do not use this repository"
+        raise HubError(f"{self.name}/{entry.name}", "came with other content than the hub stated", remedy)
+
     def _remember(self, snapshot: Path) -> None:
         """Record in the cache which commit the revision is, so that it can be found by this name offline."""
-        named = self._revision or "main"
+        named, commit = self._revision or "main", str(self._commit)
         ref = snapshot.parent.parent / "refs" / named
-        with explained(self.name):
-            if not _COMMIT.fullmatch(named) and not (ref.is_file() and ref.read_text() == self._commit):
-                ref.parent.mkdir(parents=True, exist_ok=True)
-                new = beside(ref)
-                new.write_text(str(self._commit))
-                new.replace(ref)
+        if not _COMMIT.fullmatch(named) and not (ref.is_file() and ref.read_text() == commit):
+            ref.parent.mkdir(parents=True, exist_ok=True)
+            ref.write_text(commit)  # as the client writes it
 
     def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
         """Return the results of an action for each file, a few files at a time; the first error ends it."""
@@ -319,6 +402,7 @@ class Repository:
             return
         self._refuse_ignored(added)
         self._limit_silence()
+        self._choose_transfer()
         self._api.create_commit(
             self.repo,
             [
@@ -340,6 +424,19 @@ class Repository:
             if ignored:
                 fault = f"leaves out {ignored[0]}, by its .gitignore"
                 raise HubError(self.name, fault, "delete that line there, and push again")
+
+    def _choose_transfer(self) -> None:
+        """Upload by LFS where the hub gives no Xet token; the client would ask for one for minutes."""
+        from huggingface_hub import constants, get_session
+        from huggingface_hub.utils import build_hf_headers
+
+        if constants.HF_HUB_DISABLE_XET:
+            return
+        branch = quote(self._revision or "main", safe="")
+        url = f"{self._api.endpoint}/api/{self.kind}s/{self.repo}/xet-write-token/{branch}"
+        answer = get_session().get(url, headers=build_hf_headers(library_name="hma-toolkit"))
+        if not answer.is_success or b"accessToken" not in answer.content:
+            upload_by_lfs()
 
     def _upload_modes(self, names: Iterable[str]) -> list[dict[str, Any]]:
         """Return how the hub would take files; it answers only those who may write."""
@@ -393,3 +490,15 @@ class Repository:
 def _snapshot(path: Path, name: str) -> Path:
     """Return the folder of the client's cache that holds a file of this name."""
     return path.parents[len(PurePosixPath(name).parts) - 1]
+
+
+@cache
+def _no_bar() -> Any:
+    """Return the class of a progress bar that shows nothing."""
+    from huggingface_hub.utils import tqdm
+
+    class NoBar(tqdm):
+        def __init__(self, *given: Any, **options: Any) -> None:
+            super().__init__(*given, **options | {"disable": True})
+
+    return NoBar

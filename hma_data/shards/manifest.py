@@ -21,8 +21,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.schema import SCHEMA_VERSION, EpisodeRow, Footer, Refused, read_footer
 from hma_data.shards.stats import Stats
 from hma_data.shards.wellformed import check_plan, check_spec, check_splits, check_stats, is_count
-from hma_data.storage.files import atomic_path, file_sha256, write_atomic
-from hma_data.storage.json_io import parse_json
+from hma_data.storage.files import atomic_path, file_sha256, parse_json, write_atomic
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import is_remote, place
 from hma_data.storage.yaml_io import decode_yaml, parse_yaml

@@ -1,4 +1,4 @@
-"""Take paths as callers give them: text, a `Path` or any other path object.
+"""Take paths as callers give them: text, a `Path` or any other path object. Find the files of the package.
 
 A public function takes a `StrPath` and converts it once: with `as_text` where it may be a URI or a name,
 with `as_path` for a file or folder of this machine, with `as_address` for a hub, and with
@@ -28,7 +28,7 @@ def as_text(path: StrPath) -> str:
         return path
     text = str(path) if isinstance(path, PurePath) else os.fspath(path)  # a RemotePath has no os.fspath
     if isinstance(text, bytes):
-        raise UsageError(repr(text), "is a path of bytes", "give text: os.fsdecode makes it of them")
+        raise UsageError(repr(text), "is a path of bytes", "give text: os.fsdecode converts it")
     return _CUT.sub(_whole_scheme, text, count=1) if _CUT.match(text) else text
 
 
@@ -52,3 +52,13 @@ def as_address(path: StrPath) -> str | Path:
 
 def _whole_scheme(found: re.Match[str]) -> str:
     return f"{found[1]}://" + ("/" if found[1] in ("file", "local") else "")
+
+
+def shipped(name: str) -> Path:
+    """Return the folder `registry` or `recipes` of this installation.
+
+    In a checkout it lies at the top level; in a wheel it is inside `hma_data/shipped/`.
+    """
+    package = Path(__file__).resolve().parents[1]
+    packed = package / "shipped" / name
+    return packed if packed.is_dir() else package.parent / name

@@ -13,14 +13,12 @@ import stat
 from collections.abc import Callable, Generator
 from contextlib import suppress
 from fnmatch import fnmatchcase
-from inspect import signature
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
 from hma_data.errors import HMAError, StorageAwayError, StorageError
-from hma_data.storage.fetch import file_system
+from hma_data.storage.fetch import ABSENT, address_hint, file_system, may_pass, retried, said
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.retry import ABSENT, address_hint, may_pass, retried, said
 
 WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
 TAIL, AHEAD = 256 << 10, 8 << 20  # bytes read at once: at the end of a file; ahead of a sequential reader
@@ -256,8 +254,23 @@ class RemotePath(PosixPath):
             if not missing_ok:
                 raise
 
+    def replace(self, target: Any) -> "RemotePath":
+        """Rename the file; where a store has no renames, copy it and delete it."""
+
+        def rename() -> None:
+            if self.scheme in WHOLE_PUTS:
+                self.files.cp_file(self.key, target.key)
+                self.files.rm_file(self.key)
+            else:
+                self.files.mv(self.key, target.key)
+
+        attempt(target, "written", rename)
+        return RemotePath(target)
+
     def mkdir(self, *_: Any, **__: Any) -> None:
-        """Do nothing: a folder of a store exists when a file is in it."""
+        """Make the folder; do nothing in a store where a folder exists when a file is in it."""
+        if self.scheme not in WHOLE_PUTS:
+            attempt(self, "made", lambda: self.files.makedirs(self.key, exist_ok=True))
 
     def delete_tree(self, keep: Callable[[str], bool] = lambda name: False) -> None:
         """Delete every file below, except where `keep` returns True for its name below this folder."""
@@ -300,17 +313,13 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
     Raises:
         StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
-    files = to.files
-    if "mode" not in signature(getattr(files, "_pipe_file", files.pipe_file)).parameters:
-        put_bytes(content, to)
-        return True
 
     def once() -> bool:
         try:
-            files.pipe_file(to.key, content, mode="create")
+            to.files.pipe_file(to.key, content, mode="create")
         except Exception:  # each driver has its own error for an existing file
-            files.invalidate_cache()
-            if files.exists(to.key):
+            to.files.invalidate_cache()
+            if to.files.exists(to.key):
                 return False
             raise
         return True
@@ -327,21 +336,16 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
 def _put(to: RemotePath, upload: Callable[[str], Any], size: int) -> None:
     whole = to.scheme in WHOLE_PUTS
     beside = to if whole else to.with_name(f".{to.name}.{os.getpid()}.part")
-
-    def once() -> None:
-        upload(beside.key)
-        if not whole:
-            to.files.mv(beside.key, to.key)
-
     try:
-        attempt(to, "written", once)
+        attempt(to, "written", lambda: upload(beside.key))
+        if not whole:
+            beside.replace(to)
         arrived = to.info()["size"]
     except FileNotFoundError as fault:
         raise StorageError(to, "cannot be written: there is no such bucket", "create it first") from fault
     if arrived != size:
-        raise StorageAwayError(
-            to, f"has {arrived} bytes after an upload of {size}", "run the same command again"
-        )
+        fault_text = f"has {arrived} bytes after an upload of {size}"
+        raise StorageAwayError(to, fault_text, "run the same command again")
 
 
 # -- reading by ranges

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from hma_data.errors import HMAError, HubError, PluginError, TokenizerError
-from hma_data.storage.folders import parse_json
+from hma_data.storage.files import json_object
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint import migrate
 from hma_model.checkpoint.io import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
@@ -62,7 +62,7 @@ def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, 
     inside = {name.removeprefix(root): size for name, size in files.items() if name.startswith(root)}
     where = store.name + (f"/{root.rstrip('/')}" if root else "")
     try:
-        values = parse_json(store.read(root + CONFIG), f"{where}/{CONFIG}", HubError)
+        values = json_object(store.read(root + CONFIG), f"{where}/{CONFIG}", HubError)
     except HMAError as fault:
         return _unusable(where, fault) if TRUNK in inside else None
     if values.get("library") == LIBRARY:
@@ -90,7 +90,7 @@ def _ours(
         place = f"embodiments/{name}"
         size = total_bytes(store, files, [f"{place}/{part}" for part in PARTS])
         try:
-            card = parse_json(store.read(f"{root}{place}/{CARD}"), f"{where}/{place}/{CARD}", HubError)
+            card = json_object(store.read(f"{root}{place}/{CARD}"), f"{where}/{place}/{CARD}", HubError)
             lacks = "the cache lacks" if store.from_cache else "lacks"
             lacking = [f"{lacks} {part}" for part in PARTS if f"{place}/{part}" not in files]
             problems = lacking + _card_problems(card, values)

@@ -38,48 +38,32 @@ _OBJECTIVE = {
 }
 # The values of fields that a released file does not state.
 _DEFAULTS: dict[str, Any] = {
-    "T": 12,
-    "S": 256,
-    "image_vocab_size": 262144,
-    "use_mup": False,
-    "num_factored_vocabs": 1,
-    "max_corrupt_rate": 0.2,
-    "non_mlm_ratio": 0.2,
-    "num_prompt_frames": 4,
-    "action_network": "mlp",
-    "jointly_predict_actions": False,
-    "jointly_predict_states": True,
-    "action_token_size": 64,
-    "action_loss_weight": 0.5,
-    "qkv_bias": False,
-    "proj_bias": True,
-    "qk_norm": True,
-    "mlp_ratio": 4.0,
-    "mlp_drop": 0.0,
-    "mlp_bias": True,
-}
+    "T": 12, "S": 256, "image_vocab_size": 262144, "num_factored_vocabs": 1,
+    "max_corrupt_rate": 0.2, "non_mlm_ratio": 0.2, "num_prompt_frames": 4,
+    "action_network": "mlp", "jointly_predict_actions": False, "jointly_predict_states": True,
+    "action_token_size": 64, "action_loss_weight": 0.5,
+    "use_mup": False, "qk_norm": True, "qkv_bias": False, "proj_bias": True,
+    "mlp_ratio": 4.0, "mlp_drop": 0.0, "mlp_bias": True,
+}  # fmt: skip
 _CONTINUOUS_DEFAULTS: dict[str, Any] = {
-    "image_vocab_size": None,
-    "action_loss_weight": 1.0,
-    "patch_size": 1,
-    "vae_embed_dim": 4,
-    "diffloss_d": 4,
-    "diffloss_w": 1024,
-    "num_sampling_steps": "100",
-    "diffusion_batch_mul": 1,
-}
+    "image_vocab_size": None, "action_loss_weight": 1.0, "patch_size": 1, "vae_embed_dim": 4,
+    "diffloss_d": 4, "diffloss_w": 1024, "num_sampling_steps": "100", "diffusion_batch_mul": 1,
+}  # fmt: skip
 _COUNTS = {"num_layers": 1000, "diffloss_d": 1000, "num_factored_vocabs": 64} | dict.fromkeys(
     ("num_heads", "d_model", "T", "S", "action_token_size", "patch_size", "vae_embed_dim", "diffloss_w",
      "diffusion_batch_mul"), 1_000_000
 )  # fmt: skip
 
 
-def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | None = None) -> HMAConfig:
+def config_from_released(
+    config: Mapping[str, Any], case: Mapping[str, Any] | None = None, where: object = "config.json"
+) -> HMAConfig:
     """Convert a released `config.json` to our configuration.
 
     Args:
         config: the released configuration.
         case: may give `grid`, the tokenizer's (h, w), if a frame is not square.
+        where: the file, for the errors.
 
     Raises:
         CheckpointError: the configuration needs something that the released code cannot do or does wrongly,
@@ -88,20 +72,22 @@ def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | No
     continuous = bool(config.get("Diffusion", config.get("image_vocab_size", 0) is None))
     given = {key: value for key, value in config.items() if value is not None}
     values = _DEFAULTS | (_CONTINUOUS_DEFAULTS if continuous else {}) | given
-    _check_counts(values)
+    remedy = "is it a released checkpoint?"
     try:
+        _check_counts(values)
         shared = _shared(values, continuous)
         shared["grid"] = _grid(values["S"], (case or {}).get("grid"))
         own = _continuous(values) if continuous else _discrete(values)
         return HMAConfig(**_LAYOUT, **shared, **own)
+    except CheckpointError as error:
+        raise CheckpointError(where, error.fault, error.remedy) from error
     except KeyError as error:
-        raise CheckpointError(_WHERE, f"lacks {error.args[0]}", "is it a released checkpoint?") from error
+        raise CheckpointError(where, f"lacks {error.args[0]}", remedy) from error
     except RecipeError as error:
         fault = f"{error.where.removeprefix('model.')}: {error.fault}"
-        raise CheckpointError(_WHERE, fault, "is it a released checkpoint?") from error
+        raise CheckpointError(where, fault, remedy) from error
     except (TypeError, ValueError, ArithmeticError) as error:
-        fault = f"has a value of the wrong type: {error}"
-        raise CheckpointError(_WHERE, fault, "is it a released checkpoint?") from error
+        raise CheckpointError(where, f"has a value of the wrong type: {error}", remedy) from error
 
 
 def _check_counts(values: Mapping[str, Any]) -> None:
@@ -109,11 +95,8 @@ def _check_counts(values: Mapping[str, Any]) -> None:
     for name, most in _COUNTS.items():
         value = values.get(name, 1)
         if type(value) is not int or not 1 <= value <= most:
-            raise CheckpointError(
-                _WHERE,
-                f"{name} is {value!r}, not a whole number from 1 to {most}",
-                "is it a released checkpoint?",
-            )
+            fault = f"{name} is {value!r}, not a whole number from 1 to {most}"
+            raise CheckpointError(_WHERE, fault, "is it a released checkpoint?")
 
 
 def _shared(values: Mapping[str, Any], continuous: bool) -> dict[str, Any]:
@@ -214,11 +197,8 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
     """
     faults = _inexpressible(config)
     if faults:
-        raise CheckpointError(
-            where,
-            f"the released layout cannot express {'; '.join(faults)}",
-            "the released code cannot read it",
-        )
+        fault = f"the released layout cannot express {'; '.join(faults)}"
+        raise CheckpointError(where, fault, "the released code cannot read it")
     concat = "concat+" if "concat" in config.conditioning else ""
     inside = (
         "modulate" if "modulation" in config.conditioning else "mlp" if "add" in config.conditioning else ""

@@ -327,7 +327,7 @@ def test_plain_values_come_back_from_their_yaml(values: dict[str, Any]) -> None:
 def test_a_file_of_megabytes_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "big.yaml"
     path.write_bytes(b"#" * (MAX_BYTES + 1))
-    with pytest.raises(RegistryError, match=r"big\.yaml: larger than 1,000,000 bytes"):
+    with pytest.raises(RegistryError, match=r"big\.yaml: is larger than 1,000,000 bytes"):
         read_yaml(path)
 
 

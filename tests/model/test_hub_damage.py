@@ -9,21 +9,15 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from hma_data.errors import CheckpointError, HMAError, HubError
-from hma_data.storage import remote_lock
 from hma_data.storage.files import file_sha256
-from hma_data.storage.folders import read_metadata
 from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.weights import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.hub.datasets import pull_data, push_data
 from tests.model.robots import save
 from tests.model.shards import make_shards
 
 pytest_plugins = ["tests.hub_fixtures"]
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_lock, "SETTLE_S", 0.01)
 
 
 @pytest.fixture

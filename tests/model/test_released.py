@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.registry.embodiment import find
-from hma_data.storage.folders import to_json
+from hma_data.storage.files import to_json
+from hma_model import hub
 from hma_model.checkpoint.io import Checkpoint, require_tokenizer
 from hma_model.cli import app
 from hma_model.config import ActionSpace, HMAConfig
-from hma_model.hub import publish as hub
 from hma_model.network.model import HMA
 from hma_model.released.config import config_from_released, config_to_released
 from hma_model.released.state import state_to_released
