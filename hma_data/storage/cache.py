@@ -10,8 +10,7 @@ import hashlib
 import os
 import shutil
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from hma_data.errors import ShardError, UsageError
@@ -56,12 +55,14 @@ def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
         if _is_there(final, size):
             return final
         folder.mkdir(parents=True, exist_ok=True)
-        with _one_at_a_time(folder / f".{sha256}.lock"):
-            if _is_there(final, size):
-                return final
-            if not _make_room(folder, size):
-                return None
-            return _download(path, sha256, size, final)
+        with (lock := folder / f".{sha256}.lock").open("w") as handle:
+            fcntl.flock(handle, fcntl.LOCK_EX)  # only one of the processes that want it downloads it
+            try:
+                if _is_there(final, size):
+                    return final
+                return _download(path, sha256, size, final) if _make_room(folder, size) else None
+            finally:
+                lock.unlink(missing_ok=True)
     except OSError:  # the cache cannot be written
         return None
 
@@ -113,14 +114,3 @@ def _make_room(folder: Path, size: int) -> bool:
         path.unlink(missing_ok=True)
         over -= length
     return True
-
-
-@contextmanager
-def _one_at_a_time(lock: Path) -> Iterator[None]:
-    """Let only one of several processes that want a shard download it."""
-    with lock.open("w") as handle:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)

@@ -41,7 +41,8 @@ def place(where: StrPath) -> Path:
     text = as_text(where)
     found, bare = _SCHEME.fullmatch(text), text.rstrip("/")
     if bare.endswith(":") and bare[:-1] in WHOLE_PUTS | {"hf"}:
-        raise StorageError(f"{bare}//", "names no bucket or repository", f"as in {bare}//bucket/folder")
+        remedy = f"write it as in {bare}//bucket/folder"
+        raise StorageError(f"{bare}//", "names no bucket or repository", remedy)
     if not found:
         return Path(text)
     if found[1] in ("file", "local"):
@@ -122,7 +123,11 @@ class RemotePath(PosixPath):
             StorageError: no store is known by that scheme.
             MissingDependencyError: the package of the store is not installed.
         """
-        return _files(str(self))
+        try:
+            return file_system(str(self))[0]
+        except ValueError as fault:
+            text = f"is of no store that is known: {said(fault)}"
+            raise StorageError(str(self), text, "use s3://, gs:// or hf://") from fault
 
     @property
     def key(self) -> str:
@@ -159,24 +164,20 @@ class RemotePath(PosixPath):
         sizes = {name: int(found[name]["size"] or 0) for name in sorted(found)}
         return {name.removeprefix(begin): size for name, size in sizes.items() if name.startswith(begin)}
 
-    def exists(self, **_: Any) -> bool:
+    def _kind(self) -> str:
         try:
-            self.info()
+            return str(self.info()["type"])
         except FileNotFoundError:
-            return False
-        return True
+            return ""
+
+    def exists(self, **_: Any) -> bool:
+        return bool(self._kind())
 
     def is_file(self, **_: Any) -> bool:
-        try:
-            return bool(self.info()["type"] == "file")
-        except FileNotFoundError:
-            return False
+        return self._kind() == "file"
 
     def is_dir(self, **_: Any) -> bool:
-        try:
-            return bool(self.info()["type"] == "directory")
-        except FileNotFoundError:
-            return False
+        return self._kind() == "directory"
 
     def stat(self, **_: Any) -> os.stat_result:
         """Return size and kind; stores have no more facts in common."""
@@ -220,15 +221,15 @@ class RemotePath(PosixPath):
     def resolve(self, strict: bool = False) -> "RemotePath":
         return self
 
-    def absolute(self) -> "RemotePath":
-        return self
+    absolute = resolve
 
     # -- reading and deleting
 
     def open(self, mode: str = "r", *_: Any, **options: Any) -> Any:
         """Open the file to read it; any other mode raises StorageError."""
         if mode not in ("r", "rb", "rt"):
-            raise StorageError(self, f"cannot be opened for {mode!r}", "files of a store are put as a whole")
+            remedy = "a file of a store is written as a whole"
+            raise StorageError(self, f"cannot be opened for {mode!r}", remedy)
         data = io.BufferedReader(RangeFile(self), 1 << 20)
         if "b" in mode:
             return data
@@ -277,14 +278,6 @@ class RemotePath(PosixPath):
         for name in self.listing():
             if not keep(name):
                 (self / name).unlink(missing_ok=True)
-
-
-def _files(uri: str) -> Any:
-    try:
-        return file_system(uri)[0]
-    except ValueError as fault:
-        remedy = "use s3://, gs:// or hf://"
-        raise StorageError(uri, f"is of no store that is known: {said(fault)}", remedy) from fault
 
 
 # -- writing

@@ -79,7 +79,7 @@ def parse_yaml(text: str, where: str, error: type[HMAError] = RegistryError) -> 
         mark = getattr(fault, "problem_mark", None)
         place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(fault, "problem", None) or str(fault).splitlines()[0]
-        if mark and any("\t" in line[: mark.column + 1] for line in text.split("\n")[mark.line :][:1]):
+        if mark and "\t" in "".join(text.split("\n")[mark.line : mark.line + 1])[: mark.column + 1]:
             problem += " (a tab: indent with spaces)"
         raise error(where, f"not valid YAML{place}: {problem}") from fault
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HubError, ShardError
-from hma_data.hub.repository import REPOSITORY
 from hma_data.shards.manifest import EPISODES, MANIFEST, SHARD_NAME, Manifest, seal_problem
 from hma_data.shards.publish import SMALL, publish
 from hma_data.storage.files import file_sha256, write_atomic
-from hma_data.storage.paths import StrPath, as_address, as_path
+from hma_data.storage.paths import REPOSITORY, StrPath, as_address, as_path
 from hma_data.storage.yaml_io import write_yaml
 from hma_model.checkpoint.folder import README
 from hma_model.checkpoint.model_card import licence, line, number

@@ -9,15 +9,16 @@ yet.
 import hashlib
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from hma_data.errors import CheckpointError, HMAError, HubError
-from hma_data.hub.repository import Repository, addressed, is_repository
+from hma_data.hub.repository import Repository
 from hma_data.registry.embodiment import ID_PATTERN, find
 from hma_data.shards.manifest import MANIFEST
 from hma_data.storage.files import cache_folder, file_sha256, json_object
-from hma_data.storage.paths import StrPath, as_address, as_path
+from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import migrate
 from hma_model.checkpoint.folder import (
@@ -42,8 +43,6 @@ if TYPE_CHECKING:
 
 Content = Path | bytes
 SHOWN = 50  # ids that an error lists
-MOST_PICTURE = 10_000_000  # maximum bytes of a sample.png, which a page shows
-_PNG_BEGIN, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xae\x42\x60\x82"
 
 
 class Store(Protocol):
@@ -294,15 +293,9 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
             stats[name] = {"action": action}
     with tempfile.TemporaryDirectory() as folder:
-        checkpoints.save(
-            model,
-            Path(folder) / "model",
-            embodiment_yaml=yaml,
-            stats=stats,
-            cards=cards,
-            tokenizer=model.config.tokenizer,
-        )
-        return push(Path(folder) / "model", target, embodiments)
+        made, tokenizer = Path(folder) / "model", model.config.tokenizer
+        checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards, tokenizer=tokenizer)
+        return push(made, target, embodiments)
 
 
 # -- checks before a push
@@ -319,8 +312,9 @@ def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None
     for name in embodiments:
         _require_yaml(source, name)
         checkpoints.read_embodiment(source, name)
-        _require_card(source, name)
-        _require_picture(source, name)
+        if source.card(name).get("id", name) != name:
+            fault = f"is the card of {str(source.card(name)['id'])[:60]!r}"
+            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
 
 
 def _require_yaml(source: Checkpoint, name: str) -> None:
@@ -331,27 +325,6 @@ def _require_yaml(source: Checkpoint, name: str) -> None:
     if recorded not in (None, file_sha256(path)):
         remedy = "put the one back that it was trained with; facts for readers can be changed in the card"
         raise CheckpointError(path, f"is not the file that {CARD} names", remedy)
-
-
-def _require_card(source: Checkpoint, name: str) -> None:
-    card, path = source.card(name), source.path(name, CARD)
-    if card.get("id", name) != name:
-        raise CheckpointError(path, f"is the card of {str(card['id'])[:60]!r}", "save the checkpoint again")
-    wanted = {"data": (dict, "an object"), "metrics": (dict, "an object"), "license": (str, "text")}
-    for key, (kind, words) in wanted.items():
-        if not isinstance(card.get(key), (kind, type(None))):
-            fault = f"has a {key} that is {type(card[key]).__name__}, not {words}"
-            raise CheckpointError(path, fault, "correct it, or save the checkpoint again")
-
-
-def _require_picture(source: Checkpoint, name: str) -> None:
-    if not (source.folder / "embodiments" / name / SAMPLE).is_file():
-        return
-    path = source.path(name, SAMPLE)
-    content = path.read_bytes() if path.stat().st_size <= MOST_PICTURE else b""
-    if not (content.startswith(_PNG_BEGIN) and content.endswith(_PNG_END)):
-        fault = f"is not a whole PNG of at most {MOST_PICTURE:,} bytes"
-        raise CheckpointError(path, fault, "make it again with hma hub push --sample DATA, or delete it")
 
 
 # -- the changes of a push
@@ -385,12 +358,10 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
 
 def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:
     if there.get("trunk_sha256") != source.trunk_sha256:
-        raise HubError(
-            where,
-            f"has another trunk: {str(there.get('trunk_sha256'))[:16]}, this checkpoint's is "
-            f"{source.trunk_sha256[:16]}",
-            "push to a hub of its own, or finetune on the trunk that is there",
-        )
+        theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
+        fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
+        remedy = "push to a hub of its own, or finetune on the trunk that is there"
+        raise HubError(where, fault, remedy)
     if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
         raise HubError(where, "has the same trunk with another tokenizer", "push to a hub of its own")
 
@@ -409,14 +380,8 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
 
 def embodiment_ids(files: Iterable[str]) -> list[str]:
     """Return the ids that have a card, which is written last, in a listing of a checkpoint's files."""
-    found = set()
-    for path in files:
-        parts = path.split("/")
-        if len(parts) != 3 or parts[0] != "embodiments" or parts[2] != CARD:
-            continue
-        if ID_PATTERN.fullmatch(parts[1]) and ".." not in parts[1]:
-            found.add(parts[1])
-    return sorted(found)
+    found = {path.split("/")[1] for path in files if fnmatchcase(path, f"embodiments/*/{CARD}")}
+    return sorted(name for name in found if ID_PATTERN.fullmatch(name) and ".." not in name)
 
 
 def _card(store: Store, name: str) -> dict[str, Any]:
@@ -436,8 +401,6 @@ def _registered(name: str) -> str:
     try:
         return find(name).to_yaml()
     except HMAError as fault:
-        raise HubError(
-            f"embodiment {name}",
-            "has no YAML where the model was loaded from, nor in the registry",
-            "save with hma_model.checkpoint.io.save and push the folder",
-        ) from fault
+        text = "has no YAML where the model was loaded from, nor in the registry"
+        remedy = "save with hma_model.checkpoint.save and push the folder"
+        raise HubError(f"embodiment {name}", text, remedy) from fault

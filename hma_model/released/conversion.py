@@ -20,10 +20,10 @@ import torch
 from torch import Tensor, nn
 
 from hma_data.errors import CheckpointError, HMAError, HubError
-from hma_data.hub.repository import Repository, addressed, is_repository
+from hma_data.hub.repository import Repository
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.storage.files import new_folder, read_json, to_json
-from hma_data.storage.paths import StrPath, as_address, as_path
+from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import find_entry
 from hma_model.checkpoint.folder import CONFIG, LIBRARY, Checkpoint
@@ -66,7 +66,9 @@ def import_released(
     address = as_address(source)
     weights = _weights(address, revision)
     folder = weights.parent
-    values = _config_values(folder / CONFIG)
+    values = read_json(folder / CONFIG)
+    if values.get("library") == LIBRARY:
+        raise CheckpointError(folder, f"is a checkpoint of {LIBRARY} already", "use it as it is")
     state = _read_state(weights)
     config = config_from_released(values, {"grid": grid} if grid else None, folder / CONFIG)
     config = config.replace(tokenizer=_tokenizer_spec(config, tokenizer, folder).to_json())
@@ -78,15 +80,14 @@ def import_released(
     model.load_trunk(trunk)
     for domain, name in names.items():
         model.load_embodiment(name, *parts[domain])
-    spaces = {name: model.embodiments[name] for name in names.values()}
-    return save(
-        model,
-        out,
-        embodiment_yaml={name: _yaml(domain, spaces[name]) for domain, name in names.items()},
-        stats={name: _stats(space) for name, space in spaces.items()},
-        cards={name: _card(domain, address) for domain, name in names.items()},
-        tokenizer=config.tokenizer,
-    )
+    origin = Path(address).name if Path(address).exists() else str(address)
+    yaml, stats, cards = {}, {}, {}
+    for domain, name in names.items():
+        space = model.embodiments[name]
+        action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
+        yaml[name], stats[name] = _yaml(domain, space), {"action": action}
+        cards[name] = {"data": {"released_checkpoint": origin, "released_domain": domain}}
+    return save(model, out, embodiment_yaml=yaml, stats=stats, cards=cards, tokenizer=config.tokenizer)
 
 
 def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[str] | None = None) -> Path:
@@ -112,7 +113,9 @@ def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[
     values = config_to_released(opened.config, opened.folder)
     model = load(opened.folder, embodiments)
     domains = _domains(model, opened.folder)
-    values |= _actions(model, domains)
+    values |= {"init_actions": bool(domains), "use_actions": bool(domains)}
+    values["action_domains"] = list(domains) or None
+    values["d_actions"] = [model.embodiments[name].chunk_dim for name in domains.values()] or None
     parts = {domain: (model.stem_state(name), model.head_state(name)) for domain, name in domains.items()}
     state = state_to_released(model.trunk_state(), parts, opened.config)
     _check_norms(model, opened.folder)
@@ -139,11 +142,10 @@ def _weights(address: str | Path, revision: str | None) -> Path:
     if path.is_file():
         return path
     if path.is_dir():
-        found = [path / name for name in WEIGHTS if (path / name).is_file()]
-        if not found:
-            fault = f"has no {' or '.join(WEIGHTS)}"
-            raise CheckpointError(path, fault, "give a released checkpoint's folder")
-        return found[0]
+        for name in WEIGHTS:
+            if (path / name).is_file():
+                return path / name
+        raise CheckpointError(path, f"has no {' or '.join(WEIGHTS)}", "give a released checkpoint's folder")
     address, revision = addressed(address, revision)
     if not is_repository(address):
         raise CheckpointError(address, "no such file or folder", "give a folder, or ORGANISATION/NAME")
@@ -154,16 +156,6 @@ def _weights(address: str | Path, revision: str | None) -> Path:
         fault = f"has no {CONFIG} with {' or '.join(WEIGHTS)}"
         raise HubError(store.name, fault, "is it a released checkpoint?")
     return store.pull([CONFIG, *names]) / names[0]
-
-
-def _config_values(path: Path) -> dict[str, Any]:
-    values = read_json(path)
-    if values.get("library") == LIBRARY:
-        raise CheckpointError(path, f"is a checkpoint of {LIBRARY} already", "use it as it is")
-    missing = [name for name in ("num_layers", "num_heads", "d_model") if name not in values]
-    if missing:
-        raise CheckpointError(path, f"lacks {missing[0]}", "is it a released checkpoint?")
-    return values
 
 
 def _read_state(path: Path) -> State:
@@ -209,11 +201,8 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
         for name, shape in sorted(expected.items())
         if name in state and tuple(state[name].shape) != shape
     ]
-    faults = [
-        f"{what} {_some(found)}" for what, found in (("lacks", missing), ("has unknown", extra)) if found
-    ]
-    faults += [f"shapes differ: {_some(shapes)}"] if shapes else []
-    if faults:
+    kinds = {"lacks": missing, "has unknown": extra, "shapes differ:": shapes}
+    if faults := [f"{what} {_some(found)}" for what, found in kinds.items() if found]:
         fault = f"is not the model that {CONFIG} describes: {'; '.join(faults)}"
         raise CheckpointError(path, fault, f"give weights and {CONFIG} of one released checkpoint")
 
@@ -232,9 +221,9 @@ def _expected(path: Path, state: State, config: HMAConfig, domains: list[str]) -
 def _space(path: Path, state: State, domain: str) -> ActionSpace:
     """Return the action space of a domain, with the width and stride that its tensors' shapes imply."""
     names = f"action_preprocessor.{domain}.mean", f"action_mlp.{domain}.model.0.weight"
-    if any(name not in state for name in names):
-        lacking = next(name for name in names if name not in state)
-        raise CheckpointError(path, f"lacks {lacking}", "is the file complete?")
+    for name in names:
+        if name not in state:
+            raise CheckpointError(path, f"lacks {name}", "is the file complete?")
     dims, chunk = state[names[0]].numel(), state[names[1]].shape[-1]
     if dims < 1 or chunk % dims:
         fault = f"domain {domain!r} has chunks of {chunk} values and statistics of {dims}"
@@ -336,17 +325,6 @@ def _unknown(domain: str, space: ActionSpace) -> dict[str, Any]:
     }
 
 
-def _stats(space: ActionSpace) -> dict[str, Any]:
-    return {
-        "action": {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
-    }
-
-
-def _card(domain: str, source: str | Path) -> dict[str, Any]:
-    shown = Path(source).name if Path(source).exists() else str(source)
-    return {"data": {"released_checkpoint": shown, "released_domain": domain}}
-
-
 # -- describing ours to the release
 
 
@@ -360,17 +338,6 @@ def _domains(model: HMA, where: object) -> dict[str, str]:
             raise CheckpointError(where, fault, "export the others by --embodiment")
         domains[domain] = name
     return domains
-
-
-def _actions(model: HMA, domains: dict[str, str]) -> dict[str, Any]:
-    if not domains:
-        return {"init_actions": False, "use_actions": False, "action_domains": None, "d_actions": None}
-    return {
-        "init_actions": True,
-        "use_actions": True,
-        "action_domains": list(domains),
-        "d_actions": [model.embodiments[name].chunk_dim for name in domains.values()],
-    }
 
 
 def _check_norms(model: HMA, where: object) -> None:

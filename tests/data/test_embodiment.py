@@ -336,7 +336,7 @@ def test_what_is_no_text_or_no_file_is_refused(tmp_path: Path) -> None:
     folder.mkdir()
     binary.write_bytes(b"\xff\xfe\x00a")
     os.mkfifo(pipe)
-    for path, said in [(folder, "is a folder"), (binary, "is not UTF-8 text"), (pipe, "is not a file")]:
+    for path, said in [(folder, "is not a file"), (binary, "is not UTF-8 text"), (pipe, "is not a file")]:
         with pytest.raises(RegistryError, match=rf"{path.name}: {said}"):
             read_yaml(path)
 
