@@ -422,8 +422,7 @@ INNER = {  # take what a public function has made of a path already
     "hma_data.tokenizers.training.frames": {"read_pictures"},
     "hma_data.tokenizers.training.train": {"Run"},
     "hma_model.checkpoint.folder": {"inside"},
-    "hma_model.hub.publish": {"Store", "embodiment_ids"},
-    "hma_model.hub.datasets": {"DataStore"},
+    "hma_model.hub.publish": {"embodiment_ids"},
     "hma_model.training.recipe": {"differences"},
     "hma_model.training.logging": {"RunLog"},
 }

@@ -71,7 +71,7 @@ class Entry:
 
 
 class Repository:
-    """A repository of the hub; see `hma_model.hub.publish.Store`.
+    """A repository of the hub, in which a checkpoint or a shard set is published.
 
     Args:
         repo: organisation/name.

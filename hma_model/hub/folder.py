@@ -31,7 +31,7 @@ from hma_model.checkpoint.folder import CONFIG, README, TRUNK
 
 
 class FolderStore:
-    """A hub in a folder; see `hma_model.hub.publish.Store`.
+    """A hub in a folder; it has the methods of `hma_data.hub.repository.Repository`.
 
     Args:
         address: a path or an fsspec URI.

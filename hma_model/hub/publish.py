@@ -8,10 +8,10 @@ yet.
 
 import hashlib
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.hub.repository import Repository
@@ -42,58 +42,8 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 Content = Path | bytes
+Store = FolderStore | Repository  # a place where a checkpoint or a shard set is published
 SHOWN = 50  # ids that an error lists
-
-
-class Store(Protocol):
-    """A place where a checkpoint or a shard set is published."""
-
-    name: str  # for errors
-
-    @property
-    def from_cache(self) -> bool:
-        """Check whether the hub was out of reach, so that `files` lists the content of the cache."""
-        ...
-
-    @property
-    def repo(self) -> str | None:
-        """Return the repository's name for the card; None for a path."""
-        ...
-
-    def files(self) -> dict[str, int]:
-        """Return the sizes of the published files by name."""
-        ...
-
-    def read(self, name: str) -> bytes:
-        """Return the content of a small file."""
-        ...
-
-    def warm(self, names: list[str]) -> None:
-        """Announce which small files will be read."""
-        ...
-
-    def has(self, name: str, content: Content, sha256: str | None = None) -> bool:
-        """Check whether the files that `files` listed have this content under this name."""
-        ...
-
-    def check_card(self, page: bytes) -> None:
-        """Raise if the hub would refuse the page."""
-        ...
-
-    def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str:
-        """Write the files of `changes`, delete those that are None, and return the address.
-
-        `changes` is called again if somebody else published in the meantime.
-        """
-        ...
-
-    def pull(self, names: list[str], out: Path | None) -> Path:
-        """Fetch files, cards last, and return their folder, which may be a cache and not `out`."""
-        ...
-
-    def download(self, names: list[str], out: Path) -> None:
-        """Fetch files to a folder."""
-        ...
 
 
 def open_store(

@@ -28,6 +28,11 @@ _LAYOUT: dict[str, Any] = {
     "final_norm": False,
     "add_at": "layers",
 }
+_EXPORTED = ("time_position", "action_alignment", "temporal_norm", "final_norm")  # what an export needs
+_CONTINUOUS_NEEDS: dict[str, Any] = {
+    "action_loss": "diffusion", "latent_scale": LATENT_SCALE, "diffusion_train_steps": 1000,
+    "diffusion_target": "noise",
+}  # fmt: skip
 # Our objective by their (jointly_predict_actions, jointly_predict_states). Without the first, the second is
 # ignored: video is predicted.
 _OBJECTIVE = {
@@ -199,11 +204,8 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
     if faults:
         fault = f"the released layout cannot express {'; '.join(faults)}"
         raise CheckpointError(where, fault, "the released code cannot read it")
-    concat = "concat+" if "concat" in config.conditioning else ""
-    inside = (
-        "modulate" if "modulation" in config.conditioning else "mlp" if "add" in config.conditioning else ""
-    )
-    joint = config.absent_action == "tokens"
+    named = {"concat": "concat", "modulation": "modulate", "add": "mlp"}
+    network = [theirs for ours, theirs in named.items() if ours in config.conditioning]
     values = {
         "num_layers": config.layers,
         "num_heads": config.heads,
@@ -216,8 +218,8 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
         "max_corrupt_rate": config.corrupt_max,
         "non_mlm_ratio": config.history_probability,
         "num_prompt_frames": config.history_frames,
-        "action_network": f"{concat}{inside}".strip("+"),
-        "jointly_predict_actions": joint,
+        "action_network": "+".join(network),
+        "jointly_predict_actions": config.absent_action == "tokens",
         "jointly_predict_states": any(OBJECTIVES[name].predicts_video for name in config.objectives),
         "action_token_size": config.action_tokens,
         "action_loss_weight": config.action_loss_weight,
@@ -228,11 +230,9 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
         "mlp_drop": config.dropout,
         "mlp_bias": config.mlp_bias,
     }
-    return values | (_continuous_fields(config) if config.kind == "continuous" else {})
-
-
-def _continuous_fields(config: HMAConfig) -> dict[str, Any]:
-    return {
+    if config.kind == "discrete":
+        return values
+    return values | {
         "Diffusion": True,
         "patch_size": config.patch,
         "vae_embed_dim": config.channels,
@@ -245,39 +245,25 @@ def _continuous_fields(config: HMAConfig) -> dict[str, Any]:
 
 def _inexpressible(config: HMAConfig) -> list[str]:
     """Return each field and value that the released code cannot express."""
-    fixed = ("time_position", "action_alignment", "temporal_norm", "final_norm")
-    faults = [f"{name} {getattr(config, name)!r}" for name in fixed if getattr(config, name) != _LAYOUT[name]]
-    if config.absent_action == "embedding":
-        faults.append("absent_action 'embedding'")
+    continuous, tokens = config.kind == "continuous", math.prod(config.grid)
+    needed = {name: _LAYOUT[name] for name in _EXPORTED}
+    needed |= _CONTINUOUS_NEEDS if continuous else {"action_loss": "mse"}
+    needed |= {"base_width": 256} if config.mup else {}
+    faults = [f"{name} {getattr(config, name)!r}" for name in needed if getattr(config, name) != needed[name]]
     inside = set(config.conditioning) - {"concat"}
+    trained = sorted(name for name, weight in config.objectives.items() if weight > 0)
+    policy = any(OBJECTIVES[name].readout == POLICY for name in trained)
+    faults += [f"objective {name}" for name in trained if OBJECTIVES[name].readout == INVERSE]
     if "cross_attention" in inside or len(inside) > 1 or ("add" in inside and config.add_at != "layers"):
         faults.append(f"conditioning {'+'.join(config.conditioning)} (add_at {config.add_at})")
+    if config.absent_action == "embedding" or (policy and config.absent_action != "tokens"):
+        faults.append(f"objectives {', '.join(trained)} with absent_action {config.absent_action!r}")
     if config.qk_norm != (config.norms == "qk"):
         faults.append(f"qk_norm {config.qk_norm} with norms {config.norms!r}")
-    if math.isqrt(math.prod(config.grid)) ** 2 != math.prod(config.grid):
-        faults.append(f"a frame of {math.prod(config.grid)} tokens, which is no square")
-    trained = {name for name, weight in config.objectives.items() if weight > 0}
-    faults += [f"objective {name}" for name in sorted(trained) if OBJECTIVES[name].readout == INVERSE]
-    if any(OBJECTIVES[name].readout == POLICY for name in trained) and config.absent_action != "tokens":
-        faults.append(f"objectives {', '.join(sorted(trained))} with absent_action {config.absent_action!r}")
-    if config.mup and config.base_width != 256:
-        faults.append(f"base_width {config.base_width}")
-    return faults + (_not_continuous(config) if config.kind == "continuous" else _not_discrete(config))
-
-
-def _not_discrete(config: HMAConfig) -> list[str]:
-    faults = [f"action_loss {config.action_loss!r}"] if config.action_loss != "mse" else []
-    return faults + ([f"unequal digits {config.factored}"] if len(set(config.factored)) > 1 else [])
-
-
-def _not_continuous(config: HMAConfig) -> list[str]:
-    faults = [f"action_loss {config.action_loss!r}"] if config.action_loss != "diffusion" else []
-    if config.latent_scale != LATENT_SCALE:
-        faults.append(f"latent_scale {config.latent_scale}")
-    if config.diffusion_train_steps != 1000:
-        faults.append(f"diffusion_train_steps {config.diffusion_train_steps}")
-    if config.diffusion_target != "noise":
-        faults.append(f"diffusion_target {config.diffusion_target!r}")
-    if config.mup and config.width != 256:
+    if math.isqrt(tokens) ** 2 != tokens:
+        faults.append(f"a frame of {tokens} tokens, which is no square")
+    if continuous and config.mup and config.width != 256:
         faults.append(f"muP at width {config.width} in a continuous model")
+    if not continuous and len(set(config.factored)) > 1:
+        faults.append(f"unequal digits {config.factored}")
     return faults
