@@ -140,7 +140,7 @@ def _answered(where: str, fault: Any) -> HubError:
         else "the token may not write here: use one with write access to this organisation"
     )
     remedies = {
-        400: "what it says should tell what to change",
+        400: "change what the hub names in its answer",
         401: "the token is not valid: " + LOG_IN,
         402: "its plan does not cover this: see the account's billing page",
         403: forbidden,
@@ -149,7 +149,7 @@ def _answered(where: str, fault: Any) -> HubError:
         429: "too many requests: wait some minutes and run it again",
         507: "the storage of this account is full",
     }
-    remedy = remedies.get(code or 0, "run the same command again later; what was there is as it was")
+    remedy = remedies.get(code or 0, "run the same command again later; nothing there was changed")
     said = shown(getattr(fault, "server_message", None) or "")
     return HubError(where, f"the hub answered {code}" + (f": {said}" if said else ""), remedy)
 

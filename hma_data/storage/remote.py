@@ -289,13 +289,12 @@ def put_file(local: Path, to: RemotePath) -> None:
     Raises:
         StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
-    files, size = to.files, local.stat().st_size
-    _put(to, lambda key: files.put_file(str(local), key), size)
+    _put(to, lambda key: to.files.put_file(str(local), key))
 
 
 def put_bytes(content: bytes, to: RemotePath) -> None:
     """Upload a small file; see `put_file`."""
-    _put(to, lambda key: to.files.pipe_file(key, content), len(content))
+    _put(to, lambda key: to.files.pipe_file(key, content))
 
 
 def create_bytes(content: bytes, to: RemotePath) -> bool:
@@ -326,19 +325,15 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
         return True
 
 
-def _put(to: RemotePath, upload: Callable[[str], Any], size: int) -> None:
+def _put(to: RemotePath, upload: Callable[[str], Any]) -> None:
     whole = to.scheme in WHOLE_PUTS
     beside = to if whole else to.with_name(f".{to.name}.{os.getpid()}.part")
     try:
         attempt(to, "written", lambda: upload(beside.key))
         if not whole:
             beside.replace(to)
-        arrived = to.info()["size"]
     except FileNotFoundError as fault:
         raise StorageError(to, "cannot be written: there is no such bucket", "create it first") from fault
-    if arrived != size:
-        fault_text = f"has {arrived} bytes after an upload of {size}"
-        raise StorageAwayError(to, fault_text, "run the same command again")
 
 
 # -- reading by ranges

@@ -72,7 +72,7 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
     shards = {shard.path: shard.sha256 for shard in manifest.shards}
     lacking = [path for path in shards if path not in files]
     if lacking:
-        raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "push it again")
+        raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "have it pushed again")
     wanted = [path for path in shards if not _is(out / path, shards[path])]
     store.download([*wanted, *(name for name in SMALL if name in files)], out)
     for path in wanted:

@@ -44,7 +44,7 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
     ]
     if not found:
         fault = f"has no {CONFIG} of a checkpoint of {LIBRARY} or of the release"
-        raise HubError(store.name, fault, "is not of hma-toolkit; check the name")
+        raise HubError(store.name, fault, "check the name: it is not of hma-toolkit")
     return found
 
 

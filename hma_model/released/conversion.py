@@ -193,7 +193,7 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
     lacking = [name for name in named if name not in domains]
     if lacking:
         remedy = f"they have {_some(domains) or 'none'}; is it another model's {CONFIG}?"
-        raise CheckpointError(path, f"lack the domains {_some(lacking)} that {CONFIG} names", remedy)
+        raise CheckpointError(path, f"lacks the domains {_some(lacking)} that {CONFIG} names", remedy)
     expected = _expected(path, state, config, domains)
     missing, extra = sorted(expected.keys() - state.keys()), sorted(state.keys() - expected.keys())
     shapes = [
@@ -255,7 +255,7 @@ def _ids(domains: list[str], path: Path) -> dict[str, str]:
         name = name if re.match(r"[a-z0-9]", name) else f"d{name}"[:100]
         if name in ids.values():
             fault = f"two domains would have the id {name!r}"
-            raise CheckpointError(path, fault, "import one with embodiments=")
+            raise CheckpointError(path, fault, "import one of them by embodiments=")
         ids[domain] = name
     return ids
 

@@ -69,7 +69,7 @@ def state_from_released(state: Mapping[str, Tensor], config: HMAConfig) -> tuple
             name: (_stem(source, name, config), _head(source, name, config)) for name in domains_of(state)
         }
     except KeyError as error:
-        raise CheckpointError("released weights", f"lack {error.args[0]}", "is the file complete?") from error
+        raise CheckpointError("released weights", f"{error.args[0]} is missing", "is the file complete?") from error
     return trunk, parts
 
 
