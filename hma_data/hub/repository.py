@@ -240,8 +240,10 @@ class Repository:
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             path.replace(out / name)
 
-        self._each(bring, [name for name in names if name in self._entries])
-        shutil.rmtree(staging, ignore_errors=True)
+        try:
+            self._each(bring, [name for name in names if name in self._entries])
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
 
     def _brought(self, names: Sequence[str]) -> list[Path]:
         """Return paths of files in the cache; download those that are missing or damaged."""
