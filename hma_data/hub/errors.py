@@ -31,37 +31,36 @@ def explain(where: str, fault: BaseException) -> HubError:
     import httpx
     from huggingface_hub import errors
 
-    cause = fault.__cause__ or fault.__context__
+    plain = {
+        errors.GatedRepoError: ("is gated", f"ask for access on its page, then {LOG_IN}"),
+        errors.RevisionNotFoundError: ("has no such revision", "name a branch, tag or commit of it"),
+        errors.RepositoryNotFoundError: (
+            "no such repository, or no access to it",
+            f"check the name; {LOG_IN}",
+        ),
+        errors.RemoteEntryNotFoundError: ("no such file there", "check the name and the revision"),
+        errors.HFValidationError: ("is not a repository's name", "write ORGANISATION/NAME"),
+        errors.FileMetadataError: ("was not answered by a hub", "check HF_ENDPOINT and your proxy"),
+    }
+    for kind, (text, remedy) in plain.items():
+        if isinstance(fault, kind):
+            return HubError(where, text, remedy)
+    name, cause = type(fault).__name__, fault.__cause__ or fault.__context__
     match fault:
-        case errors.LocalEntryNotFoundError() if isinstance(cause, errors.HfHubHTTPError):
-            return explain(where, cause)
-        case errors.LocalEntryNotFoundError():
+        case errors.LocalEntryNotFoundError() if not isinstance(cause, errors.HfHubHTTPError):
             return HubError(where, "is out of reach, and not in the cache", "go online and pull again")
-        case errors.GatedRepoError():
-            return HubError(where, "is gated", "ask for access on its page, then " + LOG_IN)
-        case errors.RevisionNotFoundError():
-            return HubError(where, "has no such revision", "name a branch, tag or commit of it")
-        case errors.RepositoryNotFoundError():
-            return HubError(where, "no such repository, or no access to it", "check the name; " + LOG_IN)
-        case errors.RemoteEntryNotFoundError():
-            return HubError(where, "no such file there", "check the name and the revision")
-        case errors.HFValidationError():
-            return HubError(where, "is not a repository's name", "write ORGANISATION/NAME")
+        case errors.LocalEntryNotFoundError() | RuntimeError() | ValueError() if isinstance(
+            cause, httpx.HTTPError | errors.OfflineModeIsEnabled
+        ):
+            return explain(where, cause)  # the client wraps what a download or an upload raised
         case errors.HfHubHTTPError():
             return _answered(where, fault)
         case errors.OfflineModeIsEnabled() | httpx.ConnectError() | httpx.TimeoutException():
-            name = type(fault).__name__
             return HubError(where, f"is out of reach: {name}", "check the network, try again")
         case httpx.TooManyRedirects() | httpx.DecodingError() | httpx.UnsupportedProtocol():
             return _strange(where, fault)
         case httpx.HTTPError():
-            return HubError(where, f"the connection was cut: {type(fault).__name__}", AGAIN)
-        case errors.FileMetadataError():
-            return HubError(where, "was not answered by a hub", "check HF_ENDPOINT and your proxy")
-        case RuntimeError() | ValueError() if isinstance(
-            cause, httpx.HTTPError | errors.OfflineModeIsEnabled
-        ):
-            return explain(where, cause)  # the client wraps what an upload or a repeated download raised
+            return HubError(where, f"the connection was cut: {name}", AGAIN)
         case OSError() if fault.errno is not None:
             return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
         case OSError():

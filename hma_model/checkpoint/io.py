@@ -262,17 +262,14 @@ def _facts(embodiment: Embodiment) -> dict[str, Any]:
 def _check_parts(
     model: "HMA", folder: Path, yaml: Mapping[str, str], stats: Mapping[str, dict[str, Any]]
 ) -> None:
+    if unnamed := sorted(set(model.embodiments) - set(yaml)):
+        raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
     for name in yaml:
         check_id(name, folder)
-        if name not in model.embodiments:
-            raise CheckpointError(folder, f"the model has no embodiment {name!r}", "add it before saving")
         found = Embodiment.from_yaml(yaml[name], f"{folder}: {name}").id
         if found != name:
             raise CheckpointError(folder, f"the YAML given for {name!r} has id {found!r}")
         action_stats(stats.get(name, {}), f"{folder}: statistics of {name}")
-    unnamed = sorted(set(model.embodiments) - set(yaml))
-    if unnamed:
-        raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
     foreign = any(folder.iterdir()) if folder.is_dir() else folder.exists()
     if foreign and not (folder / CONFIG).is_file():
         raise CheckpointError(folder, "is there already and is no checkpoint", "choose another folder")

@@ -12,6 +12,7 @@ refuses a configuration that the layout cannot express, with every reason.
 import keyword
 import pickle
 import re
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -174,7 +175,9 @@ def _read_state(path: Path) -> State:
 
 def _unpickled(path: Path) -> Any:
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # warnings of old protocols; the error below covers them
+            return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as fault:
         text = "holds more than tensors, or is damaged; it is not opened"
         raise CheckpointError(path, text, "convert it to safetensors") from fault
