@@ -98,12 +98,12 @@ class FolderStore:
         for name in names:
             target = out / name
             with _explained(target, "pulled"):
+                remove_dead_parts(target.parent)  # of a killed pull
                 if target.is_file() and self._is_same(self._root / name, target):
                     continue
                 if name in (CONFIG, TRUNK) and target.is_file() and any(out.glob("embodiments/*/card.json")):
                     fault = f"has another {name} with embodiments of its own"
                     raise HubError(out, fault, "pull to another folder")
-                remove_dead_parts(target.parent)
                 with atomic_path(target) as part:
                     _copy(self._root / name, part)
         return out

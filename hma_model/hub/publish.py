@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.hub.repository import Repository
 from hma_data.registry.embodiment import ID_PATTERN, find
-from hma_data.shards.manifest import MANIFEST
 from hma_data.storage.files import cache_folder, file_sha256, json_object
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_model.checkpoint import io as checkpoints
@@ -281,6 +280,8 @@ def _require_yaml(source: Checkpoint, name: str) -> None:
 
 
 def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
+    from hma_data.shards.manifest import MANIFEST  # imports pyarrow
+
     files = store.files()
     present: dict[str, Content] = {}
     if CONFIG in files:
