@@ -75,12 +75,10 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
         raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "have it pushed again")
     wanted = [path for path in shards if not _is(out / path, shards[path])]
     store.download([*wanted, *(name for name in SMALL if name in files)], out)
-    for path in wanted:
-        if not _is(out / path, shards[path]):
-            raise ShardError(out / path, f"is not the shard that {MANIFEST} names", _AGAIN)
-    for name in SMALL:
-        if name in manifest.files and not _is(out / name, manifest.files[name]):
-            raise ShardError(out / name, f"is not the file that {MANIFEST} names", _AGAIN)
+    for name in (*wanted, *(name for name in SMALL if name in manifest.files)):
+        if not _is(out / name, shards.get(name) or manifest.files[name]):
+            kind = "shard" if name in shards else "file"
+            raise ShardError(out / name, f"is not the {kind} that {MANIFEST} names", _AGAIN)
     write_atomic(out / MANIFEST, content)
     return out
 
