@@ -34,10 +34,7 @@ def explain(where: str, fault: BaseException) -> HubError:
     plain = {
         errors.GatedRepoError: ("is gated", f"ask for access on its page, then {LOG_IN}"),
         errors.RevisionNotFoundError: ("has no such revision", "name a branch, tag or commit of it"),
-        errors.RepositoryNotFoundError: (
-            "no such repository, or no access to it",
-            f"check the name; {LOG_IN}",
-        ),
+        errors.RepositoryNotFoundError: ("no such repository, or no access", f"check the name; {LOG_IN}"),
         errors.RemoteEntryNotFoundError: ("no such file there", "check the name and the revision"),
         errors.HFValidationError: ("is not a repository's name", "write ORGANISATION/NAME"),
         errors.FileMetadataError: ("was not answered by a hub", "check HF_ENDPOINT and your proxy"),
@@ -47,14 +44,14 @@ def explain(where: str, fault: BaseException) -> HubError:
             return HubError(where, text, remedy)
     name, cause = type(fault).__name__, fault.__cause__ or fault.__context__
     match fault:
+        case errors.HfHubHTTPError():
+            return _answered(where, fault)
         case errors.LocalEntryNotFoundError() if not isinstance(cause, errors.HfHubHTTPError):
             return HubError(where, "is out of reach, and not in the cache", "go online and pull again")
         case errors.LocalEntryNotFoundError() | RuntimeError() | ValueError() if isinstance(
             cause, httpx.HTTPError | errors.OfflineModeIsEnabled
         ):
             return explain(where, cause)  # the client wraps what a download or an upload raised
-        case errors.HfHubHTTPError():
-            return _answered(where, fault)
         case errors.OfflineModeIsEnabled() | httpx.ConnectError() | httpx.TimeoutException():
             return HubError(where, f"is out of reach: {name}", "check the network, try again")
         case httpx.TooManyRedirects() | httpx.DecodingError() | httpx.UnsupportedProtocol():
