@@ -5,6 +5,7 @@ conversion, loading; beside them lab, bench and cli. A room imports only from ro
 below are imported on use, so that `import hma_data` costs nothing.
 """
 
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -15,22 +16,34 @@ if TYPE_CHECKING:
     from hma_data.sources.base import open_source as open_source
     from hma_data.tokenizers.base import get_tokenizer as get_tokenizer
 
-_LAZY = {
-    "find": "hma_data.registry.embodiment",
-    "open_source": "hma_data.sources.base",
-    "get_tokenizer": "hma_data.tokenizers.base",
-    "convert": "hma_data.conversion.job",
-    "open_sets": "hma_data.loading.dataset",
-    "MixtureDataset": "hma_data.loading.dataset",
-}
 
+def lazy(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a package whose public names are imported on use.
 
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
+    Args:
+        package: the name of the package.
+        modules: public name -> the module that defines it.
+    """
+
+    def load(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
         from importlib import import_module
 
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(modules[name]), name)
+
+    return load
 
 
+__getattr__ = lazy(
+    __name__,
+    {
+        "find": "hma_data.registry.embodiment",
+        "open_source": "hma_data.sources.base",
+        "get_tokenizer": "hma_data.tokenizers.base",
+        "convert": "hma_data.conversion.job",
+        "open_sets": "hma_data.loading.dataset",
+        "MixtureDataset": "hma_data.loading.dataset",
+    },
+)
 __version__ = "0.1.0"

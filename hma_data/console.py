@@ -103,11 +103,13 @@ def human_number(value: float | None) -> str | None:
 
 def human_bytes(count: float) -> str:
     """Return a number of bytes as text: 1234567 -> 1.2 MB."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if count < 1000 or unit == "TB":
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+    if count < 1000:
+        return f"{count:.0f} B"
+    for unit in ("kB", "MB", "GB"):
         count /= 1000
-    return ""
+        if count < 1000:
+            return f"{count:.1f} {unit}"
+    return f"{count / 1000:.1f} TB"
 
 
 def human_seconds(seconds: float) -> str:

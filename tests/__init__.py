@@ -2,7 +2,7 @@
 
 import os
 
-from hma_data.threads import bound_spinning
+from hma_data.cpu import bound_spinning
 
 bound_spinning()
 os.environ.setdefault("OMP_NUM_THREADS", "1")

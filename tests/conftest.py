@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from hma_data.priority import ordinary_priority, take_ordinary_priority
+from hma_data.cpu import ordinary_priority, take_ordinary_priority
 from hma_data.registry.embodiment import Embodiment
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 

@@ -397,7 +397,7 @@ PUBLIC = (
     "hma_model.checkpoint.folder", "hma_model.checkpoint.io", "hma_model.demo.run",
     "hma_model.evaluation.evaluate", "hma_model.evaluation.rollout_video", "hma_model.hub.datasets",
     "hma_model.hub.listing", "hma_model.hub.publish", "hma_model.hub.sample", "hma_model.network.model",
-    "hma_model.released.exporting", "hma_model.released.importing", "hma_model.training.finetune",
+    "hma_model.released.conversion", "hma_model.training.finetune",
     "hma_model.training.logging", "hma_model.training.loop", "hma_model.training.recipe",
     "hma_model.training.report",
 )  # fmt: skip
@@ -421,8 +421,7 @@ INNER = {  # take what a public function has made of a path already
     "hma_data.tokenizers.training.frames": {"read_pictures", "load_pools"},
     "hma_data.tokenizers.training.train": {"Run"},
     "hma_model.checkpoint.folder": {"inside"},
-    "hma_model.hub.publish": {"Store", "embodiment_ids"},
-    "hma_model.hub.datasets": {"DataStore"},
+    "hma_model.hub.publish": {"embodiment_ids"},
     "hma_model.training.recipe": {"differences"},
     "hma_model.training.logging": {"RunLog"},
 }

@@ -14,8 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hma_data.cpu import usable_cores
 from hma_data.errors import UsageError
-from hma_data.threads import usable_cores
 
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment

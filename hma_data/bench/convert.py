@@ -102,7 +102,7 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]
     import sys
 
     from hma_data.conversion.worker import BATCH
-    from hma_data.threads import usable_cores
+    from hma_data.cpu import usable_cores
     from hma_data.tokenizers.base import get_tokenizer
 
     tokenizer = get_tokenizer(settings["tokenizer"])

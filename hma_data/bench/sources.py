@@ -28,11 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.bench import make_robot, peak_rss_mib
+from hma_data.cpu import ordinary_priority, usable_cores
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError, UsageError
-from hma_data.priority import ordinary_priority
 from hma_data.registry.embodiment import Embodiment
-from hma_data.threads import usable_cores
 
 ABOUT = "recordings of every format to 256×256 RGB, with one process and with all cores"
 DEFAULTS: dict[str, Any] = {"formats": ["all"], "frames": 600, "episodes": 6, "seed": 0}

@@ -158,7 +158,7 @@ def shards_merge(
     Example: hma shards merge shards/monday shards/tuesday --out shards/week
     """
     from hma_data.conversion.rewrite import merge
-    from hma_data.threads import usable_cores
+    from hma_data.cpu import usable_cores
 
     with progress("merge") as update:
         manifest = merge(folders, out, workers or usable_cores(), _in(update))
@@ -182,7 +182,7 @@ def shards_split(
     Example: hma shards split shards/my_arm --val-fraction 0.1 --out shards/my_arm_10
     """
     from hma_data.conversion.rewrite import split
-    from hma_data.threads import usable_cores
+    from hma_data.cpu import usable_cores
 
     options: dict[str, Any] = {"val_fraction": val_fraction, "seed": seed, "by": by}
     with progress("split") as update:

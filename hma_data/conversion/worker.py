@@ -25,6 +25,7 @@ from hma_data.conversion.engines.base import FIRST, Attempt, Report, Step, Work
 from hma_data.conversion.extend import Content, kept_frames
 from hma_data.conversion.output import Made
 from hma_data.conversion.plan import ShardUnit
+from hma_data.cpu import usable_cores
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
@@ -41,8 +42,8 @@ from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags
 from hma_data.shards.stats import Stats
 from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_data.sources.base import EpisodeRef, Source, open_source
-from hma_data.storage.retry import WAITS_S, disk_is_full, storage_is_away, worth_another_try
-from hma_data.threads import usable_cores
+from hma_data.storage.fetch import EPISODE_WAITS_S as WAITS_S
+from hma_data.storage.fetch import disk_is_full, storage_is_away, worth_another_try
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 BATCH = 32  # frames decoded and tokenized together

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from hma_data.errors import HubError
-from hma_data.storage.retry import causes
+from hma_data.storage.fetch import causes
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
@@ -31,38 +31,41 @@ def explain(where: str, fault: BaseException) -> HubError:
     import httpx
     from huggingface_hub import errors
 
-    cause = fault.__cause__ or fault.__context__
+    plain = {
+        errors.GatedRepoError: ("is gated", f"ask for access on its page, then {LOG_IN}"),
+        errors.RevisionNotFoundError: ("has no such revision", "name a branch, tag or commit of it"),
+        errors.RepositoryNotFoundError: ("no such repository, or no access", f"check the name; {LOG_IN}"),
+        errors.RemoteEntryNotFoundError: ("no such file there", "check the name and the revision"),
+        errors.HFValidationError: ("is not a repository's name", "write ORGANISATION/NAME"),
+        errors.FileMetadataError: ("was not answered by a hub", "check HF_ENDPOINT and your proxy"),
+    }
+    for kind, (text, remedy) in plain.items():
+        if isinstance(fault, kind):
+            return HubError(where, text, remedy)
+    name, cause = type(fault).__name__, fault.__cause__ or fault.__context__
     match fault:
-        case errors.GatedRepoError():
-            return HubError(where, "is gated", "ask for access on its page, then " + LOG_IN)
-        case errors.RevisionNotFoundError():
-            return HubError(where, "has no such revision", "name a branch, tag or commit of it")
-        case errors.RepositoryNotFoundError():
-            return HubError(where, "no such repository, or no access to it", "check the name; " + LOG_IN)
-        case errors.RemoteEntryNotFoundError():
-            return HubError(where, "no such file there", "check the name and the revision")
-        case errors.LocalEntryNotFoundError():
-            if isinstance(cause, errors.HfHubHTTPError):
-                return explain(where, cause)
-            return HubError(where, "is out of reach, and not in the cache", "go online and pull again")
-        case errors.HFValidationError():
-            return HubError(where, "is not a repository's name", "write ORGANISATION/NAME")
         case errors.HfHubHTTPError():
             return _answered(where, fault)
+        case errors.LocalEntryNotFoundError() if not isinstance(cause, errors.HfHubHTTPError):
+            return HubError(where, "is out of reach, and not in the cache", "go online and pull again")
+        case errors.LocalEntryNotFoundError() | RuntimeError() | ValueError() if isinstance(
+            cause, httpx.HTTPError | errors.OfflineModeIsEnabled
+        ):
+            return explain(where, cause)  # the client wraps what a download or an upload raised
         case errors.OfflineModeIsEnabled() | httpx.ConnectError() | httpx.TimeoutException():
-            name = type(fault).__name__
             return HubError(where, f"is out of reach: {name}", "check the network, try again")
         case httpx.TooManyRedirects() | httpx.DecodingError() | httpx.UnsupportedProtocol():
             return _strange(where, fault)
         case httpx.HTTPError():
-            fault_text = f"the connection was cut: {type(fault).__name__}"
-            return HubError(where, fault_text, AGAIN)
-        case errors.FileMetadataError():
-            return HubError(where, "was not answered by a hub", "check HF_ENDPOINT and your proxy")
-    wrapped = isinstance(fault, RuntimeError | ValueError)  # of an upload, or of a repeated download
-    if wrapped and isinstance(cause, httpx.HTTPError | errors.OfflineModeIsEnabled):
-        return explain(where, cause)
-    return _plain(where, fault)
+            return HubError(where, f"the connection was cut: {name}", AGAIN)
+        case OSError() if fault.errno is not None:
+            return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
+        case OSError():
+            return HubError(where, f"did not come whole: {shown(str(fault))}", AGAIN)
+        case RuntimeError() if not isinstance(fault, RecursionError):  # of the hub's library for transfers
+            remedy = "run it again; HF_HUB_DISABLE_XET=1 may help"
+            return HubError(where, f"the transfer failed: {shown(str(fault))}", remedy)
+    return _strange(where, fault)
 
 
 def status(fault: BaseException) -> int | None:
@@ -88,11 +91,7 @@ def waiting(fault: BaseException, attempt: int) -> float | None:
 
 
 def failed_by_xet(fault: BaseException) -> bool:
-    """Check whether an upload in chunks failed; if so, make this process upload by plain LFS from now on.
-
-    The client uploads to every hub by its Xet protocol. Some hubs do not support it, and some firewalls block
-    it. Every hub takes files by LFS.
-    """
+    """Check whether an upload by Xet failed, as behind some firewalls; if so, upload by LFS from now on."""
     import httpx
     from huggingface_hub import constants
 
@@ -100,8 +99,15 @@ def failed_by_xet(fault: BaseException) -> bool:
     of_library = any(isinstance(item, ConnectionError | TimeoutError | RuntimeError) for item in chain)
     if constants.HF_HUB_DISABLE_XET or not of_library or any(isinstance(c, httpx.HTTPError) for c in chain):
         return False
-    constants.HF_HUB_DISABLE_XET = True
+    upload_by_lfs()
     return True
+
+
+def upload_by_lfs() -> None:
+    """Make this process upload by plain LFS, which every hub takes, instead of the client's Xet protocol."""
+    from huggingface_hub import constants
+
+    constants.HF_HUB_DISABLE_XET = True
 
 
 def raised() -> tuple[type[BaseException], ...]:
@@ -124,33 +130,24 @@ def _answered(where: str, fault: Any) -> HubError:
     if code == 401 and "authorization" not in response.request.headers:
         return HubError(where, "no such repository, or it is private", "check the name; " + LOG_IN)
     reading = response is not None and response.request.method in ("GET", "HEAD")
+    forbidden = (
+        "the token may not read this: ask its owners for access"
+        if reading
+        else "the token may not write here: use one with write access to this organisation"
+    )
     remedies = {
-        400: "what it says should tell what to change",
+        400: "change what the hub names in its answer",
         401: "the token is not valid: " + LOG_IN,
         402: "its plan does not cover this: see the account's billing page",
-        403: "the token may not read this: ask its owners for access"
-        if reading
-        else "the token may not write here: use one with write access to this organisation",
+        403: forbidden,
         404: "check the name",
         413: "a file is too large for the hub",
         429: "too many requests: wait some minutes and run it again",
         507: "the storage of this account is full",
     }
-    remedy = remedies.get(code or 0, "run the same command again later; what was there is as it was")
+    remedy = remedies.get(code or 0, "run the same command again later; nothing there was changed")
     said = shown(getattr(fault, "server_message", None) or "")
     return HubError(where, f"the hub answered {code}" + (f": {said}" if said else ""), remedy)
-
-
-def _plain(where: str, fault: BaseException) -> HubError:
-    text = shown(str(fault))
-    if isinstance(fault, OSError) and fault.errno is not None:
-        return HubError(where, f"could not be stored: {fault.strerror}", "free space, try again")
-    if isinstance(fault, OSError):
-        return HubError(where, f"did not come whole: {text}", AGAIN)
-    library = isinstance(fault, RuntimeError) and not isinstance(fault, RecursionError)
-    if library:  # of the hub's library for transfers
-        return HubError(where, f"the transfer failed: {text}", "run it again; HF_HUB_DISABLE_XET=1 may help")
-    return _strange(where, fault)
 
 
 def _strange(where: str, fault: BaseException) -> HubError:

@@ -1,9 +1,12 @@
 """List, pull and push a repository of the Hugging Face Hub at one commit.
 
 A push is one commit on top of the commit it was prepared for. If somebody else has committed in between, the
-push is prepared again. Pulled files are in the cache of the hub's client, which works offline.
+push is prepared again. Pulled files are in the cache of the hub's client, which works offline. The client
+compares no digests, so this module does: a file that differs from the listing is downloaded once more.
 """
 
+import hashlib
+import io
 import logging
 import random
 import re
@@ -11,19 +14,21 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import batched
+from dataclasses import dataclass
+from functools import cache
+from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
 from hma_data.errors import HubError
-from hma_data.hub.download import Entry, fetch
-from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, waiting
-from hma_data.hub.partial import beside, remove_abandoned_folders
+from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, upload_by_lfs, waiting
+from hma_data.storage.files import PART
 
 ATTEMPTS = 8  # attempts to commit; half as many for any other call
 LISTING_S, SILENCE_S = 30.0, 300.0  # seconds; the hub needs minutes for a commit of many files
 AT_ONCE = 4  # downloads at a time
+LARGE = 1_000_000  # bytes of a file; from here on a bar shows the progress
 MOST_READ = 16_000_000  # largest size in bytes of a file that `read` takes
 CARD = "README.md"
 _ABSENT = object()
@@ -33,8 +38,40 @@ _COMMIT = re.compile(r"[0-9a-f]{40}|[0-9a-f]{64}")
 log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class Entry:
+    """A file of a repository, as a listing states it.
+
+    Attributes:
+        name: path in the repository.
+        size: bytes.
+        sha256: SHA-256 of a file that the hub keeps by LFS; None for any other file.
+        blob_id: git's name of its content, if `sha256` is None; empty if the hub does not state it.
+    """
+
+    name: str
+    size: int
+    sha256: str | None
+    blob_id: str
+
+    def states(self, content: Path | bytes) -> bool:
+        """Check whether a file or bytes have this entry's content; False if there is no such file."""
+        if isinstance(content, Path) and not content.is_file():
+            return False
+        with io.BytesIO(content) if isinstance(content, bytes) else content.open("rb") as file:
+            if file.seek(0, io.SEEK_END) != self.size:
+                return False
+            file.seek(0)
+            if self.sha256:
+                return hashlib.file_digest(file, "sha256").hexdigest() == self.sha256
+            if not _COMMIT.fullmatch(self.blob_id):
+                return True
+            begun = hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
+            return hashlib.file_digest(file, lambda: begun).hexdigest() == self.blob_id
+
+
 class Repository:
-    """A repository of the hub; see `hma_model.hub.publish.Store`.
+    """A repository of the hub, in which a checkpoint or a shard set is published.
 
     Args:
         repo: organisation/name.
@@ -61,7 +98,7 @@ class Repository:
         private: bool | None = None,
         name: str | None = None,
     ) -> None:
-        from huggingface_hub import HfApi, get_token
+        from huggingface_hub import HfApi, get_session, get_token
 
         prefix = "datasets/" if kind == "dataset" else ""
         self.name, self.repo, self.kind, self._revision = name or f"hf://{prefix}{repo}", repo, kind, revision
@@ -70,9 +107,11 @@ class Repository:
         self._write, self._private, self._absent = write, private, False
         self._commit: str | None = None
         self._cached: Path | None = None
-        self._entries: dict[str, Entry] | None = None
+        self._entries: dict[str, Entry] = {}
         if write and get_token() is None:
             raise HubError(self.name, "needs a token to be written", f"{LOG_IN}; for a folder write ./{repo}")
+        if get_session().timeout.read is None:  # by default the client waits for an answer without limit
+            get_session().timeout = SILENCE_S
 
     @property
     def from_cache(self) -> bool:
@@ -110,7 +149,7 @@ class Repository:
 
     def stated(self, name: str) -> Entry | None:
         """Return the entry of a file in the listing of `files`; None if there is none."""
-        return (self._entries or {}).get(name)
+        return self._entries.get(name)
 
     def _info(self) -> Any:
         """Return the client's facts; None if the hub is out of reach, `_ABSENT` if the repository is new."""
@@ -175,16 +214,16 @@ class Repository:
 
     def read(self, name: str) -> bytes:
         """Return the content of a file of at most 16 MB at the commit that `files` listed."""
-        if self._known()[name].size > MOST_READ:
+        if self._entries[name].size > MOST_READ:
             fault = f"is larger than {MOST_READ:,} bytes"
             raise HubError(f"{self.name}/{name}", fault, "this is not a file of ours")
         return self._brought([name])[0].read_bytes()
 
     def warm(self, names: Iterable[str]) -> None:
         """Download small files to the cache together, for later calls of `read`."""
-        known = self._known()
         if not self.from_cache:
-            self._brought([name for name in names if name in known and known[name].size <= MOST_READ])
+            sizes = {name: self._entries[name].size for name in names if name in self._entries}
+            self._brought([name for name in sizes if sizes[name] <= MOST_READ])
 
     def pull(self, names: list[str], out: Path | None = None) -> Path:
         """Download files to the client's cache and return their folder there; `out` has no effect."""
@@ -192,53 +231,67 @@ class Repository:
 
     def download(self, names: list[str], out: Path) -> None:
         """Download files to a folder, not to the client's cache; each gets its name when it is complete."""
-        known = self._known()
         if self.from_cache:
             raise HubError(self.name, "is out of reach", "go online and pull again")
-        with explained(self.name):
-            out.mkdir(parents=True, exist_ok=True)
-            remove_abandoned_folders(out)
-        staging = beside(out / "pull")
+        staging = out / f".pull{PART}"
 
         def bring(name: str) -> None:
-            path = fetch(self.repo, self.kind, str(self._commit), known[name], staging)
+            path = self._fetch(name, staging)
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             path.replace(out / name)
 
         try:
-            self._each(bring, [name for name in names if name in known])
+            self._each(bring, [name for name in names if name in self._entries])
         finally:
             shutil.rmtree(staging, ignore_errors=True)
 
-    def _known(self) -> dict[str, Entry]:
-        if self._entries is None:
-            self.files()
-        return self._entries or {}
-
     def _brought(self, names: Sequence[str]) -> list[Path]:
         """Return paths of files in the cache; download those that are missing or damaged."""
-        known = self._known()
         if (folder := self._cached) is not None:
-            if missing := [name for name in names if name not in known]:
+            if missing := [name for name in names if name not in self._entries]:
                 fault = f"is out of reach, and {missing[0]} is not in the cache"
                 raise HubError(self.name, fault, "go online and pull again")
             return [folder / name for name in names]
-        commit = str(self._commit)
-        paths = self._each(lambda name: fetch(self.repo, self.kind, commit, known[name]), names)
+        paths = self._each(self._fetch, names)
         if paths:
             self._remember(_snapshot(paths[0], names[0]))
         return paths
 
+    def _fetch(self, name: str, folder: Path | None = None) -> Path:
+        """Download a file to a folder or to the client's cache, unless it is there; return its path."""
+        from huggingface_hub import hf_hub_download
+
+        entry = self._entries[name]
+        if folder is not None and entry.size == 0:  # some hubs do not send empty files
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+            return path
+        for anew in (False, True):
+            path = Path(
+                hf_hub_download(
+                    self.repo,
+                    name,
+                    repo_type=self.kind,
+                    revision=self._commit,
+                    local_dir=folder,
+                    force_download=anew,
+                    library_name="hma-toolkit",
+                    tqdm_class=None if entry.size >= LARGE else _no_bar(),
+                )
+            )
+            if entry.states(path):
+                return path
+        remedy = f"pull again; if it stays so, delete {path}, or do not use this repository"
+        raise HubError(f"{self.name}/{name}", "came with other content than the hub stated", remedy)
+
     def _remember(self, snapshot: Path) -> None:
         """Record in the cache which commit the revision is, so that it can be found by this name offline."""
-        named = self._revision or "main"
+        named, commit = self._revision or "main", str(self._commit)
         ref = snapshot.parent.parent / "refs" / named
-        with explained(self.name):
-            if not _COMMIT.fullmatch(named) and not (ref.is_file() and ref.read_text() == self._commit):
-                ref.parent.mkdir(parents=True, exist_ok=True)
-                new = beside(ref)
-                new.write_text(str(self._commit))
-                new.replace(ref)
+        if not _COMMIT.fullmatch(named) and not (ref.is_file() and ref.read_text() == commit):
+            ref.parent.mkdir(parents=True, exist_ok=True)
+            ref.write_text(commit)  # as the client writes it
 
     def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
         """Return the results of an action for each file, a few files at a time; the first error ends it."""
@@ -293,32 +346,33 @@ class Repository:
                     self._commit_changes(files, message)
                 return self.address
             except HubError as fault:
-                seconds = self._pause(fault, attempt)
-                if seconds is None:
-                    raise
-                log.info("%s; trying again", fault)
-            time.sleep(seconds)
+                self._pause(fault, attempt)
             files = changes()
         raise HubError(self.name, f"others committed first {ATTEMPTS} times", "push again later")
 
-    def _pause(self, fault: HubError, attempt: int) -> float | None:
-        """Return the seconds to wait before a commit is prepared again; None if waiting would not help."""
+    def _pause(self, fault: HubError, attempt: int) -> None:
+        """Wait before a request is made again; raise the fault if that would not help."""
         if failed_by_xet(fault):
-            return 0.0
-        if status(fault) in _CONFLICTS:
-            return min(0.2 * 2**attempt, 10.0) * (0.5 + random.random())
-        return waiting(fault, attempt) if attempt < ATTEMPTS // 2 else None
+            seconds: float | None = 0.0
+        elif status(fault) in _CONFLICTS:
+            seconds = min(0.2 * 2**attempt, 10.0) * (0.5 + random.random())
+        else:
+            seconds = waiting(fault, attempt) if attempt < ATTEMPTS // 2 else None
+        if seconds is None:
+            raise fault
+        log.info("%s; trying again", fault)
+        time.sleep(seconds)
 
     def _commit_changes(self, files: Mapping[str, Path | bytes | None], message: str) -> None:
         """Commit what differs from the listed commit, all of it or nothing."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
         added = {name: new for name, new in files.items() if new is not None and not self.has(name, new)}
-        deleted = [name for name, new in files.items() if new is None and name in self._known()]
+        deleted = [name for name, new in files.items() if new is None and name in self._entries]
         if not added and not deleted:
             return
         self._refuse_ignored(added)
-        self._limit_silence()
+        self._choose_transfer()
         self._api.create_commit(
             self.repo,
             [
@@ -333,19 +387,26 @@ class Repository:
 
     def _refuse_ignored(self, names: Iterable[str]) -> None:
         """Raise HubError if a .gitignore there would silently leave files out of the commit."""
-        if not any(PurePosixPath(name).name == ".gitignore" for name in self._known()):
+        if not any(PurePosixPath(name).name == ".gitignore" for name in self._entries):
             return
-        for some in batched(names, 256):
-            ignored = [facts["path"] for facts in self._upload_modes(some) if facts.get("shouldIgnore")]
-            if ignored:
-                fault = f"leaves out {ignored[0]}, by its .gitignore"
+        for facts in self._upload_modes(names):
+            if facts.get("shouldIgnore"):
+                fault = f"leaves out {facts['path']}, by its .gitignore"
                 raise HubError(self.name, fault, "delete that line there, and push again")
+
+    def _choose_transfer(self) -> None:
+        """Upload by LFS where the hub gives no Xet token; the client would ask for one for minutes."""
+        from huggingface_hub import constants
+
+        if not constants.HF_HUB_DISABLE_XET:
+            answer = self._request("GET", f"{self.kind}s/{self.repo}/xet-write-token/{self._branch}")
+            if not answer.is_success or b"accessToken" not in answer.content:
+                upload_by_lfs()
 
     def _upload_modes(self, names: Iterable[str]) -> list[dict[str, Any]]:
         """Return how the hub would take files; it answers only those who may write."""
-        branch = quote(self._revision or "main", safe="")
         asked = {"files": [{"path": name, "size": 1, "sample": "ew=="} for name in names]}
-        return list(self._posted(f"{self.kind}s/{self.repo}/preupload/{branch}", asked)["files"])
+        return list(self._posted(f"{self.kind}s/{self.repo}/preupload/{self._branch}", asked)["files"])
 
     def _make(self) -> None:
         private = self._private or None
@@ -355,41 +416,52 @@ class Repository:
 
     # -- asking
 
-    def _posted(self, place: str, value: Any, accepted: tuple[int, ...] = ()) -> Any:
-        """Post JSON to the hub and return the JSON of its answer; `accepted` lists error states to accept."""
+    @property
+    def _branch(self) -> str:
+        return quote(self._revision or "main", safe="")
+
+    def _request(self, method: str, place: str, value: Any = None) -> Any:
+        """Return the hub's answer to a request that the client has no function for."""
         from huggingface_hub import get_session
-        from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
+        from huggingface_hub.utils import build_hf_headers
 
         headers = build_hf_headers(library_name="hma-toolkit")
-        answer = get_session().post(f"{self._api.endpoint}/api/{place}", json=value, headers=headers)
+        return get_session().request(method, f"{self._api.endpoint}/api/{place}", json=value, headers=headers)
+
+    def _posted(self, place: str, value: Any, accepted: tuple[int, ...] = ()) -> Any:
+        """Post JSON to the hub and return the JSON of its answer; `accepted` lists error states to accept."""
+        from huggingface_hub.utils import hf_raise_for_status
+
+        answer = self._request("POST", place, value)
         if answer.status_code not in accepted:
             hf_raise_for_status(answer)
         return answer.json()
 
     def _ask[T](self, call: Callable[[], T], where: str = "") -> T:
         """Return the result of a client's call; repeat it if the hub is busy or the connection was cut."""
-        for attempt in range(ATTEMPTS // 2):
-            self._limit_silence()
+        for attempt in count():
             try:
                 with explained(where or self.name):
                     return call()
             except HubError as fault:
-                seconds = waiting(fault, attempt)
-                if seconds is None or attempt == ATTEMPTS // 2 - 1:
+                if status(fault) in _CONFLICTS:
                     raise
-                log.info("%s; trying again", fault)
-            time.sleep(seconds)
-        raise AssertionError("the last attempt returns or raises")
-
-    def _limit_silence(self) -> None:
-        """Limit the time that the client's session waits for an answer; by default it waits without limit."""
-        from huggingface_hub import get_session
-
-        session = get_session()
-        if session.timeout.read is None:
-            session.timeout = SILENCE_S
+                self._pause(fault, attempt)
+        raise AssertionError("the loop returns or raises")
 
 
 def _snapshot(path: Path, name: str) -> Path:
     """Return the folder of the client's cache that holds a file of this name."""
     return path.parents[len(PurePosixPath(name).parts) - 1]
+
+
+@cache
+def _no_bar() -> Any:
+    """Return the class of a progress bar that shows nothing."""
+    from huggingface_hub.utils import tqdm
+
+    class NoBar(tqdm):
+        def __init__(self, *given: Any, **options: Any) -> None:
+            super().__init__(*given, **options | {"disable": True})
+
+    return NoBar

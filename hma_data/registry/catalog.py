@@ -18,8 +18,7 @@ from typing import Any
 from hma_data.errors import HMAError, RegistryError
 from hma_data.registry import FORMATS
 from hma_data.storage.files import cache_folder, write_atomic
-from hma_data.storage.paths import StrPath, as_path
-from hma_data.storage.shipped import shipped
+from hma_data.storage.paths import StrPath, as_path, shipped
 from hma_data.storage.yaml_io import decode_yaml, parse_yaml, read_bytes
 
 

@@ -30,8 +30,7 @@ from hma_data.shards.schema import (
     read_footer,
 )
 from hma_data.shards.stats import Stats
-from hma_data.storage.files import atomic_path, file_sha256, write_atomic
-from hma_data.storage.json_io import parse_json
+from hma_data.storage.files import atomic_path, file_sha256, parse_json, write_atomic
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath, place
 from hma_data.storage.yaml_io import parse_yaml

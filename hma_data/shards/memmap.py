@@ -24,8 +24,7 @@ import pyarrow.parquet as pq
 from hma_data.errors import OutputError, UsageError
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import token_column
-from hma_data.storage.files import write_atomic
-from hma_data.storage.folders import new_folder
+from hma_data.storage.files import new_folder, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 

@@ -18,7 +18,7 @@ from hma_data.errors import ShardError, UsageError
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
 from hma_data.shards.schema import mask_columns, to_numpy, token_column
 from hma_data.storage.cache import kept_shard, limit_bytes
-from hma_data.storage.json_io import parse_json
+from hma_data.storage.files import parse_json
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RangeFile, RemotePath, parquet_file, place
 

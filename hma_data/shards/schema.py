@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hma_data.errors import ShardError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.stats import Stats
-from hma_data.storage.json_io import parse_json
+from hma_data.storage.files import parse_json
 from hma_data.storage.remote import parquet_input
 from hma_data.tokenizers.base import TokenizerSpec
 

@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from hma_data.cpu import usable_cores
 from hma_data.errors import HMAError
 from hma_data.shards.manifest import (
     EMBODIMENT,
@@ -41,7 +42,6 @@ from hma_data.shards.stats import Stats
 from hma_data.storage.files import PART, file_sha256
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import parquet_file, parquet_input, place
-from hma_data.threads import usable_cores
 
 REMAKE = "delete it and run the same hma convert again"
 KNOWN = {"action": "action_known", "state": "state_known"}  # bool columns of sets whose values can be missing

@@ -10,12 +10,11 @@ import hashlib
 import os
 import shutil
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from hma_data.errors import ShardError, UsageError
-from hma_data.storage.files import PART, cache_folder
+from hma_data.storage.files import cache_folder, part_of
 from hma_data.storage.remote import AHEAD, RangeFile, RemotePath
 
 LIMIT, DEFAULT_GB = "HMA_CACHE_GB", 20.0
@@ -34,9 +33,8 @@ def limit_bytes() -> int:
         gigabytes = float(stated) if stated else DEFAULT_GB
         return int(gigabytes * 1e9)
     except (ValueError, OverflowError) as fault:
-        raise UsageError(
-            f"${LIMIT}", f"{stated!r} is no number of gigabytes", "for example 20; 0: none"
-        ) from fault
+        fault_text = f"{stated!r} is no number of gigabytes"
+        raise UsageError(f"${LIMIT}", fault_text, "give for example 20, or 0 for no cache") from fault
 
 
 def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
@@ -57,12 +55,14 @@ def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
         if _is_there(final, size):
             return final
         folder.mkdir(parents=True, exist_ok=True)
-        with _one_at_a_time(folder / f".{sha256}.lock"):
-            if _is_there(final, size):
-                return final
-            if not _make_room(folder, size):
-                return None
-            return _download(path, sha256, size, final)
+        with (lock := folder / f".{sha256}.lock").open("w") as handle:
+            fcntl.flock(handle, fcntl.LOCK_EX)  # only one of the processes that want it downloads it
+            try:
+                if _is_there(final, size):
+                    return final
+                return _download(path, sha256, size, final) if _make_room(folder, size) else None
+            finally:
+                lock.unlink(missing_ok=True)
     except OSError:  # the cache cannot be written
         return None
 
@@ -77,7 +77,7 @@ def _is_there(final: Path, size: int) -> bool:
 
 
 def _download(path: RemotePath, sha256: str, size: int, final: Path) -> Path:
-    part = final.with_name(f".{sha256}.{os.getpid()}{PART}")
+    part = part_of(final)
     digest = hashlib.sha256()
     try:
         with part.open("wb") as out:
@@ -87,7 +87,7 @@ def _download(path: RemotePath, sha256: str, size: int, final: Path) -> Path:
                 out.write(piece)
         if digest.hexdigest() != sha256:
             fault = "its bytes are not those of the manifest (sha256 differs)"
-            raise ShardError(path, fault, "hma shards verify tells what is damaged")
+            raise ShardError(path, fault, "run hma shards verify to see what is damaged")
         part.replace(final)
     finally:
         part.unlink(missing_ok=True)
@@ -102,7 +102,9 @@ def _make_room(folder: Path, size: int) -> bool:
             facts = path.stat()
             found.append((facts.st_mtime, facts.st_size, path))
     taken, limit = sum(item[1] for item in found), limit_bytes()
-    over = max(taken + size - limit, size - _usable_bytes(folder))
+    disk = shutil.disk_usage(folder)
+    usable = disk.free - min(int(SPARE * disk.total), SPARE_BYTES)
+    over = max(taken + size - limit, size - usable)
     old = [item for item in sorted(found) if item[0] < time.time() - IN_USE_S]
     if size > limit or over > sum(item[1] for item in old):
         return False
@@ -112,19 +114,3 @@ def _make_room(folder: Path, size: int) -> bool:
         path.unlink(missing_ok=True)
         over -= length
     return True
-
-
-def _usable_bytes(folder: Path) -> int:
-    disk = shutil.disk_usage(folder)
-    return disk.free - min(int(SPARE * disk.total), SPARE_BYTES)
-
-
-@contextmanager
-def _one_at_a_time(lock: Path) -> Iterator[None]:
-    """Let only one of several processes that want a shard download it."""
-    with lock.open("w") as handle:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)

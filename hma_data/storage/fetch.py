@@ -1,25 +1,143 @@
 """Read bytes of files wherever fsspec finds them: by ranges, again when the network fails.
 
-File systems raise many kinds of exceptions; this module turns them into one SourceError that names the
-file. Faults that may pass by themselves (a lost connection, a busy server) are tried again; others are not.
+File systems raise many kinds of exceptions. Faults that may pass by themselves (a lost connection, a busy
+server) are tried again; faults of the data are not. What remains becomes one SourceError that names the file.
 """
 
-from collections.abc import Callable
+import errno
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import fsspec
 
 from hma_data.errors import HMAError, MissingDependencyError, SourceError, StorageAwayError
-from hma_data.storage.retry import ABSENT, address_hint, may_pass, retried, said
 
 CONNECT_S = 3.0  # seconds to wait for a server to answer
 WAITS_S = (0.2, 0.6, 1.8)  # before the second, third and fourth try
+EPISODE_WAITS_S = (0.5, 3.0, 15.0)  # the same, before an episode is read again
+ABSENT = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 PACKAGES = {
     "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",
     "hf": "huggingface_hub", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
 }  # fmt: skip
 MARKS = ("etag", "ETag", "md5Hash", "crc32c", "mtime", "updated", "LastModified", "Last-Modified", "oid")
 NO_LISTING = ("http", "https")
+_ANSWERS_LATER = {
+    errno.EAGAIN, errno.EBUSY, errno.ECONNABORTED, errno.ECONNREFUSED, errno.ECONNRESET, errno.EHOSTUNREACH,
+    errno.ENETDOWN, errno.ENETUNREACH, errno.ENOLINK, errno.EPIPE, errno.EREMOTEIO, errno.ESTALE,
+    errno.ETIMEDOUT,
+}  # fmt: skip
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_BUSY = {408, 425, 429, 500, 502, 503, 504}
+_UNREACHABLE = {
+    "ConnectionRefusedError", "ClientConnectorError", "ConnectionTimeoutError",  # aiohttp
+    "EndpointConnectionError", "ConnectTimeoutError",  # botocore
+}  # fmt: skip
+_OF_THE_NETWORK = _UNREACHABLE | {
+    "ClientConnectionError", "ClientPayloadError",  # aiohttp
+    "HTTPClientError", "ReadTimeoutError", "ResponseParserError", "IncompleteRead",  # botocore
+    "TransportError",  # google-auth, httpx
+}  # fmt: skip
+
+log = logging.getLogger(__name__)
+
+
+# -- faults
+
+
+def retried[T](action: Callable[[], T], where: object, waits_s: Sequence[float]) -> T:
+    """Return what `action` returns; run it again where a file system failed in a way that may pass.
+
+    Args:
+        where: for the log.
+        waits_s: seconds before the second and further tries.
+
+    Raises:
+        Exception: what the last try raised.
+    """
+    for wait_s in waits_s:
+        try:
+            return action()
+        except HMAError:
+            raise
+        except Exception as fault:  # file systems raise exceptions of any kind
+            if not may_pass(fault):
+                raise
+            log.info("%s: %s; trying again", where, said(fault))
+            time.sleep(wait_s)
+    return action()
+
+
+def may_pass(fault: BaseException) -> bool:
+    """Check whether what a remote file system raised may be gone on the next try."""
+    if isinstance(fault, (*ABSENT, PermissionError, ImportError)):
+        return False
+    if status := _status(fault):
+        return status in _BUSY
+    if isinstance(fault, OSError) and worth_another_try(fault):
+        return True
+    return bool(_kinds(fault) & _OF_THE_NETWORK)
+
+
+def address_hint(fault: BaseException) -> str:
+    """Return the first part of a remedy where a server's address may be wrong; else an empty text."""
+    if _kinds(fault) & _UNREACHABLE:
+        return "check the network, and the address (AWS_ENDPOINT_URL for s3); "
+    return ""
+
+
+def said(fault: BaseException) -> str:
+    """Return an exception as one line of text."""
+    text = " ".join(str(fault).split())
+    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
+
+
+def _kinds(fault: BaseException) -> set[str]:
+    return {kind.__name__ for kind in type(fault).__mro__}
+
+
+def _status(fault: BaseException) -> int:
+    """Return the HTTP status that an exception carries; 0 where it carries none."""
+    for name in ("status", "code", "status_code"):
+        value = getattr(fault, name, None) or getattr(getattr(fault, "response", None), name, None)
+        if str(value).isdecimal():
+            return int(str(value))
+    return 0
+
+
+def causes(fault: BaseException | None) -> Iterator[BaseException]:
+    """Yield a fault, the fault it was raised from, and so on to the first."""
+    seen: set[int] = set()
+    while fault is not None and id(fault) not in seen:
+        seen.add(id(fault))
+        yield fault
+        fault = fault.__cause__ or fault.__context__
+
+
+def storage_is_away(fault: BaseException) -> bool:
+    """Check whether storage did not answer; such a fault is not the episode's."""
+    return any(
+        isinstance(item, ConnectionError | TimeoutError | StorageAwayError)
+        or (isinstance(item, OSError) and item.errno in _ANSWERS_LATER)
+        for item in causes(fault)
+    )
+
+
+def worth_another_try(fault: BaseException) -> bool:
+    """Check whether reading again may succeed: storage did not answer, or the disk failed to read."""
+    return storage_is_away(fault) or any(
+        isinstance(item, OSError) and item.errno == errno.EIO for item in causes(fault)
+    )
+
+
+def disk_is_full(fault: BaseException) -> bool:
+    """Check whether a disk of this machine has no space; such a fault is not the recording's."""
+    return any(isinstance(item, OSError) and item.errno in _FULL for item in causes(fault))
+
+
+# -- file systems
 
 
 def file_system(uri: str) -> tuple[Any, str]:
@@ -68,6 +186,9 @@ def is_listless(files: Any) -> bool:
     return protocol(files) in NO_LISTING
 
 
+# -- reading
+
+
 def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
     """Return what `action` returns; try again when a remote file system fails in a way that may pass.
 
@@ -95,9 +216,8 @@ def info(files: Any, path: str) -> dict[str, Any]:
     """
     found: dict[str, Any] = attempt(files, path, lambda: files.info(path))
     if found.get("size") is None:
-        raise SourceError(
-            path, "its length is not told by its server", "copy the files here, or name a server that does"
-        )
+        remedy = "copy the files here, or name a server that states it"
+        raise SourceError(path, "its server does not state its length", remedy)
     return found
 
 
@@ -114,11 +234,8 @@ def fetch(files: Any, path: str, start: int, end: int) -> bytes:
     """
     data: bytes = attempt(files, path, lambda: files.cat_file(path, start=start, end=end))
     if len(data) > end - start:
-        raise SourceError(
-            path,
-            f"its server gives {len(data)} bytes where {end - start} were asked for",
-            "it answers no range requests: copy the files here",
-        )
+        fault = f"its server sent {len(data)} bytes where {end - start} were asked for"
+        raise SourceError(path, fault, "the server ignores range requests: copy the files here")
     return data
 
 
@@ -126,7 +243,7 @@ def fetch_whole(files: Any, path: str, limit: int) -> bytes | None:
     """Return all bytes of a small file; None when there is no such file.
 
     Raises:
-        SourceError: it cannot be read, or is longer than `limit` bytes.
+        SourceError: it cannot be read, or is a local file longer than `limit` bytes.
     """
 
     def whole() -> bytes | None:
@@ -139,7 +256,6 @@ def fetch_whole(files: Any, path: str, limit: int) -> bytes | None:
     if is_local(files):
         size = attempt(files, path, lambda: files.size(path) if files.isfile(path) else 0)
         if size > limit:
-            raise SourceError(
-                path, f"has {size:,} bytes, more than {limit:,}", "it is no description of TFDS"
-            )
+            fault = f"has {size:,} bytes, more than {limit:,}"
+            raise SourceError(path, fault, "a description by TFDS is smaller: check the file")
     return attempt(files, path, whole)

@@ -1,19 +1,31 @@
-"""Write files so that they are whole or absent: write beside the final name, flush, rename.
+"""Write files and folders so that they are whole or absent: write beside the final name, flush, rename.
 
-Files of a store are written on this machine and then uploaded.
+Files of a store are written on this machine and then uploaded. JSON is read and written here as well.
 """
 
 import hashlib
+import json
+import math
 import os
 import platform
-from collections.abc import Iterator
+import shutil
+import uuid
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from hma_data.errors import OutputError
+from hma_data.errors import CheckpointError, HMAError, OutputError
 from hma_data.storage.remote import RemotePath, put_bytes, put_file
 
 PART = ".part"  # ends the name of every unfinished file
+PARTIAL = ".partial-"  # is in the name of every unfinished folder
+MAX_JSON_BYTES = 16_000_000
+_AGAIN = "have it saved or pushed again"
+
+
+# -- files
 
 
 @contextmanager
@@ -26,42 +38,38 @@ def atomic_path(final: Path) -> Iterator[Path]:
         OutputError: the folder cannot be written, or the disk is full.
         StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
-    if isinstance(final, RemotePath):
-        with _uploaded(final) as part:
-            yield part
-        return
-    part = final.with_name(f".{final.name}.{os.getpid()}{PART}")
+    remote = isinstance(final, RemotePath)
+    part = part_of(upload_folder(final.parent) / final.name if isinstance(final, RemotePath) else final)
+    remedy = "free space, or name a folder by $HMA_CACHE" if remote else "free space or choose another --out"
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
+        part.parent.mkdir(parents=True, exist_ok=True)
         yield part
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-        part.replace(final)
-        sync_folder(final.parent)
+        if isinstance(final, RemotePath):
+            put_file(part, final)
+        else:
+            sync_folder(part)
+            part.replace(final)
+            sync_folder(final.parent)
     except OSError as fault:
-        raise OutputError(
-            final, f"cannot be written: {fault.strerror or fault}", "free space or choose another --out"
-        ) from fault
+        text = f"cannot be written: {fault.strerror or fault}"
+        raise OutputError(part if remote else final, text, remedy) from fault
     finally:
         part.unlink(missing_ok=True)
 
 
-@contextmanager
-def _uploaded(final: RemotePath) -> Iterator[Path]:
-    part = upload_folder(final.parent) / f".{final.name}.{os.getpid()}{PART}"
-    try:
-        try:
-            part.parent.mkdir(parents=True, exist_ok=True)
-            yield part
-        except OSError as fault:
-            raise OutputError(
-                part,
-                f"cannot be written: {fault.strerror or fault}",
-                "free space, or name a folder by $HMA_CACHE",
-            ) from fault
-        put_file(part, final)
-    finally:
-        part.unlink(missing_ok=True)
+def write_atomic(final: Path, content: str | bytes) -> None:
+    """Write a small file, whole or not at all; see `atomic_path`."""
+    data = content.encode() if isinstance(content, str) else content
+    if isinstance(final, RemotePath):
+        put_bytes(data, final)
+        return
+    with atomic_path(final) as part:
+        part.write_bytes(data)
+
+
+def part_of(final: Path) -> Path:
+    """Return the path beside a file where this process writes it until it is complete."""
+    return final.with_name(f".{final.name}.{os.getpid()}{PART}")
 
 
 def upload_folder(folder: RemotePath) -> Path:
@@ -70,22 +78,46 @@ def upload_folder(folder: RemotePath) -> Path:
     return cache_folder() / "uploads" / hashlib.sha256(name.encode()).hexdigest()[:16]
 
 
-def write_atomic(final: Path, content: str | bytes) -> None:
-    """Write a small file, whole or not at all; see `atomic_path`."""
-    if isinstance(final, RemotePath):
-        put_bytes(content.encode() if isinstance(content, str) else content, final)
-        return
-    with atomic_path(final) as part:
-        part.write_bytes(content.encode() if isinstance(content, str) else content)
+def remove_parts(folder: Path) -> None:
+    """Delete the unfinished files of a killed run in a folder and in the folders directly below it."""
+    if isinstance(folder, RemotePath):
+        for place in (folder, folder / "train", folder / "val"):
+            remove_dead_parts(upload_folder(place))  # another job may be writing the same set
+    for part in [*folder.glob(f".*{PART}"), *folder.glob(f"*/.*{PART}")]:
+        part.unlink(missing_ok=True)
 
 
-def sync_folder(folder: Path) -> None:
-    """Make renames in a folder durable."""
-    handle = os.open(folder, os.O_RDONLY)
+def remove_dead_parts(folder: Path) -> None:
+    """Delete the unfinished files that ended processes of this machine left in a folder."""
+    for part in folder.glob(f".*{PART}"):
+        pid = part.name.removesuffix(PART).rpartition(".")[2]
+        if pid.isdecimal() and not _is_running(int(pid)):
+            part.unlink(missing_ok=True)
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # a process of another user
+        return True
+    return True
+
+
+def sync_folder(path: Path) -> None:
+    """Make the renames in a folder durable; also the content of a file."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 hex digest of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def cache_folder() -> Path:
@@ -97,29 +129,106 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "hma"
 
 
-def file_sha256(path: Path) -> str:
-    """Return the SHA-256 hex digest of a file's bytes."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+# -- folders
 
 
-def remove_parts(folder: Path) -> None:
-    """Delete the unfinished files of a killed run in a folder and in the folders directly below it."""
-    if isinstance(folder, RemotePath):
-        for place in (folder, folder / "train", folder / "val"):
-            for part in upload_folder(place).glob(f".*{PART}"):  # another job may be writing the same set
-                if not is_running(int(part.name.removesuffix(PART).rpartition(".")[2])):
-                    part.unlink(missing_ok=True)
-    for part in [*folder.glob(f".*{PART}"), *folder.glob(f"*/.*{PART}")]:
-        part.unlink(missing_ok=True)
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder to fill; it gets the given name when the block ends without an error.
 
-
-def is_running(pid: int) -> bool:
-    """Check whether this machine has a process with that number."""
+    It replaces an older folder of that name. On an error the new folder is deleted and the older one stays as
+    it was.
+    """
+    folder = folder.absolute()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    new, old = _beside(folder), _beside(folder)
+    new.mkdir()
     try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
+        yield new
+        for path in (*new.rglob("*"), new):
+            sync_folder(path)
+        if folder.exists():
+            folder.rename(old)
+        new.rename(folder)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+    sync_folder(folder.parent)
+
+
+def remove_partial(folder: Path) -> None:
+    """Delete the unfinished folders that killed writers left in a folder."""
+    for path in folder.glob(f".*{PARTIAL}*"):
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _beside(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}{PARTIAL}{uuid.uuid4().hex[:12]}")
+
+
+# -- JSON
+
+
+def parse_json(content: bytes | str) -> Any:
+    """Return the plain values of a JSON text.
+
+    A key may not be given twice: readers differ in which of the two values they take, so the same text would
+    mean one thing here and another elsewhere.
+
+    Raises:
+        ValueError: it is not JSON, or an object gives a key twice.
+        RecursionError: it is nested too deeply.
+    """
+    return json.loads(content, object_pairs_hook=_unambiguous)
+
+
+def _unambiguous(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) != len(pairs):
+        (twice, _), *_ = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"key {twice[:60]!r} is given twice")
+    return values
+
+
+def json_object(content: bytes, where: object, error: type[HMAError] = CheckpointError) -> dict[str, Any]:
+    """Return the object in a JSON text; see `parse_json`.
+
+    Raises:
+        error: it is not JSON, gives a key twice, or is no object.
+    """
+    try:
+        values = parse_json(content)
+    except (ValueError, RecursionError) as fault:
+        raise error(where, f"is not valid JSON: {fault}", _AGAIN) from fault
+    if not isinstance(values, dict):
+        raise error(where, f"must hold a JSON object, holds {type(values).__name__}", _AGAIN)
+    return values
+
+
+def read_json(path: Path, error: type[HMAError] = CheckpointError) -> dict[str, Any]:
+    """Read the object in a JSON file.
+
+    Raises:
+        error: the file is missing, unreadable, larger than 16 MB, or holds no JSON object.
+    """
+    try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise error(path, f"is larger than {MAX_JSON_BYTES:,} bytes", "this is not a file of ours")
+        content = path.read_bytes()
+    except OSError as fault:
+        raise error(path, f"cannot be read: {fault.strerror}") from fault
+    return json_object(content, path, error)
+
+
+def to_json(values: Any) -> bytes:
+    """Return indented JSON that ends with a newline; numbers that are not finite become null."""
+    return (json.dumps(finite(values), indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def finite(values: Any) -> Any:
+    """Return the same plain values, with None for numbers that JSON cannot hold."""
+    if isinstance(values, Mapping):
+        return {str(key): finite(value) for key, value in values.items()}
+    if isinstance(values, list | tuple):
+        return [finite(value) for value in values]
+    return None if isinstance(values, float) and not math.isfinite(values) else values

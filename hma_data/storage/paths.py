@@ -1,4 +1,4 @@
-"""Take paths as callers give them: text, a `Path` or any other path object.
+"""Take paths as callers give them: text, a `Path` or any other path object; recognise a hub's repository.
 
 A public function takes a `StrPath` and converts it once: with `as_text` where it may be a URI or a name,
 with `as_path` for a file or folder of this machine, with `as_address` for a hub, and with
@@ -9,9 +9,10 @@ import os
 import re
 from pathlib import Path, PurePath
 
-from hma_data.errors import UsageError
+from hma_data.errors import HubError, UsageError
 
 StrPath = str | os.PathLike[str]
+REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
 _CUT = re.compile(r"([a-z][a-z0-9+.-]+):/+(?=.)")
 
 
@@ -28,7 +29,7 @@ def as_text(path: StrPath) -> str:
         return path
     text = str(path) if isinstance(path, PurePath) else os.fspath(path)  # a RemotePath has no os.fspath
     if isinstance(text, bytes):
-        raise UsageError(repr(text), "is a path of bytes", "give text: os.fsdecode makes it of them")
+        raise UsageError(repr(text), "is a path of bytes", "give text: os.fsdecode converts it")
     return _CUT.sub(_whole_scheme, text, count=1) if _CUT.match(text) else text
 
 
@@ -48,6 +49,42 @@ def as_address(path: StrPath) -> str | Path:
     """
     text = as_text(path)
     return text if isinstance(path, str) or "://" in text else Path(text)
+
+
+def is_repository(address: StrPath) -> bool:
+    """Check whether an address is a repository: hf://org/name, or org/name unless it is a local folder.
+
+    Raises:
+        HubError: it begins with hf:// and names no model repository.
+    """
+    place = as_address(address)
+    if isinstance(place, Path):
+        return False
+    if place.startswith("hf://"):
+        if not REPOSITORY.fullmatch(place.removeprefix("hf://")):
+            raise HubError(place, "is not hf://ORGANISATION/NAME", "name a model repository")
+        return True
+    return REPOSITORY.fullmatch(place) is not None and not Path(place).is_dir()
+
+
+def addressed[Address: str | Path](
+    address: Address, revision: str | None = None
+) -> tuple[Address | str, str | None]:
+    """Split `org/name@revision` into repository and revision; return any other address unchanged."""
+    repository, _, named = str(address).partition("@")
+    if revision is None and named and not Path(address).exists() and is_repository(repository):
+        return repository, named
+    return address, revision
+
+
+def shipped(name: str) -> Path:
+    """Return the folder `registry` or `recipes` of this installation.
+
+    In a checkout it lies at the top level; in a wheel it is inside `hma_data/shipped/`.
+    """
+    package = Path(__file__).resolve().parents[1]
+    packed = package / "shipped" / name
+    return packed if packed.is_dir() else package.parent / name
 
 
 def _whole_scheme(found: re.Match[str]) -> str:

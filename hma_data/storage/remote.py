@@ -13,14 +13,12 @@ import stat
 from collections.abc import Callable, Generator
 from contextlib import suppress
 from fnmatch import fnmatchcase
-from inspect import signature
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
 from hma_data.errors import HMAError, StorageAwayError, StorageError
-from hma_data.storage.fetch import file_system
+from hma_data.storage.fetch import ABSENT, address_hint, file_system, may_pass, retried, said
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.retry import ABSENT, address_hint, may_pass, retried, said
 
 WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
 TAIL, AHEAD = 256 << 10, 8 << 20  # bytes read at once: at the end of a file; ahead of a sequential reader
@@ -43,7 +41,8 @@ def place(where: StrPath) -> Path:
     text = as_text(where)
     found, bare = _SCHEME.fullmatch(text), text.rstrip("/")
     if bare.endswith(":") and bare[:-1] in WHOLE_PUTS | {"hf"}:
-        raise StorageError(f"{bare}//", "names no bucket or repository", f"as in {bare}//bucket/folder")
+        remedy = f"write it as in {bare}//bucket/folder"
+        raise StorageError(f"{bare}//", "names no bucket or repository", remedy)
     if not found:
         return Path(text)
     if found[1] in ("file", "local"):
@@ -124,7 +123,11 @@ class RemotePath(PosixPath):
             StorageError: no store is known by that scheme.
             MissingDependencyError: the package of the store is not installed.
         """
-        return _files(str(self))
+        try:
+            return file_system(str(self))[0]
+        except ValueError as fault:
+            text = f"is of no store that is known: {said(fault)}"
+            raise StorageError(str(self), text, "use s3://, gs:// or hf://") from fault
 
     @property
     def key(self) -> str:
@@ -161,24 +164,20 @@ class RemotePath(PosixPath):
         sizes = {name: int(found[name]["size"] or 0) for name in sorted(found)}
         return {name.removeprefix(begin): size for name, size in sizes.items() if name.startswith(begin)}
 
-    def exists(self, **_: Any) -> bool:
+    def _kind(self) -> str:
         try:
-            self.info()
+            return str(self.info()["type"])
         except FileNotFoundError:
-            return False
-        return True
+            return ""
+
+    def exists(self, **_: Any) -> bool:
+        return bool(self._kind())
 
     def is_file(self, **_: Any) -> bool:
-        try:
-            return bool(self.info()["type"] == "file")
-        except FileNotFoundError:
-            return False
+        return self._kind() == "file"
 
     def is_dir(self, **_: Any) -> bool:
-        try:
-            return bool(self.info()["type"] == "directory")
-        except FileNotFoundError:
-            return False
+        return self._kind() == "directory"
 
     def stat(self, **_: Any) -> os.stat_result:
         """Return size and kind; stores have no more facts in common."""
@@ -222,15 +221,15 @@ class RemotePath(PosixPath):
     def resolve(self, strict: bool = False) -> "RemotePath":
         return self
 
-    def absolute(self) -> "RemotePath":
-        return self
+    absolute = resolve
 
     # -- reading and deleting
 
     def open(self, mode: str = "r", *_: Any, **options: Any) -> Any:
         """Open the file to read it; any other mode raises StorageError."""
         if mode not in ("r", "rb", "rt"):
-            raise StorageError(self, f"cannot be opened for {mode!r}", "files of a store are put as a whole")
+            remedy = "a file of a store is written as a whole"
+            raise StorageError(self, f"cannot be opened for {mode!r}", remedy)
         data = io.BufferedReader(RangeFile(self), 1 << 20)
         if "b" in mode:
             return data
@@ -256,22 +255,29 @@ class RemotePath(PosixPath):
             if not missing_ok:
                 raise
 
+    def replace(self, target: Any) -> "RemotePath":
+        """Rename the file; where a store has no renames, copy it and delete it."""
+
+        def rename() -> None:
+            if self.scheme in WHOLE_PUTS:
+                self.files.cp_file(self.key, target.key)
+                self.files.rm_file(self.key)
+            else:
+                self.files.mv(self.key, target.key)
+
+        attempt(target, "written", rename)
+        return RemotePath(target)
+
     def mkdir(self, *_: Any, **__: Any) -> None:
-        """Do nothing: a folder of a store exists when a file is in it."""
+        """Make the folder; do nothing in a store where a folder exists when a file is in it."""
+        if self.scheme not in WHOLE_PUTS:
+            attempt(self, "made", lambda: self.files.makedirs(self.key, exist_ok=True))
 
     def delete_tree(self, keep: Callable[[str], bool] = lambda name: False) -> None:
         """Delete every file below, except where `keep` returns True for its name below this folder."""
         for name in self.listing():
             if not keep(name):
                 (self / name).unlink(missing_ok=True)
-
-
-def _files(uri: str) -> Any:
-    try:
-        return file_system(uri)[0]
-    except ValueError as fault:
-        remedy = "use s3://, gs:// or hf://"
-        raise StorageError(uri, f"is of no store that is known: {said(fault)}", remedy) from fault
 
 
 # -- writing
@@ -283,13 +289,12 @@ def put_file(local: Path, to: RemotePath) -> None:
     Raises:
         StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
-    files, size = to.files, local.stat().st_size
-    _put(to, lambda key: files.put_file(str(local), key), size)
+    _put(to, lambda key: to.files.put_file(str(local), key))
 
 
 def put_bytes(content: bytes, to: RemotePath) -> None:
     """Upload a small file; see `put_file`."""
-    _put(to, lambda key: to.files.pipe_file(key, content), len(content))
+    _put(to, lambda key: to.files.pipe_file(key, content))
 
 
 def create_bytes(content: bytes, to: RemotePath) -> bool:
@@ -300,17 +305,13 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
     Raises:
         StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
-    files = to.files
-    if "mode" not in signature(getattr(files, "_pipe_file", files.pipe_file)).parameters:
-        put_bytes(content, to)
-        return True
 
     def once() -> bool:
         try:
-            files.pipe_file(to.key, content, mode="create")
+            to.files.pipe_file(to.key, content, mode="create")
         except Exception:  # each driver has its own error for an existing file
-            files.invalidate_cache()
-            if files.exists(to.key):
+            to.files.invalidate_cache()
+            if to.files.exists(to.key):
                 return False
             raise
         return True
@@ -324,24 +325,15 @@ def create_bytes(content: bytes, to: RemotePath) -> bool:
         return True
 
 
-def _put(to: RemotePath, upload: Callable[[str], Any], size: int) -> None:
+def _put(to: RemotePath, upload: Callable[[str], Any]) -> None:
     whole = to.scheme in WHOLE_PUTS
     beside = to if whole else to.with_name(f".{to.name}.{os.getpid()}.part")
-
-    def once() -> None:
-        upload(beside.key)
-        if not whole:
-            to.files.mv(beside.key, to.key)
-
     try:
-        attempt(to, "written", once)
-        arrived = to.info()["size"]
+        attempt(to, "written", lambda: upload(beside.key))
+        if not whole:
+            beside.replace(to)
     except FileNotFoundError as fault:
         raise StorageError(to, "cannot be written: there is no such bucket", "create it first") from fault
-    if arrived != size:
-        raise StorageAwayError(
-            to, f"has {arrived} bytes after an upload of {size}", "run the same command again"
-        )
 
 
 # -- reading by ranges

@@ -5,8 +5,6 @@ the file and, for a fault in the text, the line. libyaml scans the text where Py
 times as fast); the rules for what is accepted are the same either way.
 """
 
-import os
-import stat
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +79,7 @@ def parse_yaml(text: str, where: str, error: type[HMAError] = RegistryError) -> 
         mark = getattr(fault, "problem_mark", None)
         place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(fault, "problem", None) or str(fault).splitlines()[0]
-        if mark and any("\t" in line[: mark.column + 1] for line in text.split("\n")[mark.line :][:1]):
+        if mark and "\t" in "".join(text.split("\n")[mark.line : mark.line + 1])[: mark.column + 1]:
             problem += " (a tab: indent with spaces)"
         raise error(where, f"not valid YAML{place}: {problem}") from fault
 
@@ -95,31 +93,22 @@ def read_bytes(path: Path, error: type[HMAError] = RegistryError) -> bytes:
     """Return the bytes of a YAML file.
 
     Raises:
-        error: there is none, it is no regular file, or it is larger than MAX_BYTES.
+        error: it is no file that can be read, or is larger than MAX_BYTES.
     """
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe in the folder must not block
-        with os.fdopen(handle, "rb") as file:
-            if not stat.S_ISREG(os.fstat(handle).st_mode):
-                raise error(path, "is not a file")
+        if not path.is_file():
+            raise error(path, "is not a file" if path.exists() else "no such file")
+        with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
-    except FileNotFoundError as fault:
-        raise error(path, "no such file") from fault
-    except IsADirectoryError as fault:
-        raise error(path, "is a folder, not a YAML file") from fault
     except OSError as fault:
         raise error(path, f"cannot be read: {fault.strerror or fault}") from fault
     if len(content) > MAX_BYTES:
-        raise error(path, f"larger than {MAX_BYTES:,} bytes", "a YAML of ours is a few kilobytes")
+        raise error(path, f"is larger than {MAX_BYTES:,} bytes", "a YAML of ours is a few kilobytes")
     return content
 
 
 def decode_yaml(content: bytes, path: Path, error: type[HMAError] = RegistryError) -> str:
-    """Return the text of a YAML file.
-
-    Raises:
-        error: it is not UTF-8.
-    """
+    """Return the text of a YAML file; raise `error` if it is not UTF-8."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as fault:

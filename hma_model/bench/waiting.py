@@ -1,6 +1,6 @@
 """Compare the speed of threads by the way they wait for one another (`hma bench waiting`).
 
-See `hma_data.threads`. The bench measures training steps and generated frames of a model as large as that of
+See `hma_data.cpu`. The bench measures training steps and generated frames of a model as large as that of
 `hma demo`, for each way of waiting, alone on the machine and beside processes that keep every core busy. The
 cases are interleaved and measured several times. The median counts, because other work on the machine
 disturbs single figures. The CPU seconds show the cost of spinning.
@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from statistics import median
 from typing import Any
 
-from hma_data.threads import usable_cores
+from hma_data.cpu import usable_cores
 from hma_model.bench import generate as bench_generate
 from hma_model.bench import train as bench_train
 from hma_model.bench.generate import check, in_fresh_process, make_model

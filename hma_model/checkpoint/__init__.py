@@ -3,25 +3,22 @@
 In goes a model, out comes a folder, which is also the layout of the hub. Next: `hma_model.generation`.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from hma_data import lazy
 
 if TYPE_CHECKING:
     from hma_model.checkpoint.folder import Checkpoint as Checkpoint
+    from hma_model.checkpoint.folder import resolve as resolve
     from hma_model.checkpoint.io import load as load
-    from hma_model.checkpoint.io import resolve as resolve
     from hma_model.checkpoint.io import save as save
 
-_LAZY = {
-    "Checkpoint": "hma_model.checkpoint.folder",
-    "load": "hma_model.checkpoint.io",
-    "resolve": "hma_model.checkpoint.io",
-    "save": "hma_model.checkpoint.io",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        from importlib import import_module
-
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy(
+    __name__,
+    {
+        "Checkpoint": "hma_model.checkpoint.folder",
+        "load": "hma_model.checkpoint.io",
+        "resolve": "hma_model.checkpoint.folder",
+        "save": "hma_model.checkpoint.io",
+    },
+)

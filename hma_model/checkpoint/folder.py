@@ -8,7 +8,7 @@
 
 Every card and every stem holds the SHA-256 of the trunk, and the digests of the tokenizer and of the
 statistics that the stem was trained on. Parts that do not belong together are therefore refused. Only JSON,
-YAML and safetensors files are read. Links that lead out of the folder are not followed.
+YAML and safetensors files are read.
 """
 
 import hashlib
@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import ID_PATTERN, Embodiment
-from hma_data.storage.files import file_sha256
-from hma_data.storage.folders import read_json, read_metadata
+from hma_data.storage.files import file_sha256, read_json
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint import migrate
+from hma_model.checkpoint.weights import read_metadata
 from hma_model.config import HMAConfig
 
 if TYPE_CHECKING:
@@ -101,9 +101,8 @@ class Checkpoint:
         """
         path = inside(self.folder, TRUNK)
         if self._measured_sha256 != self.trunk_sha256:
-            raise CheckpointError(
-                path, f"is another trunk than {CONFIG} names", "pull the checkpoint again, into a new folder"
-            )
+            remedy = "pull the checkpoint again, into a new folder"
+            raise CheckpointError(path, f"is another trunk than {CONFIG} names", remedy)
         return path
 
     @cached_property
@@ -114,15 +113,12 @@ class Checkpoint:
         """Return the path of a file of an embodiment.
 
         Raises:
-            CheckpointError: not an id, no such embodiment or file, or a link out of the folder.
+            CheckpointError: not an id, or no such embodiment or file.
         """
         check_id(embodiment, self.folder)
         if embodiment not in self.embodiments:
-            raise CheckpointError(
-                self.folder,
-                f"has no embodiment {embodiment!r}",
-                f"it has: {', '.join(self.embodiments) or 'none'}",
-            )
+            known = f"it has: {', '.join(self.embodiments) or 'none'}"
+            raise CheckpointError(self.folder, f"has no embodiment {embodiment!r}", known)
         return inside(self.folder, f"embodiments/{embodiment}/{part}")
 
     def card(self, embodiment: str) -> dict[str, Any]:
@@ -149,24 +145,20 @@ class Checkpoint:
         Raises:
             CheckpointError: a part does not belong to them; it names the first such part and the reason.
         """
-        path = self.path(embodiment, STEM)
+        path, card = self.path(embodiment, STEM), self.card(embodiment)
         stem = read_metadata(path)
+        stats = file_sha256(self.path(embodiment, STATS))
         _same(path, stem, "embodiment", embodiment, "was saved for another embodiment")
-        for where, facts in ((path, stem), (self.path(embodiment, CARD), self.card(embodiment))):
+        for where, facts in ((path, stem), (self.path(embodiment, CARD), card)):
             _same(where, facts, "trunk_sha256", self.trunk_sha256, "belongs to another trunk")
             _same(where, facts, "tokenizer", self.tokenizer, "was trained on another tokenizer")
-            stats = file_sha256(self.path(embodiment, STATS))
             other = f"was trained with other statistics than {STATS}"
             _same(where, facts, "stats_sha256", stats, other, _CUT_SHORT)
-        files = self.card(embodiment).get("files")
+        files = card.get("files")
         for part in (STEM, HEAD):
-            recorded = files.get(part) if isinstance(files, dict) else None
-            if recorded != file_sha256(self.path(embodiment, part)):
-                raise CheckpointError(
-                    self.path(embodiment, part),
-                    f"is not the file that {CARD} names",
-                    _CUT_SHORT,
-                )
+            path = self.path(embodiment, part)
+            if not isinstance(files, dict) or files.get(part) != file_sha256(path):
+                raise CheckpointError(path, f"is not the file that {CARD} names", _CUT_SHORT)
 
 
 def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
@@ -176,11 +168,8 @@ def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
         CheckpointError: the values are of another library or format version, or are not valid.
     """
     if values.get("library") != LIBRARY:
-        raise CheckpointError(
-            where,
-            f"is not of {LIBRARY}: library is {values.get('library')!r}",
-            "give a checkpoint of hma train; hma hub import brings in one of the paper's release",
-        )
+        remedy = "give a checkpoint of hma train; hma hub import converts one of the paper's release"
+        raise CheckpointError(where, f"is not of {LIBRARY}: library is {values.get('library')!r}", remedy)
     values = migrate.config(values, where)
     model, tokenizer = values.get("model"), values.get("tokenizer")
     if not isinstance(model, dict) or not isinstance(tokenizer, dict):
@@ -216,22 +205,11 @@ def training_checkpoints(run: StrPath) -> list[Path]:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """Return the path of a file that lies in the folder itself.
-
-    A link is refused, except a link of a Hugging Face cache to one of its blobs.
-
-    Raises:
-        CheckpointError: there is no such file, or it is a link, or it lies outside the folder.
-    """
+    """Return the path of a file of a checkpoint; raise CheckpointError if it is not there."""
     path = folder / name
     if not path.is_file():
         raise CheckpointError(path, "no such file", "pull or save the checkpoint again")
-    real, home = path.resolve(), folder.resolve()
-    repo = home.parent.parent if home.parent.name == "snapshots" else None
-    blobs = (repo / "blobs", repo.parent / "blobs" / real.parent.name) if repo else ()  # its own, the shared
-    if real == home / name or real.parent in blobs:
-        return path
-    raise CheckpointError(path, "is a link, or lies outside the checkpoint", "put the file itself there")
+    return path
 
 
 def check_id(embodiment: str, where: object) -> None:
@@ -256,12 +234,11 @@ def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -
     differing = [key for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
     if differing:
         key = differing[0]
-        raise CheckpointError(
-            where,
+        fault = (
             f"was trained on tokenizer {ours.get('name')!r}, this is {spec.name!r}: "
-            f"{key} is {ours.get(key)!r} there and {theirs.get(key)!r} here",
-            "use the tokenizer named in its config.json",
+            f"{key} is {ours.get(key)!r} there and {theirs.get(key)!r} here"
         )
+        raise CheckpointError(where, fault, f"use the tokenizer named in its {CONFIG}")
 
 
 def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
@@ -283,8 +260,5 @@ def _same(
 ) -> None:
     found = facts.get(key)
     if found != expected:
-        raise CheckpointError(
-            where,
-            f"{fault}: its {key} is {str(found)[:16]}, here it is {expected[:16]}",
-            remedy,
-        )
+        shown = f"its {key} is {str(found)[:16]}, here it is {expected[:16]}"
+        raise CheckpointError(where, f"{fault}: {shown}", remedy)

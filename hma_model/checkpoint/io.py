@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.storage.files import file_sha256, write_atomic
-from hma_data.storage.folders import new_folder, to_json, write_tensors
+from hma_data.storage.files import file_sha256, new_folder, to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint import weights
 from hma_model.checkpoint.folder import (
@@ -40,6 +39,8 @@ from hma_model.checkpoint.folder import (
     training_checkpoints,
 )  # fmt: skip
 from hma_model.checkpoint.migrate import FORMAT_VERSION
+from hma_model.checkpoint.model_card import render
+from hma_model.checkpoint.weights import write_tensors
 from hma_model.config import ActionSpace, HMAConfig
 
 if TYPE_CHECKING:
@@ -109,11 +110,8 @@ def save(
                 training(new / TRAINING)
             write_readme(new)
     except (OSError, SafetensorError) as fault:
-        raise CheckpointError(
-            folder,
-            f"cannot be written: {fault}",
-            "free space or choose another folder; older checkpoints are intact",
-        ) from fault
+        remedy = "free space or choose another folder; older checkpoints are intact"
+        raise CheckpointError(folder, f"cannot be written: {fault}", remedy) from fault
     return Checkpoint.open(folder)
 
 
@@ -170,9 +168,8 @@ def read_embodiment(
     try:
         space = ActionSpace.of(yaml, action_stats(checkpoint.stats(embodiment), path))
     except HMAError as fault:
-        raise CheckpointError(
-            path, f"does not fit {YAML}: {fault.fault}", "pull the embodiment again"
-        ) from fault
+        text = f"does not fit {YAML}: {fault.fault}"
+        raise CheckpointError(path, text, "pull the embodiment again") from fault
     return space, *weights.embodiment(checkpoint, embodiment, space)
 
 
@@ -189,8 +186,6 @@ def update_card(folder: StrPath, embodiment: str, **facts: Any) -> dict[str, Any
 
 def write_readme(folder: StrPath) -> None:
     """Write README.md from the cards in a checkpoint's folder."""
-    from hma_model.checkpoint.model_card import render
-
     folder = as_path(folder)
     checkpoint = Checkpoint.open(folder)
     cards = {name: checkpoint.card(name) for name in checkpoint.embodiments}
@@ -267,18 +262,14 @@ def _facts(embodiment: Embodiment) -> dict[str, Any]:
 def _check_parts(
     model: "HMA", folder: Path, yaml: Mapping[str, str], stats: Mapping[str, dict[str, Any]]
 ) -> None:
+    if unnamed := sorted(set(model.embodiments) - set(yaml)):
+        raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
     for name in yaml:
         check_id(name, folder)
-        if name not in model.embodiments:
-            raise CheckpointError(folder, f"the model has no embodiment {name!r}", "add it before saving")
         found = Embodiment.from_yaml(yaml[name], f"{folder}: {name}").id
         if found != name:
             raise CheckpointError(folder, f"the YAML given for {name!r} has id {found!r}")
         action_stats(stats.get(name, {}), f"{folder}: statistics of {name}")
-    unnamed = sorted(set(model.embodiments) - set(yaml))
-    if unnamed:
-        raise CheckpointError(folder, f"no embodiment YAML was given for {', '.join(unnamed)}")
-    if folder.exists() and (
-        not folder.is_dir() or (any(folder.iterdir()) and not (folder / CONFIG).is_file())
-    ):
+    foreign = any(folder.iterdir()) if folder.is_dir() else folder.exists()
+    if foreign and not (folder / CONFIG).is_file():
         raise CheckpointError(folder, "is there already and is no checkpoint", "choose another folder")

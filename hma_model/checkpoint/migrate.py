@@ -15,14 +15,6 @@ FORMAT_VERSION = 1
 Values = dict[str, Any]
 
 
-def _same(values: Values) -> Values:
-    return values
-
-
-def _same_tensors(part: str, tensors: Values) -> Values:
-    return tensors
-
-
 @dataclass(frozen=True)
 class Step:
     """The conversion from one version to the next.
@@ -33,9 +25,9 @@ class Step:
         tensors: converts the tensors of a file by name, given its name without suffix (trunk, stem, head).
     """
 
-    config: Callable[[Values], Values] = _same
-    card: Callable[[Values], Values] = _same
-    tensors: Callable[[str, Values], Values] = _same_tensors
+    config: Callable[[Values], Values]
+    card: Callable[[Values], Values]
+    tensors: Callable[[str, Values], Values]
 
 
 STEPS: dict[int, Step] = {}
@@ -71,12 +63,8 @@ def tensors(part: str, values: Values, version: int, where: object) -> Values:
 def _path(version: object, where: object) -> range:
     """Return the versions to convert from, one after the other."""
     oldest = min(STEPS, default=FORMAT_VERSION)
-    if not isinstance(version, int) or isinstance(version, bool) or not oldest <= version <= FORMAT_VERSION:
-        newer = isinstance(version, int) and version > FORMAT_VERSION
+    if not isinstance(version, int) or not oldest <= version <= FORMAT_VERSION:
         read = str(FORMAT_VERSION) if oldest == FORMAT_VERSION else f"{oldest} to {FORMAT_VERSION}"
-        raise CheckpointError(
-            where,
-            f"has format_version {version!r}, this release reads {read}",
-            "update hma-toolkit" if newer else "save the checkpoint again",
-        )
+        fault = f"has format_version {version!r}, this release reads {read}"
+        raise CheckpointError(where, fault, "update hma-toolkit, or save the checkpoint again")
     return range(version, FORMAT_VERSION)

@@ -1,17 +1,28 @@
 """Write README.md of a checkpoint, from its config.json and card.json files alone.
 
 The same facts give the same text, so it does not matter who pushes last. Cards may come from untrusted
-authors: see `hma_model.checkpoint.card_text`.
+authors, so every value becomes one plain line before it enters the page.
 """
 
-from collections.abc import Collection, Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from hma_data.storage.yaml_io import write_yaml
-from hma_model.checkpoint.card_text import licence, line, number
 
 _TAGS = ("robotics", "world-model", "video-prediction", "hma")
-_HEADINGS = ("embodiment", "robot", "action dims", "Hz", "stride", "data", "metrics", "licence")
+_HEADINGS = ["embodiment", "robot", "action dims", "Hz", "stride", "data", "metrics", "licence"]
+
+# The identifiers that the hub accepts in a card's front matter; it refuses any other.
+LICENCES = frozenset((
+    "apache-2.0", "mit", "cc0-1.0", "cc-by-2.0", "cc-by-2.5", "cc-by-3.0", "cc-by-4.0", "cc-by-sa-3.0",
+    "cc-by-sa-4.0", "cc-by-nc-2.0", "cc-by-nc-3.0", "cc-by-nc-4.0", "cc-by-nd-4.0", "cc-by-nc-nd-3.0",
+    "cc-by-nc-nd-4.0", "cc-by-nc-sa-2.0", "cc-by-nc-sa-3.0", "cc-by-nc-sa-4.0", "cdla-permissive-1.0",
+    "cdla-permissive-2.0", "cdla-sharing-1.0", "odc-by", "odbl", "pddl", "bsd", "bsd-2-clause",
+    "bsd-3-clause", "isc", "gpl", "gpl-2.0", "gpl-3.0", "lgpl", "lgpl-2.1", "lgpl-3.0", "agpl-3.0",
+    "mpl-2.0", "epl-2.0", "eupl-1.2", "unlicense", "wtfpl", "zlib", "bsl-1.0", "ecl-2.0", "artistic-2.0",
+    "openrail", "creativeml-openrail-m",
+))  # fmt: skip
 
 
 def render(
@@ -37,7 +48,8 @@ def render(
         "## Embodiments\n\n" + _table(cards),
         *(_pictures(cards, samples)),
         "## How to use\n\n" + _usage(name, cards),
-        _links(config),
+        f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
+        "parts that do not belong together are refused on loading.",
     ]
     return ("\n\n".join(parts) + "\n").encode()
 
@@ -67,24 +79,20 @@ def _about(config: Mapping[str, Any]) -> str:
 def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
     if not cards:
         return "None yet."
-    rows = [" | ".join(_HEADINGS), " | ".join("---" for _ in _HEADINGS)]
+    rows = [_HEADINGS, ["---"] * len(_HEADINGS)]
     for name in sorted(cards):
         card = cards[name]
-        rows.append(
-            " | ".join(
-                (
-                    f"`{name}`",
-                    line(card.get("robot") or card.get("description")),
-                    f"{line(card.get('action_dim'))} ({line(card.get('action_space'))})",
-                    number(card.get("effective_hz")),
-                    line(card.get("stride")),
-                    _pairs(card.get("data")),
-                    _pairs(card.get("metrics")),
-                    line(card.get("license")) or "not stated",
-                )
-            )
-        )
-    return "\n".join(f"| {row} |" for row in rows)
+        rows.append([
+            f"`{name}`",
+            line(card.get("robot") or card.get("description")),
+            f"{line(card.get('action_dim'))} ({line(card.get('action_space'))})",
+            number(card.get("effective_hz")),
+            line(card.get("stride")),
+            _pairs(card.get("data")),
+            _pairs(card.get("metrics")),
+            line(card.get("license")) or "not stated",
+        ])  # fmt: skip
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def _pictures(cards: Mapping[str, Any], samples: Collection[str]) -> list[str]:
@@ -112,13 +120,6 @@ def _usage(name: str, cards: Mapping[str, Any]) -> str:
     )
 
 
-def _links(config: Mapping[str, Any]) -> str:
-    return (
-        f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
-        "parts that do not belong together are refused on loading."
-    )
-
-
 def _pairs(values: Any) -> str:
     if not isinstance(values, Mapping) or not values:
         return "not stated"
@@ -127,3 +128,33 @@ def _pairs(values: Any) -> str:
         for key, value in values.items()
         if value is not None and not isinstance(value, dict | list)
     )
+
+
+# -- values as text
+
+
+def licence(stated: Iterable[Any]) -> dict[str, str]:
+    """Return the licence fields of the front matter; empty if the embodiments state no licence."""
+    names = sorted({line(value) for value in stated} - {"", "unknown"})
+    if not names:
+        return {}
+    if len(names) == 1 and names[0].lower() in LICENCES:
+        return {"license": names[0].lower()}
+    shown = re.sub(r"[^a-z0-9.+-]+", "-", names[0].lower()).strip("-")[:60] if len(names) == 1 else "several"
+    return {"license": "other", "license_name": shown or "stated-below"}
+
+
+def line(value: Any) -> str:
+    """Return a value as one line that cannot leave its cell, become markup or change the text direction."""
+    text = "".join(c if c.isprintable() else " " for c in str("" if value is None else value))
+    text = " ".join(text.split())[:200]
+    if re.fullmatch(r"[\w.-]*", text, re.ASCII):
+        return text
+    text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    text = re.sub(r"([|`\[\]\\*_~!#(){}$])", r"\\\1", text)
+    return re.sub(r"(?i)(\w)(://|@)", r"\1&#8203;\2", text)  # prevents automatic links
+
+
+def number(value: Any) -> str:
+    """Return a float with four digits, or any other value as `line` does."""
+    return f"{value:.4g}" if isinstance(value, float) else line(value)

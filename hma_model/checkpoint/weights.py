@@ -1,20 +1,21 @@
-"""Read the weights of a checkpoint, and check its configuration against them before a network is built.
+"""Read and write the weights of a checkpoint, and check its configuration against them.
 
 A configuration from an untrusted author may ask for more memory than there is. The file of weights limits it:
-a network with more values than the file is refused.
+a network with more values than the file is refused before it is built.
 """
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hma_data.errors import CheckpointError
-from hma_data.storage.folders import read_metadata, read_tensors
 from hma_model.checkpoint import migrate
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from hma_model.checkpoint.io import Checkpoint
+    from hma_model.checkpoint.folder import Checkpoint
     from hma_model.config import ActionSpace, HMAConfig
 
 State = dict[str, "Tensor"]
@@ -22,9 +23,55 @@ MOST = 1_000_000  # upper limit of every count in a configuration
 _COUNTS = ("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "history_frames",
            "diffusion_depth", "diffusion_width", "diffusion_train_steps", "diffusion_sample_steps",
            "grid", "factored")  # fmt: skip
-MOST_TENSORS = 20_000  # upper limit of a file; the paper's largest has some 2,000
-_FLOATS = ("float16", "bfloat16", "float32", "float64")
 _REMEDY = "pull the checkpoint again; if it stays so, do not use it"
+
+
+# -- safetensors files
+
+
+def read_tensors(path: Path) -> State:
+    """Read all tensors of a safetensors file to the CPU.
+
+    Raises:
+        CheckpointError: the file is damaged, truncated or of another format.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as fault:
+        raise CheckpointError(path, f"is not whole safetensors: {fault}", "pull or save it again") from fault
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """Read the metadata in the header of a safetensors file; see `read_tensors`."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:  # the header alone needs no torch
+            return file.metadata() or {}
+    except (SafetensorError, OSError) as fault:
+        raise CheckpointError(path, f"is not whole safetensors: {fault}", "pull or save it again") from fault
+
+
+def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[str, str]) -> None:
+    """Write a safetensors file; the same tensors give the same bytes, whatever device they are on."""
+    from safetensors.torch import save_file
+
+    plain = {name: tensors[name].detach().cpu().contiguous().clone() for name in sorted(tensors)}
+    save_file(plain, path, metadata)
+    with path.open("r+b") as file:  # safetensors writes the metadata in a different order each time
+        length = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(length))
+        values = {"__metadata__": dict(sorted(header.pop("__metadata__").items())), **header}
+        content = json.dumps(values, ensure_ascii=False, separators=(",", ":")).encode().ljust(length)
+        if len(content) == length:
+            file.seek(8)
+            file.write(content)
+
+
+# -- the weights of a checkpoint
 
 
 def trunk(checkpoint: "Checkpoint") -> State:
@@ -51,27 +98,23 @@ def embodiment(checkpoint: "Checkpoint", name: str, space: "ActionSpace") -> tup
     for part in ("stem", "head"):
         path = checkpoint.path(name, f"{part}.safetensors")
         if space.chunk_dim > path.stat().st_size:
-            raise CheckpointError(
-                path,
-                f"is too small for chunks of {space.chunk_dim:,} values, which embodiment.yaml asks for",
-                "pull the embodiment again",
-            )
+            fault = f"is too small for chunks of {space.chunk_dim:,} values, which embodiment.yaml asks for"
+            raise CheckpointError(path, fault, "pull the embodiment again")
         version = read_metadata(path).get("format_version", str(migrate.FORMAT_VERSION))
-        number = int(version) if version.isdecimal() and len(version) < 6 else -1
-        states.append(migrate.tensors(part, read_tensors(path), number, path))
-        _require_values(path, states[-1])
+        state = migrate.tensors(part, read_tensors(path), int(version) if version.isdecimal() else -1, path)
+        _require_values(path, state)
+        states.append(state)
     return states[0], states[1]
 
 
 def _require_values(where: object, state: Mapping[str, "Tensor"]) -> None:
-    """Raise if weights are not finite floating point numbers, or if there are too many tensors."""
-    if len(state) > MOST_TENSORS:
-        raise CheckpointError(where, f"has {len(state):,} tensors: no network of ours", _REMEDY)
+    """Raise if weights are not finite floating point numbers."""
     for name, tensor in state.items():
         kind = str(tensor.dtype).removeprefix("torch.")
-        if kind not in _FLOATS and not name.startswith("normalizer."):
-            raise CheckpointError(where, f"holds {name[:80]} as {kind}, not floating point", _REMEDY)
-        if kind in _FLOATS and not bool(tensor.isfinite().all()):
+        if kind not in ("float16", "bfloat16", "float32", "float64"):
+            if not name.startswith("normalizer."):
+                raise CheckpointError(where, f"holds {name[:80]} as {kind}, not floating point", _REMEDY)
+        elif not bool(tensor.isfinite().all()):
             raise CheckpointError(where, f"holds values in {name[:80]} that are not finite", _REMEDY)
 
 
@@ -100,6 +143,5 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
         needed["channels"] = config.patch_dim * width
     for key, count in needed.items():
         if not count <= values:
-            raise CheckpointError(
-                where, f"model.{key} asks for {count:.3g} values, its trunk has {values:,}", _REMEDY
-            )
+            fault = f"model.{key} asks for {count:.3g} values, its trunk has {values:,}"
+            raise CheckpointError(where, fault, _REMEDY)

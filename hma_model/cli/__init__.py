@@ -14,9 +14,8 @@ import typer
 from hma_data.bench import BENCHES
 from hma_data.cli import mount
 from hma_data.console import print_json, print_table
+from hma_data.cpu import bound_spinning, take_ordinary_priority
 from hma_data.errors import HMAError
-from hma_data.priority import take_ordinary_priority
-from hma_data.threads import bound_spinning
 from hma_model.cli import train as cli_train
 from hma_model.cli.hub import Json, hub_app
 

@@ -133,7 +133,7 @@ def import_released(
 
     Example: hma hub import liruiw/hma-base-disc --out hma-base-disc
     """
-    from hma_model.hub import publish as hub
+    from hma_model import hub
 
     made = hub.import_released(
         source, out, embodiments=embodiment, grid=grid, tokenizer=tokenizer, revision=revision
@@ -154,7 +154,7 @@ def export_released(
 
     Example: hma hub export runs/first --out released
     """
-    from hma_model.hub import publish as hub
+    from hma_model import hub
 
     print(f"exported to {hub.export_released(checkpoint, out, embodiments=embodiment)}")
 

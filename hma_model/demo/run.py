@@ -22,6 +22,7 @@ from hma_data.conversion.engines.base import Attempt, Retry
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
+from hma_data.cpu import usable_cores
 from hma_data.errors import OutputError, ShardError
 from hma_data.loading.dataset import open_sets
 from hma_data.loading.mixture import Mixture
@@ -32,7 +33,6 @@ from hma_data.shards.verify import verify
 from hma_data.shards.windows import WindowIndex
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.threads import usable_cores
 
 if TYPE_CHECKING:
     from hma_model.evaluation.rollout_video import RolloutVideo

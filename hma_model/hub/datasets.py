@@ -1,41 +1,28 @@
 """Publish and pull shard sets: in a dataset repository of the hub, a folder, or any fsspec URI.
 
-The files have the layout of `docs/format.md`. The card tells the hub's viewer which of them are tables.
+The files have the layout of `docs/format.md`. README.md tells the hub's viewer which of them are tables.
 """
 
 import tempfile
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
-from hma_data.conversion.publish import SMALL, Place, publish
+from hma_data.conversion.publish import SMALL, publish
 from hma_data.errors import HubError, ShardError
-from hma_data.shards.manifest import MANIFEST, SHARD_NAME, Manifest, seal_problem
+from hma_data.shards.manifest import EPISODES, MANIFEST, SHARD_NAME, Manifest, seal_problem
 from hma_data.storage.files import file_sha256, write_atomic
-from hma_data.storage.paths import StrPath, as_address, as_path
-from hma_model.checkpoint.io import README
-from hma_model.hub.data_card import render
-from hma_model.hub.publish import REPOSITORY, is_repository
+from hma_data.storage.paths import REPOSITORY, StrPath, as_address, as_path
+from hma_data.storage.yaml_io import write_yaml
+from hma_model.checkpoint.folder import README
+from hma_model.checkpoint.model_card import licence, line, number
+from hma_model.hub.publish import Store, open_store
 
 _OURS = {*SMALL, MANIFEST, README, ".gitattributes"}
 _AGAIN = "pull again; if it stays so, have it pushed again"
 _DATASETS = "hf://datasets/"
-
-
-class DataStore(Place, Protocol):
-    """A place where a shard set is published; see `hma_model.hub.publish.Store`."""
-
-    name: str
-
-    @property
-    def repo(self) -> str | None: ...
-
-    def check_card(self, page: bytes) -> None:
-        """Raise if the hub would refuse the page."""
-        ...
-
-    def download(self, names: list[str], out: Path) -> None:
-        """Fetch files to a folder."""
-        ...
+_SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"),
+          (10**7, "1M<n<10M"), (10**8, "10M<n<100M"), (10**9, "100M<n<1B"), (10**10, "1B<n<10B"))  # fmt: skip
+_SPLITS = {"train": "train", "val": "validation"}  # our names, and the hub's names
 
 
 def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str:
@@ -56,7 +43,7 @@ def push_data(folder: StrPath, target: StrPath, *, private: bool = False) -> str
     folder = as_path(folder)
     manifest = _whole(folder)
     store = _open(as_address(target), write=True, private=private)
-    page = render(manifest, store.repo)
+    page = _page(manifest, store.repo)
     _refuse_others(store, manifest)
     store.check_card(page)
     return publish(store, folder, lambda: _refuse_others(store, manifest), page=page)
@@ -85,20 +72,18 @@ def pull_data(source: StrPath, out: StrPath, *, revision: str | None = None) -> 
     shards = {shard.path: shard.sha256 for shard in manifest.shards}
     lacking = [path for path in shards if path not in files]
     if lacking:
-        raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "push it again")
+        raise HubError(store.name, f"lacks {len(lacking)} shards, {lacking[0]} first", "have it pushed again")
     wanted = [path for path in shards if not _is(out / path, shards[path])]
     store.download([*wanted, *(name for name in SMALL if name in files)], out)
-    for path in wanted:
-        if not _is(out / path, shards[path]):
-            raise ShardError(out / path, f"is not the shard that {MANIFEST} names", _AGAIN)
-    for name in SMALL:
-        if name in manifest.files and not _is(out / name, manifest.files[name]):
-            raise ShardError(out / name, f"is not the file that {MANIFEST} names", _AGAIN)
+    for name in (*wanted, *(name for name in SMALL if name in manifest.files)):
+        if not _is(out / name, shards.get(name) or manifest.files[name]):
+            kind = "shard" if name in shards else "file"
+            raise ShardError(out / name, f"is not the {kind} that {MANIFEST} names", _AGAIN)
     write_atomic(out / MANIFEST, content)
     return out
 
 
-# -- pieces
+# -- checks
 
 
 def _whole(folder: Path) -> Manifest:
@@ -119,25 +104,16 @@ def _whole(folder: Path) -> Manifest:
 
 def _open(
     address: str | Path, revision: str | None = None, write: bool = False, private: bool = False
-) -> DataStore:
-    text = str(address)
-    given = text.startswith(_DATASETS)
-    name = text.removeprefix(_DATASETS)
-    if given or is_repository(address):
-        from hma_data.hub.repository import Repository
-
-        name = name.removeprefix("hf://")
+) -> Store:
+    if str(address).startswith(_DATASETS):
+        name = str(address).removeprefix(_DATASETS)
         if not REPOSITORY.fullmatch(name):
             raise HubError(address, f"is not {_DATASETS}ORGANISATION/NAME", "name a dataset repository")
-        return Repository(name, revision, write, "dataset", private)
-    from hma_model.hub.folder import FolderStore
-
-    if revision is not None:
-        raise HubError(address, f"is a folder, and has no revision {revision!r}", "leave the revision out")
-    return FolderStore(address, write)
+        address = f"hf://{name}"
+    return open_store(address, revision, write, private, "dataset")
 
 
-def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[Manifest, bytes]:
+def _published(store: Store, remedy: str = "have it pushed again") -> tuple[Manifest, bytes]:
     """Return the published manifest and its bytes.
 
     Raises:
@@ -154,7 +130,7 @@ def _published(store: DataStore, remedy: str = "have it pushed again") -> tuple[
             raise ShardError(f"{store.name}/{MANIFEST}", fault.fault, remedy) from fault
 
 
-def _refuse_others(store: DataStore, manifest: Manifest) -> dict[str, int]:
+def _refuse_others(store: Store, manifest: Manifest) -> dict[str, int]:
     """Return the published files; raise HubError if they are of another robot, tokenizer or kind."""
     files = store.files()
     strange = [name for name in files if not (name in _OURS or SHARD_NAME.fullmatch(name))]
@@ -173,3 +149,69 @@ def _refuse_others(store: DataStore, manifest: Manifest) -> dict[str, int]:
 
 def _is(path: Path, sha256: str) -> bool:
     return path.is_file() and file_sha256(path) == sha256
+
+
+# -- README.md
+
+
+def _page(manifest: Manifest, repo: str | None) -> bytes:
+    """Return README.md of a set; `repo` is None if the set lies in a folder."""
+    name, robot = repo or "PATH", manifest.embodiment
+    parts = [
+        f"---\n{write_yaml(_front(manifest))}---",
+        f"# {line(robot.id)}",
+        line(robot.description) or "Recordings of one robot, tokenized.",
+        _facts(manifest),
+        "## Splits\n\n" + _table(manifest),
+        "## How to use\n\n" + _usage(name),
+        "Made with hma-toolkit: one row is one frame; `manifest.json` lists every file with its SHA-256.",
+    ]
+    return ("\n\n".join(parts) + "\n").encode()
+
+
+def _front(manifest: Manifest) -> dict[str, Any]:
+    rows = sum(shard.rows for shard in manifest.shards)
+    present = [split for split in _SPLITS if any(shard.split == split for shard in manifest.shards)]
+    frames = [{"split": _SPLITS[split], "path": f"{split}/*.parquet"} for split in present]
+    configs: list[dict[str, Any]] = [{"config_name": "frames", "data_files": frames, "default": True}]
+    episodes = {"split": "train", "path": EPISODES}  # of both splits; datasets reserves the name "all"
+    configs.append({"config_name": "episodes", "data_files": [episodes]})
+    return {
+        **licence([manifest.embodiment.license]),
+        "task_categories": ["robotics"],
+        "size_categories": [next((name for most, name in _SIZES if rows < most), "n>1T")],
+        "tags": ["robotics", "hma", "world-model", f"embodiment:{manifest.embodiment.id}",
+                 f"tokenizer:{manifest.tokenizer.name}"],
+        "configs": configs if frames else configs[1:],
+    }  # fmt: skip
+
+
+def _facts(manifest: Manifest) -> str:
+    robot, tokenizer = manifest.embodiment, manifest.tokenizer
+    unknown = robot.frequency_hz == "unknown"
+    facts = {
+        "robot": line(robot.robot),
+        "actions": f"{robot.action_dim} dims, {line(robot.action.space)}",
+        "frames per second of the model": "unknown" if unknown else number(robot.effective_hz),
+        "tokenizer": f"{line(tokenizer.name)}, {'×'.join(map(str, tokenizer.grid))} of "
+        f"{tokenizer.image_size} pixels, {line(tokenizer.kind)}",
+        "licence": line(robot.license) or "not stated",
+        "quarantined episodes": str(manifest.quarantined),
+    }
+    return "\n".join(f"- {key}: {value}" for key, value in facts.items() if value)
+
+
+def _table(manifest: Manifest) -> str:
+    rows = ["| split | episodes | frames | shards | MB |", "|---|---|---|---|---|"]
+    for split, counts in manifest.splits.items():
+        size = sum(shard.bytes for shard in manifest.shards if shard.split == split) / 1e6
+        counted = " | ".join(f"{counts[key]:,}" for key in ("episodes", "frames", "shards"))
+        rows.append(f"| {line(split)} | {counted} | {size:,.1f} |")
+    return "\n".join(rows)
+
+
+def _usage(name: str) -> str:
+    return (
+        f"```sh\nhma hub pull-data {name} --out shards\nhma shards preview shards --out seen\n```\n\n"
+        f'```python\nfrom datasets import load_dataset\n\nframes = load_dataset("{name}", "frames")\n```'
+    )

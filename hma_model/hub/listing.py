@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from hma_data.errors import HMAError, HubError, PluginError, TokenizerError
-from hma_data.storage.folders import parse_json
+from hma_data.storage.files import json_object
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint import migrate
 from hma_model.checkpoint.io import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
@@ -44,7 +44,7 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
     ]
     if not found:
         fault = f"has no {CONFIG} of a checkpoint of {LIBRARY} or of the release"
-        raise HubError(store.name, fault, "is not of hma-toolkit; check the name")
+        raise HubError(store.name, fault, "check the name: it is not of hma-toolkit")
     return found
 
 
@@ -62,9 +62,9 @@ def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, 
     inside = {name.removeprefix(root): size for name, size in files.items() if name.startswith(root)}
     where = store.name + (f"/{root.rstrip('/')}" if root else "")
     try:
-        values = parse_json(store.read(root + CONFIG), f"{where}/{CONFIG}", HubError)
+        values = json_object(store.read(root + CONFIG), f"{where}/{CONFIG}", HubError)
     except HMAError as fault:
-        return _unusable(where, fault) if TRUNK in inside else None
+        return _facts(where, LIBRARY, 0, [fault.fault]) if TRUNK in inside else None
     if values.get("library") == LIBRARY:
         return _ours(store, inside, root, where, values)
     if any(name in inside for name in RELEASED_WEIGHTS) and "num_layers" in values and "d_model" in values:
@@ -76,6 +76,7 @@ def _ours(
     store: Store, files: Mapping[str, int], root: str, where: str, values: dict[str, Any]
 ) -> dict[str, Any]:
     size = total_bytes(store, files, [TRUNK])
+    lacks = "the cache lacks" if store.from_cache else "lacks"
     facts = _facts(where, LIBRARY, size, _tokenizer_problems(values.get("tokenizer")))
     try:
         parse_config(values, f"{where}/{CONFIG}")
@@ -84,16 +85,15 @@ def _ours(
         facts["problems"].append(f"{fault.fault}: {fault.remedy}")
     facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
     if TRUNK not in files:
-        facts["problems"].append(f"the cache lacks {TRUNK}" if store.from_cache else f"has no {TRUNK}")
+        facts["problems"].append(f"{lacks} {TRUNK}")
     store.warm([f"{root}embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
     for name in embodiment_ids(files):
-        place = f"embodiments/{name}"
-        size = total_bytes(store, files, [f"{place}/{part}" for part in PARTS])
+        parts = {f"embodiments/{name}/{part}": part for part in PARTS}
+        size, path = total_bytes(store, files, parts), f"embodiments/{name}/{CARD}"
         try:
-            card = parse_json(store.read(f"{root}{place}/{CARD}"), f"{where}/{place}/{CARD}", HubError)
-            lacks = "the cache lacks" if store.from_cache else "lacks"
-            lacking = [f"{lacks} {part}" for part in PARTS if f"{place}/{part}" not in files]
-            problems = lacking + _card_problems(card, values)
+            card = json_object(store.read(root + path), f"{where}/{path}", HubError)
+            problems = [f"{lacks} {part}" for path, part in parts.items() if path not in files]
+            problems += _card_problems(card, values)
         except HMAError as fault:
             card, problems = {}, [fault.fault]
         facts["embodiments"].append(_row(name, card, size, problems))
@@ -107,27 +107,16 @@ def _released(files: Mapping[str, int], where: str, values: dict[str, Any]) -> d
     facts = _facts(where, "released", size, ["in the release's layout: bring it in with hma hub import"])
     facts["model"] = {"layers": values.get("num_layers"), "width": values.get("d_model")}
     domains, dims = values.get("action_domains"), values.get("d_actions")
-    if isinstance(domains, list) and isinstance(dims, list) and len(domains) == len(dims):
-        facts["embodiments"] = [
-            _row(str(name)[:100], {"chunk_dim": dim}, 0, []) for name, dim in zip(domains, dims)
-        ]
+    if isinstance(domains, list) and isinstance(dims, list):
+        rows = zip(domains, dims)
+        facts["embodiments"] = [_row(str(name)[:100], {"chunk_dim": dim}, 0, []) for name, dim in rows]
     return facts
 
 
-def _unusable(where: str, fault: HMAError) -> dict[str, Any]:
-    return _facts(where, LIBRARY, 0, [fault.fault])
-
-
 def _facts(where: str, layout: str, size: int | None, problems: list[str]) -> dict[str, Any]:
-    named = ("format_version", "origin", "model", "tokenizer", "trunk_sha256")
-    return {
-        "checkpoint": where,
-        "format": layout,
-        **dict.fromkeys(named),
-        "trunk_bytes": size,
-        "problems": problems,
-        "embodiments": [],
-    }
+    unknown = dict.fromkeys(("format_version", "origin", "model", "tokenizer", "trunk_sha256"))
+    facts = {"checkpoint": where, "format": layout, **unknown, "trunk_bytes": size}
+    return facts | {"problems": problems, "embodiments": []}
 
 
 def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[str]) -> dict[str, Any]:

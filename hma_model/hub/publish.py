@@ -7,23 +7,33 @@ yet.
 """
 
 import hashlib
-import os
-import re
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError, HubError
-from hma_data.hub.partial import remove_dead_parts
-from hma_data.registry.embodiment import ID_PATTERN
-from hma_data.storage.folders import parse_json
-from hma_data.storage.paths import StrPath, as_address, as_path
+from hma_data.hub.repository import Repository
+from hma_data.registry.embodiment import ID_PATTERN, find
+from hma_data.storage.files import cache_folder, file_sha256, json_object
+from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import migrate
-from hma_model.checkpoint.io import CARD, CONFIG, PARTS, README, SAMPLE, TRUNK, Checkpoint, check_id, inside
+from hma_model.checkpoint.folder import (
+    CARD,
+    CONFIG,
+    PARTS,
+    README,
+    SAMPLE,
+    TRUNK,
+    YAML,
+    Checkpoint,
+    check_id,
+    inside,
+)  # fmt: skip
 from hma_model.checkpoint.model_card import render
-from hma_model.hub.check import require_publishable, require_yaml
+from hma_model.hub.folder import FolderStore
 
 if TYPE_CHECKING:
     import torch
@@ -31,57 +41,23 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 Content = Path | bytes
+Store = FolderStore | Repository  # a place where a checkpoint or a shard set is published
 SHOWN = 50  # ids that an error lists
-REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[\w.-]{1,96}")
-
-
-class Store(Protocol):
-    """A place where a checkpoint is published."""
-
-    name: str  # for errors
-
-    @property
-    def from_cache(self) -> bool:
-        """Check whether the hub was out of reach, so that `files` lists the content of the cache."""
-        ...
-
-    @property
-    def repo(self) -> str | None:
-        """Return the repository's name for the model card; None for a path."""
-        ...
-
-    def files(self) -> dict[str, int]:
-        """Return the sizes of the published files by name."""
-        ...
-
-    def read(self, name: str) -> bytes:
-        """Return the content of a small file."""
-        ...
-
-    def warm(self, names: list[str]) -> None:
-        """Announce which small files will be read."""
-        ...
-
-    def publish(self, changes: Callable[[], Mapping[str, Content | None]], message: str) -> str:
-        """Write the files of `changes`, delete those that are None, and return the address.
-
-        `changes` is called again if somebody else published in the meantime.
-        """
-        ...
-
-    def pull(self, names: list[str], out: Path | None) -> Path:
-        """Fetch files, cards last, and return their folder, which may be a cache and not `out`."""
-        ...
 
 
 def open_store(
-    address: StrPath, revision: str | None = None, write: bool = False, private: bool | None = None
+    address: StrPath,
+    revision: str | None = None,
+    write: bool = False,
+    private: bool | None = None,
+    kind: str = "model",
 ) -> Store:
     """Open the hub at an address.
 
     Args:
-        address: str or path, see `addressed`; without a revision if `write` is true.
+        address: str or path: `org/name`, a folder or a URI; `org/name@revision` too unless `write` is true.
         private: make a new repository a private one.
+        kind: of a repository: model or dataset.
 
     Raises:
         HubError: the hub does not exist, or cannot be reached.
@@ -90,36 +66,10 @@ def open_store(
     if not write:
         place, revision = addressed(place, revision)
     if is_repository(place):
-        from hma_data.hub.repository import Repository
-
-        return Repository(str(place).removeprefix("hf://"), revision, write, private=private)
-    from hma_model.hub.folder import FolderStore
-
+        return Repository(str(place).removeprefix("hf://"), revision, write, kind, private)
     if revision is not None:
         raise HubError(place, f"is a folder, and has no revision {revision!r}", "leave the revision out")
     return FolderStore(place, write)
-
-
-def addressed[Address: str | Path](
-    address: Address, revision: str | None = None
-) -> tuple[Address | str, str | None]:
-    """Split `org/name@revision` into repository and revision; return any other address unchanged."""
-    repository, _, named = str(address).partition("@")
-    if revision is None and named and not Path(address).exists() and is_repository(repository):
-        return repository, named
-    return address, revision
-
-
-def is_repository(address: StrPath) -> bool:
-    """Check whether an address is a repository: hf://org/name, or org/name unless it is a local folder."""
-    place = as_address(address)
-    if isinstance(place, Path):
-        return False
-    if place.startswith("hf://"):
-        if not REPOSITORY.fullmatch(place.removeprefix("hf://")):
-            raise HubError(place, "is not hf://ORGANISATION/NAME", "name a model repository")
-        return True
-    return REPOSITORY.fullmatch(place) is not None and not Path(place).is_dir()
 
 
 def push(
@@ -146,7 +96,7 @@ def push(
     """
     source = Checkpoint.open(checkpoint)
     ids = sorted(set(source.embodiments if embodiments is None else embodiments))
-    require_publishable(source, ids)
+    _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
 
     def changes() -> dict[str, Content]:
@@ -209,17 +159,14 @@ def _pull(
         key = f"{store.name} {values.get('trunk_sha256')}".encode()
         place = cache_folder() / "hub" / hashlib.sha256(key).hexdigest()[:24]
     folder = store.pull(names, place)
-    if place and folder != place and is_repository(source):
-        from hma_model.hub.folder import FolderStore
-
+    if place and folder != place:
         folder = FolderStore(folder).pull(names, place)
     pulled = Checkpoint.open(folder)
     pulled.trunk()
     for name in wanted:
         pulled.check(name)
-        require_yaml(pulled, name)
+        _require_yaml(pulled, name)
     if out:
-        remove_dead_parts(folder / README)
         checkpoints.write_readme(folder)
     return folder, wanted
 
@@ -276,60 +223,6 @@ def from_pretrained(
     return checkpoints.load(folder, ids, str(device))
 
 
-def import_released(
-    source: StrPath,
-    out: StrPath,
-    *,
-    embodiments: Iterable[str] | None = None,
-    grid: tuple[int, int] | None = None,
-    tokenizer: str | None = None,
-    revision: str | None = None,
-) -> Checkpoint:
-    """Convert a checkpoint of the paper's release to our layout.
-
-    Args:
-        source: str or path of a folder or file, or a hub repository.
-        revision: branch, tag or commit of a repository.
-
-    The rest as for `hma_model.released.importing.import_released`.
-
-    Raises:
-        CheckpointError: not a released checkpoint, damaged, or of an architecture the release does not have.
-        HubError: the repository is not there or out of reach.
-    """
-    from hma_model.released import importing
-
-    address = as_address(source)
-    local = address if Path(address).expanduser().exists() else _fetch_released(address, revision)
-    return importing.import_released(
-        local, out, embodiments=embodiments, grid=grid, tokenizer=tokenizer, origin=address
-    )
-
-
-def _fetch_released(address: str | Path, revision: str | None) -> Path:
-    """Fetch config and weights of the release from a repository; return the weights' file."""
-    from hma_model.released.importing import CONFIG as RELEASED_CONFIG
-    from hma_model.released.importing import WEIGHTS
-
-    address, revision = addressed(address, revision)
-    if not is_repository(address) and "://" not in str(address):
-        raise CheckpointError(address, "no such file or folder", "give a folder, or ORGANISATION/NAME")
-    store = open_store(address, revision)
-    there = store.files()
-    wanted = [name for name in WEIGHTS if name in there][:1]
-    if RELEASED_CONFIG not in there or not wanted:
-        fault = f"has no {RELEASED_CONFIG} with {' or '.join(WEIGHTS)}"
-        raise HubError(store.name, fault, "is it a released checkpoint?")
-    return store.pull([RELEASED_CONFIG, *wanted], None) / wanted[0]
-
-
-def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[str] | None = None) -> Path:
-    """Write a checkpoint in the paper's released layout; see `hma_model.released.exporting`."""
-    from hma_model.released import exporting as released_export
-
-    return released_export.export_released(checkpoint, out, embodiments=embodiments)
-
-
 def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None = None) -> str:
     """Publish a model as `HMA.push_to_hub` does, with the YAML, statistics and cards that it was loaded with.
 
@@ -349,28 +242,45 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
             stats[name] = {"action": action}
     with tempfile.TemporaryDirectory() as folder:
-        checkpoints.save(
-            model,
-            Path(folder) / "model",
-            embodiment_yaml=yaml,
-            stats=stats,
-            cards=cards,
-            tokenizer=model.config.tokenizer,
-        )
-        return push(Path(folder) / "model", target, embodiments)
+        made, tokenizer = Path(folder) / "model", model.config.tokenizer
+        checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards, tokenizer=tokenizer)
+        return push(made, target, embodiments)
 
 
-def cache_folder() -> Path:
-    """Return the folder for pulled URIs: $HMA_CACHE, or a folder below the user's cache."""
-    given = os.environ.get("HMA_CACHE")
-    return Path(given) if given else Path.home() / ".cache" / "hma-toolkit"
+# -- checks before a push
+
+
+def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
+    """Raise unless others can load the embodiments.
+
+    Raises:
+        CheckpointError: parts do not belong together, are damaged, or hold values that no model can use.
+        RegistryError: an embodiment's YAML is not valid.
+    """
+    source.trunk()
+    for name in embodiments:
+        _require_yaml(source, name)
+        checkpoints.read_embodiment(source, name)
+        if source.card(name).get("id", name) != name:
+            fault = f"is the card of {str(source.card(name)['id'])[:60]!r}"
+            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
+
+
+def _require_yaml(source: Checkpoint, name: str) -> None:
+    """Raise CheckpointError unless embodiment.yaml is the file that the embodiment was saved with."""
+    files = source.card(name).get("files")
+    recorded = files.get(YAML) if isinstance(files, dict) else None
+    path = source.path(name, YAML)
+    if recorded not in (None, file_sha256(path)):
+        remedy = "put the one back that it was trained with; facts for readers can be changed in the card"
+        raise CheckpointError(path, f"is not the file that {CARD} names", remedy)
 
 
 # -- the changes of a push
 
 
 def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
-    from hma_data.shards.manifest import MANIFEST
+    from hma_data.shards.manifest import MANIFEST  # imports pyarrow
 
     files = store.files()
     present: dict[str, Content] = {}
@@ -399,12 +309,10 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
 
 def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:
     if there.get("trunk_sha256") != source.trunk_sha256:
-        raise HubError(
-            where,
-            f"has another trunk: {str(there.get('trunk_sha256'))[:16]}, this checkpoint's is "
-            f"{source.trunk_sha256[:16]}",
-            "push to a hub of its own, or finetune on the trunk that is there",
-        )
+        theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
+        fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
+        remedy = "push to a hub of its own, or finetune on the trunk that is there"
+        raise HubError(where, fault, remedy)
     if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
         raise HubError(where, "has the same trunk with another tokenizer", "push to a hub of its own")
 
@@ -413,7 +321,7 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
     """Return the values of config.json, checked."""
     if CONFIG not in files:
         raise HubError(store.name, f"has no {CONFIG}", "it is no checkpoint of hma-toolkit; check the name")
-    values = parse_json(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
+    values = json_object(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
     try:
         checkpoints.parse_config(values, f"{store.name}: {CONFIG}")
         return migrate.config(values, store.name) | {"format_version": values["format_version"]}
@@ -423,19 +331,13 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
 
 def embodiment_ids(files: Iterable[str]) -> list[str]:
     """Return the ids that have a card, which is written last, in a listing of a checkpoint's files."""
-    found = set()
-    for path in files:
-        parts = path.split("/")
-        if len(parts) != 3 or parts[0] != "embodiments" or parts[2] != CARD:
-            continue
-        if ID_PATTERN.fullmatch(parts[1]) and ".." not in parts[1]:
-            found.add(parts[1])
-    return sorted(found)
+    found = {path.split("/")[1] for path in files if fnmatchcase(path, f"embodiments/*/{CARD}")}
+    return sorted(name for name in found if ID_PATTERN.fullmatch(name) and ".." not in name)
 
 
 def _card(store: Store, name: str) -> dict[str, Any]:
     path = f"embodiments/{name}/{CARD}"
-    return parse_json(store.read(path), f"{store.name}: {path}", HubError)
+    return json_object(store.read(path), f"{store.name}: {path}", HubError)
 
 
 def _readable_card(store: Store, name: str) -> dict[str, Any]:
@@ -447,13 +349,9 @@ def _readable_card(store: Store, name: str) -> dict[str, Any]:
 
 
 def _registered(name: str) -> str:
-    from hma_data.registry.embodiment import find
-
     try:
         return find(name).to_yaml()
     except HMAError as fault:
-        raise HubError(
-            f"embodiment {name}",
-            "has no YAML where the model was loaded from, nor in the registry",
-            "save with hma_model.checkpoint.io.save and push the folder",
-        ) from fault
+        text = "has no YAML where the model was loaded from, nor in the registry"
+        remedy = "save with hma_model.checkpoint.save and push the folder"
+        raise HubError(f"embodiment {name}", text, remedy) from fault

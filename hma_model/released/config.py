@@ -27,6 +27,11 @@ _LAYOUT: dict[str, Any] = {
     "final_norm": False,
     "add_at": "layers",
 }
+_EXPORTED = ("time_position", "action_alignment", "temporal_norm", "final_norm")  # what an export needs
+_CONTINUOUS_NEEDS: dict[str, Any] = {
+    "action_loss": "diffusion", "latent_scale": LATENT_SCALE, "diffusion_train_steps": 1000,
+    "diffusion_target": "noise",
+}  # fmt: skip
 # Our objective by their (jointly_predict_actions, jointly_predict_states). Without the first, the second is
 # ignored: video is predicted.
 _OBJECTIVE = {
@@ -37,48 +42,32 @@ _OBJECTIVE = {
 }
 # The values of fields that a released file does not state.
 _DEFAULTS: dict[str, Any] = {
-    "T": 12,
-    "S": 256,
-    "image_vocab_size": 262144,
-    "use_mup": False,
-    "num_factored_vocabs": 1,
-    "max_corrupt_rate": 0.2,
-    "non_mlm_ratio": 0.2,
-    "num_prompt_frames": 4,
-    "action_network": "mlp",
-    "jointly_predict_actions": False,
-    "jointly_predict_states": True,
-    "action_token_size": 64,
-    "action_loss_weight": 0.5,
-    "qkv_bias": False,
-    "proj_bias": True,
-    "qk_norm": True,
-    "mlp_ratio": 4.0,
-    "mlp_drop": 0.0,
-    "mlp_bias": True,
-}
+    "T": 12, "S": 256, "image_vocab_size": 262144, "num_factored_vocabs": 1,
+    "max_corrupt_rate": 0.2, "non_mlm_ratio": 0.2, "num_prompt_frames": 4,
+    "action_network": "mlp", "jointly_predict_actions": False, "jointly_predict_states": True,
+    "action_token_size": 64, "action_loss_weight": 0.5,
+    "use_mup": False, "qk_norm": True, "qkv_bias": False, "proj_bias": True,
+    "mlp_ratio": 4.0, "mlp_drop": 0.0, "mlp_bias": True,
+}  # fmt: skip
 _CONTINUOUS_DEFAULTS: dict[str, Any] = {
-    "image_vocab_size": None,
-    "action_loss_weight": 1.0,
-    "patch_size": 1,
-    "vae_embed_dim": 4,
-    "diffloss_d": 4,
-    "diffloss_w": 1024,
-    "num_sampling_steps": "100",
-    "diffusion_batch_mul": 1,
-}
+    "image_vocab_size": None, "action_loss_weight": 1.0, "patch_size": 1, "vae_embed_dim": 4,
+    "diffloss_d": 4, "diffloss_w": 1024, "num_sampling_steps": "100", "diffusion_batch_mul": 1,
+}  # fmt: skip
 _COUNTS = {"num_layers": 1000, "diffloss_d": 1000, "num_factored_vocabs": 64} | dict.fromkeys(
     ("num_heads", "d_model", "T", "S", "action_token_size", "patch_size", "vae_embed_dim", "diffloss_w",
      "diffusion_batch_mul"), 1_000_000
 )  # fmt: skip
 
 
-def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | None = None) -> HMAConfig:
+def config_from_released(
+    config: Mapping[str, Any], case: Mapping[str, Any] | None = None, where: object = "config.json"
+) -> HMAConfig:
     """Convert a released `config.json` to our configuration.
 
     Args:
         config: the released configuration.
         case: may give `grid`, the tokenizer's (h, w), if a frame is not square.
+        where: the file, for the errors.
 
     Raises:
         CheckpointError: the configuration needs something that the released code cannot do or does wrongly,
@@ -87,20 +76,22 @@ def config_from_released(config: Mapping[str, Any], case: Mapping[str, Any] | No
     continuous = bool(config.get("Diffusion", config.get("image_vocab_size", 0) is None))
     given = {key: value for key, value in config.items() if value is not None}
     values = _DEFAULTS | (_CONTINUOUS_DEFAULTS if continuous else {}) | given
-    _check_counts(values)
+    remedy = "is it a released checkpoint?"
     try:
+        _check_counts(values)
         shared = _shared(values, continuous)
         shared["grid"] = _grid(values["S"], (case or {}).get("grid"))
         own = _continuous(values) if continuous else _discrete(values)
         return HMAConfig(**_LAYOUT, **shared, **own)
+    except CheckpointError as error:
+        raise CheckpointError(where, error.fault, error.remedy) from error
     except KeyError as error:
-        raise CheckpointError(_WHERE, f"lacks {error.args[0]}", "is it a released checkpoint?") from error
+        raise CheckpointError(where, f"lacks {error.args[0]}", remedy) from error
     except RecipeError as error:
         fault = f"{error.where.removeprefix('model.')}: {error.fault}"
-        raise CheckpointError(_WHERE, fault, "is it a released checkpoint?") from error
+        raise CheckpointError(where, fault, remedy) from error
     except (TypeError, ValueError, ArithmeticError) as error:
-        fault = f"has a value of the wrong type: {error}"
-        raise CheckpointError(_WHERE, fault, "is it a released checkpoint?") from error
+        raise CheckpointError(where, f"has a value of the wrong type: {error}", remedy) from error
 
 
 def _check_counts(values: Mapping[str, Any]) -> None:
@@ -108,11 +99,8 @@ def _check_counts(values: Mapping[str, Any]) -> None:
     for name, most in _COUNTS.items():
         value = values.get(name, 1)
         if type(value) is not int or not 1 <= value <= most:
-            raise CheckpointError(
-                _WHERE,
-                f"{name} is {value!r}, not a whole number from 1 to {most}",
-                "is it a released checkpoint?",
-            )
+            fault = f"{name} is {value!r}, not a whole number from 1 to {most}"
+            raise CheckpointError(_WHERE, fault, "is it a released checkpoint?")
 
 
 def _shared(values: Mapping[str, Any], continuous: bool) -> dict[str, Any]:
@@ -213,16 +201,10 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
     """
     faults = _inexpressible(config)
     if faults:
-        raise CheckpointError(
-            where,
-            f"the released layout cannot express {'; '.join(faults)}",
-            "the released code cannot read it",
-        )
-    concat = "concat+" if "concat" in config.conditioning else ""
-    inside = (
-        "modulate" if "modulation" in config.conditioning else "mlp" if "add" in config.conditioning else ""
-    )
-    joint = config.absent_action == "tokens"
+        fault = f"the released layout cannot express {'; '.join(faults)}"
+        raise CheckpointError(where, fault, "the released code cannot read it")
+    named = {"concat": "concat", "modulation": "modulate", "add": "mlp"}
+    network = [theirs for ours, theirs in named.items() if ours in config.conditioning]
     values = {
         "num_layers": config.layers,
         "num_heads": config.heads,
@@ -235,8 +217,8 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
         "max_corrupt_rate": config.corrupt_max,
         "non_mlm_ratio": config.history_probability,
         "num_prompt_frames": config.history_frames,
-        "action_network": f"{concat}{inside}".strip("+"),
-        "jointly_predict_actions": joint,
+        "action_network": "+".join(network),
+        "jointly_predict_actions": config.absent_action == "tokens",
         "jointly_predict_states": any(OBJECTIVES[name].predicts_video for name in config.objectives),
         "action_token_size": config.action_tokens,
         "action_loss_weight": config.action_loss_weight,
@@ -247,11 +229,9 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
         "mlp_drop": config.dropout,
         "mlp_bias": config.mlp_bias,
     }
-    return values | (_continuous_fields(config) if config.kind == "continuous" else {})
-
-
-def _continuous_fields(config: HMAConfig) -> dict[str, Any]:
-    return {
+    if config.kind == "discrete":
+        return values
+    return values | {
         "Diffusion": True,
         "patch_size": config.patch,
         "vae_embed_dim": config.channels,
@@ -264,39 +244,25 @@ def _continuous_fields(config: HMAConfig) -> dict[str, Any]:
 
 def _inexpressible(config: HMAConfig) -> list[str]:
     """Return each field and value that the released code cannot express."""
-    fixed = ("time_position", "action_alignment", "temporal_norm", "final_norm")
-    faults = [f"{name} {getattr(config, name)!r}" for name in fixed if getattr(config, name) != _LAYOUT[name]]
-    if config.absent_action == "embedding":
-        faults.append("absent_action 'embedding'")
+    continuous, tokens = config.kind == "continuous", math.prod(config.grid)
+    needed = {name: _LAYOUT[name] for name in _EXPORTED}
+    needed |= _CONTINUOUS_NEEDS if continuous else {"action_loss": "mse"}
+    needed |= {"base_width": 256} if config.mup else {}
+    faults = [f"{name} {getattr(config, name)!r}" for name in needed if getattr(config, name) != needed[name]]
     inside = set(config.conditioning) - {"concat"}
+    trained = sorted(name for name, weight in config.objectives.items() if weight > 0)
+    policy = any(OBJECTIVES[name].readout == POLICY for name in trained)
+    faults += [f"objective {name}" for name in trained if OBJECTIVES[name].readout == INVERSE]
     if "cross_attention" in inside or len(inside) > 1 or ("add" in inside and config.add_at != "layers"):
         faults.append(f"conditioning {'+'.join(config.conditioning)} (add_at {config.add_at})")
+    if config.absent_action == "embedding" or (policy and config.absent_action != "tokens"):
+        faults.append(f"objectives {', '.join(trained)} with absent_action {config.absent_action!r}")
     if config.qk_norm != (config.norms == "qk"):
         faults.append(f"qk_norm {config.qk_norm} with norms {config.norms!r}")
-    if math.isqrt(math.prod(config.grid)) ** 2 != math.prod(config.grid):
-        faults.append(f"a frame of {math.prod(config.grid)} tokens, which is no square")
-    trained = {name for name, weight in config.objectives.items() if weight > 0}
-    faults += [f"objective {name}" for name in sorted(trained) if OBJECTIVES[name].readout == INVERSE]
-    if any(OBJECTIVES[name].readout == POLICY for name in trained) and config.absent_action != "tokens":
-        faults.append(f"objectives {', '.join(sorted(trained))} with absent_action {config.absent_action!r}")
-    if config.mup and config.base_width != 256:
-        faults.append(f"base_width {config.base_width}")
-    return faults + (_not_continuous(config) if config.kind == "continuous" else _not_discrete(config))
-
-
-def _not_discrete(config: HMAConfig) -> list[str]:
-    faults = [f"action_loss {config.action_loss!r}"] if config.action_loss != "mse" else []
-    return faults + ([f"unequal digits {config.factored}"] if len(set(config.factored)) > 1 else [])
-
-
-def _not_continuous(config: HMAConfig) -> list[str]:
-    faults = [f"action_loss {config.action_loss!r}"] if config.action_loss != "diffusion" else []
-    if config.latent_scale != LATENT_SCALE:
-        faults.append(f"latent_scale {config.latent_scale}")
-    if config.diffusion_train_steps != 1000:
-        faults.append(f"diffusion_train_steps {config.diffusion_train_steps}")
-    if config.diffusion_target != "noise":
-        faults.append(f"diffusion_target {config.diffusion_target!r}")
-    if config.mup and config.width != 256:
+    if math.isqrt(tokens) ** 2 != tokens:
+        faults.append(f"a frame of {tokens} tokens, which is no square")
+    if continuous and config.mup and config.width != 256:
         faults.append(f"muP at width {config.width} in a continuous model")
+    if not continuous and len(set(config.factored)) > 1:
+        faults.append(f"unequal digits {config.factored}")
     return faults

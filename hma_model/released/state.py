@@ -68,7 +68,8 @@ def state_from_released(state: Mapping[str, Tensor], config: HMAConfig) -> tuple
             name: (_stem(source, name, config), _head(source, name, config)) for name in domains_of(state)
         }
     except KeyError as error:
-        raise CheckpointError("released weights", f"lack {error.args[0]}", "is the file complete?") from error
+        fault = f"{error.args[0]} is missing"
+        raise CheckpointError("released weights", fault, "is the file complete?") from error
     return trunk, parts
 
 
@@ -81,12 +82,13 @@ def state_to_released(
     """
     released = _back(trunk, _renamed(config))
     released |= _positions_back(trunk, config)
-    if config.qk_norm:
-        for layer in range(config.layers):
-            for theirs, ours in (("spatial_attn", "space"), ("temporal_attn", "time")):
-                prefix = f"decoder.layers.{layer}.{theirs}.norm"
-                released |= _move(trunk, f"trunk.blocks.{layer}.{ours}.q_norm", prefix)
-    released |= _patches_back(trunk, config) if config.kind == "continuous" else _digits_back(trunk, config)
+    for theirs, ours in _norms(config):
+        released |= _move(trunk, f"{ours}.q_norm", theirs)
+    if config.kind == "continuous":
+        released |= _patches_back(trunk, config)
+    else:
+        released["token_embed.mask_token_embed"] = trunk["trunk.embed.mask"].unsqueeze(0)
+        released |= {theirs: trunk[ours] for theirs, ours in _digits(config).items()}
     for name, (stem, head) in parts.items():
         released |= _stem_back(stem, trunk, name, config) | _head_back(head, stem, name, config)
     return {name: tensor.float().contiguous() for name, tensor in released.items()}
@@ -139,29 +141,28 @@ def _trunk(source: State, config: HMAConfig) -> State:
         "trunk.position": source["pos_embed_TSC"][0, :, :tokens],
         "trunk.absent": source["action_mask_tokens"][0, :, 0],
     }
-    if config.qk_norm:
-        for layer in range(config.layers):
-            for theirs, ours in (("spatial_attn", "space"), ("temporal_attn", "time")):
-                norm = f"decoder.layers.{layer}.{theirs}.norm"
-                for own in ("q_norm", "k_norm"):
-                    trunk |= _move(source, norm, f"trunk.blocks.{layer}.{ours}.{own}")
-    return trunk | (
-        _latents(source, trunk, config) if config.kind == "continuous" else _tokens(source, config)
-    )
+    for theirs, ours in _norms(config):
+        trunk |= _move(source, theirs, f"{ours}.q_norm") | _move(source, theirs, f"{ours}.k_norm")
+    if config.kind == "continuous":
+        return trunk | _latents(source, trunk, config)
+    trunk["trunk.embed.mask"] = source["token_embed.mask_token_embed"][0]
+    return trunk | {ours: source[theirs] for theirs, ours in _digits(config).items()}
 
 
-def _tokens(source: State, config: HMAConfig) -> State:
-    ends = {"trunk.embed.mask": source["token_embed.mask_token_embed"][0]}
-    for digit in range(len(config.factored)):
-        ends[f"trunk.embed.digits.{digit}"] = source[f"token_embed.factored_embeds.{digit}.weight"]
-    return ends
+def _norms(config: HMAConfig) -> list[tuple[str, str]]:
+    """Return each of their norms, which queries and keys share, with our attention module."""
+    sides = (("spatial_attn", "space"), ("temporal_attn", "time")) if config.qk_norm else ()
+    return [
+        (f"decoder.layers.{layer}.{theirs}.norm", f"trunk.blocks.{layer}.{ours}")
+        for layer in range(config.layers)
+        for theirs, ours in sides
+    ]
 
 
-def _digits_back(trunk: Mapping[str, Tensor], config: HMAConfig) -> State:
-    ends = {"token_embed.mask_token_embed": trunk["trunk.embed.mask"].unsqueeze(0)}
-    for digit in range(len(config.factored)):
-        ends[f"token_embed.factored_embeds.{digit}.weight"] = trunk[f"trunk.embed.digits.{digit}"]
-    return ends
+def _digits(config: HMAConfig) -> dict[str, str]:
+    """Return the embeddings of digits: their name -> our name."""
+    digits = range(len(config.factored))
+    return {f"token_embed.factored_embeds.{i}.weight": f"trunk.embed.digits.{i}" for i in digits}
 
 
 def _positions_back(trunk: Mapping[str, Tensor], config: HMAConfig) -> State:
@@ -323,10 +324,9 @@ def _head_back(head: State, stem: State, domain: str, config: HMAConfig) -> Stat
         released[f"{theirs}.cond_embed.weight"] = into @ weight
         released[f"{theirs}.cond_embed.bias"] = head["diffusion.condition.bias"].float() + into @ bias
         values = stem["input.weight"].shape[1]
-        output = _with_variance(head["diffusion.output.weight"], head["diffusion.output.bias"], values)
-        return released | dict(
-            zip((f"{theirs}.final_layer.linear.weight", f"{theirs}.final_layer.linear.bias"), output)
-        )
+        weight, bias = _with_variance(head["diffusion.output.weight"], head["diffusion.output.bias"], values)
+        last = f"{theirs}.final_layer.linear"
+        return released | {f"{last}.weight": weight, f"{last}.bias": bias}
     if config.action_target == "normalized":  # the released heads give raw actions
         mean, std = stem["normalizer.mean"].float(), stem["normalizer.std"].float()
         plain, steps = ~stem["normalizer.normalize"], len(bias) // len(mean)

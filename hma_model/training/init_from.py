@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HubError, RecipeError
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.folders import read_json
+from hma_data.storage.files import read_json
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import weights
 from hma_model.checkpoint.io import Checkpoint, require_tokenizer

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from hma_data.console import human_seconds
 from hma_data.errors import OutputError
-from hma_data.storage.files import write_atomic
-from hma_data.storage.folders import finite
+from hma_data.storage.files import finite, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.metrics import perplexity
 from hma_model.evaluation.sample_images import FOLDER as PICTURES

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hma_data.errors import RecipeError, UsageError
-from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.shipped import shipped
+from hma_data.storage.paths import StrPath, as_text, shipped
 from hma_data.storage.yaml_io import parse_yaml, read_yaml
 from hma_model.config import HMAConfig
 from hma_model.training.recipe_faults import DERIVED, network_values, problem

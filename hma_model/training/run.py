@@ -17,8 +17,7 @@ from torch import Tensor
 from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
 from hma_data.loading.dataset import Batch, WindowDataset, open_sets
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import write_atomic
-from hma_data.storage.folders import remove_partial, to_json
+from hma_data.storage.files import remove_partial, to_json, write_atomic
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.io import Checkpoint, action_stats, training_checkpoints
 from hma_model.config import ActionSpace, HMAConfig

@@ -331,7 +331,7 @@ def test_plain_values_come_back_from_their_yaml(values: dict[str, Any]) -> None:
 def test_a_file_of_megabytes_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "big.yaml"
     path.write_bytes(b"#" * (MAX_BYTES + 1))
-    with pytest.raises(RegistryError, match=r"big\.yaml: larger than 1,000,000 bytes"):
+    with pytest.raises(RegistryError, match=r"big\.yaml: is larger than 1,000,000 bytes"):
         read_yaml(path)
 
 
@@ -340,7 +340,7 @@ def test_what_is_no_text_or_no_file_is_refused(tmp_path: Path) -> None:
     folder.mkdir()
     binary.write_bytes(b"\xff\xfe\x00a")
     os.mkfifo(pipe)
-    for path, said in [(folder, "is a folder"), (binary, "is not UTF-8 text"), (pipe, "is not a file")]:
+    for path, said in [(folder, "is not a file"), (binary, "is not UTF-8 text"), (pipe, "is not a file")]:
         with pytest.raises(RegistryError, match=rf"{path.name}: {said}"):
             read_yaml(path)
 

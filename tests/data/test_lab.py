@@ -22,7 +22,7 @@ from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
 from hma_data.lab.pusht import SLOW_LOOK, Arena, record_pusht
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
-from hma_data.storage.shipped import shipped
+from hma_data.storage.paths import shipped
 
 EPISODES = 5
 

@@ -11,7 +11,7 @@ import pytest
 def test_a_command_begun_under_real_time_priority_takes_the_ordinary_one() -> None:
     script = (
         "import os\n"
-        "from hma_data.priority import take_ordinary_priority\n"
+        "from hma_data.cpu import take_ordinary_priority\n"
         "try:\n"
         "    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))\n"
         "except PermissionError:\n"

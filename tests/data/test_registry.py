@@ -121,7 +121,7 @@ def test_what_is_no_file_is_refused_and_the_rest_listed(folder: Path) -> None:
     assert found["arm"]["id"] == "arm"
     assert [found[name][0] for name in ("pipe", "huge", "gone")] == [
         "is not a file",
-        "larger than 1,000,000 bytes",
+        "is larger than 1,000,000 bytes",
         "no such file",
     ]
 

@@ -13,7 +13,7 @@ from hma_data.episodes.align import to_clip
 from hma_data.registry.catalog import entries, registry_files
 from hma_data.registry.embodiment import Embodiment, find, schema
 from hma_data.sources.base import open_source
-from hma_data.storage.shipped import shipped
+from hma_data.storage.paths import shipped
 from tests.data import rlds_files
 
 ROOT = shipped("registry")

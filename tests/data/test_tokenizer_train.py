@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from hma_data.errors import RecipeError, TokenizerError
-from hma_data.storage.shipped import shipped
+from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.checkpoints import read_weights
 from hma_data.tokenizers.fsq import FORMAT, WEIGHTS, FsqConfig

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from hma_data.errors import TokenizerError
-from hma_data.storage.shipped import shipped
+from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
 from hma_data.tokenizers.fsq import WEIGHTS as FSQ_WEIGHTS

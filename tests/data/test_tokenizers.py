@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from hma_data.errors import TokenizerError
-from hma_data.storage.shipped import shipped
+from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG
 from hma_data.tokenizers.checkpoints import read_weights, save_weights

@@ -10,8 +10,8 @@ import av
 import numpy as np
 import pytest
 
+from hma_data.cpu import ordinary_priority
 from hma_data.errors import EpisodeError
-from hma_data.priority import ordinary_priority
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
 

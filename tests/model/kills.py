@@ -13,13 +13,11 @@ from typing import Any
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from hma_data.storage import remote_lock
 from hma_model.hub import publish as hub
-from hma_model.hub import swap as hub_swap
 from hma_model.hub.datasets import push_data
 
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
-CHANGES = ("os.rename", "os.link", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "exchange")
+CHANGES = ("os.rename", "os.link", "os.mkdir", "os.remove", "os.rmdir", "os.truncate")
 ACTS = {"push": hub.push, "pull": hub.pull, "push_data": push_data}
 
 
@@ -35,15 +33,13 @@ class FileStore(LocalFileSystem):
 
 
 def make_quick(setattr_: Callable[[Any, str, Any], None]) -> None:
-    """Make stores known and locks quick, here or in a process to be killed."""
+    """Make stores known and writes quick, here or in a process to be killed."""
     fsspec.register_implementation("filestore", FileStore, clobber=True)
-    setattr_(remote_lock, "SETTLE_S", 0.001)
-    setattr_(remote_lock, "STALE_S", 0.0)  # one cut short names nobody, and counts so long
     setattr_(os, "fsync", lambda handle: None)  # a killed process loses nothing by it
-    setattr_(hub, "require_publishable", lambda *given: None)  # reads only; has tests of its own
+    setattr_(hub, "_require_publishable", lambda *given: None)  # reads only; has tests of its own
 
 
-def killed(act: str, given: tuple[Any, ...], root: Path, at: int, exchanges: bool = True) -> int:
+def killed(act: str, given: tuple[Any, ...], root: Path, at: int) -> int:
     """Run an act in a process that ends at its operation number `at` in a folder.
 
     A file that is opened to be written is left empty; all else is left undone.
@@ -55,7 +51,7 @@ def killed(act: str, given: tuple[Any, ...], root: Path, at: int, exchanges: boo
     context.set_forkserver_preload([__name__])
     counted = context.Value("i", 0)
     process = context.Process(
-        target=act_until, args=(act, given, str(root), at, exchanges, counted, os.environ["HMA_CACHE"])
+        target=act_until, args=(act, given, str(root), at, counted, os.environ["HMA_CACHE"])
     )
     process.start()
     process.join(60)
@@ -63,11 +59,8 @@ def killed(act: str, given: tuple[Any, ...], root: Path, at: int, exchanges: boo
     return min(counted.value, at)
 
 
-def act_until(
-    act: str, given: tuple[Any, ...], root: str, at: int, exchanges: bool, counted: Any, cache: str
-) -> None:
+def act_until(act: str, given: tuple[Any, ...], root: str, at: int, counted: Any, cache: str) -> None:
     """Do what `killed` says, in its process."""
-    plain = hub_swap.exchange
 
     def watch(event: str, about: Any) -> None:
         if event == "open" and not (isinstance(about[2], int) and about[2] & WRITES):
@@ -80,12 +73,7 @@ def act_until(
                 os.open(about[0], about[2], 0o644)
             os._exit(7)
 
-    def exchange(one: Path, other: Path) -> bool:
-        sys.audit("exchange", str(one))
-        return exchanges and plain(one, other)
-
     os.environ["HMA_CACHE"] = cache
     make_quick(setattr)
-    hub_swap.exchange = exchange
     sys.addaudithook(watch)
     ACTS[act](*given)

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 
 from hma_data.errors import CheckpointError
-from hma_model.hub import publish as hub
+from hma_model import hub
 from hma_model.network.model import HMA
 from hma_model.released.config import config_from_released
 from hma_model.released.state import state_from_released

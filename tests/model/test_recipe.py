@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hma_data.errors import RecipeError, UsageError
-from hma_data.storage.shipped import shipped
+from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.training.recipe import differences, load_recipe, make_recipe, parse_overrides
 from tests.model.robots import SPEC

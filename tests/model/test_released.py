@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.registry.embodiment import find
-from hma_data.storage.folders import to_json
+from hma_data.storage.files import to_json
+from hma_model import hub
 from hma_model.checkpoint.io import Checkpoint, require_tokenizer
 from hma_model.cli import app
 from hma_model.config import ActionSpace, HMAConfig
-from hma_model.hub import publish as hub
 from hma_model.network.model import HMA
 from hma_model.released.config import config_from_released, config_to_released
 from hma_model.released.state import state_to_released
@@ -299,7 +299,7 @@ BAD = {
     "another shape": (_edit(lambda s: s.update(pos_embed_TSC=torch.zeros(1, 9, 17, 32))), "pos_embed_TSC is"),
     "not finite": (_edit(lambda s: s["out_x_proj.bias"].fill_(float("nan"))), "not finite"),
     "negative std": (_edit(lambda s: s["action_preprocessor.arm.std"].fill_(-1.0)), "negative"),
-    "another architecture": (_another, "lack the domains arm, pusher"),
+    "another architecture": (_another, "lacks the domains arm, pusher"),
     "another architecture, no domains named": (
         lambda f: (_another(f), _configure(action_domains=None)(f)),
         "not the model that config.json describes: lacks .* and .* more",
@@ -329,7 +329,7 @@ BAD = {
     "another conditioning": (_configure(action_network="concat"), "has unknown decoder.layers.0.action_proj"),
     "continuous config": (_configure(Diffusion=True, vae_embed_dim=4), "is not the model"),
     "ours": (_configure(library="hma-toolkit"), "already"),
-    "domain that is not there": (_configure(action_domains=["arm", "dog"]), "lack the domains dog"),
+    "domain that is not there": (_configure(action_domains=["arm", "dog"]), "lacks the domains dog"),
 }  # fmt: skip
 
 

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from hma_data.registry.embodiment import Embodiment
+from hma_model import hub
 from hma_model.checkpoint.io import save
 from hma_model.config import ActionSpace, HMAConfig
-from hma_model.hub import publish as hub
 from hma_model.network.model import HMA
 
 os.environ.setdefault("XFORMERS_DISABLED", "true")  # read when its attention is imported

@@ -79,7 +79,7 @@ def test_the_command_saves_on_sigterm_and_says_how_to_go_on(recipe, tmp_path):
 @pytest.fixture
 def full(monkeypatch):
     """The disk is full from the second checkpoint on."""
-    from hma_data.storage import folders as files
+    from hma_model.checkpoint import weights as files
 
     plain, calls = files.write_tensors, []
 

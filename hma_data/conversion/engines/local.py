@@ -25,8 +25,8 @@ from hma_data.conversion.engines.base import (
     Step,
     Work,
 )
+from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import HMAError
-from hma_data.priority import take_ordinary_priority
 
 CRASHES = {"SIGSEGV", "SIGABRT", "SIGBUS", "SIGILL", "SIGFPE", "SIGSYS"}  # signals of a process's own faults
 TICK_S = 0.5

@@ -1,34 +1,41 @@
-"""Convert the paper's released checkpoints, from a folder or repository, to checkpoints of our format.
+"""Convert the paper's released checkpoints to checkpoints of our format, and ours to theirs.
 
-A released folder holds config.json and model.safetensors, or pytorch_model.bin. Everything is read and
-checked before anything is written. Facts that the release does not state (cameras, rates, units) are marked
+A released folder holds config.json and model.safetensors, or pytorch_model.bin. An import reads and checks
+everything before it writes anything. Facts that the release does not state (cameras, rates, units) are marked
 unknown in the embodiments' YAML, unless the registry has an embodiment of the domain's name and width.
+
+An export repeats the weights that our embodiments share for each of them. It folds the normalisation of
+action targets, variance outputs and readouts before a diffusion head into the weights of the layout. It
+refuses a configuration that the layout cannot express, with every reason.
 """
 
+import keyword
 import pickle
 import re
 import warnings
-import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from hma_data.errors import CheckpointError, HMAError
+from hma_data.errors import CheckpointError, HMAError, HubError
+from hma_data.hub.repository import Repository
 from hma_data.registry.embodiment import Embodiment, find
-from hma_data.storage.folders import read_json, read_tensors
-from hma_data.storage.paths import StrPath, as_address
+from hma_data.storage.files import new_folder, read_json, to_json
+from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import find_entry
-from hma_model.checkpoint.io import LIBRARY, Checkpoint, save
+from hma_model.checkpoint.folder import CONFIG, LIBRARY, Checkpoint
+from hma_model.checkpoint.io import load, save
+from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA
-from hma_model.released.config import LATENT_SCALE, config_from_released
+from hma_model.released.config import LATENT_SCALE, config_from_released, config_to_released
 from hma_model.released.state import State, domains_of, state_from_released, state_to_released
 
-CONFIG, WEIGHTS = "config.json", ("model.safetensors", "pytorch_model.bin")
+WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 _PREFIXES = ("module.", "_orig_mod.")
 _SHOWN = 3  # maximum number of names in an error
 
@@ -40,72 +47,116 @@ def import_released(
     embodiments: Iterable[str] | None = None,
     grid: tuple[int, int] | None = None,
     tokenizer: str | None = None,
-    origin: StrPath | None = None,
+    revision: str | None = None,
 ) -> Checkpoint:
-    """Convert a released checkpoint of this machine to our layout.
+    """Convert a released checkpoint to our layout.
 
     Args:
-        source: str or path of a folder with config.json and weights, or of the weights' file in it.
+        source: str or path of a folder with config.json and weights, or of the weights' file in it, or a hub
+            repository.
         out: str or path of the folder of the new checkpoint.
         embodiments: domains to take, by their released names or our ids; all by default.
         grid: the tokenizer's (h, w), where a frame is not square.
         tokenizer: name of the one the model was trained on; by default the paper's, where the sizes are its.
-        origin: where it is from, for the cards; `source` by default.
+        revision: branch, tag or commit of a repository.
 
     Raises:
         CheckpointError: not a released checkpoint, damaged, or of an architecture the release does not have.
+        HubError: the repository is not there or out of reach.
     """
     address = as_address(source)
-    folder, weights = _files(address)
-    values = _config_values(folder / CONFIG)
+    weights = _weights(address, revision)
+    folder = weights.parent
+    values = read_json(folder / CONFIG)
+    if values.get("library") == LIBRARY:
+        raise CheckpointError(folder, f"is a checkpoint of {LIBRARY} already", "use it as it is")
     state = _read_state(weights)
-    config = _explained(folder, lambda: config_from_released(values, {"grid": grid} if grid else None))
+    config = config_from_released(values, {"grid": grid} if grid else None, folder / CONFIG)
     config = config.replace(tokenizer=_tokenizer_spec(config, tokenizer, folder).to_json())
     _check_fit(weights, state, config, values)
-    _check_finite(weights, state)
+    _check_values(weights, state)
     names = _choose(_ids(domains_of(state), weights), embodiments, weights)
     trunk, parts = state_from_released(state, config)
     model = HMA(config)
     model.load_trunk(trunk)
     for domain, name in names.items():
         model.load_embodiment(name, *parts[domain])
-    spaces = {name: model.embodiments[name] for name in names.values()}
-    return save(
-        model,
-        out,
-        embodiment_yaml={name: _yaml(domain, spaces[name]) for domain, name in names.items()},
-        stats={name: _stats(space) for name, space in spaces.items()},
-        cards={name: _card(domain, as_address(origin or source)) for domain, name in names.items()},
-        tokenizer=config.tokenizer,
-    )
+    origin = Path(address).name if Path(address).exists() else str(address)
+    yaml, stats, cards = {}, {}, {}
+    for domain, name in names.items():
+        space = model.embodiments[name]
+        action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
+        yaml[name], stats[name] = _yaml(domain, space), {"action": action}
+        cards[name] = {"data": {"released_checkpoint": origin, "released_domain": domain}}
+    return save(model, out, embodiment_yaml=yaml, stats=stats, cards=cards, tokenizer=config.tokenizer)
 
 
-# -- reading
+def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[str] | None = None) -> Path:
+    """Write config.json and model.safetensors so that the released code's `from_pretrained` reads them.
+
+    Args:
+        checkpoint: str or path of its folder, or of the folder of a training run.
+        out: str or path of a folder that does not exist or is empty.
+        embodiments: ids; all by default.
+
+    Returns:
+        The folder.
+
+    Raises:
+        CheckpointError: the released layout cannot express the model, or the folder cannot be written.
+    """
+    from safetensors import SafetensorError
+
+    out = as_path(out)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise CheckpointError(out, "is there already", "choose another folder")
+    opened = Checkpoint.open(checkpoint)
+    values = config_to_released(opened.config, opened.folder)
+    model = load(opened.folder, embodiments)
+    domains = _domains(model, opened.folder)
+    values |= {"init_actions": bool(domains), "use_actions": bool(domains)}
+    values["action_domains"] = list(domains) or None
+    values["d_actions"] = [model.embodiments[name].chunk_dim for name in domains.values()] or None
+    parts = {domain: (model.stem_state(name), model.head_state(name)) for domain, name in domains.items()}
+    state = state_to_released(model.trunk_state(), parts, opened.config)
+    _check_norms(model, opened.folder)
+    values["action_stats"] = [
+        [state[f"action_preprocessor.{domain}.{part}"].tolist() for part in ("mean", "std")]
+        for domain in domains
+    ] or None
+    try:
+        with new_folder(out) as folder:
+            (folder / CONFIG).write_bytes(to_json(values))
+            write_tensors(folder / WEIGHTS[0], state, {"format": "pt"})
+    except (OSError, SafetensorError) as fault:
+        remedy = "free space or choose another folder"
+        raise CheckpointError(out, f"cannot be written: {fault}", remedy) from fault
+    return out
 
 
-def _files(source: str | Path) -> tuple[Path, Path]:
-    """Return the folder of config.json, and the file of the weights."""
-    path = Path(source).expanduser()
+# -- reading a released checkpoint
+
+
+def _weights(address: str | Path, revision: str | None) -> Path:
+    """Return the file of the weights, beside config.json; fetch both from a repository."""
+    path = Path(address).expanduser()
     if path.is_file():
-        return path.parent, path
+        return path
     if path.is_dir():
-        found = [path / name for name in WEIGHTS if (path / name).is_file()]
-        if not found:
-            raise CheckpointError(
-                path, f"has no {' or '.join(WEIGHTS)}", "give a released checkpoint's folder"
-            )
-        return path, found[0]
-    raise CheckpointError(source, "no such file or folder", "give a folder, or ORGANISATION/NAME")
-
-
-def _config_values(path: Path) -> dict[str, Any]:
-    values = read_json(path)
-    if values.get("library") == LIBRARY:
-        raise CheckpointError(path, f"is a checkpoint of {LIBRARY} already", "use it as it is")
-    missing = [name for name in ("num_layers", "num_heads", "d_model") if name not in values]
-    if missing:
-        raise CheckpointError(path, f"lacks {missing[0]}", "is it a released checkpoint?")
-    return values
+        for name in WEIGHTS:
+            if (path / name).is_file():
+                return path / name
+        raise CheckpointError(path, f"has no {' or '.join(WEIGHTS)}", "give a released checkpoint's folder")
+    address, revision = addressed(address, revision)
+    if not is_repository(address):
+        raise CheckpointError(address, "no such file or folder", "give a folder, or ORGANISATION/NAME")
+    store = Repository(str(address).removeprefix("hf://"), revision)
+    there = store.files()
+    names = [name for name in WEIGHTS if name in there][:1]
+    if CONFIG not in there or not names:
+        fault = f"has no {CONFIG} with {' or '.join(WEIGHTS)}"
+        raise HubError(store.name, fault, "is it a released checkpoint?")
+    return store.pull([CONFIG, *names]) / names[0]
 
 
 def _read_state(path: Path) -> State:
@@ -128,33 +179,14 @@ def _unpickled(path: Path) -> Any:
             warnings.simplefilter("ignore")  # warnings of old protocols; the error below covers them
             return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as fault:
-        raise CheckpointError(
-            path, "holds more than tensors, or is damaged; it is not opened", "convert it to safetensors"
-        ) from fault
-    except (
-        OSError,
-        RuntimeError,
-        ValueError,
-        EOFError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        zipfile.BadZipFile,
-    ) as fault:
+        text = "holds more than tensors, or is damaged; it is not opened"
+        raise CheckpointError(path, text, "convert it to safetensors") from fault
+    except Exception as fault:  # torch raises errors of many kinds for a damaged file
         first = (str(fault).splitlines() or [type(fault).__name__])[0]
         raise CheckpointError(path, f"cannot be read: {first}", "download it again") from fault
 
 
 # -- checking
-
-
-def _explained(folder: Path, make: Any) -> HMAConfig:
-    """Return the configuration; an error names the path of its file."""
-    try:
-        config: HMAConfig = make()
-    except CheckpointError as fault:
-        raise CheckpointError(folder / CONFIG, fault.fault, fault.remedy) from fault
-    return config
 
 
 def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str, Any]) -> None:
@@ -163,10 +195,8 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
     named = values.get("action_domains") or []
     lacking = [name for name in named if name not in domains]
     if lacking:
-        fault = f"lack the domains {_some(lacking)} that {CONFIG} names"
-        raise CheckpointError(
-            path, fault, f"they have {_some(domains) or 'none'}; is it another model's {CONFIG}?"
-        )
+        remedy = f"they have {_some(domains) or 'none'}; is it another model's {CONFIG}?"
+        raise CheckpointError(path, f"lacks the domains {_some(lacking)} that {CONFIG} names", remedy)
     expected = _expected(path, state, config, domains)
     missing, extra = sorted(expected.keys() - state.keys()), sorted(state.keys() - expected.keys())
     shapes = [
@@ -174,11 +204,8 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
         for name, shape in sorted(expected.items())
         if name in state and tuple(state[name].shape) != shape
     ]
-    faults = [
-        f"{what} {_some(found)}" for what, found in (("lacks", missing), ("has unknown", extra)) if found
-    ]
-    faults += [f"shapes differ: {_some(shapes)}"] if shapes else []
-    if faults:
+    kinds = {"lacks": missing, "has unknown": extra, "shapes differ:": shapes}
+    if faults := [f"{what} {_some(found)}" for what, found in kinds.items() if found]:
         fault = f"is not the model that {CONFIG} describes: {'; '.join(faults)}"
         raise CheckpointError(path, fault, f"give weights and {CONFIG} of one released checkpoint")
 
@@ -197,9 +224,9 @@ def _expected(path: Path, state: State, config: HMAConfig, domains: list[str]) -
 def _space(path: Path, state: State, domain: str) -> ActionSpace:
     """Return the action space of a domain, with the width and stride that its tensors' shapes imply."""
     names = f"action_preprocessor.{domain}.mean", f"action_mlp.{domain}.model.0.weight"
-    if any(name not in state for name in names):
-        lacking = next(name for name in names if name not in state)
-        raise CheckpointError(path, f"lacks {lacking}", "is the file complete?")
+    for name in names:
+        if name not in state:
+            raise CheckpointError(path, f"lacks {name}", "is the file complete?")
     dims, chunk = state[names[0]].numel(), state[names[1]].shape[-1]
     if dims < 1 or chunk % dims:
         fault = f"domain {domain!r} has chunks of {chunk} values and statistics of {dims}"
@@ -207,7 +234,7 @@ def _space(path: Path, state: State, domain: str) -> ActionSpace:
     return ActionSpace(domain, dims, chunk // dims, (0.0,) * dims, (1.0,) * dims, (True,) * dims, "divide")
 
 
-def _check_finite(path: Path, state: State) -> None:
+def _check_values(path: Path, state: State) -> None:
     for name, tensor in state.items():
         if not bool(torch.isfinite(tensor).all()):
             raise CheckpointError(path, f"{name} holds values that are not finite", "download it again")
@@ -230,9 +257,8 @@ def _ids(domains: list[str], path: Path) -> dict[str, str]:
         name = re.sub(r"[^a-z0-9_-]+", "_", domain.lower())[:100]
         name = name if re.match(r"[a-z0-9]", name) else f"d{name}"[:100]
         if name in ids.values():
-            raise CheckpointError(
-                path, f"two domains would have the id {name!r}", "import one with embodiments="
-            )
+            fault = f"two domains would have the id {name!r}"
+            raise CheckpointError(path, fault, "import one of them by embodiments=")
         ids[domain] = name
     return ids
 
@@ -302,12 +328,25 @@ def _unknown(domain: str, space: ActionSpace) -> dict[str, Any]:
     }
 
 
-def _stats(space: ActionSpace) -> dict[str, Any]:
-    return {
-        "action": {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
-    }
+# -- describing ours to the release
 
 
-def _card(domain: str, source: str | Path) -> dict[str, Any]:
-    shown = Path(source).name if Path(source).exists() else str(source)
-    return {"data": {"released_checkpoint": shown, "released_domain": domain}}
+def _domains(model: HMA, where: object) -> dict[str, str]:
+    """Return the id of each released name, which has no dots because it is a module's name in their code."""
+    domains: dict[str, str] = {}
+    for name in model.embodiments:
+        domain = name.replace(".", "_")
+        if domain in domains or hasattr(nn.ModuleDict(), domain) or keyword.iskeyword(domain):
+            fault = f"embodiment {name!r} cannot be a domain called {domain!r}"
+            raise CheckpointError(where, fault, "export the others by --embodiment")
+        domains[domain] = name
+    return domains
+
+
+def _check_norms(model: HMA, where: object) -> None:
+    """Raise unless queries and keys have equal norms: the released code has one norm for both."""
+    state = model.trunk_state()
+    for name in state:
+        if ".q_norm." in name and not torch.equal(state[name], state[name.replace(".q_norm.", ".k_norm.")]):
+            fault = f"{name} differs from that of the keys; the released layout has one norm for both"
+            raise CheckpointError(where, fault, "the released code cannot read it")
