@@ -10,16 +10,8 @@ from statistics import median
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from hma_model.bench.generate import (
-    PRECISIONS,
-    ROBOT,
-    check,
-    device_name,
-    finish,
-    in_fresh_process,
-    make_model,
-    memory,
-)
+from hma_model import bench
+from hma_model.bench import ROBOT, device_name, finish, in_fresh_process, make_model, memory, random_frames
 
 if TYPE_CHECKING:
     import torch
@@ -28,25 +20,13 @@ if TYPE_CHECKING:
 
 ABOUT = "seconds and memory of a training step"
 DEFAULTS: dict[str, Any] = {
-    "kind": "discrete",  # discrete | continuous | both
+    **bench.DEFAULTS,  # bf16: products in bf16, weights in fp32
+    "kind": "discrete",
     "steps": 3,  # measured, after a warm-up
     "batch": 2,
-    "window": 12,
-    "precision": "fp32",  # fp32 | bf16: products in bf16, weights in fp32
-    "device": "auto",
-    "compile": False,
     "checkpointing": False,  # recompute each block in the backward pass
     "optimizer": True,
-    "layers": 32,
-    "width": 256,
-    "heads": 8,
-    "conditioning": "modulation",
-    "action_tokens": 1,
-    "action_dims": 35,  # of a chunk
-    "diffusion_width": 1024,
-    "threads": 0,  # 0: torch's choice
 }
-_KINDS = ("discrete", "continuous")
 _PEAKS = {"H200": 989e12, "H100": 989e12, "A100": 312e12, "L40": 181e12, "4090": 165e12}  # bf16, dense
 
 
@@ -56,9 +36,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     Raises:
         UsageError: a setting has a value that is not allowed.
     """
-    check("train", settings, kind=(*_KINDS, "both"), precision=PRECISIONS)
-    kinds = _KINDS if settings["kind"] == "both" else (settings["kind"],)
-    return [in_fresh_process(measure, settings, kind) for kind in kinds]
+    return [in_fresh_process(measure, settings, kind) for kind in bench.kinds("train", settings)]
 
 
 def measure(settings: dict[str, Any], kind: str) -> dict[str, Any]:
@@ -107,19 +85,16 @@ def _step_seconds(model: "HMA", settings: dict[str, Any]) -> list[float]:
 def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator") -> Any:
     import torch
 
-    config, b, t = model.config, settings["batch"], settings["window"]
-    tokens = latents = None
-    if config.kind == "discrete":
-        tokens = torch.randint(0, config.vocab_size, (b, t, *config.grid), generator=generator)
-    else:
-        latents = torch.randn(b, t, config.channels, *config.grid, generator=generator)
+    b, t = settings["batch"], settings["window"]
+    frames = random_frames(model, b, t, generator)
     actions = torch.randn(b, t, settings["action_dims"], generator=generator)
+    discrete = model.config.kind == "discrete"
     return SimpleNamespace(
         embodiment=[ROBOT] * b,
         actions=actions.to(model.device),
         action_mask=torch.ones(b, t, dtype=torch.bool, device=model.device),
-        tokens=None if tokens is None else tokens.to(model.device),
-        latents=None if latents is None else latents.to(model.device),
+        tokens=frames if discrete else None,
+        latents=None if discrete else frames,
     )
 
 

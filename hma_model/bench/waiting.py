@@ -16,9 +16,9 @@ from statistics import median
 from typing import Any
 
 from hma_data.threads import usable_cores
+from hma_model.bench import check, in_fresh_process, make_model
 from hma_model.bench import generate as bench_generate
 from hma_model.bench import train as bench_train
-from hma_model.bench.generate import check, in_fresh_process, make_model
 
 ABOUT = "training steps and frames a second by how threads wait for one another"
 DEFAULTS: dict[str, Any] = {

@@ -71,21 +71,16 @@ def listing(
     if json:
         print_json(found[0] if len(found) == 1 else {"checkpoints": found})
         return
-    columns = ["robot", "action_dim", "chunk_dim", "hz", *FIGURES, "licence"]
+    columns = ["embodiment", "robot", "action_dim", "chunk_dim", "hz", *FIGURES, "licence"]
     for facts in found:
         rows = [
-            [
-                _cell(row["embodiment"]),
-                *(_cell(row[key]) for key in columns),
-                _megabytes(row["bytes"]),
-                _state(row),
-            ]
+            [*(_cell(row[key]) for key in columns), _megabytes(row["bytes"]), _state(row)]
             for row in facts["embodiments"]
         ]
         print(_summary(facts))
+        shown = [i for i in range(len(columns) + 2) if i == 0 or any(row[i] is not None for row in rows)]
         if rows:
-            shown = [i for i in range(len(rows[0])) if i == 0 or any(row[i] is not None for row in rows)]
-            names = ["embodiment", *columns, "MB", "state"]
+            names = [*columns, "MB", "state"]
             print_table([names[i] for i in shown], [[row[i] for i in shown] for row in rows])
 
 
@@ -168,13 +163,9 @@ def _summary(facts: dict[str, Any]) -> str:
         parts.append(f"{_cell(model.get('layers'))} layers, width {_cell(model.get('width'))}")
     if tokenizer:
         parts.append(f"tokenizer {_cell(tokenizer.get('name'))}")
-    trunk = (
-        f"trunk {_cell(facts['trunk_sha256'])[:12]}, "
-        if isinstance(facts["trunk_sha256"], str)
-        else "weights "
-    )
-    size = _megabytes(facts["trunk_bytes"])
-    parts.append(f"{trunk}{'not in the cache' if size is None else f'{size} MB'}")
+    sha256, size = facts["trunk_sha256"], _megabytes(facts["trunk_bytes"])
+    trunk = f"trunk {_cell(sha256)[:12]}, " if isinstance(sha256, str) else "weights "
+    parts.append(trunk + ("not in the cache" if size is None else f"{size} MB"))
     if facts["from_cache"]:
         parts.append("the hub is out of reach, this is what the cache has")
     return f"{_cell(facts['checkpoint'], 1000)}: {'; '.join(parts)}; {_state(facts)}"

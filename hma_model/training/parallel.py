@@ -1,14 +1,22 @@
-"""Train on several ranks under torchrun: join them, exchange values, and distribute the network.
+"""Train on several ranks under torchrun: join them, report their errors, and distribute the network.
 
     torchrun --nproc-per-node 8 --no-python hma train discrete_base data=[…] --out runs/base
 
 A recipe states the whole step, and the ranks share its passes. Training is therefore the same on any number
 of ranks. DDP keeps the whole network on every rank. FSDP2 shards the trunk's blocks; stems, heads, embeddings
 and readouts stay whole, because the ranks may use different ones in the same step.
+
+The error that ends a run is reported exactly once. A rank that fails writes its error into the store of the
+run. A rank that has only lost the others finds it there. The first failing rank to claim the report prints
+its error; the others exit silently. A rank exits only after the report is claimed, and the reporting rank
+ignores the signal by which torchrun then ends it. The claim needs a store that outlives the ranks; torchrun
+has one. Ranks that are started in another way each print their own error.
 """
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -20,27 +28,21 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
-from hma_model.training.rank_errors import PREFIX, read_error, write_error
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 PATIENCE = timedelta(hours=2)  # rank 0 evaluates and writes while the others wait
+ANSWER = timedelta(seconds=30)  # the time limit for an answer of torchrun's store
+PREFIX, ERROR, REPORTS = "errors", "error", "reports"  # of the keys in the store
 
 
 @dataclass(frozen=True)
 class World:
-    """The ranks of a run.
-
-    Attributes:
-        rank: the number of this process, from 0.
-        size: the number of ranks.
-        local_rank: the number of this process among those of this machine.
-    """
+    """The ranks of a run: `rank` is the number of this process, from 0, and `size` their number."""
 
     rank: int = 0
     size: int = 1
-    local_rank: int = 0
 
     @property
     def main(self) -> bool:
@@ -106,7 +108,7 @@ def join(device: torch.device) -> Iterator[World]:
         return
     ours = not dist.is_initialized()
     store = _met(device) if ours else None
-    world = World(dist.get_rank(), dist.get_world_size(), local_rank())
+    world = World(dist.get_rank(), dist.get_world_size())
     try:
         yield world
     except Exception as fault:
@@ -147,6 +149,59 @@ def _explained(fault: Exception, world: World, store: dist.Store | None) -> Exce
         f"has lost the others: {said}",
         "see what ended another rank; the same command goes on from the last checkpoint",
     )
+
+
+def write_error(store: dist.Store | None, rank: int, error: Exception) -> None:
+    """Write the error that ends a rank into the store, unless another rank has written one."""
+    kind = "" if hasattr(error, "exit_code") else f"{type(error).__name__}: "
+    try:
+        if store is not None:
+            store.compare_set(ERROR, "", f"{rank} {kind}{error}")
+    except RuntimeError:  # the store is gone with the process that kept it
+        return
+
+
+def read_error(store: dist.Store | None) -> TrainingError | None:
+    """Return the error that another rank has written, or None."""
+    try:
+        if store is None or not store.check([ERROR]):
+            return None
+        rank, _, text = store.get(ERROR).decode().partition(" ")
+    except RuntimeError:
+        return None
+    return TrainingError(f"rank {rank}", text)
+
+
+@contextmanager
+def report_once() -> Iterator[None]:
+    """Let one rank of a failed run raise its error; end the others silently with its exit code.
+
+    Raises:
+        SystemExit: another rank reports its error.
+    """
+    try:
+        yield
+    except Exception as error:
+        if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+            raise
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if _claim_report():
+            raise
+        raise SystemExit(getattr(error, "exit_code", 1)) from error
+
+
+def _claim_report() -> bool:
+    """Check whether this rank must report: it is the first to claim it, or there is no store."""
+    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
+        return True
+    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    try:
+        store = dist.TCPStore(host, port, is_master=False, wait_for_workers=False, timeout=ANSWER)
+        attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+        return bool(store.add(f"{PREFIX}/{REPORTS} {attempt}", 1) == 1)
+    except RuntimeError:  # torchrun has ended
+        return True
 
 
 def local_rank() -> int:
@@ -198,7 +253,7 @@ class ParallelModel:
 
     def passing(self, last: bool) -> AbstractContextManager[None]:
         """Return a context for a forward and backward pass; the last pass of a step averages gradients."""
-        if isinstance(self._call, nn.parallel.DistributedDataParallel):
+        if isinstance(self._call, _DDP):
             return nullcontext() if last else self._call.no_sync()
         if self.sharded:
             self._call.set_requires_gradient_sync(last)  # type: ignore[operator]

@@ -10,10 +10,11 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -46,14 +47,8 @@ def choose_device(name: str) -> torch.device:
 
 def environment(device: torch.device) -> dict[str, Any]:
     """Return the facts besides the recipe on which the run's figures may depend."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        release = version("hma-toolkit")
-    except PackageNotFoundError:
-        release = ""
     return {
-        "hma_toolkit": release,
+        "hma_toolkit": version("hma-toolkit"),
         "git_revision": _git_revision(),
         "python": platform.python_version(),
         "torch": torch.__version__,
@@ -66,10 +61,9 @@ def environment(device: torch.device) -> dict[str, Any]:
 def _git_revision() -> str:
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 @contextmanager
@@ -87,47 +81,31 @@ def own_folder(out: Path) -> Iterator[None]:
         others = [path.name for path in out.iterdir() if not path.name.startswith(".")]
         if others and not (out / RECIPE).is_file():
             raise OutputError(out, f"holds {others[0]} and no {RECIPE}", "train into a folder of its own")
-        ours = not (out / LOCK).exists()
+        begun = (out / LOCK).exists()
         lock = (out / LOCK).open("a")
     except OSError as fault:
         raise OutputError(out, f"cannot be used: {fault.strerror}", "choose another folder") from fault
     with lock:
-        _hold(lock, out)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as fault:
+            raise OutputError(out, "another training is at work here", "wait for it or stop it") from fault
+        except OSError:  # some file systems of clusters have no locks
+            pass
         try:
             yield
         except HMAError:
-            if ours and {path.name for path in out.iterdir()} <= {LOCK, START}:
-                _remove_empty(out, made)
+            if not begun and {path.name for path in out.iterdir()} <= {LOCK, START}:
+                shutil.rmtree(out / START, ignore_errors=True)
+                (out / LOCK).unlink()
+                for path in made:
+                    path.rmdir()
             raise
-
-
-def _hold(lock: TextIO, out: Path) -> None:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        held = os.path.samestat(os.fstat(lock.fileno()), (out / LOCK).stat())
-    except (BlockingIOError, FileNotFoundError):
-        held = False
-    except OSError:  # a file system without locks
-        return
-    if not held:
-        raise OutputError(out, "another training is at work here", "wait for it or stop it")
-
-
-def _remove_empty(out: Path, made: list[Path]) -> None:
-    with suppress(OSError):  # another process has written something there in the meantime
-        shutil.rmtree(out / START, ignore_errors=True)
-        (out / LOCK).unlink()
-        for path in made:
-            path.rmdir()
 
 
 @contextmanager
 def writable(out: Path) -> Iterator[None]:
-    """Convert an OSError of the block, which writes into a run's folder.
-
-    Raises:
-        OutputError: something cannot be written.
-    """
+    """Convert an OSError of the block, which writes into a run's folder, to an OutputError."""
     try:
         yield
     except OSError as fault:
@@ -138,22 +116,18 @@ def writable(out: Path) -> Iterator[None]:
 
 @contextmanager
 def enough_memory() -> Iterator[None]:
-    """Convert an out-of-memory error of the block.
-
-    Raises:
-        TrainingError: the block needed more memory than there is.
-    """
+    """Convert an out-of-memory error of the block to a TrainingError."""
     try:
         yield
     except (RuntimeError, MemoryError) as fault:
-        text = (str(fault).splitlines() or [""])[0]
+        text = str(fault).partition("\n")[0][:200] or type(fault).__name__
         if isinstance(fault, RuntimeError) and not _NO_MEMORY.search(text):
             raise
-        raise TrainingError(
-            "memory",
-            f"there is not enough for this model and batch: {text[:200] or type(fault).__name__}",
-            "lower batch_size (accumulate makes up for it), frames or model.width, or set checkpointing=true",
-        ) from fault
+        told = f"there is not enough for this model and batch: {text}"
+        remedy = (
+            "lower batch_size (accumulate makes up for it), frames or model.width, or set checkpointing=true"
+        )
+        raise TrainingError("memory", told, remedy) from fault
 
 
 def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen: bool) -> None:
@@ -177,12 +151,9 @@ def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen
     else:
         there = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     if needed > there:
-        raise RecipeError(
-            "recipe: model",
-            f"{values / 1e9:,.1f} billion weights take {needed / 2**30:,.0f} GiB in training, "
-            f"here are {there / 2**30:,.0f} GiB",
-            "lower model.width or model.layers",
-        )
+        needs = f"{values / 1e9:,.1f} billion weights take {needed / 2**30:,.0f} GiB in training"
+        fault = f"{needs}, here are {there / 2**30:,.0f} GiB"
+        raise RecipeError("recipe: model", fault, "lower model.width or model.layers")
 
 
 @contextmanager

@@ -22,8 +22,7 @@ from hma_model.evaluation.evaluate import (
     validation_losses,
     windows,
 )
-from hma_model.evaluation.metrics import token_hits, token_nats
-from hma_model.evaluation.teacher_forcing import teacher_forced
+from hma_model.evaluation.metrics import teacher_forced, token_hits, token_nats
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
 from tests.model.shards import make_shards

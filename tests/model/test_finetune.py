@@ -12,8 +12,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import Checkpoint
 from hma_model.hub import publish as hub
-from hma_model.training.finetune import finetune
-from hma_model.training.loop import TrainResult, train
+from hma_model.training.loop import TrainResult, finetune, train
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import run_command
 from tests.model.robots import SPEC

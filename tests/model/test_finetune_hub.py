@@ -8,7 +8,7 @@ from hma_data.errors import HubError, RecipeError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import Checkpoint
 from hma_model.hub import publish as hub
-from hma_model.training.finetune import finetune
+from hma_model.training.loop import finetune
 from tests.hub_fixtures import REPO
 from tests.model.processes import run_command
 from tests.model.robots import make_model, save

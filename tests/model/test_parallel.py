@@ -19,8 +19,7 @@ from hma_data.errors import HMAError, ShardError, TrainingError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from hma_model.training.parallel import ParallelModel, World, join
-from hma_model.training.rank_errors import read_error, report_once, write_error
+from hma_model.training.parallel import ParallelModel, World, join, read_error, report_once, write_error
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import ROOT, errors, run_ranks
 from tests.model.runs import TINY, weights

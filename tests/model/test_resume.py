@@ -48,7 +48,7 @@ def test_a_flipped_bit_is_found_wherever_it_is(recipe, tmp_path, capsys, name, w
     content[place] ^= 1
     path.write_bytes(content)
     assert train(recipe(), out=run).step == 6
-    assert f"passed over a damaged checkpoint: {run}/checkpoints/step-00000006" in capsys.readouterr().err
+    assert f"skipped a damaged checkpoint: {run}/checkpoints/step-00000006" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -100,9 +100,9 @@ def test_robots_that_force_leaves_behind_are_named(recipe, whole, tmp_path, caps
     assert "left out of checkpoints from here on: arm" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("out", ["", " ", "a\0b"])
+@pytest.mark.parametrize("out", ["", " "])
 def test_what_cannot_be_a_folder_is_wrong_usage(recipe, out):
-    with pytest.raises(UsageError, match="no name of a folder"):
+    with pytest.raises(UsageError, match="out: is not given"):
         train(recipe(), out=out, show=False)
 
 

@@ -136,7 +136,7 @@ def test_a_step_in_which_nothing_may_learn_is_said(recipe, tmp_path):
     skipping = recipe(steps=1, model={**TINY["model"], "absent_action": "skip"})
     base = train(skipping, out=tmp_path / "a", show=False)
     frozen = recipe(start=str(base.out), freeze="trunk", objectives={"passive": 1}, model={})
-    with pytest.raises(RecipeError, match="nothing that may learn takes part in the objective passive"):
+    with pytest.raises(RecipeError, match="leaves nothing to train with the objective passive"):
         train(frozen, out=tmp_path / "b", show=False)
 
 

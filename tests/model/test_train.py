@@ -192,7 +192,7 @@ def test_a_damaged_newest_checkpoint_is_passed_over(recipe, tmp_path, capsys):
     trunk = whole.checkpoint / "trunk.safetensors"
     trunk.write_bytes(trunk.read_bytes()[:-1])
     again = train(recipe(), out=tmp_path / "run")
-    assert "passed over a damaged checkpoint" in capsys.readouterr().err
+    assert "skipped a damaged checkpoint" in capsys.readouterr().err
     assert same(kept, again.checkpoint)
 
 
