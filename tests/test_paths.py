@@ -424,7 +424,8 @@ INNER = {  # take what a public function has made of a path already
     "hma_model.hub.publish": {"Store", "embodiment_ids"},
     "hma_model.hub.datasets": {"DataStore"},
     "hma_model.training.recipe": {"differences"},
-    "hma_model.training.logging": {"RunLog"},
+    "hma_model.training.logging": {"EventFile", "Remote", "RunLog", "open_trackers"},
+    "hma_model.evaluation.rollout_video": {"newest_sheets", "write_sheets"},
 }
 NAMES = {
     "path", "paths", "uri", "uris", "folder", "folders", "out", "source", "target", "repo", "checkpoint",

@@ -27,7 +27,6 @@ DEFAULTS: dict[str, Any] = {
     "checkpointing": False,  # recompute each block in the backward pass
     "optimizer": True,
 }
-_PEAKS = {"H200": 989e12, "H100": 989e12, "A100": 312e12, "L40": 181e12, "4090": 165e12}  # bf16, dense
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -46,16 +45,15 @@ def measure(settings: dict[str, Any], kind: str) -> dict[str, Any]:
     if settings["compile"]:
         model.trunk.compile()
     seconds = _step_seconds(model, settings)
+    told = ("precision", "batch", "window", "optimizer", "compile", "checkpointing")
     return {
         "kind": kind,
         "device": device_name(model.device),
-        **{key: settings[key] for key in ("precision", "batch", "window", "optimizer", "compile")},
-        "checkpointing": settings["checkpointing"],
+        **{key: settings[key] for key in told},
         "seconds_per_step": round(min(seconds), 4),
         "median_seconds_per_step": round(median(seconds), 4),
         "windows_per_second": round(settings["batch"] / min(seconds), 4),
         **memory(model.device),
-        **_used(model, settings, min(seconds)),
     }
 
 
@@ -96,27 +94,3 @@ def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator
         tokens=frames if discrete else None,
         latents=None if discrete else frames,
     )
-
-
-def step_flops(model: "HMA", settings: dict[str, Any]) -> int:
-    """Return the floating point operations of a step's products, without the readout.
-
-    The backward pass counts as two forward passes. A recomputed forward pass does not count, because it is no
-    useful work.
-    """
-    config = model.config
-    frames, tokens = settings["batch"] * settings["window"], config.tokens_per_frame + config.appended_tokens
-    linear = sum(p.numel() for p in model.trunk.blocks.parameters() if p.ndim == 2) * frames * tokens
-    space = 2 * config.layers * frames * tokens**2 * config.width
-    time_ = config.layers * frames * tokens * (settings["window"] + 1) * config.width
-    return 3 * 2 * (linear + space + time_)
-
-
-def _used(model: "HMA", settings: dict[str, Any], seconds: float) -> dict[str, float]:
-    """Return the operations a second and, for a known GPU, their share of its peak."""
-    rate = step_flops(model, settings) / seconds
-    figures = {"teraflop_per_second": round(rate / 1e12, 3)}
-    peak = next((value for name, value in _PEAKS.items() if name in device_name(model.device)), None)
-    if peak is not None:
-        figures["mfu"] = round(rate / peak, 4)
-    return figures

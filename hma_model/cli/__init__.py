@@ -28,9 +28,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Robot recordings to tokenized shards, to a world model, to the hub. Add --debug for tracebacks.",
 )
-_Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[
-    2
-]  # ClickException, wherever typer keeps its click
+_Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[2]  # ClickException of typer's click
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -130,23 +128,12 @@ def evaluate(
 
     Example: hma evaluate runs/first shards/my_arm
     """
-    from hma_data.shards.preview import tokenizer_of
-    from hma_data.shards.reader import ShardSet
     from hma_model.evaluation.evaluate import evaluate as run
 
-    shards = ShardSet(data)
     found = run(
-        _model(checkpoint, shards.embodiment.id),
-        tokenizer_of(shards),
-        shards,
-        split=split,
-        count=windows,
-        frames=frames,
-        prompt=prompt,
-        unmask_steps=unmask_steps,
-        sample_steps=sample_steps,
-        seed=seed,
-    )
+        *_opened(checkpoint, data), split=split, count=windows, frames=frames, prompt=prompt, seed=seed,
+        unmask_steps=unmask_steps, sample_steps=sample_steps,
+    )  # fmt: skip
     if json:
         print_json(found)
         return
@@ -179,34 +166,26 @@ def generate(
 
     Example: hma generate runs/first shards/my_arm --out rollout.mp4
     """
-    from hma_data.shards.preview import tokenizer_of
-    from hma_data.shards.reader import ShardSet
     from hma_model.evaluation.rollout_video import rollout_video, write_video
 
-    shards = ShardSet(data)
     film = rollout_video(
-        _model(checkpoint, shards.embodiment.id),
-        tokenizer_of(shards),
-        shards,
-        split=split,
-        window=window,
-        frames=frames,
-        prompt=prompt,
-        unmask_steps=unmask_steps,
-        sample_steps=sample_steps,
-        temperature=temperature,
-        seed=seed,
-    )
+        *_opened(checkpoint, data), split=split, window=window, frames=frames, prompt=prompt, seed=seed,
+        unmask_steps=unmask_steps, sample_steps=sample_steps, temperature=temperature,
+    )  # fmt: skip
     write_video(out, film)
-    print(
-        f"wrote {out}: {len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
-    )
+    about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
+    print(f"wrote {out}: {about}")
 
 
-def _model(checkpoint: str, embodiment: str) -> Any:
+def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
+    """Return the model with the shard set's embodiment, its tokenizer, and the shard set."""
+    from hma_data.shards.preview import tokenizer_of
+    from hma_data.shards.reader import ShardSet
     from hma_model.network.model import HMA
 
-    return HMA.from_pretrained(checkpoint, embodiments=[embodiment]).eval()
+    shards = ShardSet(data)
+    model = HMA.from_pretrained(checkpoint, embodiments=[shards.embodiment.id])
+    return model.eval(), tokenizer_of(shards), shards
 
 
 mount(app)

@@ -297,11 +297,11 @@ def evaluate(
         roll = partial(rollout, model, tokenizer, batch, prompt=first, seed=seed + number, **sampling)
         true = roll()
         other = roll(actions=shuffled_actions(batch, first - 1, seed), truth=true.truth)
-        if real is not None:
-            truth = _real(real, batch, shards)
-            true, other = replace(true, truth=truth), replace(other, truth=truth)
-        for name, pictures in (("true", true), ("shuffled", other), ("copy", _copied(true))):
-            rollouts[name].append(pictures)
+        still = true.predicted.copy()
+        still[:, first:] = still[:, first - 1 : first]
+        truth = true.truth if real is None else _real(real, batch, shards)
+        for name, made in (("true", true.predicted), ("shuffled", other.predicted), ("copy", still)):
+            rollouts[name].append(Pictures(first, made, truth))
     scores = {name: _scores(parts) for name, parts in rollouts.items()}
     return {
         "embodiment": shards.embodiment.id,
@@ -334,12 +334,10 @@ def _scores(parts: list[Pictures]) -> dict[str, Any]:
     signal, similarity = [], []
     for part in parts:
         truth, predicted = part.truth[:, part.prompt :], part.predicted[:, part.prompt :]
-        size, pairs = (
-            truth.shape[:2],
-            [pictures.reshape(-1, *truth.shape[2:]) for pictures in (truth, predicted)],
-        )
-        signal.append(np.minimum(psnr(*pairs), PSNR_LIMIT).reshape(size))
-        similarity.append(ssim(*pairs).reshape(size))
+        size, shape = truth.shape[:2], (-1, *truth.shape[2:])
+        truth, predicted = truth.reshape(shape), predicted.reshape(shape)
+        signal.append(np.minimum(psnr(truth, predicted), PSNR_LIMIT).reshape(size))
+        similarity.append(ssim(truth, predicted))
     by_frame = np.concatenate(signal).mean(axis=0)
     return {
         "psnr": float(by_frame.mean()),
@@ -347,12 +345,6 @@ def _scores(parts: list[Pictures]) -> dict[str, Any]:
         "psnr_by_frame": [round(float(value), 3) for value in by_frame],
         "ssim": float(np.concatenate(similarity).mean()),
     }
-
-
-def _copied(pictures: Pictures) -> Pictures:
-    still = pictures.predicted.copy()
-    still[:, pictures.prompt :] = still[:, pictures.prompt - 1 : pictures.prompt]
-    return replace(pictures, predicted=still)
 
 
 def _real(real: RealFrames, batch: Batch, shards: ShardSet) -> NDArray[np.uint8]:

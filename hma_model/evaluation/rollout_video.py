@@ -88,11 +88,10 @@ def rollout_video(
 
 
 def _side_by_side(panels: dict[str, NDArray[np.uint8]], prompt: int) -> NDArray[np.uint8]:
-    first = next(iter(panels.values()))
-    scale = max(1, -(-SMALLEST // first.shape[2]))
+    scale = max(1, -(-SMALLEST // next(iter(panels.values())).shape[2]))
     border = ((0, 0), (24, 6), (6, 6), (0, 0))
-    enlarged = {name: frames.repeat(scale, 1).repeat(scale, 2) for name, frames in panels.items()}
-    padded = [np.pad(frames, border, constant_values=250) for frames in enlarged.values()]
+    enlarged = (frames.repeat(scale, 1).repeat(scale, 2) for frames in panels.values())
+    padded = [np.pad(frames, border, constant_values=250) for frames in enlarged]
     film = np.concatenate(padded, axis=2)
     for t, sheet in enumerate(film):
         for i, name in enumerate(panels):
@@ -124,10 +123,8 @@ def write_sheets(
     Args:
         model: the evaluated model.
         sets: shard sets with validation windows.
-        out: the run's folder.
-        step: number of finished steps.
-        frames: of a window.
-        count: windows of each robot.
+        out: the run's folder, and the number of its finished steps.
+        frames, count: the frames of a window, and how many windows of each robot are shown.
         seed: of the rollouts.
 
     Returns:
@@ -143,8 +140,19 @@ def write_sheets(
         return f"no pictures: {fault}"
     training = model.training
     model.eval()
+    columns = np.unique(np.linspace(0, frames - 1, COLUMNS).astype(int))
     for name, shards in sets.items():
-        sheet = _sheet(model, tokenizer, shards, frames, count, seed)
+        (batch,) = windows(shards, "val", frames, count, count)
+        true = rollout(model, tokenizer, batch, seed=seed)
+        swapped = shuffled_actions(batch, true.prompt - 1, seed)
+        other = rollout(model, tokenizer, batch, actions=swapped, seed=seed, truth=true.truth)
+        films = {
+            "truth": true.truth,
+            f"predicted from frame {true.prompt}": true.predicted,
+            "with other actions": other.predicted,
+        }
+        rows = [list(film[i, columns]) for i in range(len(batch)) for film in films.values()]
+        sheet = png_bytes(grid(rows, list(films) * len(batch)))
         write_atomic(out / SHEETS / f"step-{step:08d}-{name}.png", sheet)
     model.train(training)
     return ""
@@ -154,20 +162,3 @@ def newest_sheets(out: Path, names: Iterable[str]) -> dict[str, bytes]:
     """Return the last sheet (PNG) of each robot that has one."""
     found = {name: sorted((out / SHEETS).glob(f"step-????????-{name}.png")) for name in names}
     return {name: paths[-1].read_bytes() for name, paths in found.items() if paths}
-
-
-def _sheet(
-    model: "HMA", tokenizer: "Tokenizer", shards: ShardSet, frames: int, count: int, seed: int
-) -> bytes:
-    (batch,) = windows(shards, "val", frames, count, count)
-    true = rollout(model, tokenizer, batch, seed=seed)
-    swapped = shuffled_actions(batch, true.prompt - 1, seed)
-    other = rollout(model, tokenizer, batch, actions=swapped, seed=seed, truth=true.truth)
-    columns = np.unique(np.linspace(0, frames - 1, COLUMNS).astype(int))
-    films = {
-        "truth": true.truth,
-        f"predicted from frame {true.prompt}": true.predicted,
-        "with other actions": other.predicted,
-    }
-    rows = [list(film[i, columns]) for i in range(len(batch)) for film in films.values()]
-    return png_bytes(grid(rows, list(films) * len(batch)))

@@ -69,17 +69,11 @@ def peak_memory_mib(device: torch.device) -> float:
 
 @dataclass
 class GradientSpikeDetector:
-    """The running mean of gradient norms.
+    """The running mean of gradient norms."""
 
-    Attributes:
-        limit: a norm above this many times the mean is a spike; with 0 no norm is.
-        mean: running mean of the norms of steps that were taken.
-        count: number of these steps.
-    """
-
-    limit: float = 0.0
-    mean: float = 0.0
-    count: int = 0
+    limit: float = 0.0  # a norm above this many times the mean is a spike; with 0 no norm is
+    mean: float = 0.0  # of the norms of steps that were taken
+    count: int = 0  # of these steps
 
     def fault(self, loss: float, norm: float) -> str:
         """Return the fault of a step; an empty string if the step may be taken."""

@@ -36,17 +36,11 @@ TRAINED_BY = {
 
 @dataclass(frozen=True)
 class Start:
-    """A checkpoint from which a run starts.
+    """A checkpoint from which a run starts."""
 
-    Attributes:
-        checkpoint: the run's own copy.
-        frozen: the trunk is not trained.
-        source: the source of the checkpoint, for notes.
-    """
-
-    checkpoint: Checkpoint
-    frozen: bool
-    source: str
+    checkpoint: Checkpoint  # the run's own copy
+    frozen: bool  # the trunk is not trained
+    source: str  # where the checkpoint is from, for notes
 
     @classmethod
     def bring(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> None:
@@ -78,9 +72,8 @@ class Start:
             if local or "://" in source:
                 raise
             both = f"is no folder here; as a repository of the hub: {fault.fault}"
-            raise HubError(
-                recipe.start, both, f"give the path of a checkpoint or run, or: {fault.remedy}"
-            ) from fault
+            remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
+            raise HubError(recipe.start, both, remedy) from fault
 
     @classmethod
     def open(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> "Start":

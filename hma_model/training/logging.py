@@ -3,7 +3,7 @@
 `metrics.jsonl` has one line a step (`"kind": "train"`) and one line an evaluation (`"kind": "eval"`). A
 terminal shows a live table; any other output gets a plain line every few seconds. The recipe may name
 trackers: TensorBoard's event files in `tensorboard/` of the run's folder (`tensorboard --logdir RUN` shows
-them), trackio or wandb. An OSError is converted by the caller, see `hma_model.training.runtime.writable`.
+them), trackio or wandb. An OSError is converted by the caller, see `hma_model.training.runtime.run_errors`.
 """
 
 import hashlib
@@ -183,7 +183,9 @@ class RunLog:
             write_atomic(self._path, "".join(_line(values) for values in kept))
         self._recent: dict[str, deque[float]] = {}
         self._last: dict[str, Any] = {}
-        self._evaluation = next((line for line in reversed(kept) if line["kind"] == "eval"), {})
+        self._evaluation: dict[str, Any] = next(
+            (line for line in reversed(kept) if line["kind"] == "eval"), {}
+        )
         self._paces: deque[float] = deque(maxlen=PACING)  # seconds of steps of this session
         self._spent, self._shown, self._said = 0.0, 0.0, ""
         self._opened = time.monotonic()

@@ -26,37 +26,25 @@ from hma_model.training.parallel import World, join
 from hma_model.training.recipe import Recipe, load_recipe
 from hma_model.training.report import write_report
 from hma_model.training.run import Run
-from hma_model.training.runtime import choose_device, enough_memory, own_folder, stop_on_signals, writable
+from hma_model.training.runtime import choose_device, own_folder, run_errors, stop_on_signals
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """The result of a run.
+    """The result of a run."""
 
-    Attributes:
-        out: the run's folder.
-        checkpoint: the newest checkpoint, to push, to evaluate or to generate from.
-        step: number of finished steps; fewer than the recipe's if the run was interrupted.
-        losses: (step, training loss) of every step.
-        evaluations: lines of kind eval in metrics.jsonl.
-        masked_val_loss: the loss of the last evaluation: nats a token of fully masked frames given the true
-            past (continuous: the diffusion loss); None without validation windows.
-        baseline: nats a token of the training frequencies on the same windows; None without a baseline.
-        interrupted: a signal ended the run early.
-        skipped: number of steps skipped because of a bad loss or gradient.
-        seconds: time spent in steps, all sessions together.
-    """
-
-    out: Path
-    checkpoint: Path
-    step: int
-    losses: list[tuple[int, float]]
-    evaluations: list[dict[str, Any]]
+    out: Path  # the run's folder
+    checkpoint: Path  # the newest checkpoint, to push, to evaluate or to generate from
+    step: int  # number of finished steps; fewer than the recipe's if the run was interrupted
+    losses: list[tuple[int, float]]  # (step, training loss) of every step
+    evaluations: list[dict[str, Any]]  # lines of kind eval in metrics.jsonl
+    # the loss of the last evaluation, in nats a token of fully masked frames given the true past (continuous:
+    # the diffusion loss), and that of the training frequencies on the same windows; None without windows
     masked_val_loss: float | None
     baseline: float | None
-    interrupted: bool
-    skipped: int
-    seconds: float
+    interrupted: bool  # a signal ended the run early
+    skipped: int  # number of steps skipped because of a bad loss or gradient
+    seconds: float  # time spent in steps, all sessions together
 
 
 def train(
@@ -145,7 +133,7 @@ def _trained(
     force: bool,
 ) -> TrainResult:
     cuda = [device] if device.type == "cuda" else []
-    with writable(folder), enough_memory(), ExitStack() as stack, torch.random.fork_rng(devices=cuda):
+    with run_errors(folder), ExitStack() as stack, torch.random.fork_rng(devices=cuda):
         world.once(lambda: stack.enter_context(own_folder(folder)))
         run = Run(recipe, folder, device, world)
         kept = run.resume(force)

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from hma_data.errors import CheckpointError
 from hma_model.training.parallel import gathered, is_sharded, like, local, whole
 
 if TYPE_CHECKING:
@@ -69,10 +68,8 @@ def parameter_groups(model: "HMA", lr: float, weight_decay: float) -> list[dict[
         decays, scaled, sharded = name not in plain, name in matrices, is_sharded(parameter)
         base_lr = lr / multiplier if scaled else lr
         decay = weight_decay * (multiplier if scaled else 1.0) if decays else 0.0
-        empty: dict[str, Any] = {"params": [], "names": []}
-        group = groups.setdefault(
-            (decays, scaled, sharded), {**empty, "lr": base_lr, "base_lr": base_lr, "weight_decay": decay}
-        )
+        fresh = {"params": [], "names": [], "lr": base_lr, "base_lr": base_lr, "weight_decay": decay}
+        group = groups.setdefault((decays, scaled, sharded), fresh)
         group["params"].append(parameter)
         group["names"].append(name)
     return list(groups.values())
@@ -117,26 +114,15 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     }
 
 
-def load_optimizer_state(
-    optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor], where: object
-) -> None:
-    """Restore a result of `optimizer_state`.
-
-    Raises:
-        CheckpointError: moments are of unknown parameters, or have other shapes.
-    """
-    known = {n: p for g in optimizer.param_groups for n, p in zip(g["names"], g["params"])}
-    for key in state:
-        name, _, moment = key.rpartition("/")
-        fits = moment == "step" or (name in known and state[key].shape == known[name].shape)
-        if name not in known or moment not in _MOMENTS or not fits:
-            raise CheckpointError(where, f"optimizer state {key!r} fits no parameter", "train from the start")
-    for name, parameter in known.items():
-        if f"{name}/step" in state:
-            moments = {key: like(state[f"{name}/{key}"].clone(), parameter) for key in _MOMENTS[:2]}
-            step_device = parameter.device if optimizer.defaults.get("fused") else "cpu"
-            step = state[f"{name}/step"].clone().to(step_device)
-            optimizer.state[parameter] = {**moments, "step": step}
+def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor]) -> None:
+    """Restore a result of `optimizer_state`; a parameter that it does not name begins without moments."""
+    for group in optimizer.param_groups:
+        for name, parameter in zip(group["names"], group["params"]):
+            if f"{name}/step" in state:
+                moments = {key: like(state[f"{name}/{key}"].clone(), parameter) for key in _MOMENTS[:2]}
+                step_device = parameter.device if optimizer.defaults.get("fused") else "cpu"
+                step = state[f"{name}/step"].clone().to(step_device)
+                optimizer.state[parameter] = {**moments, "step": step}
 
 
 class Average:

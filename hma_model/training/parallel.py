@@ -18,7 +18,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
+from hma_data.errors import HMAError, RecipeError, TrainingError
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -73,22 +73,17 @@ class World:
             try:
                 outcome[0] = action()
             except Exception as fault:  # any error: the others must not wait for a rank that has ended
-                own, outcome[1] = fault, _told(fault)
+                text = f"{type(fault).__name__}: {fault}"
+                own, outcome[1] = (
+                    fault,
+                    fault if isinstance(fault, HMAError) else TrainingError("rank 0", text),
+                )
         dist.broadcast_object_list(outcome, src=0)
         if own is not None:
             raise own
         if outcome[1] is not None:
             raise outcome[1]
         return outcome[0]
-
-
-def _told(fault: Exception) -> HMAError:
-    """Convert an error of rank 0 to the one that the other ranks raise."""
-    if isinstance(fault, HMAError):
-        return fault
-    if isinstance(fault, OSError):
-        return OutputError(fault.filename or "rank 0", f"cannot be written: {fault.strerror or fault}")
-    return TrainingError("rank 0", f"{type(fault).__name__}: {fault}", "see what it has said itself")
 
 
 @contextmanager
@@ -102,12 +97,10 @@ def join(device: torch.device) -> Iterator[World]:
         RecipeError: the ranks cannot find each other.
         TrainingError: another rank has ended; it states the reason if that rank reported one.
     """
-    size = int(os.environ.get("WORLD_SIZE", "1"))
-    if size == 1 and not dist.is_initialized():
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield World()
         return
-    ours = not dist.is_initialized()
-    store = _met(device) if ours else None
+    store = _met(device)
     world = World(dist.get_rank(), dist.get_world_size())
     try:
         yield world
@@ -119,7 +112,7 @@ def join(device: torch.device) -> Iterator[World]:
         raise error from fault
     finally:
         waits = device.type == "cuda" and sys.exc_info()[0] is not None  # NCCL waits for ended ranks
-        if ours and dist.is_initialized() and not waits:
+        if not waits:
             dist.destroy_process_group()
 
 
@@ -137,34 +130,28 @@ def _met(device: torch.device) -> dist.Store:
     return dist.PrefixStore(PREFIX, store)
 
 
-def _explained(fault: Exception, world: World, store: dist.Store | None) -> Exception:
+def _explained(fault: Exception, world: World, store: dist.Store) -> Exception:
     """Return the error to raise for a fault; if this rank lost the others, the error that ended them."""
     if isinstance(fault, HMAError) or not isinstance(fault, RuntimeError):
         return fault
-    said = (str(fault).splitlines() or [""])[0][:200]
+    where, said = f"rank {world.rank}", str(fault).partition("\n")[0][:200]
     if not isinstance(fault, dist.DistError) and "gloo" not in str(fault):
-        return TrainingError(f"rank {world.rank}", f"{type(fault).__name__}: {said}", "--debug shows where")
-    return read_error(store) or TrainingError(
-        f"rank {world.rank}",
-        f"has lost the others: {said}",
-        "see what ended another rank; the same command goes on from the last checkpoint",
-    )
+        return TrainingError(where, f"{type(fault).__name__}: {said}", "--debug shows where")
+    remedy = "see what ended another rank; the same command goes on from the last checkpoint"
+    return read_error(store) or TrainingError(where, f"has lost the others: {said}", remedy)
 
 
-def write_error(store: dist.Store | None, rank: int, error: Exception) -> None:
+def write_error(store: dist.Store, rank: int, error: Exception) -> None:
     """Write the error that ends a rank into the store, unless another rank has written one."""
     kind = "" if hasattr(error, "exit_code") else f"{type(error).__name__}: "
-    try:
-        if store is not None:
-            store.compare_set(ERROR, "", f"{rank} {kind}{error}")
-    except RuntimeError:  # the store is gone with the process that kept it
-        return
+    with suppress(RuntimeError):  # the store is gone with the process that kept it
+        store.compare_set(ERROR, "", f"{rank} {kind}{error}")
 
 
-def read_error(store: dist.Store | None) -> TrainingError | None:
+def read_error(store: dist.Store) -> TrainingError | None:
     """Return the error that another rank has written, or None."""
     try:
-        if store is None or not store.check([ERROR]):
+        if not store.check([ERROR]):
             return None
         rank, _, text = store.get(ERROR).decode().partition(" ")
     except RuntimeError:
@@ -202,11 +189,6 @@ def _claim_report() -> bool:
         return bool(store.add(f"{PREFIX}/{REPORTS} {attempt}", 1) == 1)
     except RuntimeError:  # torchrun has ended
         return True
-
-
-def local_rank() -> int:
-    """Return the number of this process among those of its machine."""
-    return int(os.environ.get("LOCAL_RANK", "0"))
 
 
 # -- the distributed network
@@ -262,9 +244,8 @@ class ParallelModel:
     def average(self) -> None:
         """Average, after the last pass, the gradients that neither DDP nor FSDP has averaged."""
         if self.sharded:
-            _average(
-                [p for p in self.model.parameters() if p.requires_grad and not is_sharded(p)], self.world
-            )
+            trained = (p for p in self.model.parameters() if p.requires_grad)
+            _average([p for p in trained if not is_sharded(p)], self.world)
 
     def clip(self, limit: float) -> float:
         """Scale the gradients to at most this norm over all ranks, and return the norm they had."""

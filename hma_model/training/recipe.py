@@ -78,9 +78,13 @@ def _words(value: Any) -> Any:
 
 Count = Annotated[int, BeforeValidator(_no_bool)]
 Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
+Steps = Annotated[Count, Field(ge=0)]
+Share = Annotated[Number, Field(ge=0, le=1)]
 Beta = Annotated[Number, Field(ge=0, lt=1)]
 Cap = Annotated[Number, Field(gt=0, le=1)]
 Place = Annotated[str, AfterValidator(_named)]
+Places = Annotated[tuple[Place, ...], BeforeValidator(_listed)]
+Trackers = Annotated[tuple[Literal["tensorboard", "trackio", "wandb"], ...], BeforeValidator(_listed)]
 
 
 class _Settings(BaseModel):
@@ -114,9 +118,7 @@ class MixtureSettings(_Settings):
 class Recipe(_Settings):
     """The settings of a training run. `load_recipe` makes it and explains its errors."""
 
-    data: Annotated[tuple[Place, ...], BeforeValidator(_listed)] = Field(
-        (), description="folders of shards, one an embodiment"
-    )
+    data: Places = Field((), description="folders of shards, one an embodiment")
     mixture: MixtureSettings = MixtureSettings()
     frames: Count = Field(12, ge=2, le=4096, description="T of a window")
     short: Literal["drop", "pad"] = Field("drop", description="episodes shorter than a window")
@@ -125,37 +127,28 @@ class Recipe(_Settings):
     model: dict[str, Any] = Field({}, description="fields of HMAConfig")
     objectives: dict[str, Number] = Field({"forward": 1.0}, description="how often each is drawn")
 
-    start: Place | None = Field(None, description="a checkpoint to begin from: folder, run, URI or hub repo")
+    start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
-    readout_bias: Literal["frequencies", "zero"] = Field(
-        "frequencies", description="what the token readout begins with: the training tokens' log frequencies"
-    )
+    # what the bias of the token readout starts with: the log frequencies of the training tokens
+    readout_bias: Literal["frequencies", "zero"] = "frequencies"
 
     steps: Count = Field(1000, ge=1, le=10**12)
     lr: Number = Field(3e-4, gt=0, le=1e6)
     lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")
-    warmup: Count = Field(100, ge=0, description="steps in which lr rises from 0")
+    warmup: Steps = Field(100, description="steps in which lr rises from 0")
     schedule: Literal["constant_with_warmup", "cosine"] = "constant_with_warmup"
-    lr_end: Number = Field(0.1, ge=0, le=1, description="cosine: the last step's share of lr")
+    lr_end: Share = Field(0.1, description="cosine: the last step's share of lr")
     betas: tuple[Beta, Beta] = (0.9, 0.95)
     eps: Number = Field(1e-8, gt=0, le=1e6)
     weight_decay: Number = Field(0.05, ge=0, le=1e6)
-    clip: Number = Field(1.0, gt=0, description="of the gradient's norm")
-    nonfinite: Literal["stop", "skip"] = Field(
-        "stop", description="at a loss that is not a number, or at a spike"
-    )
-    spike: Number = Field(
-        0.0, ge=0, description="a gradient's norm above this many times its running mean; 0 never"
-    )
-    ema: Number = Field(
-        0.0, ge=0, lt=1, description="decay of averaged weights, then evaluated and saved; 0 without"
-    )
-    self_forward: Number = Field(
-        0.0, ge=0, le=1, description="share of the windows whose past is the model's own prediction"
-    )
+    clip: Number = Field(1.0, gt=0, description="limit of the gradient's norm")
+    nonfinite: Literal["stop", "skip"] = Field("stop", description="at a loss that is not finite, or a spike")
+    spike: Number = Field(0.0, ge=0, description="a gradient's norm above spike × its mean is one; 0 never")
+    ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0 without")
+    self_forward: Share = Field(0.0, description="share of windows whose past is the model's prediction")
     self_forward_frames: Count = Field(2, ge=1, description="frames in a row of such a past")
-    self_forward_from: Count = Field(0, ge=0, description="step from which that share rises,")
-    self_forward_over: Count = Field(0, ge=0, description="and in how many steps it is reached")
+    self_forward_from: Steps = Field(0, description="step from which that share rises")
+    self_forward_over: Steps = Field(0, description="number of steps in which that share rises")
 
     seed: Count = Field(42, ge=0, lt=2**63)
     precision: Literal["fp32", "bf16"] = "fp32"
@@ -164,21 +157,15 @@ class Recipe(_Settings):
     compile: bool = Field(False, description="torch.compile of the trunk's blocks")
     checkpointing: bool = Field(False, description="recompute activations: less memory, a third more time")
     workers: Count = Field(0, ge=0, le=512, description="processes that decode batches, a rank")
-    eval_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
+    eval_every: Steps = Field(250, description="steps between evaluations; 0 only at the end")
     eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
-    pictures: Count = Field(1, ge=0, description="windows rolled out for a picture at evaluations, a robot")
-    pictures_share: Number = Field(
-        0.05, ge=0, description="of the steps' time, for pictures before the last evaluation's"
-    )
-    checkpoint_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
-    keep_last: Count = Field(3, ge=1)
+    pictures: Steps = Field(1, description="windows of a robot that an evaluation rolls out for a picture")
+    pictures_share: Number = Field(0.05, ge=0, description="share of the time for pictures before the last")
+    checkpoint_every: Steps = Field(250, description="steps between checkpoints; 0 only at the end")
+    keep_last: Count = Field(3, ge=1, description="number of checkpoints that are kept")
     report: bool = Field(True, description="write report.html")
-    track: Annotated[tuple[Literal["tensorboard", "trackio", "wandb"], ...], BeforeValidator(_listed)] = (
-        Field(
-            (), description="where figures go besides metrics.jsonl and report.html; each needs its package"
-        )
-    )
-    project: str = Field("hma", description="the name trackio and wandb file the run under")
+    track: Trackers = Field((), description="trackers of the figures; each needs its package")
+    project: str = Field("hma", description="the name under which trackio and wandb file the run")
     out: Place | None = Field(None, description="the run's folder")
 
     @property

@@ -179,24 +179,17 @@ class Run:
         own.copy_(torch.from_numpy(bias).to(own))
 
     def prepare(self, kept: Kept | None) -> None:
-        """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given.
-
-        Raises:
-            CheckpointError: moments fit no parameter.
-        """
+        """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given."""
         if self.recipe.compile:
             for block in self.model.trunk.blocks:
                 block.compile()
         self.parallel_model = ParallelModel(self.model, self.world, self.recipe.parallel)
         self.optimizer = make_optimizer(self.model, self.recipe)
         self.average = Average(self.model, self.recipe.ema) if self.recipe.ema else None
-        if kept is None:
-            return
-        own = {name for group in self.optimizer.param_groups for name in group["names"]}
-        moments = {key: value for key, value in kept.moments.items() if key.rpartition("/")[0] in own}
-        load_optimizer_state(self.optimizer, moments, self.out)
-        if self.average:
-            self.average.load(kept.averages)
+        if kept:
+            load_optimizer_state(self.optimizer, kept.moments)
+            if self.average:
+                self.average.load(kept.averages)
 
     # -- a step
 

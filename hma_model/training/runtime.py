@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
-from hma_model.training.parallel import local_rank
 
 if TYPE_CHECKING:
     from hma_model.config import HMAConfig
@@ -38,7 +37,7 @@ def choose_device(name: str) -> torch.device:
     cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
     if name == "auto":
         name = "cuda" if cuda else "mps" if mps else "cpu"
-    device = torch.device(f"cuda:{local_rank()}" if name == "cuda" else name)
+    device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if name == "cuda" else name)
     there = {"cuda": cuda and (device.index or 0) < torch.cuda.device_count(), "mps": mps, "cpu": True}
     if not there[device.type]:
         raise RecipeError("recipe: device", f"{name} is not there", "use device=auto or device=cpu")
@@ -104,29 +103,25 @@ def own_folder(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def writable(out: Path) -> Iterator[None]:
-    """Convert an OSError of the block, which writes into a run's folder, to an OutputError."""
+def run_errors(out: Path) -> Iterator[None]:
+    """Convert errors of the block, which trains into a folder: no memory, or a file that cannot be written.
+
+    Raises:
+        OutputError: something cannot be written.
+        TrainingError: the block needed more memory than there is.
+    """
     try:
         yield
     except OSError as fault:
         where, why = fault.filename or out, fault.strerror or str(fault)
         remedy = "free space or choose another folder; checkpoints that are there are intact"
         raise OutputError(where, f"cannot be written: {why}", remedy) from fault
-
-
-@contextmanager
-def enough_memory() -> Iterator[None]:
-    """Convert an out-of-memory error of the block to a TrainingError."""
-    try:
-        yield
     except (RuntimeError, MemoryError) as fault:
-        text = str(fault).partition("\n")[0][:200] or type(fault).__name__
+        text = str(fault).partition("\n")[0][:200]
         if isinstance(fault, RuntimeError) and not _NO_MEMORY.search(text):
             raise
         told = f"there is not enough for this model and batch: {text}"
-        remedy = (
-            "lower batch_size (accumulate makes up for it), frames or model.width, or set checkpointing=true"
-        )
+        remedy = "lower batch_size (accumulate makes up for it), frames or width, or set checkpointing=true"
         raise TrainingError("memory", told, remedy) from fault
 
 

@@ -29,13 +29,9 @@ SAMPLE_STEPS = 8  # of the diffusion head; enough for a past to learn from
 
 @dataclass
 class Forwarded(Batch):
-    """A batch in which the model sees other frames than those of the loss.
+    """A batch in which the model sees other frames than those of the loss."""
 
-    Attributes:
-        context: (B, T, h, w) tokens or (B, T, c, H, W) latents that the model sees.
-    """
-
-    context: Tensor | None = None
+    context: Tensor | None = None  # (B, T, h, w) tokens or (B, T, c, H, W) latents that the model sees
 
 
 def share_at(step: int, recipe: "Recipe") -> float:
