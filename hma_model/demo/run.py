@@ -271,12 +271,11 @@ def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "RolloutVideo"]
 
 def _refuse_foreign(out: Path) -> None:
     ours = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, RESULTS}
-    if out.is_dir():
-        foreign = sorted(item.name for item in out.iterdir() if item.name not in ours)
-        if foreign:
-            raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
-    elif out.exists():
+    if out.exists() and not out.is_dir():
         raise OutputError(out, "is not a folder", "choose another --out")
+    foreign = sorted({item.name for item in out.glob("*")} - ours)
+    if foreign:
+        raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
 
 
 def _size(path: Path) -> int:
@@ -293,16 +292,10 @@ def write_report(made: Demo) -> Path:
 
     versions = f"Python {platform.python_version()}, torch {torch.__version__}"
     machine = f"{usable_cores()} cores, {platform.machine()}, {versions}"
-    page = Page(
-        "HMA Toolkit: two robots, one world model",
-        f"Recorded, tokenized, trained, published and rolled out by hma demo on {machine}.",
-    )
-    _headline(page, made)
-    _robots(page, made)
-    _reconstructions(page, made)
-    _mixture(page, made)
-    _training(page, made)
-    _rollouts(page, made)
+    lead = f"Recorded, tokenized, trained, published and rolled out by hma demo on {machine}."
+    page = Page("HMA Toolkit: two robots, one world model", lead)
+    for section in (_headline, _robots, _reconstructions, _mixture, _training, _rollouts):
+        section(page, made)
     page.section("Sizes and timings")
     page.table(["what", "size"], [[name, human_bytes(size)] for name, size in made.sizes.items()])
     page.table(["stage", "wall time"], [[name, human_seconds(s)] for name, s in made.seconds.items()])
@@ -353,10 +346,8 @@ def _robots(page: Page, made: Demo) -> None:
 
 
 def _reconstructions(page: Page, made: Demo) -> None:
-    page.section(
-        "What the tokens keep",
-        "Recorded frames, and the same decoded from their tokens. All that follows is predicted in tokens.",
-    )
+    about = "Recorded frames, and the same decoded from their tokens. The model predicts tokens only."
+    page.section("What the tokens keep", about)
     for robot, shards in made.sets.items():
         rows, labels = [], []
         for row in [row for row in shards.episodes.to_pylist() if row["split"] == "val"][:2]:
@@ -392,15 +383,9 @@ def _mixture(page: Page, made: Demo) -> None:
 def _training(page: Page, made: Demo) -> None:
     result = made.training
     page.section("Training")
-    rows = [
-        ["this model, whole frames masked", result.masked_val_loss],
-        ["token frequencies alone", result.baseline],
-    ]
-    page.table(["held-out loss", "nats a token"], rows)
     validation = [(line["step"], line["loss"]) for line in result.evaluations]
-    plot = loss_curves(
-        {"both robots": result.losses}, {"both robots": validation}, "loss, nats a token", result.baseline
-    )
+    curves = {"both robots": result.losses}, {"both robots": validation}
+    plot = loss_curves(*curves, "loss, nats a token", result.baseline)
     caption = "Loss over training (line: masked tokens; markers: held-out windows, whole frames masked)"
     page.picture(plot, "svg+xml", caption)
 

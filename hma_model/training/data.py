@@ -30,11 +30,11 @@ def share(recipe: "Recipe", ranks: int) -> tuple[int, int]:
     total = recipe.windows_per_step
     passes = recipe.accumulate if recipe.accumulate % ranks == 0 else ranks
     if total % passes:
-        raise RecipeError(
-            "recipe: batch_size",
-            f"{total} windows a step cannot be shared evenly by {ranks} ranks",
-            f"choose batch_size × accumulate as a multiple of {ranks}, such as {-(-total // ranks) * ranks}",
+        fault = f"{total} windows a step cannot be shared evenly by {ranks} ranks"
+        remedy = (
+            f"choose batch_size × accumulate as a multiple of {ranks}, such as {-(-total // ranks) * ranks}"
         )
+        raise RecipeError("recipe: batch_size", fault, remedy)
     return passes, total // passes
 
 
@@ -70,19 +70,14 @@ class TrainData:
     def _dataset(
         self, recipe: "Recipe", sets: Mapping[str, ShardSet], size: int, number: int
     ) -> MixtureDataset:
-        mixture = recipe.mixture
+        given: dict[str, Any] = {key: value or None for key, value in recipe.mixture}
         try:
             return MixtureDataset(
                 list(sets.values()),
                 size,
                 recipe.frames,
-                temperature=mixture.temperature,
-                weights=mixture.weights or None,
-                groups=mixture.groups or None,
-                caps=mixture.caps or None,
-                max_epochs=mixture.max_epochs,
-                samples=recipe.steps * recipe.windows_per_step if mixture.max_epochs else None,
-                draw=mixture.draw,
+                **given,
+                samples=recipe.steps * recipe.windows_per_step if recipe.mixture.max_epochs else None,
                 short=recipe.short,
                 seed=seed_for(recipe.seed, "sampler"),
                 rank=number,

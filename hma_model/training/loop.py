@@ -22,7 +22,7 @@ from hma_data.errors import UsageError
 from hma_data.storage.paths import StrPath, as_text
 from hma_model.checkpoint import io as checkpoints
 from hma_model.training.logging import RunLog, Tracker, open_trackers, read_metrics
-from hma_model.training.parallel import World, join
+from hma_model.training.parallel import join
 from hma_model.training.recipe import Recipe, load_recipe
 from hma_model.training.report import write_report
 from hma_model.training.run import Run
@@ -79,8 +79,24 @@ def train(
     if "://" in folder:
         raise UsageError("out", f"is {folder!r}, no folder of this machine", "train here, then hma hub push")
     device = choose_device(recipe.device)
-    with join(device) as world:
-        return _trained(recipe, Path(folder), device, world, on_progress, show, force)
+    cuda = [device] if device.type == "cuda" else []
+    with join(device) as world, run_errors(Path(folder)), ExitStack() as stack, torch.random.fork_rng(cuda):
+        world.once(lambda: stack.enter_context(own_folder(Path(folder))))
+        run = Run(recipe, Path(folder), device, world)
+        kept = run.resume(force)
+        if kept is None:
+            run.begin()
+        run.prepare(kept)
+        run.note_settings()
+        trackers: list[Tracker] = []
+        world.once(lambda: trackers.extend(open_trackers(recipe, run.out, run.step)))
+        log = RunLog(run.out, recipe.steps, run.step, show and world.main, world.main, trackers, run.nats)
+        with log, stop_on_signals() as stop:
+            _loop(run, log, stop, on_progress)
+        result = _result(run)
+        if recipe.report:
+            world.once(lambda: write_report(result.out))
+        return result
 
 
 def finetune(
@@ -123,35 +139,6 @@ def finetune(
     return train(load_recipe(recipe, [*ours, *overrides]), out=out, **options)
 
 
-def _trained(
-    recipe: Recipe,
-    folder: Path,
-    device: torch.device,
-    world: World,
-    on_progress: Callable[[dict[str, Any]], None] | None,
-    show: bool,
-    force: bool,
-) -> TrainResult:
-    cuda = [device] if device.type == "cuda" else []
-    with run_errors(folder), ExitStack() as stack, torch.random.fork_rng(devices=cuda):
-        world.once(lambda: stack.enter_context(own_folder(folder)))
-        run = Run(recipe, folder, device, world)
-        kept = run.resume(force)
-        if kept is None:
-            run.begin()
-        run.prepare(kept)
-        run.note_settings()
-        trackers: list[Tracker] = []
-        world.once(lambda: trackers.extend(open_trackers(recipe, folder, run.step)))
-        log = RunLog(folder, recipe.steps, run.step, show and world.main, world.main, trackers, run.nats)
-        with log, stop_on_signals() as stop:
-            _loop(run, log, stop, on_progress)
-        result = _result(run)
-        if recipe.report:
-            world.once(lambda: write_report(result.out))
-        return result
-
-
 def _loop(
     run: Run, log: RunLog, stop: threading.Event, on_progress: Callable[[dict[str, Any]], None] | None
 ) -> None:
@@ -165,7 +152,7 @@ def _loop(
         asked = run.world.sum(torch.tensor([float(stop.is_set())]))  # all ranks stop after the same step
         stopped = bool(asked[0])
         last = run.step == recipe.steps
-        if (last or _due(run.step, recipe.eval_every)) and run.held_out:
+        if run.held_out and (last or _due(run.step, recipe.eval_every)):
             log.evaluation({**run.evaluate(), "mixture": run.train_data.realised()})
             log.pictures(run.out, run.step)
             _show_notes(run, log)

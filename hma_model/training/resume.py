@@ -60,11 +60,9 @@ class State:
         before = {**Recipe().identity(), **self.recipe}  # keys added by later releases had their defaults
         changed = differences(before, recipe) + differences(self.data, data, "data")
         if changed:
-            raise RecipeError(
-                where,
-                f"was begun with another recipe or other shards: {'; '.join(changed)}",
-                "train into another folder, undo the change, or accept it with --force",
-            )
+            fault = f"was begun with another recipe or other shards: {'; '.join(changed)}"
+            remedy = "train into another folder, undo the change, or accept it with --force"
+            raise RecipeError(where, fault, remedy)
 
 
 def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
@@ -113,22 +111,18 @@ def _digest(values: Mapping[str, Any]) -> str:
 
 
 def require_version(path: Path) -> None:
-    """Raise unless this release can resume a run from the checkpoint in a folder.
-
-    Raises:
-        OtherVersionError: the checkpoint is of another version; the error names both versions.
-        CheckpointError: a file that states a version is missing or damaged.
-    """
-    checks = (
-        (path / CONFIG, "format_version", FORMAT_VERSION, None),
-        (path / TRAINING / STATE, "version", VERSION, 1),
-    )
-    for file, key, own, absent in checks:
-        found = read_json(file).get(key, absent)
-        if isinstance(found, int) and found != own:
+    """Raise OtherVersionError unless this release can resume a run from the checkpoint in a folder."""
+    for file, key, own in (
+        (CONFIG, "format_version", FORMAT_VERSION),
+        (f"{TRAINING}/{STATE}", "version", VERSION),
+    ):
+        found = read_json(path / file).get(key, own)  # older releases wrote none
+        if found != own:
             newer = "update hma-toolkit, or begin" if found > own else "begin"
             remedy = f"{newer} a new run from its weights with start={path}"
-            raise OtherVersionError(file, f"is of {key} {found}, this release trains on with {own}", remedy)
+            raise OtherVersionError(
+                path / file, f"is of {key} {found}, this release trains on with {own}", remedy
+            )
 
 
 @dataclass(frozen=True)

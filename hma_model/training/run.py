@@ -113,9 +113,8 @@ class Run:
             self.stats = {name: self.start.stats(shards) for name, shards in self.sets.items()}
         torch.manual_seed(seed_for(recipe.seed, "init"))
         self.model = self._fresh_model()
-        self.held_out = {
-            name: s for name, s in self.sets.items() if len(WindowDataset(s, "val", recipe.frames))
-        }
+        held_out = ((name, s, WindowDataset(s, "val", recipe.frames)) for name, s in self.sets.items())
+        self.held_out = {name: shards for name, shards, dataset in held_out if len(dataset)}
         self.step, self.skipped, self.seconds = 0, 0, 0.0
         self.spike_detector = GradientSpikeDetector(recipe.spike)
         self.evaluation: dict[str, Any] = {}
@@ -155,9 +154,8 @@ class Run:
         if missing := sorted(set(self.sets) - set(self.held_out)):
             self.notes.append(f"no validation windows of {recipe.frames} frames: {', '.join(missing)}")
         if recipe.warmup > recipe.steps:
-            self.notes.append(
-                f"the learning rate never reaches lr: warmup takes {recipe.warmup} of {recipe.steps} steps"
-            )
+            steps = f"warmup takes {recipe.warmup} of {recipe.steps} steps"
+            self.notes.append(f"the learning rate never reaches lr: {steps}")
         if self.start and not self.step:
             self.notes += self.start.remarks(self.sets)
         if self.world.size > 1:
@@ -170,10 +168,8 @@ class Run:
         plain = self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete"
         if plain or self.start:
             return
-        shares = [
-            [p * digit for digit in digit_frequencies(shards)]
-            for p, shards in zip(self.train_data.mixture.p, self.sets.values())
-        ]
+        drawn = zip(self.train_data.mixture.p, self.sets.values())
+        shares = [[p * digit for digit in digit_frequencies(shards)] for p, shards in drawn]
         bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
@@ -243,9 +239,8 @@ class Run:
         with self.parallel_model.passing(last):
             with self._autocast():
                 if share := share_at(self.step, recipe):
-                    draws = torch.Generator().manual_seed(
-                        seed_for(recipe.seed, "self_forward", self.step, number)
-                    )
+                    own = seed_for(recipe.seed, "self_forward", self.step, number)
+                    draws = torch.Generator().manual_seed(own)
                     batch = forwarded(self.model, batch, share, recipe.self_forward_frames, draws)
                 output = self.parallel_model(batch, generator=generator)
             if not output.loss.requires_grad:
@@ -375,11 +370,8 @@ class Run:
 
     def _card(self, name: str, shards: ShardSet) -> dict[str, Any]:
         figures = (("val_loss", "loss"), ("baseline_loss", "baseline"), ("accuracy", "accuracy"))
-        metrics = {
-            ours: self.evaluation[f"{theirs}_by_embodiment"].get(name)
-            for ours, theirs in figures
-            if f"{theirs}_by_embodiment" in self.evaluation
-        }
+        found = ((ours, self.evaluation.get(f"{theirs}_by_embodiment")) for ours, theirs in figures)
+        metrics = {ours: values.get(name) for ours, values in found if values is not None}
         train = shards.manifest.splits.get("train", {})
         data: dict[str, Any] = {key: train.get(key) for key in ("episodes", "frames")}
         if "://" in shards.manifest.source:  # a path is of no use on another machine
