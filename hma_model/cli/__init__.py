@@ -81,10 +81,10 @@ Checkpoint = Annotated[
     str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
 Data = Annotated[Path, typer.Argument(help="A shard set.")]
-UnmaskSteps = Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps a frame.")]
+UnmaskSteps = Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps of a frame.")]
 SampleSteps = Annotated[
     int | None,
-    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; default its own."),
+    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
 ]
 
 
@@ -94,10 +94,10 @@ def demo(
         "hma-demo"
     ),
     episodes: Annotated[
-        int, typer.Option("--episodes", min=4, help="Recorded for each of the two robots.")
+        int, typer.Option("--episodes", min=4, help="Episodes of each of the two robots.")
     ] = 24,
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Of training.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of recording and training.")] = 0,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Number of training steps.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of recording and training.")] = 0,
 ) -> None:
     """Run the whole pipeline, small: record, convert, mix, train, publish, roll out, report.
 
@@ -114,14 +114,16 @@ def evaluate(
     checkpoint: Checkpoint,
     data: Data,
     split: Annotated[str, typer.Option("--split", help="train or val.")] = "val",
-    windows: Annotated[int, typer.Option("--windows", min=1, help="How many, evenly spaced.")] = 64,
+    windows: Annotated[int, typer.Option("--windows", min=1, help="Number of windows, evenly spaced.")] = 64,
     frames: Annotated[
-        int | None, typer.Option("--frames", min=2, help="Of a window; default the model's.")
+        int | None, typer.Option("--frames", min=2, help="Frames of a window; by default the model's.")
     ] = None,
-    prompt: Annotated[int | None, typer.Option("--prompt", min=1, help="True frames to start from.")] = None,
+    prompt: Annotated[
+        int | None, typer.Option("--prompt", min=1, help="Number of true frames to start from.")
+    ] = None,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the rollouts.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
     json: Json = False,
 ) -> None:
     """Measure the loss and its baseline, and rollouts with true and shuffled actions.
@@ -152,9 +154,10 @@ def generate(
     split: Annotated[str, typer.Option("--split", help="train or val.")] = "val",
     window: Annotated[int, typer.Option("--window", min=0, help="Number of the window to start at.")] = 0,
     frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="To predict; default to the window's end.")
+        int | None,
+        typer.Option("--frames", min=1, help="Frames to predict; by default to the end of the window."),
     ] = None,
-    prompt: Annotated[int, typer.Option("--prompt", min=1, help="True frames to start from.")] = 2,
+    prompt: Annotated[int, typer.Option("--prompt", min=1, help="Number of true frames to start from.")] = 2,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
     temperature: Annotated[

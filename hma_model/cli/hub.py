@@ -12,7 +12,7 @@ Embodiments = Annotated[
     list[str] | None, typer.Option("--embodiment", "-e", help="Only this robot; repeat for more.")
 ]
 Revision = Annotated[str | None, typer.Option("--revision", help="Branch, tag or commit.")]
-Private = Annotated[bool, typer.Option("--private", help="Make a new repository a private one.")]
+Private = Annotated[bool, typer.Option("--private", help="Create a new repository as a private one.")]
 hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, one robot at a time.")
 
 
@@ -43,7 +43,7 @@ def push(
 def pull(
     source: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
     embodiment: Embodiments = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder; default the local cache.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder; by default the local cache.")] = None,
     revision: Revision = None,
 ) -> None:
     """Fetch the trunk and only the chosen robots.
@@ -119,8 +119,10 @@ def import_released(
     source: Annotated[str, typer.Argument(help="A released checkpoint: a folder, or org/name on the hub.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the new checkpoint.")],
     embodiment: Embodiments = None,
-    grid: Annotated[tuple[int, int] | None, typer.Option("--grid", help="h w, if not square.")] = None,
-    tokenizer: Annotated[str | None, typer.Option("--tokenizer", help="Default the paper's.")] = None,
+    grid: Annotated[
+        tuple[int, int] | None, typer.Option("--grid", help="Height and width, if not square.")
+    ] = None,
+    tokenizer: Annotated[str | None, typer.Option("--tokenizer", help="By default the paper's.")] = None,
     revision: Revision = None,
     json: Json = False,
 ) -> None:

@@ -110,7 +110,7 @@ class TrainData:
                 if isinstance(fault, RuntimeError) and "DataLoader worker" not in str(fault):
                     raise
                 said = f"a process that decodes batches has ended ({type(fault).__name__})"
-                remedy = "if memory is short choose fewer; the same command goes on from the last checkpoint"
+                remedy = "use fewer workers if memory is short, and run the same command to continue"
                 raise TrainingError("workers", said, remedy) from fault
             yield number, batch
 
@@ -129,15 +129,15 @@ class TrainData:
         """Continue from `state`, which any number of ranks may have saved.
 
         Returns:
-            The reason why the sampler begins anew: a step has another number of passes, or, with `force`, the
-            mixture is another one. An empty string if the sampler continues.
+            The reason why the sampler starts again: a step has another number of passes, or the mixture is
+            another one and `force` accepts it. An empty string if the sampler continues.
 
         Raises:
             UsageError: the state is of another mixture.
         """
         kept = state["passes"]
         if len(kept) != self.passes:
-            return f"its state is of {len(kept)} passes a step, this run has {self.passes}"
+            return f"its state has {len(kept)} passes a step, this run has {self.passes}"
         try:
             for number, data in zip(self.own, self._data):
                 data.load_state_dict(kept[number])

@@ -119,7 +119,7 @@ class Start:
         for key in ("action_dim", "stride", "normalize_mask"):
             a, b = getattr(theirs, key), getattr(ours, key)
             if not np.array_equal(a, b):
-                fault = f"knows {name} with {key} {a}, the shards have {b}"
+                fault = f"has {name} with {key} {a}, the shards have {b}"
                 raise CheckpointError(self.source, fault, "give the robot of the shards another id")
         return self.checkpoint.stats(name)
 
@@ -139,9 +139,9 @@ class Start:
         fresh = [name for name in names if name not in known]
         notes = [f"from {self.source}: trunk {'frozen' if self.frozen else 'tuned'}"]
         if fresh:
-            notes.append(f"fresh stem and head: {', '.join(fresh)}")
+            notes.append(f"new stem and head: {', '.join(fresh)}")
         if known:
-            notes.append(f"going on from its stem and head, with its statistics: {', '.join(known)}")
+            notes.append(f"stem, head and statistics from the checkpoint: {', '.join(known)}")
         return notes
 
 
@@ -162,7 +162,7 @@ def _require_source(source: str, out: Path) -> None:
     else:
         trunk = Checkpoint.open(checkpoints.resolve(path)).trunk_sha256 if path.exists() else None
     if trunk not in (None, Checkpoint.open(out / START).trunk_sha256):
-        fault = f"was begun from {before}, not from {source}"
+        fault = f"was started from {before}, not from {source}"
         raise RecipeError(out, fault, "train into another folder, or name the first")
 
 

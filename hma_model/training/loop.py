@@ -164,7 +164,7 @@ def _loop(
         shares = (f"{r['embodiment']} {r['realised']:.1%} ({r['intended']:.1%} intended)" for r in rows)
         log.note(f"drawn: {', '.join(shares)}")
     if stopped:
-        log.note(f"stopped by a signal and saved at step {run.step}; the same command goes on")
+        log.note(f"stopped by a signal and saved at step {run.step}; run the same command to continue")
 
 
 def _show_notes(run: Run, log: RunLog) -> None:

@@ -125,7 +125,7 @@ def _met(device: torch.device) -> dist.Store:
         own = dist.PrefixStore("group", store)
         dist.init_process_group(backend, store=own, rank=rank, world_size=size, timeout=PATIENCE)
     except (RuntimeError, ValueError) as fault:
-        text = f"cannot find each other: {str(fault).splitlines()[0]}"
+        text = f"cannot connect to each other: {str(fault).splitlines()[0]}"
         raise RecipeError("ranks", text, "start them with torchrun") from fault
     return dist.PrefixStore(PREFIX, store)
 
@@ -137,8 +137,8 @@ def _explained(fault: Exception, world: World, store: dist.Store) -> Exception:
     where, said = f"rank {world.rank}", str(fault).partition("\n")[0][:200]
     if not isinstance(fault, dist.DistError) and "gloo" not in str(fault):
         return TrainingError(where, f"{type(fault).__name__}: {said}", "--debug shows where")
-    remedy = "see what ended another rank; the same command goes on from the last checkpoint"
-    return read_error(store) or TrainingError(where, f"has lost the others: {said}", remedy)
+    remedy = "see what ended another rank, and run the same command to continue"
+    return read_error(store) or TrainingError(where, f"has lost the other ranks: {said}", remedy)
 
 
 def write_error(store: dist.Store, rank: int, error: Exception) -> None:

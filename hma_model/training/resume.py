@@ -60,7 +60,7 @@ class State:
         before = {**Recipe().identity(), **self.recipe}  # keys added by later releases had their defaults
         changed = differences(before, recipe) + differences(self.data, data, "data")
         if changed:
-            fault = f"was begun with another recipe or other shards: {'; '.join(changed)}"
+            fault = f"was started with another recipe or other shards: {'; '.join(changed)}"
             remedy = "train into another folder, undo the change, or accept it with --force"
             raise RecipeError(where, fault, remedy)
 
@@ -72,10 +72,10 @@ def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
         old, new = getattr(before, item.name), getattr(now, item.name)
         if item.name in free or old == new:
             continue
-        fault = f"was begun with another network: {item.name} is {new!r}, there it is {old!r}"
+        fault = f"was started with another network: {item.name} is {new!r}, it was {old!r}"
         if item.name == "tokenizer":
             names = f"{old.get('name')!r}, now {new.get('name')!r}"
-            fault = f"was begun with another tokenizer: {names} or other weights of it"
+            fault = f"was started with another tokenizer: {names} or other weights of it"
         raise RecipeError(where, fault, "train into another folder; --force cannot accept this")
 
 
@@ -112,17 +112,13 @@ def _digest(values: Mapping[str, Any]) -> str:
 
 def require_version(path: Path) -> None:
     """Raise OtherVersionError unless this release can resume a run from the checkpoint in a folder."""
-    for file, key, own in (
-        (CONFIG, "format_version", FORMAT_VERSION),
-        (f"{TRAINING}/{STATE}", "version", VERSION),
-    ):
-        found = read_json(path / file).get(key, own)  # older releases wrote none
+    state = path / TRAINING / STATE
+    for file, key, own in ((path / CONFIG, "format_version", FORMAT_VERSION), (state, "version", VERSION)):
+        found = read_json(file).get(key, own)  # older releases wrote none
         if found != own:
-            newer = "update hma-toolkit, or begin" if found > own else "begin"
-            remedy = f"{newer} a new run from its weights with start={path}"
-            raise OtherVersionError(
-                path / file, f"is of {key} {found}, this release trains on with {own}", remedy
-            )
+            fault = f"is of {key} {found}, this release resumes from {own}"
+            remedy = "update hma-toolkit, or start" if found > own else "start"
+            raise OtherVersionError(file, fault, f"{remedy} a new run from its weights with start={path}")
 
 
 @dataclass(frozen=True)
@@ -165,7 +161,7 @@ def read_kept(checkpoint: Checkpoint, embodiments: Iterable[str]) -> Kept:
     values = read_json(path)
     stated = values.pop("sha256", None)  # an older release wrote neither this nor the files' hashes
     if stated is not None and stated != _digest(values):
-        raise CheckpointError(path, "is not what was written", "delete this checkpoint")
+        raise CheckpointError(path, "has changed since it was written", "delete this checkpoint")
     files = values.pop("files", None)
     if files is None:
         files = {name: "" for name in (OPTIMIZER, WEIGHTS) if (path.parent / name).is_file()}

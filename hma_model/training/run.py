@@ -93,7 +93,7 @@ class Run:
             raise RecipeError("recipe: data", "names no shards", "add data=[FOLDER, …]")
         self.out, self.device, self.world = out, device, world or World()
         if recipe.self_forward and recipe.parallel == "fsdp" and self.world.size > 1:
-            fault = "needs a network that each rank can call by itself"
+            fault = "does not work with parallel=fsdp on several ranks"
             raise RecipeError("recipe: self_forward", fault, "use parallel=ddp")
         self.sets = open_sets(recipe.data)
         self.start: Start | None = None
@@ -101,7 +101,11 @@ class Run:
             self.world.once(lambda: Start.bring(recipe, self.sets, self.out))
             self.start = Start.open(recipe, self.sets, self.out)
         elif recipe.freeze == "trunk":
-            raise RecipeError("recipe: freeze", "keeps a trunk that nothing has trained", "add start=…")
+            raise RecipeError(
+                "recipe: freeze",
+                "freezes a trunk that nothing has trained",
+                "name a trained checkpoint with start=…",
+            )
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
         self.recipe = recipe
@@ -422,9 +426,9 @@ class Run:
         self.evaluation = state.evaluation
         if state.norms:
             self.spike_detector.mean, self.spike_detector.count = state.norms[0], int(state.norms[1])
-        self.notes += [*notes, f"going on from step {state.step}"]
+        self.notes += [*notes, f"resuming from step {state.step}"]
         if fault := self.train_data.load_state(state.sampler, force):
-            self.notes.append(f"the sampler begins anew: {fault}")
+            self.notes.append(f"the sampler starts again: {fault}")
         return kept
 
     def _adopt(self, checkpoint: Checkpoint) -> list[str]:
@@ -432,18 +436,18 @@ class Run:
         notes = []
         for name, shards in self.sets.items():
             if name not in checkpoint.embodiments:
-                notes.append(f"{name} is new here: fresh stem and head")
+                notes.append(f"{name} is new in this run and gets a new stem and head")
                 continue
             stats = checkpoint.stats(name)
             space = ActionSpace.of(shards.embodiment, action_stats(stats, name))
             if not self.model.embodiments[name].agrees_with(space):
                 self.stats[name] = stats
-                notes.append(f"{name} keeps the statistics it was begun with")
+                notes.append(f"{name} keeps the statistics that its stem was trained with")
         if notes:
             self.model = self._fresh_model()
         left = sorted(set(checkpoint.embodiments) - set(self.sets))
         if left and not (self.start and self.start.frozen):
-            notes.append(f"left out of checkpoints from here on: {', '.join(left)}")
+            notes.append(f"the next checkpoints leave out: {', '.join(left)}")
         return notes
 
     def _describe(self) -> None:

@@ -40,7 +40,7 @@ def choose_device(name: str) -> torch.device:
     device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if name == "cuda" else name)
     there = {"cuda": cuda and (device.index or 0) < torch.cuda.device_count(), "mps": mps, "cpu": True}
     if not there[device.type]:
-        raise RecipeError("recipe: device", f"{name} is not there", "use device=auto or device=cpu")
+        raise RecipeError("recipe: device", f"this machine has no {name}", "use device=auto or device=cpu")
     return device
 
 
@@ -88,7 +88,7 @@ def own_folder(out: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as fault:
-            raise OutputError(out, "another training is at work here", "wait for it or stop it") from fault
+            raise OutputError(out, "another training uses this folder", "wait for it or stop it") from fault
         except OSError:  # some file systems of clusters have no locks
             pass
         try:
@@ -114,7 +114,7 @@ def run_errors(out: Path) -> Iterator[None]:
         yield
     except OSError as fault:
         where, why = fault.filename or out, fault.strerror or str(fault)
-        remedy = "free space or choose another folder; checkpoints that are there are intact"
+        remedy = "free space or choose another folder; existing checkpoints are intact"
         raise OutputError(where, f"cannot be written: {why}", remedy) from fault
     except (RuntimeError, MemoryError) as fault:
         text = str(fault).partition("\n")[0][:200]
@@ -147,7 +147,7 @@ def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen
         there = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     if needed > there:
         needs = f"{values / 1e9:,.1f} billion weights take {needed / 2**30:,.0f} GiB in training"
-        fault = f"{needs}, here are {there / 2**30:,.0f} GiB"
+        fault = f"{needs}, this device has {there / 2**30:,.0f} GiB"
         raise RecipeError("recipe: model", fault, "lower model.width or model.layers")
 
 

@@ -56,7 +56,7 @@ def test_a_revision_is_the_one_that_is_fetched(published, leg, tmp_path, form):
     new = tune(REPO, leg, tmp_path / "run1")
     trunks = [Checkpoint.open(result.checkpoint).trunk_sha256 for result in (old, new)]
     assert trunks[1] == other.trunk_sha256 != trunks[0]
-    with pytest.raises(RecipeError, match=f"was begun from {REPO}, not from .*{REPO}@{first}"):
+    with pytest.raises(RecipeError, match=f"was started from {REPO}, not from .*{REPO}@{first}"):
         tune(form.format(REPO, first), leg, tmp_path / "run1")
 
 

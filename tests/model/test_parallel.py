@@ -120,7 +120,7 @@ def test_a_sharded_run_cut_on_two_ranks_goes_on_on_one(recipe, alone, tmp_path):
 def test_a_run_cut_on_one_rank_goes_on_on_two(recipe, alone, tmp_path):
     train_until(recipe(), tmp_path / "run", 3)
     told = spread(recipe(parallel="fsdp"), tmp_path / "run")
-    assert "going on from step 2" in told
+    assert "resuming from step 2" in told
     assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4)
     close(alone.checkpoint, checkpoint.resolve(tmp_path / "run"))
 
@@ -129,7 +129,7 @@ def test_a_step_shared_otherwise_goes_on_with_windows_anew_and_says_so(recipe, t
     given = recipe(accumulate=1, batch_size=4)
     train_until(given, tmp_path / "run", 3)
     told = spread(given, tmp_path / "run")
-    assert "the sampler begins anew: " in told and "is of 1 passes a step, this run has 2" in told
+    assert "the sampler starts again: " in told and "has 1 passes a step, this run has 2" in told
     assert len(curve(tmp_path / "run")) == 6
 
 
