@@ -87,13 +87,14 @@ def _medians(rounds: list[dict[str, float]]) -> dict[str, float]:
 @contextmanager
 def _environment(values: dict[str, str]) -> Iterator[None]:
     """Set exactly these variables of OpenMP for processes that start in the block."""
-    before = {key: os.environ.pop(key) for key in _OURS if key in os.environ}
+    before = dict(os.environ)
+    for key in _OURS:
+        os.environ.pop(key, None)
     os.environ.update(values)
     try:
         yield
     finally:
-        for key in values:
-            del os.environ[key]
+        os.environ.clear()
         os.environ.update(before)
 
 

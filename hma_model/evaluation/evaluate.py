@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 BASELINE_FRAMES = 200_000
 PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
 
-RealFrames = Callable[[int, NDArray[np.int64]], NDArray[np.uint8]]
-
 
 class Sampling(TypedDict, total=False):
     """Options of `HMA.generate` that a rollout passes on to it."""
@@ -109,17 +107,15 @@ def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
     return validation_losses(model, batches)[0].mean()
 
 
-def digit_frequencies(
-    shards: ShardSet, split: str = "train", max_frames: int = BASELINE_FRAMES
-) -> list[NDArray[np.float64]]:
-    """Return the frequency of each value of each digit: F arrays (V,), add-one smoothed, summing to one.
+def digit_frequencies(shards: ShardSet, max_frames: int = BASELINE_FRAMES) -> list[NDArray[np.float64]]:
+    """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
 
-    In a split of more than `max_frames` frames, only row groups spread evenly over it are counted, about
-    `max_frames` frames at most.
+    Of more than `max_frames` frames, only row groups spread evenly over them are counted, about `max_frames`
+    frames at most.
     """
     factored = shards.spec.factored or (shards.spec.vocab_size or 1,)
     counts = [np.ones(values) for values in factored]
-    files = list(zip(shards.shards(split), shards.row_groups(split)))
+    files = list(zip(shards.shards("train"), shards.row_groups("train")))
     groups = [(name, group) for name, rows in files for group in range(len(rows))]
     stride = max(1, -(-sum(sum(rows) for _, rows in files) // max_frames))
     column = token_column(shards.spec)[0]
@@ -252,10 +248,9 @@ def evaluate(
     prompt: int | None = None,
     batch_size: int = 16,
     seed: int = 0,
-    real: RealFrames | None = None,
     **sampling: Unpack[Sampling],
 ) -> dict[str, Any]:
-    """Compute a model's figures on one shard set.
+    """Compute a model's figures on one shard set; rollouts are compared with the decoded true tokens.
 
     Args:
         model: a model that has the embodiment of the shard set.
@@ -266,8 +261,6 @@ def evaluate(
         frames: T of a window; by default the model's.
         prompt: true frames a rollout starts from.
         seed: of the rollouts.
-        real: returns the recorded frames of (episode_index, (n,) frame indices) at the tokenizer's size. The
-            rollouts are compared with them; by default they are compared with the decoded true tokens.
         sampling: options of `HMA.generate` for the rollouts.
 
     Returns:
@@ -299,9 +292,8 @@ def evaluate(
         other = roll(actions=shuffled_actions(batch, first - 1, seed), truth=true.truth)
         still = true.predicted.copy()
         still[:, first:] = still[:, first - 1 : first]
-        truth = true.truth if real is None else _real(real, batch, shards)
         for name, made in (("true", true.predicted), ("shuffled", other.predicted), ("copy", still)):
-            rollouts[name].append(Pictures(first, made, truth))
+            rollouts[name].append(Pictures(first, made, true.truth))
     scores = {name: _scores(parts) for name, parts in rollouts.items()}
     return {
         "embodiment": shards.embodiment.id,
@@ -309,7 +301,7 @@ def evaluate(
         "windows": sum(len(part.truth) for part in rollouts["true"]),
         "frames": length,
         "prompt": first,
-        "against": "decoded tokens" if real is None else "real frames",
+        "against": "decoded tokens",
         **table,
         **scores,
         "psnr_action_gain_last": scores["true"]["psnr_last"] - scores["shuffled"]["psnr_last"],
@@ -345,13 +337,6 @@ def _scores(parts: list[Pictures]) -> dict[str, Any]:
         "psnr_by_frame": [round(float(value), 3) for value in by_frame],
         "ssim": float(np.concatenate(similarity).mean()),
     }
-
-
-def _real(real: RealFrames, batch: Batch, shards: ShardSet) -> NDArray[np.uint8]:
-    assert batch.episode is not None and batch.frame is not None
-    rows = batch.frame.numpy()[:, None] + np.arange(batch.actions.shape[1]) * shards.row_stride
-    recorded = rows * shards.manifest.frame_stride
-    return np.stack([real(int(e), frames) for e, frames in zip(batch.episode, recorded)])
 
 
 def _opened(item: StrPath | ShardSet) -> ShardSet:

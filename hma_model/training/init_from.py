@@ -54,11 +54,11 @@ class Start:
 
         assert recipe.start is not None
         frozen, place = recipe.freeze == "trunk", out / START
-        source, revision = hub.addressed(recipe.start)
-        local = not hub.is_repository(source) and "://" not in source
         if (place / checkpoints.README).is_file():  # written last
             _require_source(recipe.start, out)
             return
+        source, revision = hub.addressed(recipe.start)
+        local = not hub.is_repository(source) and "://" not in source
         if local:
             found = Checkpoint.open(checkpoints.resolve(Path(source).expanduser()))
             require_tokenizer(found.config, _spec(sets), found.folder)

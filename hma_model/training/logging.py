@@ -163,8 +163,8 @@ class RunLog:
 
     Args:
         out: the run's folder.
-        steps: the number of steps of the whole run.
-        begin: the number of finished steps; later lines of an earlier, killed run are dropped.
+        steps, begin: the steps of the whole run, and how many are finished; lines of later steps, which an
+            earlier, killed session has written, are dropped.
         show: print progress to standard error.
         write: write metrics.jsonl; only the first rank does.
         trackers: the trackers that get the same figures.
@@ -183,9 +183,10 @@ class RunLog:
             write_atomic(self._path, "".join(_line(values) for values in kept))
         self._recent: dict[str, deque[float]] = {}
         self._last: dict[str, Any] = {}
-        self._evaluation: dict[str, Any] = next(
-            (line for line in reversed(kept) if line["kind"] == "eval"), {}
-        )
+        self._evaluation: dict[str, Any] = {}
+        for line in kept:
+            if line["kind"] == "eval":
+                self._evaluation = line
         self._paces: deque[float] = deque(maxlen=PACING)  # seconds of steps of this session
         self._spent, self._shown, self._said = 0.0, 0.0, ""
         self._opened = time.monotonic()
@@ -310,16 +311,12 @@ class RunLog:
         ignoring = self._evaluation.get("baseline_by_embodiment", {})
         for name, loss in self._smooth().items():
             known = [_number(values.get(name)) for values in (held, ignoring)]
-            table.add_row(name, f"{loss:.3f}", _rounded(perplexity(loss)) if self._nats else "-", *known)
+            table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.1f}" if self._nats else "-", *known)
         last = self._last
         head = f"step {last['step']:,}/{self._steps:,}   {rate:.1f} windows/s   {left} left"
         rest = f"lr {last['lr']:.2e}   {last.get('memory_mib', 0):,.0f} MiB"
         skipped = f"   {last['skipped']} steps skipped" if last.get("skipped") else ""
         return Group(f"{head}   {rest}{skipped}", table)
-
-
-def _rounded(value: float) -> str:
-    return f"{value:,.1f}" if value < 100 else f"{value:,.0f}"
 
 
 def _number(value: float | None) -> str:

@@ -259,18 +259,6 @@ def test_a_perfect_model_has_the_highest_psnr_and_loses_it_with_shuffled_actions
     assert figures["copy"]["psnr"] < 60
 
 
-def test_rollouts_are_held_against_real_frames_where_they_are_given(model, data):
-    asked = []
-
-    def real(episode: int, frames: np.ndarray) -> np.ndarray:
-        asked.append((episode, frames.tolist()))
-        return np.full((len(frames), 16, 16, 3), 36, np.uint8)
-
-    figures = evaluate(model, Blocks(), data, count=2, real=real, prompt=1)
-    assert figures["against"] == "real frames"
-    assert asked == [(5, [0, 2, 4, 6]), (5, [16, 18, 20, 22])]
-
-
 def test_a_model_of_another_tokenizer_is_refused(data):
     other = CONFIG.replace(tokenizer={**SPEC.to_json(), "version": 2})
     with pytest.raises(CheckpointError, match="version is 2 there and 1 here"):
