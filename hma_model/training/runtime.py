@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
@@ -96,9 +96,10 @@ def own_folder(out: Path) -> Iterator[None]:
         except HMAError:
             if not begun and {path.name for path in out.iterdir()} <= {LOCK, START}:
                 shutil.rmtree(out / START, ignore_errors=True)
-                (out / LOCK).unlink()
-                for path in made:
-                    path.rmdir()
+                with suppress(OSError):  # another run has written into one of these folders
+                    (out / LOCK).unlink()
+                    for path in made:
+                        path.rmdir()
             raise
 
 
