@@ -4,17 +4,25 @@ Small models of several widths learn a synthetic world at several learning rates
 world consists of patterns of tokens that actions move along a line. With muP the best rate should stay the
 same as the width grows (Yang et al. 2022, arXiv 2203.03466); without muP it moves. `plot=FILE.svg` draws the
 losses over the rates.
+
+B batch, T frames, h,w token grid.
 """
 
 import math
 from pathlib import Path
 from statistics import fmean
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import UsageError
+from hma_data.storage.files import write_atomic
+from hma_model.config import ActionSpace, HMAConfig
 
 if TYPE_CHECKING:
+    import torch
     from matplotlib.axes import Axes
+
+    from hma_model.network.model import HMA
 
 ABOUT = "loss by learning rate and width, with muP and without: where the best rate lies"
 DEFAULTS: dict[str, Any] = {
@@ -26,6 +34,8 @@ DEFAULTS: dict[str, Any] = {
     "seeds": 1,
     "plot": "",
 }
+SPACE = ActionSpace("mover", 1, 1, (0.0,), (1.0,), (True,))
+_GRID, _FRAMES, _DIGITS, _PATTERNS = (4, 4), 4, (16, 16), 16
 _TAIL = 0.2  # the share of the steps, at the end, over which the loss is averaged
 
 
@@ -54,8 +64,6 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _end(settings: dict[str, Any], width: int, rate: float, mup: bool, base_width: int) -> float:
-    from hma_model.bench.mup_world import make_model, train
-
     ends = []
     for seed in range(settings["seeds"]):
         model = make_model(width, settings["layers"], mup, base_width, seed)
@@ -75,23 +83,80 @@ def _numbers(text: Any, kind: type) -> list[Any]:
     return values
 
 
+def windows(batch: int, generator: "torch.Generator") -> Any:
+    """Return a batch in which the action (B, T, 1) of -1, 0 or 1 shifts each frame to the next."""
+    import torch
+
+    cells = _GRID[0] * _GRID[1]
+    patterns = torch.randint(0, 256, (_PATTERNS, cells), generator=torch.Generator().manual_seed(0))
+    moves = torch.randint(-1, 2, (batch, _FRAMES), generator=generator)
+    start = torch.randint(0, cells, (batch, 1), generator=generator)
+    offset = start + torch.nn.functional.pad(moves[:, :-1], (1, 0)).cumsum(1)
+    index = (torch.arange(cells) + offset.unsqueeze(-1)) % cells
+    chosen = patterns[torch.randint(0, _PATTERNS, (batch,), generator=generator)]
+    tokens = chosen.unsqueeze(1).expand(-1, _FRAMES, -1).gather(2, index)
+    return SimpleNamespace(
+        tokens=tokens.unflatten(2, _GRID),
+        latents=None,
+        actions=moves.unsqueeze(-1).float(),
+        action_mask=torch.ones(batch, _FRAMES, dtype=torch.bool),
+        embodiment=[SPACE.id] * batch,
+    )
+
+
+def make_model(width: int, layers: int, mup: bool, base_width: int, seed: int = 0) -> "HMA":
+    """Return a model of the synthetic world."""
+    import torch
+
+    from hma_model.network.model import HMA
+
+    torch.manual_seed(seed)
+    config = HMAConfig(
+        layers=layers, width=width, heads=4, frames=_FRAMES, grid=_GRID, factored=_DIGITS, mup=mup,
+        base_width=base_width, label_smoothing=0.0, corrupt_max=0.0, history_probability=0.0,
+    )  # fmt: skip
+    model = HMA(config)
+    model.add_embodiment(SPACE)
+    return model.train()
+
+
+def train(model: "HMA", rate: float, steps: int, batch: int, seed: int = 0) -> list[float]:
+    """Train with AdamW at a constant rate until a loss is not finite; return all losses in nats a token."""
+    import torch
+
+    from hma_model.training.optim import parameter_groups
+
+    generator = torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.AdamW(parameter_groups(model, rate, 0.0), betas=(0.9, 0.95))
+    losses = []
+    for _ in range(steps):
+        out = model(windows(batch, generator), "forward", generator)
+        losses.append(out.loss.item())
+        if not math.isfinite(losses[-1]):
+            break
+        optimizer.zero_grad()
+        out.loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+    return losses
+
+
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw the loss over the learning rate: one curve a width, its best rate ringed; muP on the left."""
-    import matplotlib
     from matplotlib.figure import Figure
+
+    from hma_model.evaluation.pages import svg_bytes
 
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, name in zip(panels, ("muP", "standard")):
         _panel(axes, name, [row for row in rows if row["parametrisation"] == name])
-    panels[0].set_ylabel("loss at the end, nats a token")
     panels[0].legend(frameon=False, fontsize=9)
-    with matplotlib.rc_context({"svg.hashsalt": "hma", "svg.fonttype": "path"}):
-        figure.savefig(path, format="svg", metadata={"Date": None})
+    write_atomic(path, svg_bytes(figure))
 
 
 def _panel(axes: "Axes", name: str, rows: list[dict[str, Any]]) -> None:
-    from hma_model.evaluation.plots import COLOURS, MARKERS, STYLES
+    from hma_model.evaluation.pages import COLOURS, MARKERS, STYLES, label_axes
 
     for i, width in enumerate(sorted({row["width"] for row in rows})):
         chosen = [row for row in rows if row["width"] == width and row["nats_a_token"] is not None]
@@ -102,7 +167,5 @@ def _panel(axes: "Axes", name: str, rows: list[dict[str, Any]]) -> None:
         ring = [(row["lr"], row["nats_a_token"]) for row in chosen if row["best"]]
         axes.plot(*zip(*ring), ls="", marker="o", ms=13, mfc="none", color=colour)
     axes.set_xscale("log", base=2)
-    axes.set_xlabel("learning rate")
     axes.set_title(name, fontsize=10)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
+    label_axes(axes, "learning rate", "loss at the end, nats a token" if name == "muP" else "")

@@ -10,16 +10,8 @@ from statistics import median
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from hma_model.bench.generate import (
-    PRECISIONS,
-    ROBOT,
-    check,
-    device_name,
-    finish,
-    in_fresh_process,
-    make_model,
-    memory,
-)
+from hma_model import bench
+from hma_model.bench import ROBOT, device_name, finish, in_fresh_process, make_model, memory, random_frames
 
 if TYPE_CHECKING:
     import torch
@@ -28,26 +20,13 @@ if TYPE_CHECKING:
 
 ABOUT = "seconds and memory of a training step"
 DEFAULTS: dict[str, Any] = {
-    "kind": "discrete",  # discrete | continuous | both
+    **bench.DEFAULTS,  # bf16: products in bf16, weights in fp32
+    "kind": "discrete",
     "steps": 3,  # measured, after a warm-up
     "batch": 2,
-    "window": 12,
-    "precision": "fp32",  # fp32 | bf16: products in bf16, weights in fp32
-    "device": "auto",
-    "compile": False,
     "checkpointing": False,  # recompute each block in the backward pass
     "optimizer": True,
-    "layers": 32,
-    "width": 256,
-    "heads": 8,
-    "conditioning": "modulation",
-    "action_tokens": 1,
-    "action_dims": 35,  # of a chunk
-    "diffusion_width": 1024,
-    "threads": 0,  # 0: torch's choice
 }
-_KINDS = ("discrete", "continuous")
-_PEAKS = {"H200": 989e12, "H100": 989e12, "A100": 312e12, "L40": 181e12, "4090": 165e12}  # bf16, dense
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -56,9 +35,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     Raises:
         UsageError: a setting has a value that is not allowed.
     """
-    check("train", settings, kind=(*_KINDS, "both"), precision=PRECISIONS)
-    kinds = _KINDS if settings["kind"] == "both" else (settings["kind"],)
-    return [in_fresh_process(measure, settings, kind) for kind in kinds]
+    return [in_fresh_process(measure, settings, kind) for kind in bench.kinds("train", settings)]
 
 
 def measure(settings: dict[str, Any], kind: str) -> dict[str, Any]:
@@ -68,16 +45,15 @@ def measure(settings: dict[str, Any], kind: str) -> dict[str, Any]:
     if settings["compile"]:
         model.trunk.compile()
     seconds = _step_seconds(model, settings)
+    told = ("precision", "batch", "window", "optimizer", "compile", "checkpointing")
     return {
         "kind": kind,
         "device": device_name(model.device),
-        **{key: settings[key] for key in ("precision", "batch", "window", "optimizer", "compile")},
-        "checkpointing": settings["checkpointing"],
+        **{key: settings[key] for key in told},
         "seconds_per_step": round(min(seconds), 4),
         "median_seconds_per_step": round(median(seconds), 4),
         "windows_per_second": round(settings["batch"] / min(seconds), 4),
         **memory(model.device),
-        **_used(model, settings, min(seconds)),
     }
 
 
@@ -107,41 +83,14 @@ def _step_seconds(model: "HMA", settings: dict[str, Any]) -> list[float]:
 def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator") -> Any:
     import torch
 
-    config, b, t = model.config, settings["batch"], settings["window"]
-    tokens = latents = None
-    if config.kind == "discrete":
-        tokens = torch.randint(0, config.vocab_size, (b, t, *config.grid), generator=generator)
-    else:
-        latents = torch.randn(b, t, config.channels, *config.grid, generator=generator)
+    b, t = settings["batch"], settings["window"]
+    frames = random_frames(model, b, t, generator)
     actions = torch.randn(b, t, settings["action_dims"], generator=generator)
+    discrete = model.config.kind == "discrete"
     return SimpleNamespace(
         embodiment=[ROBOT] * b,
         actions=actions.to(model.device),
         action_mask=torch.ones(b, t, dtype=torch.bool, device=model.device),
-        tokens=None if tokens is None else tokens.to(model.device),
-        latents=None if latents is None else latents.to(model.device),
+        tokens=frames if discrete else None,
+        latents=None if discrete else frames,
     )
-
-
-def step_flops(model: "HMA", settings: dict[str, Any]) -> int:
-    """Return the floating point operations of a step's products, without the readout.
-
-    The backward pass counts as two forward passes. A recomputed forward pass does not count, because it is no
-    useful work.
-    """
-    config = model.config
-    frames, tokens = settings["batch"] * settings["window"], config.tokens_per_frame + config.appended_tokens
-    linear = sum(p.numel() for p in model.trunk.blocks.parameters() if p.ndim == 2) * frames * tokens
-    space = 2 * config.layers * frames * tokens**2 * config.width
-    time_ = config.layers * frames * tokens * (settings["window"] + 1) * config.width
-    return 3 * 2 * (linear + space + time_)
-
-
-def _used(model: "HMA", settings: dict[str, Any], seconds: float) -> dict[str, float]:
-    """Return the operations a second and, for a known GPU, their share of its peak."""
-    rate = step_flops(model, settings) / seconds
-    figures = {"teraflop_per_second": round(rate / 1e12, 3)}
-    peak = next((value for name, value in _PEAKS.items() if name in device_name(model.device)), None)
-    if peak is not None:
-        figures["mfu"] = round(rate / peak, 4)
-    return figures

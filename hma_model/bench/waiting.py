@@ -16,9 +16,9 @@ from statistics import median
 from typing import Any
 
 from hma_data.cpu import usable_cores
+from hma_model.bench import check, in_fresh_process, make_model
 from hma_model.bench import generate as bench_generate
 from hma_model.bench import train as bench_train
-from hma_model.bench.generate import check, in_fresh_process, make_model
 
 ABOUT = "training steps and frames a second by how threads wait for one another"
 DEFAULTS: dict[str, Any] = {
@@ -87,13 +87,14 @@ def _medians(rounds: list[dict[str, float]]) -> dict[str, float]:
 @contextmanager
 def _environment(values: dict[str, str]) -> Iterator[None]:
     """Set exactly these variables of OpenMP for processes that start in the block."""
-    before = {key: os.environ.pop(key) for key in _OURS if key in os.environ}
+    before = dict(os.environ)
+    for key in _OURS:
+        os.environ.pop(key, None)
     os.environ.update(values)
     try:
         yield
     finally:
-        for key in values:
-            del os.environ[key]
+        os.environ.clear()
         os.environ.update(before)
 
 

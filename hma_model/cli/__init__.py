@@ -27,9 +27,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Robot recordings to tokenized shards, to a world model, to the hub. Add --debug for tracebacks.",
 )
-_Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[
-    2
-]  # ClickException, wherever typer keeps its click
+_Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[2]  # ClickException of typer's click
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -82,10 +80,10 @@ Checkpoint = Annotated[
     str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
 Data = Annotated[Path, typer.Argument(help="A shard set.")]
-UnmaskSteps = Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps a frame.")]
+UnmaskSteps = Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps of a frame.")]
 SampleSteps = Annotated[
     int | None,
-    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; default its own."),
+    typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
 ]
 
 
@@ -95,10 +93,10 @@ def demo(
         "hma-demo"
     ),
     episodes: Annotated[
-        int, typer.Option("--episodes", min=4, help="Recorded for each of the two robots.")
+        int, typer.Option("--episodes", min=4, help="Episodes of each of the two robots.")
     ] = 24,
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Of training.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of recording and training.")] = 0,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Number of training steps.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of recording and training.")] = 0,
 ) -> None:
     """Run the whole pipeline, small: record, convert, mix, train, publish, roll out, report.
 
@@ -115,37 +113,28 @@ def evaluate(
     checkpoint: Checkpoint,
     data: Data,
     split: Annotated[str, typer.Option("--split", help="train or val.")] = "val",
-    windows: Annotated[int, typer.Option("--windows", min=1, help="How many, evenly spaced.")] = 64,
+    windows: Annotated[int, typer.Option("--windows", min=1, help="Number of windows, evenly spaced.")] = 64,
     frames: Annotated[
-        int | None, typer.Option("--frames", min=2, help="Of a window; default the model's.")
+        int | None, typer.Option("--frames", min=2, help="Frames of a window; by default the model's.")
     ] = None,
-    prompt: Annotated[int | None, typer.Option("--prompt", min=1, help="True frames to start from.")] = None,
+    prompt: Annotated[
+        int | None, typer.Option("--prompt", min=1, help="Number of true frames to start from.")
+    ] = None,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the rollouts.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
     json: Json = False,
 ) -> None:
     """Measure the loss and its baseline, and rollouts with true and shuffled actions.
 
     Example: hma evaluate runs/first shards/my_arm
     """
-    from hma_data.shards.preview import tokenizer_of
-    from hma_data.shards.reader import ShardSet
     from hma_model.evaluation.evaluate import evaluate as run
 
-    shards = ShardSet(data)
     found = run(
-        _model(checkpoint, shards.embodiment.id),
-        tokenizer_of(shards),
-        shards,
-        split=split,
-        count=windows,
-        frames=frames,
-        prompt=prompt,
-        unmask_steps=unmask_steps,
-        sample_steps=sample_steps,
-        seed=seed,
-    )
+        *_opened(checkpoint, data), split=split, count=windows, frames=frames, prompt=prompt, seed=seed,
+        unmask_steps=unmask_steps, sample_steps=sample_steps,
+    )  # fmt: skip
     if json:
         print_json(found)
         return
@@ -164,9 +153,10 @@ def generate(
     split: Annotated[str, typer.Option("--split", help="train or val.")] = "val",
     window: Annotated[int, typer.Option("--window", min=0, help="Number of the window to start at.")] = 0,
     frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="To predict; default to the window's end.")
+        int | None,
+        typer.Option("--frames", min=1, help="Frames to predict; by default to the end of the window."),
     ] = None,
-    prompt: Annotated[int, typer.Option("--prompt", min=1, help="True frames to start from.")] = 2,
+    prompt: Annotated[int, typer.Option("--prompt", min=1, help="Number of true frames to start from.")] = 2,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
     temperature: Annotated[
@@ -178,34 +168,26 @@ def generate(
 
     Example: hma generate runs/first shards/my_arm --out rollout.mp4
     """
-    from hma_data.shards.preview import tokenizer_of
-    from hma_data.shards.reader import ShardSet
     from hma_model.evaluation.rollout_video import rollout_video, write_video
 
-    shards = ShardSet(data)
     film = rollout_video(
-        _model(checkpoint, shards.embodiment.id),
-        tokenizer_of(shards),
-        shards,
-        split=split,
-        window=window,
-        frames=frames,
-        prompt=prompt,
-        unmask_steps=unmask_steps,
-        sample_steps=sample_steps,
-        temperature=temperature,
-        seed=seed,
-    )
+        *_opened(checkpoint, data), split=split, window=window, frames=frames, prompt=prompt, seed=seed,
+        unmask_steps=unmask_steps, sample_steps=sample_steps, temperature=temperature,
+    )  # fmt: skip
     write_video(out, film)
-    print(
-        f"wrote {out}: {len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
-    )
+    about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
+    print(f"wrote {out}: {about}")
 
 
-def _model(checkpoint: str, embodiment: str) -> Any:
+def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
+    """Return the model with the shard set's embodiment, its tokenizer, and the shard set."""
+    from hma_data.shards.preview import tokenizer_of
+    from hma_data.shards.reader import ShardSet
     from hma_model.network.model import HMA
 
-    return HMA.from_pretrained(checkpoint, embodiments=[embodiment]).eval()
+    shards = ShardSet(data)
+    model = HMA.from_pretrained(checkpoint, embodiments=[shards.embodiment.id])
+    return model.eval(), tokenizer_of(shards), shards
 
 
 mount(app)

@@ -12,7 +12,7 @@ Embodiments = Annotated[
     list[str] | None, typer.Option("--embodiment", "-e", help="Only this robot; repeat for more.")
 ]
 Revision = Annotated[str | None, typer.Option("--revision", help="Branch, tag or commit.")]
-Private = Annotated[bool, typer.Option("--private", help="Make a new repository a private one.")]
+Private = Annotated[bool, typer.Option("--private", help="Create a new repository as a private one.")]
 hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, one robot at a time.")
 
 
@@ -43,7 +43,7 @@ def push(
 def pull(
     source: Annotated[str, typer.Argument(help="A folder, or org/name on the hub.")],
     embodiment: Embodiments = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder; default the local cache.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder; by default the local cache.")] = None,
     revision: Revision = None,
 ) -> None:
     """Fetch the trunk and only the chosen robots.
@@ -71,21 +71,16 @@ def listing(
     if json:
         print_json(found[0] if len(found) == 1 else {"checkpoints": found})
         return
-    columns = ["robot", "action_dim", "chunk_dim", "hz", *FIGURES, "licence"]
+    columns = ["embodiment", "robot", "action_dim", "chunk_dim", "hz", *FIGURES, "licence"]
     for facts in found:
         rows = [
-            [
-                _cell(row["embodiment"]),
-                *(_cell(row[key]) for key in columns),
-                _megabytes(row["bytes"]),
-                _state(row),
-            ]
+            [*(_cell(row[key]) for key in columns), _megabytes(row["bytes"]), _state(row)]
             for row in facts["embodiments"]
         ]
         print(_summary(facts))
+        shown = [i for i in range(len(columns) + 2) if i == 0 or any(row[i] is not None for row in rows)]
         if rows:
-            shown = [i for i in range(len(rows[0])) if i == 0 or any(row[i] is not None for row in rows)]
-            names = ["embodiment", *columns, "MB", "state"]
+            names = [*columns, "MB", "state"]
             print_table([names[i] for i in shown], [[row[i] for i in shown] for row in rows])
 
 
@@ -124,8 +119,10 @@ def import_released(
     source: Annotated[str, typer.Argument(help="A released checkpoint: a folder, or org/name on the hub.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the new checkpoint.")],
     embodiment: Embodiments = None,
-    grid: Annotated[tuple[int, int] | None, typer.Option("--grid", help="h w, if not square.")] = None,
-    tokenizer: Annotated[str | None, typer.Option("--tokenizer", help="Default the paper's.")] = None,
+    grid: Annotated[
+        tuple[int, int] | None, typer.Option("--grid", help="Height and width, if not square.")
+    ] = None,
+    tokenizer: Annotated[str | None, typer.Option("--tokenizer", help="By default the paper's.")] = None,
     revision: Revision = None,
     json: Json = False,
 ) -> None:
@@ -168,13 +165,9 @@ def _summary(facts: dict[str, Any]) -> str:
         parts.append(f"{_cell(model.get('layers'))} layers, width {_cell(model.get('width'))}")
     if tokenizer:
         parts.append(f"tokenizer {_cell(tokenizer.get('name'))}")
-    trunk = (
-        f"trunk {_cell(facts['trunk_sha256'])[:12]}, "
-        if isinstance(facts["trunk_sha256"], str)
-        else "weights "
-    )
-    size = _megabytes(facts["trunk_bytes"])
-    parts.append(f"{trunk}{'not in the cache' if size is None else f'{size} MB'}")
+    sha256, size = facts["trunk_sha256"], _megabytes(facts["trunk_bytes"])
+    trunk = f"trunk {_cell(sha256)[:12]}, " if isinstance(sha256, str) else "weights "
+    parts.append(trunk + ("not in the cache" if size is None else f"{size} MB"))
     if facts["from_cache"]:
         parts.append("the hub is out of reach, this is what the cache has")
     return f"{_cell(facts['checkpoint'], 1000)}: {'; '.join(parts)}; {_state(facts)}"

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,7 +15,7 @@ Overrides = Annotated[
     list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Dotted overrides of the recipe.")
 ]
 Out = Annotated[Path | None, typer.Option("--out", help="The run's folder.")]
-Force = Annotated[bool, typer.Option("--force", help="Go on although recipe or shards changed.")]
+Force = Annotated[bool, typer.Option("--force", help="Resume although the recipe or the shards changed.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -37,7 +37,7 @@ def train(
     Example: hma train discrete_tiny data=[shards/my_arm] --out runs/first
     """
     from hma_model.training.loop import train as run
-    from hma_model.training.rank_errors import report_once
+    from hma_model.training.parallel import report_once
     from hma_model.training.recipe import load_recipe
 
     with report_once():
@@ -70,32 +70,19 @@ def finetune(
 
     Example: hma finetune --from team/model --data shards/my_arm --freeze-trunk --out runs/my_arm
     """
-    from hma_model.training.finetune import finetune as run
-    from hma_model.training.rank_errors import report_once
+    from hma_model.training.loop import finetune as run
+    from hma_model.training.parallel import report_once
 
-    given = overrides or []
-    folders = [*data, *(Path(text) for text in given if "=" not in text)]
-    changes = [text for text in given if "=" in text]
+    words = overrides or []
+    folders = [*data, *(Path(word) for word in words if "=" not in word)]
+    options: dict[str, Any] = {"out": out, "freeze_trunk": freeze_trunk, "recipe": recipe, "force": force}
     with report_once():
-        result = run(
-            source,
-            folders,
-            out=out,
-            freeze_trunk=freeze_trunk,
-            overrides=changes,
-            recipe=recipe,
-            force=force,
-        )
+        result = run(source, folders, overrides=[word for word in words if "=" in word], **options)
     _tell(result, json)
 
 
 def _tell(result: "TrainResult", json: bool) -> None:
-    if os.environ.get("RANK", "0") == "0":
-        _print(result, json)
-    raise typer.Exit(130 if result.interrupted else 0)
-
-
-def _print(result: "TrainResult", json: bool) -> None:
+    """Print the result on rank 0, and exit."""
     facts = {
         "out": str(result.out),
         "checkpoint": str(result.checkpoint),
@@ -106,15 +93,21 @@ def _print(result: "TrainResult", json: bool) -> None:
         "skipped_steps": result.skipped,
         "interrupted": result.interrupted,
     }
-    if json:
-        print_json(facts)
-        return
+    if os.environ.get("RANK", "0") == "0":
+        if json:
+            print_json(facts)
+        else:
+            _print(result)
+    raise typer.Exit(130 if result.interrupted else 0)
+
+
+def _print(result: "TrainResult") -> None:
     done = f"step {result.step:,}, {human_seconds(result.seconds)}"
     print(f"{result.out}: {done}, checkpoint {result.checkpoint}")
     found, base = result.masked_val_loss, result.baseline
     if found is not None and base is not None:
-        print(f"held-out loss {found:.4f} nats a token; looking at nothing {base:.4f}")
+        print(f"held-out loss {found:.4f} nats a token; token frequencies alone {base:.4f}")
     if result.skipped:
-        print(f"{result.skipped} steps were left out; see skipped in {result.out}/metrics.jsonl")
+        print(f"{result.skipped} steps were skipped; see skipped in {result.out}/metrics.jsonl")
     if (result.out / "report.html").is_file():
         print(f"open {result.out}/report.html")

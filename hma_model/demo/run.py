@@ -14,7 +14,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hma_data import lab
 from hma_data.console import human_bytes, human_seconds, progress
@@ -23,16 +27,22 @@ from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.cpu import usable_cores
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.images import prepare
+from hma_data.episodes.sheets import grid, png_bytes, webp_bytes
 from hma_data.errors import OutputError, ShardError
 from hma_data.loading.dataset import open_sets
-from hma_data.loading.mixture import Mixture
+from hma_data.loading.mixture import Mixture, plot_mixture
 from hma_data.registry.embodiment import find
 from hma_data.shards.manifest import MANIFEST
+from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.shards.windows import WindowIndex
+from hma_data.sources.base import open_source
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
+from hma_model.evaluation.pages import Page, loss_curves, psnr_over_horizon
 
 if TYPE_CHECKING:
     from hma_model.evaluation.rollout_video import RolloutVideo
@@ -44,35 +54,34 @@ TIMINGS, RESULTS = "timings.json", "results.json"
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
 LONGEST = 24  # frames of the film
 
+OWN_DATA = """
+hma inspect DATA                                          # what is in the recording
+hma registry infer DATA --id my_arm --out my_arm.yaml     # its YAML; answer the TODOs in it
+hma registry validate my_arm.yaml
+hma convert -e my_arm.yaml --source DATA --out shards/my_arm
+hma shards verify shards/my_arm
+hma shards preview shards/my_arm                          # sheet.png and preview.mp4 from the tokens
+hma train discrete_tiny data=[shards/my_arm] --out runs/my_arm
+hma evaluate runs/my_arm shards/my_arm
+hma generate runs/my_arm shards/my_arm --out rollout.mp4
+hma hub push runs/my_arm ./my-hub/team/model --embodiment my_arm
+"""
+
 
 @dataclass
 class Demo:
-    """The results of the demo so far; the report is written from them.
+    """The results of the demo so far; the report is written from them."""
 
-    Attributes:
-        out: the folder of the demo.
-        recordings: robot -> URI.
-        sets: robot -> shard set.
-        mixture: over the train windows.
-        training: result of the run.
-        published, pulled: folders of the hub, and of each robot's pulled checkpoint.
-        figures: robot -> the result of `evaluate` on its held-out windows.
-        films: robot -> a held-out rollout.
-        seconds: stage -> wall time.
-        sizes: name of a file or folder -> bytes.
-    """
-
-    out: Path
-    recordings: dict[str, Path] = field(default_factory=dict)
+    out: Path  # the folder of the demo
+    recordings: dict[str, Path] = field(default_factory=dict)  # by robot, as all that follow
     sets: dict[str, ShardSet] = field(default_factory=dict)
-    mixture: Mixture | None = None
-    training: Any = None
-    published: Path | None = None
-    pulled: dict[str, Path] = field(default_factory=dict)
-    figures: dict[str, dict[str, Any]] = field(default_factory=dict)
-    films: dict[str, "RolloutVideo"] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    sizes: dict[str, int] = field(default_factory=dict)
+    mixture: Mixture | None = None  # over the train windows
+    training: Any = None  # the result of the run
+    pulled: dict[str, Path] = field(default_factory=dict)  # checkpoints with one robot
+    figures: dict[str, dict[str, Any]] = field(default_factory=dict)  # of `evaluate` on held-out windows
+    films: dict[str, "RolloutVideo"] = field(default_factory=dict)  # a held-out rollout
+    seconds: dict[str, float] = field(default_factory=dict)  # stage -> wall time
+    sizes: dict[str, int] = field(default_factory=dict)  # name of a file or folder -> bytes
 
     @contextmanager
     def stage(self, number: int, name: str) -> Iterator[None]:
@@ -80,14 +89,9 @@ class Demo:
         print(f"[{number}/5] {name}", file=sys.stderr, flush=True)
         begun = time.monotonic()
         yield
-        self.took(name, time.monotonic() - begun)
-
-    def took(self, name: str, seconds: float) -> None:
-        """Record the time of a stage; a continued run keeps the larger of the times of its runs."""
-        path = self.out / TIMINGS
+        path = self.out / TIMINGS  # a continued run keeps the larger of the times of its sessions
         known = json.loads(path.read_text()) if path.is_file() else {}
-        known[name] = max(seconds, known.get(name, 0.0))
-        self.seconds[name] = known[name]
+        self.seconds[name] = known[name] = max(time.monotonic() - begun, known.get(name, 0.0))
         write_atomic(path, json.dumps(known))
 
 
@@ -121,24 +125,7 @@ def demo(out: StrPath, *, episodes: int = 24, steps: int | None = None, seed: in
     with made.stage(5, "roll out"):
         roll_out(made)
     write_results(made)
-    from hma_model.demo.report import write_report
-
     return write_report(made)
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """The result of the first stage for one robot.
-
-    Attributes:
-        refused: more episodes than allowed are in quarantine.
-    """
-
-    robot: str
-    recording: Path
-    splits: dict[str, int]
-    shard_bytes: int
-    refused: bool
 
 
 @dataclass(frozen=True)
@@ -149,28 +136,28 @@ class Recording:
     episodes: int
     seed: int
 
-    def __call__(self, workers: int) -> Callable[[str, Callable[[Any], None], Attempt], Recorded]:
-        """Return the function; it reports ("recorded" or "converted", episodes so far)."""
+    def __call__(
+        self, workers: int
+    ) -> Callable[[str, Callable[[Any], None], Attempt], tuple[str, Path, bool]]:
+        """Return the function; it reports ("recorded" or "converted", episodes so far).
 
-        def work(robot: str, report: Callable[[Any], None], attempt: Attempt) -> Recorded:
+        It returns the robot, its recording, and whether more episodes than allowed are in quarantine.
+        """
+
+        def work(robot: str, report: Callable[[Any], None], attempt: Attempt) -> tuple[str, Path, bool]:
             folder = self.out / "recordings"
-            there = sorted(folder.glob(f"{robot}*"))
-            recording = (
-                there[0]
-                if there
-                else lab.record(
+            recording = next(iter(sorted(folder.glob(f"{robot}*"))), None)
+            if recording is None:
+                recording = lab.record(
                     robot, folder, self.episodes, self.seed, lambda done, total: report(("recorded", done))
                 )
-            )
             report(("recorded", self.episodes))
             summary = convert(
                 find(robot), str(recording), TOKENIZER, self.out / "shards" / robot,
                 settings=Settings(val_fraction=0.15),
                 on_progress=lambda state: report(("converted", state.episodes)),
             )  # fmt: skip
-            splits = {name: split["episodes"] for name, split in summary.manifest.splits.items()}
-            size = summary.manifest.to_json()["totals"]["bytes"]
-            return Recorded(robot, recording, splits, size, summary.too_many)
+            return robot, recording, summary.too_many
 
         return work
 
@@ -183,7 +170,6 @@ def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
     finished = all((made.out / "shards" / robot / MANIFEST).is_file() for robot in ROBOTS)
     workers = 0 if finished or usable_cores() == 1 else len(ROBOTS)
     counts: dict[tuple[int, str], int] = {}
-    done: dict[str, Recorded] = {}
     with progress("record and convert", 2 * len(ROBOTS) * episodes, "episodes") as update:
 
         def show(number: int, event: Any) -> None:
@@ -191,23 +177,18 @@ def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
                 counts[number, event[0]] = event[1]
                 update(sum(counts.values()))
 
-        for one in run_local(ROBOTS, Recording(made.out, episodes, seed), workers, show):
-            done[one.robot] = one
-    for robot in ROBOTS:
-        _take_shards(made, done[robot])
-
-
-def _take_shards(made: Demo, one: Recorded) -> None:
-    """Verify a robot's shard set, and add it to the results."""
-    robot, folder = one.robot, made.out / "shards" / one.robot
-    problems = verify(folder)
-    if problems or one.refused:
-        raise ShardError(folder, "; ".join(problems) or "too many episodes are in quarantine")
-    made.recordings[robot], made.sets[robot] = one.recording, ShardSet(folder)
-    made.sizes[f"recording {robot}"] = _size(one.recording)
-    made.sizes[f"shards {robot}"] = one.shard_bytes
-    splits = ", ".join(f"{name} {count}" for name, count in one.splits.items())
-    print(f"  {robot}: {splits} episodes, {human_bytes(one.shard_bytes)}, verified", flush=True)
+        results = list(run_local(ROBOTS, Recording(made.out, episodes, seed), workers, show))
+    for robot, recording, refused in sorted(results):
+        folder = made.out / "shards" / robot
+        problems = verify(folder)
+        if problems or refused:
+            raise ShardError(folder, "; ".join(problems) or "too many episodes are in quarantine")
+        made.recordings[robot], made.sets[robot] = recording, ShardSet(folder)
+        manifest = made.sets[robot].manifest
+        size = manifest.to_json()["totals"]["bytes"]
+        made.sizes.update({f"recording {robot}": _size(recording), f"shards {robot}": size})
+        splits = ", ".join(f"{name} {split['episodes']}" for name, split in manifest.splits.items())
+        print(f"  {robot}: {splits} episodes, {human_bytes(size)}, verified", flush=True)
 
 
 def mix(made: Demo) -> None:
@@ -231,25 +212,20 @@ def train_both(made: Demo, steps: int | None, seed: int) -> None:
     changes = [f"data=[{folders}]", f"seed={seed}", f"mixture.temperature={TAU}"]
     recipe = load_recipe("demo", changes + ([f"steps={steps}"] if steps else []))
     made.training = train(recipe, out=made.out / "run")
-    result = made.training
-    if result.masked_val_loss is not None and result.baseline is not None:
-        print(
-            f"  held-out loss {result.masked_val_loss:.3f} nats a token, "
-            f"looking at nothing {result.baseline:.3f}",
-            flush=True,
-        )
+    loss, baseline = made.training.masked_val_loss, made.training.baseline
+    print(f"  held-out loss {loss:.3f} nats a token, token frequencies alone {baseline:.3f}", flush=True)
 
 
 def publish(made: Demo) -> None:
     """Push the checkpoint to a folder hub, and pull each robot back alone (stage 4)."""
     from hma_model.hub import publish as hub
 
-    made.published = made.out / "hub" / "demo" / "pusht"
-    hub.push(made.training.checkpoint, str(made.published))
+    published = made.out / "hub" / "demo" / "pusht"
+    hub.push(made.training.checkpoint, str(published))
     for robot in ROBOTS:
-        made.pulled[robot] = hub.pull(str(made.published), [robot], made.out / "pulled" / robot)
+        made.pulled[robot] = hub.pull(str(published), [robot], made.out / "pulled" / robot)
         made.sizes[f"checkpoint for {robot} alone"] = _size(made.pulled[robot])
-    made.sizes["checkpoint of both"] = _size(made.published)
+    made.sizes["checkpoint of both"] = _size(published)
 
 
 def roll_out(made: Demo) -> None:
@@ -263,11 +239,8 @@ def roll_out(made: Demo) -> None:
         results = list(pool.map(lambda robot: _rolled_out(made, robot), made.sets))
     for robot, (found, film) in zip(made.sets, results, strict=True):
         made.figures[robot], made.films[robot] = found, film
-        print(
-            f"  {robot}: last frame PSNR {found['true']['psnr_last']:.1f} dB with its actions, "
-            f"{found['shuffled']['psnr_last']:.1f} dB with another window's",
-            flush=True,
-        )
+        own, other = (f"{found[key]['psnr_last']:.1f} dB" for key in ("true", "shuffled"))
+        print(f"  {robot}: last frame PSNR {own} with its actions, {other} with another window's", flush=True)
 
 
 def write_results(made: Demo) -> None:
@@ -282,7 +255,6 @@ def write_results(made: Demo) -> None:
 
 
 def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:
-    from hma_data.shards.preview import tokenizer_of
     from hma_model.evaluation.evaluate import default_prompt, evaluate
     from hma_model.evaluation.rollout_video import rollout_video
     from hma_model.network.model import HMA
@@ -299,12 +271,11 @@ def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "RolloutVideo"]
 
 def _refuse_foreign(out: Path) -> None:
     ours = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, RESULTS}
-    if out.is_dir():
-        foreign = sorted(item.name for item in out.iterdir() if item.name not in ours)
-        if foreign:
-            raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
-    elif out.exists():
+    if out.exists() and not out.is_dir():
         raise OutputError(out, "is not a folder", "choose another --out")
+    foreign = sorted({item.name for item in out.glob("*")} - ours)
+    if foreign:
+        raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
 
 
 def _size(path: Path) -> int:
@@ -312,18 +283,135 @@ def _size(path: Path) -> int:
     return sum(item.stat().st_size for item in files)
 
 
-def machine() -> str:
-    """Return one line that describes the machine and the versions."""
+# -- the report
+
+
+def write_report(made: Demo) -> Path:
+    """Write `out`/report.html from the results of the demo, and return its path."""
     import torch
 
     versions = f"Python {platform.python_version()}, torch {torch.__version__}"
-    return f"{usable_cores()} cores, {platform.machine()}, {versions}"
-
-
-def save_page(made: Demo, html: str) -> Path:
-    """Write the report, and return its path."""
-    path = made.out / "report.html"
+    machine = f"{usable_cores()} cores, {platform.machine()}, {versions}"
+    lead = f"Recorded, tokenized, trained, published and rolled out by hma demo on {machine}."
+    page = Page("HMA Toolkit: two robots, one world model", lead)
+    for section in (_headline, _robots, _reconstructions, _mixture, _training, _rollouts):
+        section(page, made)
+    page.section("Sizes and timings")
+    page.table(["what", "size"], [[name, human_bytes(size)] for name, size in made.sizes.items()])
+    page.table(["stage", "wall time"], [[name, human_seconds(s)] for name, s in made.seconds.items()])
+    about = "Every step above is one command; DATA is a file, folder or URI."
+    page.section("The same on your own data", about)
+    page.commands(OWN_DATA)
+    page.section("This report")
+    page.commands(" ".join(["hma", *sys.argv[1:]]))
+    path, html = made.out / "report.html", page.html()
     write_atomic(path, html)
     total = human_seconds(sum(made.seconds.values()))
     print(f"  {path} ({human_bytes(len(html))}), {total} in all", flush=True)
     return path
+
+
+def _headline(page: Page, made: Demo) -> None:
+    result = made.training
+    splits = [split for shards in made.sets.values() for split in shards.manifest.splits.values()]
+    own, other = (sum(found[key] for found in made.figures.values()) for key in ("loss", "shuffled_loss"))
+    page.figures(
+        [
+            (f"{sum(split['frames'] for split in splits):,}", "frames recorded and tokenized"),
+            (f"{result.masked_val_loss:.2f}", "held-out loss, nats a token"),
+            (f"{result.baseline:.2f}", "held-out loss of the token frequencies"),
+            (f"{other / own - 1:+.0%}", "loss when given another window's actions"),
+            (f"{result.step:,}", "training steps"),
+            (human_seconds(sum(made.seconds.values())), "from recording to rollout"),
+        ]
+    )
+
+
+def _robots(page: Page, made: Demo) -> None:
+    page.section("The robots", "Two recordings of a real physics environment, each described by one YAML.")
+    rows = []
+    for robot, shards in made.sets.items():
+        e = shards.embodiment
+        wins = sum(bool(row["success"]) for row in shards.episodes.to_pylist())
+        rows.append(
+            [
+                robot, f"{made.recordings[robot].name} ({e.source.format})", ", ".join(e.action.names()),
+                e.action_dim, e.rate_hz, e.stride, e.effective_hz,
+                *(shards.manifest.splits[split]["episodes"] for split in ("train", "val")),
+                f"{wins} of {len(shards.episodes)}" if wins else "not recorded",
+            ]
+        )  # fmt: skip
+    names = ["id", "recording", "actions", "dims", "Hz", "stride", "effective Hz", "train", "val", "success"]
+    page.table(names, rows)
+
+
+def _reconstructions(page: Page, made: Demo) -> None:
+    about = "Recorded frames, and the same decoded from their tokens. The model predicts tokens only."
+    page.section("What the tokens keep", about)
+    for robot, shards in made.sets.items():
+        rows, labels = [], []
+        for row in [row for row in shards.episodes.to_pylist() if row["split"] == "val"][:2]:
+            picks = np.linspace(0, row["length"] - 1, 7).astype(int)
+            tokens = shards.tokens(shards.episode_rows(row["episode_index"], ["tokens"])["tokens"])
+            rows.append(list(_recorded_frames(made, shards, row["id"], picks)))
+            rows.append(list(tokenizer_of(shards).decode(tokens[picks])))
+            labels += [f"{robot} {row['id']}: recorded", "from its tokens"]
+        caption = f"{robot}: recorded frames above, reconstructions below"
+        page.picture(png_bytes(grid(rows, labels)), "png", caption)
+
+
+def _recorded_frames(
+    made: Demo, shards: ShardSet, episode: str, picks: NDArray[np.int64]
+) -> NDArray[np.uint8]:
+    """Return recorded frames (n, S, S, 3), as the tokenizer saw them."""
+    robot = find(shards.embodiment.id)
+    source = open_source(robot.source.format)
+    clip = to_clip(source.read(str(made.recordings[robot.id]), episode, robot), robot)
+    camera, spec = robot.primary_camera, shards.spec
+    return prepare(clip.frames_at(camera.name, picks), camera, spec.image_size, spec.resize_filter)
+
+
+def _mixture(page: Page, made: Demo) -> None:
+    assert made.mixture is not None
+    page.section("The mixture", "Probability of a training sample, p ∝ windows^(1/τ) with τ = 3.")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "mixture.svg"
+        plot_mixture(made.mixture, TAU, path)
+        page.picture(path.read_bytes(), "svg+xml", "How often each robot is drawn")
+
+
+def _training(page: Page, made: Demo) -> None:
+    result = made.training
+    page.section("Training")
+    validation = [(line["step"], line["loss"]) for line in result.evaluations]
+    curves = {"both robots": result.losses}, {"both robots": validation}
+    plot = loss_curves(*curves, "loss, nats a token", result.baseline)
+    caption = "Loss over training (line: masked tokens; markers: held-out windows, whole frames masked)"
+    page.picture(plot, "svg+xml", caption)
+
+
+def _rollouts(page: Page, made: Demo) -> None:
+    page.section(
+        "Rollouts on held-out episodes",
+        "The model, pulled from the hub for one robot alone, sees the first frames and the actions. It "
+        "continues from its own predictions. With another window's actions it should do worse. The loss "
+        "shows this; PSNR hardly shows it after so short a training, because the disc covers few pixels.",
+    )
+    rows = []
+    for robot, shards in made.sets.items():
+        film, found = made.films[robot], made.figures[robot]
+        caption = f"{robot}: truth, prediction with the true actions, with another window's; actions as bars"
+        page.picture(webp_bytes(film.frames, film.fps), "webp", caption)
+        names = {"true": "true actions", "shuffled": "shuffled actions", "copy": "last seen frame repeated"}
+        curves = {name: found[key]["psnr_by_frame"] for key, name in names.items()}
+        about = f"mean of {found['windows']} held-out windows, against {found['against']}"
+        plot = psnr_over_horizon(curves, 1 / shards.embodiment.effective_hz)
+        page.picture(plot, "svg+xml", f"{robot}: PSNR over the horizon, {about}")
+        losses = (found[key] for key in ("loss", "shuffled_loss", "baseline_loss", "perplexity"))
+        last = (found[key]["psnr_last"] for key in names)
+        rows.append([robot, *losses, found["true"]["psnr"], *last, found["true"]["ssim"]])
+    columns = [
+        "robot", "loss", "with other actions", "baseline", "perplexity", "PSNR dB", "PSNR last",
+        "shuffled last", "copy last", "SSIM",
+    ]  # fmt: skip
+    page.table(columns, rows)

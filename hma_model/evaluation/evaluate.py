@@ -11,7 +11,8 @@ B batch, T frames, P frames of the prompt, h,w grid, F digits, V values a digit,
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -24,8 +25,8 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import token_column
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.io import require_tokenizer
-from hma_model.evaluation.metrics import perplexity, psnr, ssim
-from hma_model.evaluation.teacher_forcing import teacher_forced
+from hma_model.config import OBJECTIVES
+from hma_model.evaluation.metrics import perplexity, psnr, ssim, teacher_forced
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -34,7 +35,13 @@ if TYPE_CHECKING:
 BASELINE_FRAMES = 200_000
 PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
 
-RealFrames = Callable[[int, NDArray[np.int64]], NDArray[np.uint8]]
+
+class Sampling(TypedDict, total=False):
+    """Options of `HMA.generate` that a rollout passes on to it."""
+
+    unmask_steps: int
+    temperature: float
+    sample_steps: int | None
 
 
 @dataclass
@@ -59,9 +66,6 @@ class Means:
         return sum(self.sums.values()) / max(sum(self.counts.values()), 1) if self.counts else float("nan")
 
 
-# -- the loss and its baseline
-
-
 def windows(
     data: StrPath | ShardSet, split: str, frames: int, count: int, batch_size: int = 8
 ) -> Iterator[Batch]:
@@ -73,24 +77,27 @@ def windows(
 
 
 @torch.no_grad()
-def validation_losses(model: "HMA", batches: Iterable[Batch], seed: int = 0) -> tuple[Means, Means]:
+def validation_losses(
+    model: "HMA", batches: Iterable[Batch], seed: int = 0, objective: str = "forward"
+) -> tuple[Means, Means]:
     """Return the losses and accuracies of the windows, by embodiment.
 
-    The continuous model's loss is its diffusion loss under masks and noise drawn from `seed`; it has no
-    accuracy.
+    Where a discrete model predicts video from actions, the loss is that of `teacher_forced`. Any other loss
+    is the training loss of the objective, under masks and noise drawn from `seed`; it has no accuracy.
     """
-    losses, accuracy = Means(), Means()
-    training = model.training
+    losses, accuracy, training = Means(), Means(), model.training
+    drawn = OBJECTIVES[objective]
+    exact = model.config.kind == "discrete" and drawn.predicts_video and drawn.sees_actions
     model.eval()
     for number, batch in enumerate(batches):
         batch = batch.to(model.device)
-        if model.config.kind == "discrete":
+        if exact:
             nats, hits = teacher_forced(model, batch)
             losses.add(batch.embodiment, nats.mean(dim=1))
             accuracy.add(batch.embodiment, hits.mean(dim=1))
         else:
             generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
-            losses.add(batch.embodiment, model(batch, "forward", generator).per_sample)
+            losses.add(batch.embodiment, model(batch, objective, generator).per_sample)
     model.train(training)
     return losses, accuracy
 
@@ -100,24 +107,19 @@ def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
     return validation_losses(model, batches)[0].mean()
 
 
-def digit_frequencies(
-    shards: ShardSet, split: str = "train", max_frames: int = BASELINE_FRAMES
-) -> list[NDArray[np.float64]]:
-    """Return the frequency of each value of each digit: F arrays (V,), add-one smoothed, summing to one.
+def digit_frequencies(shards: ShardSet, max_frames: int = BASELINE_FRAMES) -> list[NDArray[np.float64]]:
+    """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
 
-    In a split of more than `max_frames` frames, only row groups spread evenly over it are counted, about
-    `max_frames` frames at most.
+    Of more than `max_frames` frames, only row groups spread evenly over them are counted, about `max_frames`
+    frames at most.
     """
     factored = shards.spec.factored or (shards.spec.vocab_size or 1,)
     counts = [np.ones(values) for values in factored]
-    places = [
-        (name, group, rows)
-        for name, groups in zip(shards.shards(split), shards.row_groups(split))
-        for group, rows in enumerate(groups)
-    ]
-    stride = max(1, -(-sum(rows for _, _, rows in places) // max_frames))
+    files = list(zip(shards.shards("train"), shards.row_groups("train")))
+    groups = [(name, group) for name, rows in files for group in range(len(rows))]
+    stride = max(1, -(-sum(sum(rows) for _, rows in files) // max_frames))
     column = token_column(shards.spec)[0]
-    for name, group, _ in places[::stride]:
+    for name, group in groups[::stride]:
         tokens = shards.read(name, [group], [column])[column].astype(np.int64).ravel()
         for digit, values in enumerate(factored):
             counts[digit] += np.bincount(tokens % values, minlength=values)
@@ -151,9 +153,6 @@ def unconditional_baseline(
     return means
 
 
-# -- rollouts
-
-
 @dataclass(frozen=True)
 class Pictures:
     """A rollout and the truth, both uint8 (B, T, S, S, 3); the first P frames are the prompt."""
@@ -171,11 +170,9 @@ def rollout(
     *,
     prompt: int | None = None,
     actions: Tensor | None = None,
-    unmask_steps: int = 2,
-    temperature: float = 0.0,
-    sample_steps: int | None = None,
     seed: int = 0,
     truth: NDArray[np.uint8] | None = None,
+    **sampling: Unpack[Sampling],
 ) -> Pictures:
     """Predict the frames that follow the first frames of each window, given its actions.
 
@@ -186,9 +183,9 @@ def rollout(
         frames: how many to predict; by default all after the prompt.
         prompt: P true frames to start from; by default a third of the window, at least one.
         actions: (B, T, K) raw, which replace the actions of the windows.
-        unmask_steps, temperature, sample_steps: as in `HMA.generate`.
         seed: of every random draw.
         truth: the decoded frames of another rollout of the same windows, which are then not decoded again.
+        sampling: options of `HMA.generate`.
 
     Raises:
         UsageError: the prompt and the frames do not fit the windows, or one of them is empty.
@@ -200,16 +197,10 @@ def rollout(
         raise UsageError("rollout", f"{first} + {count} frames do not fit windows of {length}")
     stored = batch.tokens if model.config.kind == "discrete" else batch.latents
     assert stored is not None
-    predicted = model.generate(
-        stored[:, :first].to(model.device),
-        (batch.actions if actions is None else actions)[:, : first + count].to(model.device),
-        batch.embodiment,
-        count,
-        unmask_steps=unmask_steps,
-        temperature=temperature,
-        sample_steps=sample_steps,
-        generator=torch.Generator().manual_seed(seed),
-    )
+    given, chunks = stored[:, :first].to(model.device), batch.actions if actions is None else actions
+    chunks = chunks[:, : first + count].to(model.device)
+    generator = torch.Generator().manual_seed(seed)
+    predicted = model.generate(given, chunks, batch.embodiment, count, generator=generator, **sampling)
     if truth is None:
         truth = decode(tokenizer, stored[:, : first + count])
     made = decode(tokenizer, predicted)
@@ -256,13 +247,10 @@ def evaluate(
     frames: int | None = None,
     prompt: int | None = None,
     batch_size: int = 16,
-    unmask_steps: int = 2,
-    temperature: float = 0.0,
-    sample_steps: int | None = None,
     seed: int = 0,
-    real: RealFrames | None = None,
+    **sampling: Unpack[Sampling],
 ) -> dict[str, Any]:
-    """Compute a model's figures on one shard set.
+    """Compute a model's figures on one shard set; rollouts are compared with the decoded true tokens.
 
     Args:
         model: a model that has the embodiment of the shard set.
@@ -272,9 +260,8 @@ def evaluate(
         count: windows, evenly spaced; all windows if the split has fewer.
         frames: T of a window; by default the model's.
         prompt: true frames a rollout starts from.
-        unmask_steps, temperature, sample_steps, seed: settings of the rollouts.
-        real: returns the recorded frames of (episode_index, (n,) frame indices) at the tokenizer's size. The
-            rollouts are compared with them; by default they are compared with the decoded true tokens.
+        seed: of the rollouts.
+        sampling: options of `HMA.generate` for the rollouts.
 
     Returns:
         `loss` (nats a token); for discrete models also `shuffled_loss` (given another window's actions),
@@ -293,65 +280,56 @@ def evaluate(
     first = default_prompt(length) if prompt is None else prompt
     if not len(WindowDataset(shards, split, length)):
         raise UsageError(shards.folder, f"has no window of {length} frames in {split}", "use another split")
-    table = _losses(model, shards, split, length, count, batch_size)
-    gathered: dict[str, list[Pictures]] = {"true": [], "shuffled": [], "copy": []}
-    for number, batch in enumerate(windows(shards, split, length, count, batch_size)):
-        options: dict[str, Any] = {
-            "prompt": first, "unmask_steps": unmask_steps, "temperature": temperature,
-            "sample_steps": sample_steps, "seed": seed + number,
-        }  # fmt: skip
-        true = rollout(model, tokenizer, batch, **options)
-        shuffled = shuffled_actions(batch, first - 1, seed)
-        other = rollout(model, tokenizer, batch, actions=shuffled, truth=true.truth, **options)
-        if real is not None:
-            truth = _real(real, batch, shards)
-            true, other = replace(true, truth=truth), replace(other, truth=truth)
-        for name, pictures in (("true", true), ("shuffled", other), ("copy", _copied(true))):
-            gathered[name].append(pictures)
-    scores = {name: _scores(parts) for name, parts in gathered.items()}
-    gain = scores["true"]["psnr_last"] - scores["shuffled"]["psnr_last"]
+
+    def chosen() -> Iterator[Batch]:
+        return windows(shards, split, length, count, batch_size)
+
+    table = _losses(model, shards, chosen)
+    rollouts: dict[str, list[Pictures]] = {"true": [], "shuffled": [], "copy": []}
+    for number, batch in enumerate(chosen()):
+        roll = partial(rollout, model, tokenizer, batch, prompt=first, seed=seed + number, **sampling)
+        true = roll()
+        other = roll(actions=shuffled_actions(batch, first - 1, seed), truth=true.truth)
+        still = true.predicted.copy()
+        still[:, first:] = still[:, first - 1 : first]
+        for name, made in (("true", true.predicted), ("shuffled", other.predicted), ("copy", still)):
+            rollouts[name].append(Pictures(first, made, true.truth))
+    scores = {name: _scores(parts) for name, parts in rollouts.items()}
     return {
         "embodiment": shards.embodiment.id,
         "split": split,
-        "windows": sum(len(part.truth) for part in gathered["true"]),
+        "windows": sum(len(part.truth) for part in rollouts["true"]),
         "frames": length,
         "prompt": first,
-        "against": "decoded tokens" if real is None else "real frames",
+        "against": "decoded tokens",
         **table,
         **scores,
-        "psnr_action_gain_last": gain,
+        "psnr_action_gain_last": scores["true"]["psnr_last"] - scores["shuffled"]["psnr_last"],
     }
 
 
-def _losses(
-    model: "HMA", shards: ShardSet, split: str, frames: int, count: int, batch_size: int
-) -> dict[str, Any]:
-    losses, accuracy = validation_losses(model, windows(shards, split, frames, count, batch_size))
+def _losses(model: "HMA", shards: ShardSet, chosen: Callable[[], Iterator[Batch]]) -> dict[str, Any]:
+    losses, accuracy = validation_losses(model, chosen())
     if model.config.kind == "continuous":
         return {"loss": losses.mean()}
-    baseline = unconditional_baseline([shards], windows(shards, split, frames, count, batch_size))
-    other = (
-        replace(batch, actions=shuffled_actions(batch))
-        for batch in windows(shards, split, frames, count, batch_size)
-    )
+    shuffled = (replace(batch, actions=shuffled_actions(batch)) for batch in chosen())
     return {
         "loss": losses.mean(),
-        "shuffled_loss": masked_val_loss(model, other),
-        "baseline_loss": baseline.mean(),
+        "shuffled_loss": masked_val_loss(model, shuffled),
+        "baseline_loss": unconditional_baseline([shards], chosen()).mean(),
         "perplexity": perplexity(losses.mean()),
         "accuracy": accuracy.mean(),
     }
 
 
 def _scores(parts: list[Pictures]) -> dict[str, Any]:
-    first = parts[0].prompt
     signal, similarity = [], []
     for part in parts:
-        shape = part.truth[:, first:].shape
-        truth = part.truth[:, first:].reshape(-1, *shape[2:])
-        predicted = part.predicted[:, first:].reshape(-1, *shape[2:])
-        signal.append(np.minimum(psnr(truth, predicted), PSNR_LIMIT).reshape(shape[:2]))
-        similarity.append(ssim(truth, predicted).reshape(shape[:2]))
+        truth, predicted = part.truth[:, part.prompt :], part.predicted[:, part.prompt :]
+        size, shape = truth.shape[:2], (-1, *truth.shape[2:])
+        truth, predicted = truth.reshape(shape), predicted.reshape(shape)
+        signal.append(np.minimum(psnr(truth, predicted), PSNR_LIMIT).reshape(size))
+        similarity.append(ssim(truth, predicted))
     by_frame = np.concatenate(signal).mean(axis=0)
     return {
         "psnr": float(by_frame.mean()),
@@ -359,19 +337,6 @@ def _scores(parts: list[Pictures]) -> dict[str, Any]:
         "psnr_by_frame": [round(float(value), 3) for value in by_frame],
         "ssim": float(np.concatenate(similarity).mean()),
     }
-
-
-def _copied(pictures: Pictures) -> Pictures:
-    still = pictures.predicted.copy()
-    still[:, pictures.prompt :] = still[:, pictures.prompt - 1 : pictures.prompt]
-    return replace(pictures, predicted=still)
-
-
-def _real(real: RealFrames, batch: Batch, shards: ShardSet) -> NDArray[np.uint8]:
-    assert batch.episode is not None and batch.frame is not None
-    rows = batch.frame.numpy()[:, None] + np.arange(batch.actions.shape[1]) * shards.row_stride
-    recorded = rows * shards.manifest.frame_stride
-    return np.stack([real(int(e), frames) for e, frames in zip(batch.episode, recorded)])
 
 
 def _opened(item: StrPath | ShardSet) -> ShardSet:

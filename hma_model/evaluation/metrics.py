@@ -1,20 +1,30 @@
 """Compute metrics of predicted pictures and tokens.
 
 Picture metrics are numpy on uint8 or float pictures; token metrics are torch on logits.
-N pictures of (H, W, C); F factored digits, V values a digit.
+
+N pictures of (H, W, C); B batch, T frames, h,w token grid; F factored digits, V values a digit.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import cross_entropy
 
 from hma_data.errors import UsageError
+from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
+from hma_model.network.embed import to_digits
+from hma_model.network.trunk import TimePositions, rotary_angles
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from hma_data.loading.dataset import Batch
+    from hma_model.config import HMAConfig
+    from hma_model.network.model import HMA
 
 SSIM_WINDOW = 7
 
@@ -52,9 +62,8 @@ def ssim(truth: NDArray[Any], pictures: NDArray[Any], data_range: float = 255.0)
     """
     truth, pictures = _pair(truth, pictures)
     if min(truth.shape[1:3]) < SSIM_WINDOW:
-        raise UsageError(
-            "ssim", f"pictures of {truth.shape[1]}x{truth.shape[2]} are smaller than its 7x7 window"
-        )
+        height, width = truth.shape[1:3]
+        raise UsageError("ssim", f"pictures of {height}x{width} are smaller than its 7x7 window")
     return np.array([_similarity(x, y, data_range) for x, y in zip(truth, pictures, strict=True)])
 
 
@@ -74,9 +83,8 @@ def _similarity(truth: NDArray[np.float64], picture: NDArray[np.float64], data_r
 
 def _pair(truth: NDArray[Any], pictures: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if truth.shape != pictures.shape or truth.ndim not in (3, 4):
-        raise UsageError(
-            "metrics", f"pictures must agree as (N, H, W, C), are {truth.shape} and {pictures.shape}"
-        )
+        fault = f"the pictures must both be (N, H, W, C); they are {truth.shape} and {pictures.shape}"
+        raise UsageError("metrics", fault)
     shape = (-1, *truth.shape[-3:])
     return truth.reshape(shape).astype(np.float64), pictures.reshape(shape).astype(np.float64)
 
@@ -98,7 +106,7 @@ def perplexity(nats: float) -> float:
     return math.exp(nats) if nats < 700 else math.inf
 
 
-def token_nats(logits: "Tensor", tokens: "Tensor", factored: Sequence[int]) -> "Tensor":
+def token_nats(logits: Tensor, tokens: Tensor, factored: Sequence[int]) -> Tensor:
     """Return the cross-entropy of each token in nats: the sum over its digits, without label smoothing.
 
     Args:
@@ -109,19 +117,73 @@ def token_nats(logits: "Tensor", tokens: "Tensor", factored: Sequence[int]) -> "
     Returns:
         (...) float32.
     """
-    import torch.nn.functional as functional
-
-    from hma_model.network.embed import to_digits
-
     digits = to_digits(tokens, factored)
-    flat = functional.cross_entropy(
-        logits.flatten(0, -2).float(), digits.flatten().to(logits.device), reduction="none"
-    )
+    flat = cross_entropy(logits.flatten(0, -2).float(), digits.flatten().to(logits.device), reduction="none")
     return flat.view(digits.shape).sum(dim=-1)
 
 
-def token_hits(logits: "Tensor", tokens: "Tensor", factored: Sequence[int]) -> "Tensor":
+def token_hits(logits: Tensor, tokens: Tensor, factored: Sequence[int]) -> Tensor:
     """Return (...) bool, True where every likeliest digit is the true one; arguments as in `token_nats`."""
-    from hma_model.network.embed import to_digits
-
     return (logits.argmax(dim=-1) == to_digits(tokens, factored).to(logits.device)).all(dim=-1)
+
+
+@torch.no_grad()
+def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
+    """Score each frame from the second on, fully masked, given as much true past as a window holds.
+
+    One pass scores a whole window: its input is the true frames, then each frame from the second on again,
+    masked, at the same time. Each frame sees itself and the true frames before it.
+
+    Args:
+        model: a discrete model in eval mode.
+        batch: a batch on the model's device.
+
+    Returns:
+        nats (B, T-1) float32 a token, averaged over the frame, and accuracy (B, T-1) of whole tokens.
+    """
+    assert batch.tokens is not None
+    config, held = model.config, model.config.frames
+    first = _part(batch, slice(held))
+    parts = [_scored(config, first, _at_once(model, first))]
+    for t in range(held, batch.tokens.shape[1]):  # the past of such a frame begins after the first frame
+        own = _part(batch, slice(t + 1 - held, t + 1))
+        assert own.tokens is not None
+        seen = own.tokens.clone()
+        seen[:, -1] = config.vocab_size
+        logits = model.video_logits(seen, own.actions, own.embodiment, own.action_mask)
+        parts.append(_scored(config, own, logits[:, -1:]))
+    nats, hits = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
+    return nats, hits
+
+
+def _at_once(model: "HMA", batch: "Batch") -> Tensor:
+    """Return scores (B, T-1, h, w, F, V) of the masked frames, computed in one pass."""
+    assert batch.tokens is not None
+    config, frames = model.config, batch.tokens.flatten(2)
+    count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
+    given = align(config, batch.actions, batch.action_mask, count)
+    both = ActionConditioning(*(torch.cat([x, x[:, 1:]], dim=1) for x in (given.chunks, given.known)))
+    positions = torch.cat([torch.arange(count), torch.arange(1, count)]).to(frames.device)
+    true = torch.arange(len(positions), device=frames.device) < count
+    allowed = (positions.unsqueeze(1) > positions) & true
+    allowed.fill_diagonal_(True)
+    times = TimePositions(positions, allowed, rotary_angles(config, positions))
+    masked = torch.full_like(frames[:, 1:], config.vocab_size)
+    x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)))
+    features = model.trunk(x, condition(model, both, groups, times.positions), times)
+    scores = model.token_readout(model.video_features(features)[:, count:])
+    return groups.unsort(model.token_readout.split(scores)).unflatten(2, config.token_grid)
+
+
+def _part(batch: "Batch", frames: slice) -> "Batch":
+    assert batch.tokens is not None
+    known = batch.action_mask[:, frames]
+    return replace(batch, tokens=batch.tokens[:, frames], actions=batch.actions[:, frames], action_mask=known)
+
+
+def _scored(config: "HMAConfig", batch: "Batch", logits: Tensor) -> tuple[Tensor, Tensor]:
+    """Score the last frames of a batch, as many as `logits` has."""
+    assert batch.tokens is not None
+    true, factored = batch.tokens[:, -logits.shape[1] :], config.factored
+    nats = token_nats(logits, true, factored).mean(dim=(2, 3))
+    return nats, token_hits(logits, true, factored).float().mean(dim=(2, 3))

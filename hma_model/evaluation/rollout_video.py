@@ -1,25 +1,30 @@
-"""Show a rollout as a film: truth, prediction with its actions, prediction with other actions."""
+"""Show rollouts, as a video or a sheet: truth, prediction with its actions, prediction with other actions."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.sheets import webp_bytes, with_actions, write_mp4, write_text
-from hma_data.errors import UsageError
+from hma_data.episodes.sheets import grid, png_bytes, webp_bytes, with_actions, write_mp4, write_text
+from hma_data.errors import HMAError, UsageError
 from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import atomic_path
+from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.io import require_tokenizer
-from hma_model.evaluation.evaluate import rollout
+from hma_model.evaluation.evaluate import Sampling, rollout, shuffled_actions, windows
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
 
 SMALLEST = 192  # minimum width in pixels at which a picture is shown
+SHEETS = "pictures"  # the folder of a run's sheets
+COLUMNS = 8  # frames in a row of a sheet
 
 
 @dataclass(frozen=True)
@@ -40,10 +45,8 @@ def rollout_video(
     window: int = 0,
     frames: int | None = None,
     prompt: int = 2,
-    unmask_steps: int = 2,
-    temperature: float = 0.0,
-    sample_steps: int | None = None,
     seed: int = 0,
+    **sampling: Unpack[Sampling],
 ) -> RolloutVideo:
     """Roll out from one window of a shard set, with its own actions and with those of another window.
 
@@ -52,7 +55,8 @@ def rollout_video(
         window: the number of the window among the windows of this length.
         frames: how many to predict; None fills the model's window.
         prompt: how many true frames to start from.
-        unmask_steps, temperature, sample_steps, seed: settings of the rollouts, as in `HMA.generate`.
+        seed: of the rollouts.
+        sampling: options of `HMA.generate`.
 
     Raises:
         CheckpointError: the model was trained on another tokenizer.
@@ -60,22 +64,18 @@ def rollout_video(
     """
     require_tokenizer(model.config, shards.spec, shards.folder)
     length = prompt + frames if frames else max(model.config.frames, prompt + 1)
-    windows = WindowDataset(shards, split, length)
-    if window >= len(windows):
-        raise UsageError(
-            shards.folder,
-            f"has {len(windows)} windows of {length} frames in {split}, none with number {window}",
-        )
-    batch = windows.batch([window])
-    other = windows.batch([(window + len(windows) // 2) % len(windows)]).actions if len(windows) > 1 else None
+    dataset = WindowDataset(shards, split, length)
+    count = len(dataset)
+    if window >= count:
+        fault = f"has {count} windows of {length} frames in {split}, none with number {window}"
+        raise UsageError(shards.folder, fault)
+    batch = dataset.batch([window])
+    other = dataset.batch([(window + count // 2) % count]).actions if count > 1 else None
     swapped = batch.actions.clone()
     swapped[:, prompt - 1 :] = (batch.actions.flip(1) if other is None else other)[:, prompt - 1 :]
-    options: dict[str, Any] = {
-        "prompt": prompt, "unmask_steps": unmask_steps, "temperature": temperature,
-        "sample_steps": sample_steps, "seed": seed,
-    }  # fmt: skip
-    true = rollout(model, tokenizer, batch, **options)
-    changed = rollout(model, tokenizer, batch, actions=swapped, truth=true.truth, **options)
+    roll = partial(rollout, model, tokenizer, batch, prompt=prompt, seed=seed, **sampling)
+    true = roll()
+    changed = roll(actions=swapped, truth=true.truth)
     stats = shards.manifest.stats["action"]
     low, high = np.array(stats["min"]), np.array(stats["max"])
     own, foreign = (actions[0, :, : len(low)].numpy() for actions in (batch.actions, swapped))
@@ -88,11 +88,10 @@ def rollout_video(
 
 
 def _side_by_side(panels: dict[str, NDArray[np.uint8]], prompt: int) -> NDArray[np.uint8]:
-    first = next(iter(panels.values()))
-    scale = max(1, -(-SMALLEST // first.shape[2]))
+    scale = max(1, -(-SMALLEST // next(iter(panels.values())).shape[2]))
     border = ((0, 0), (24, 6), (6, 6), (0, 0))
-    enlarged = {name: frames.repeat(scale, 1).repeat(scale, 2) for name, frames in panels.items()}
-    padded = [np.pad(frames, border, constant_values=250) for frames in enlarged.values()]
+    enlarged = (frames.repeat(scale, 1).repeat(scale, 2) for frames in panels.values())
+    padded = [np.pad(frames, border, constant_values=250) for frames in enlarged]
     film = np.concatenate(padded, axis=2)
     for t, sheet in enumerate(film):
         for i, name in enumerate(panels):
@@ -111,7 +110,55 @@ def write_video(path: StrPath, film: RolloutVideo) -> None:
     if path.suffix == ".mp4":
         write_mp4(path, film.frames, film.fps)
     elif path.suffix == ".webp":
-        with atomic_path(path) as part:
-            part.write_bytes(webp_bytes(film.frames, film.fps))
+        write_atomic(path, webp_bytes(film.frames, film.fps))
     else:
         raise UsageError("--out", f"{path} is neither .mp4 nor .webp")
+
+
+def write_sheets(
+    model: "HMA", sets: Mapping[str, ShardSet], out: Path, step: int, *, frames: int, count: int, seed: int
+) -> str:
+    """Write `pictures/step-N-ID.png` for each robot.
+
+    Args:
+        model: the evaluated model.
+        sets: shard sets with validation windows.
+        out: the run's folder, and the number of its finished steps.
+        frames, count: the frames of a window, and how many windows of each robot are shown.
+        seed: of the rollouts.
+
+    Returns:
+        The reason for no pictures if the tokenizer is not available here; else an empty string.
+    """
+    from hma_data.shards.preview import tokenizer_of
+
+    if not sets:
+        return ""
+    try:
+        tokenizer = tokenizer_of(next(iter(sets.values())))
+    except HMAError as fault:
+        return f"no pictures: {fault}"
+    training = model.training
+    model.eval()
+    columns = np.unique(np.linspace(0, frames - 1, COLUMNS).astype(int))
+    for name, shards in sets.items():
+        (batch,) = windows(shards, "val", frames, count, count)
+        true = rollout(model, tokenizer, batch, seed=seed)
+        swapped = shuffled_actions(batch, true.prompt - 1, seed)
+        other = rollout(model, tokenizer, batch, actions=swapped, seed=seed, truth=true.truth)
+        films = {
+            "truth": true.truth,
+            f"predicted from frame {true.prompt}": true.predicted,
+            "with other actions": other.predicted,
+        }
+        rows = [list(film[i, columns]) for i in range(len(batch)) for film in films.values()]
+        sheet = png_bytes(grid(rows, list(films) * len(batch)))
+        write_atomic(out / SHEETS / f"step-{step:08d}-{name}.png", sheet)
+    model.train(training)
+    return ""
+
+
+def newest_sheets(out: Path, names: Iterable[str]) -> dict[str, bytes]:
+    """Return the last sheet (PNG) of each robot that has one."""
+    found = {name: sorted((out / SHEETS).glob(f"step-????????-{name}.png")) for name in names}
+    return {name: paths[-1].read_bytes() for name, paths in found.items() if paths}

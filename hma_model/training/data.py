@@ -6,7 +6,6 @@ W, so a run may continue with another number of ranks.
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import RecipeError, TrainingError, UsageError
@@ -31,32 +30,12 @@ def share(recipe: "Recipe", ranks: int) -> tuple[int, int]:
     total = recipe.windows_per_step
     passes = recipe.accumulate if recipe.accumulate % ranks == 0 else ranks
     if total % passes:
-        raise RecipeError(
-            "recipe: batch_size",
-            f"{total} windows a step cannot be shared evenly by {ranks} ranks",
-            f"choose batch_size × accumulate as a multiple of {ranks}, such as {-(-total // ranks) * ranks}",
+        fault = f"{total} windows a step cannot be shared evenly by {ranks} ranks"
+        remedy = (
+            f"choose batch_size × accumulate as a multiple of {ranks}, such as {-(-total // ranks) * ranks}"
         )
+        raise RecipeError("recipe: batch_size", fault, remedy)
     return passes, total // passes
-
-
-@contextmanager
-def _workers_alive() -> Iterator[None]:
-    """Convert an error of the block, if it shows that a decoding process has ended.
-
-    Raises:
-        TrainingError: a process that decodes batches has ended.
-    """
-    try:
-        yield
-    except (RuntimeError, ConnectionError, EOFError) as fault:
-        said = (str(fault).splitlines() or [""])[0][:200]
-        if isinstance(fault, RuntimeError) and "DataLoader worker" not in said:
-            raise
-        raise TrainingError(
-            "workers",
-            f"a process that decodes batches has ended: {said or type(fault).__name__}",
-            "where memory is short choose fewer; the same command goes on from the last checkpoint",
-        ) from fault
 
 
 class TrainData:
@@ -84,29 +63,21 @@ class TrainData:
         self._batches: list[Iterator[Batch]] = []
         count = sum(self.mixture.counts)
         if recipe.windows_per_step > count:
-            raise RecipeError(
-                "recipe: batch_size",
-                f"{recipe.windows_per_step} windows a step are more than the {count} there are",
-                "lower batch_size or accumulate, or add data",
-            )
+            fault = f"{recipe.windows_per_step} windows a step are more than the {count} there are"
+            raise RecipeError("recipe: batch_size", fault, "lower batch_size or accumulate, or add data")
         self._data += [self._dataset(recipe, sets, size, number) for number in self.own[1:]]
 
     def _dataset(
         self, recipe: "Recipe", sets: Mapping[str, ShardSet], size: int, number: int
     ) -> MixtureDataset:
-        mixture = recipe.mixture
+        given: dict[str, Any] = {key: value or None for key, value in recipe.mixture}
         try:
             return MixtureDataset(
                 list(sets.values()),
                 size,
                 recipe.frames,
-                temperature=mixture.temperature,
-                weights=mixture.weights or None,
-                groups=mixture.groups or None,
-                caps=mixture.caps or None,
-                max_epochs=mixture.max_epochs,
-                samples=recipe.steps * recipe.windows_per_step if mixture.max_epochs else None,
-                draw=mixture.draw,
+                **given,
+                samples=recipe.steps * recipe.windows_per_step if recipe.mixture.max_epochs else None,
                 short=recipe.short,
                 seed=seed_for(recipe.seed, "sampler"),
                 rank=number,
@@ -133,8 +104,14 @@ class TrainData:
         if not self._batches:
             self._batches = [data.batches(self._workers) for data in self._data]
         for number, batches in zip(self.own, self._batches):
-            with _workers_alive():
+            try:
                 batch = next(batches)
+            except (RuntimeError, ConnectionError, EOFError) as fault:  # torch's DataLoader has lost a worker
+                if isinstance(fault, RuntimeError) and "DataLoader worker" not in str(fault):
+                    raise
+                said = f"a process that decodes batches has ended ({type(fault).__name__})"
+                remedy = "use fewer workers if memory is short, and run the same command to continue"
+                raise TrainingError("workers", said, remedy) from fault
             yield number, batch
 
     def realised(self) -> list[dict[str, Any]]:
@@ -148,20 +125,24 @@ class TrainData:
         known = {number: state for part in world.gather(mine) for number, state in part.items()}
         return {"passes": [known[number] for number in range(self.passes)]}
 
-    def load_state(self, state: Mapping[str, Any]) -> None:
+    def load_state(self, state: Mapping[str, Any], force: bool) -> str:
         """Continue from `state`, which any number of ranks may have saved.
 
-        Raises:
-            UsageError: the state is of another mixture, or of another number of passes a step.
-        """
-        kept = state.get("passes")
-        if not isinstance(kept, list) or len(kept) != self.passes:
-            count = len(kept) if isinstance(kept, list) else 0
-            raise UsageError("sampler state", f"is of {count} passes a step, this run has {self.passes}")
-        for number, data in zip(self.own, self._data):
-            data.load_state_dict(kept[number])
+        Returns:
+            The reason why the sampler starts again: a step has another number of passes, or the mixture is
+            another one and `force` accepts it. An empty string if the sampler continues.
 
-    def shared_otherwise(self, state: Mapping[str, Any]) -> bool:
-        """Check whether a state has another number of passes a step."""
-        kept = state.get("passes")
-        return isinstance(kept, list) and len(kept) != self.passes
+        Raises:
+            UsageError: the state is of another mixture.
+        """
+        kept = state["passes"]
+        if len(kept) != self.passes:
+            return f"its state has {len(kept)} passes a step, this run has {self.passes}"
+        try:
+            for number, data in zip(self.own, self._data):
+                data.load_state_dict(kept[number])
+        except UsageError as fault:
+            if not force:
+                raise
+            return str(fault)
+        return ""

@@ -1,41 +1,79 @@
-"""Detect bad training steps: a loss that is not finite, or a gradient far above its running mean.
+"""Sum up training steps, and detect bad ones: a loss that is not finite, or a gradient far above its mean.
 
-The recipe decides what the run does then: stop and name the windows, or skip the step and count it.
+The recipe decides what the run does at a bad step: stop and name the windows, or skip the step and count it.
 """
 
 import math
-from collections.abc import Sequence
+import resource
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import pyarrow.compute as pc
 import torch
 from torch import Tensor
 
 from hma_data.loading.dataset import Batch
+from hma_data.shards.reader import ShardSet
+from hma_model.config import OBJECTIVES
+from hma_model.training.parallel import World
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from hma_data.shards.reader import ShardSet
+    from hma_model.network.objectives import Output
 
 NAMED = 4  # windows named in an error
 MEMORY = 0.98  # decay of the running mean of norms
 SETTLED = 20  # steps before a norm can be a spike
 
 
-@dataclass
-class GradientSpikeDetector:
-    """The running mean of gradient norms.
+class StepMetrics:
+    """Sums of losses, kept on the device of the losses, so that a step needs only one transfer.
 
-    Attributes:
-        limit: a norm above this many times the mean is a spike; with 0 no norm is.
-        mean: running mean of the norms of steps that were taken.
-        count: number of these steps.
+    Args:
+        names: the ids of the embodiments.
+        device: the device of the losses.
     """
 
-    limit: float = 0.0
-    mean: float = 0.0
-    count: int = 0
+    def __init__(self, names: list[str], device: torch.device) -> None:
+        self._names = sorted(names)
+        self._place = {name: i for i, name in enumerate(self._names)}
+        self._loss = torch.zeros(1, device=device)
+        self._sums = torch.zeros(2, len(names), device=device)
+        self._objectives = torch.zeros(len(OBJECTIVES), device=device)
+
+    def add(self, embodiment: list[str], output: "Output") -> None:
+        """Add the loss of a pass, the loss of each sample, and the objective."""
+        index = torch.tensor([self._place[name] for name in embodiment], device=self._sums.device)
+        losses = output.per_sample.to(self._sums)
+        self._loss += output.loss.detach().to(self._loss)
+        self._sums.index_add_(1, index, torch.stack([losses, torch.ones_like(losses)]))
+        self._objectives[list(OBJECTIVES).index(output.objective)] += 1
+
+    def whole(self, world: World, passes: int) -> tuple[float, dict[str, float], list[str]]:
+        """Return the mean loss over all ranks, the mean by embodiment, and the objectives of the step."""
+        flat = world.sum(torch.cat([self._loss, self._sums.flatten(), self._objectives])).tolist()
+        count = len(self._names)
+        sums, counts, objectives = flat[1 : 1 + count], flat[1 + count : 1 + 2 * count], flat[1 + 2 * count :]
+        by_name = {name: s / n for name, s, n in zip(self._names, sums, counts) if n}
+        return flat[0] / passes, by_name, sorted(n for n, used in zip(OBJECTIVES, objectives) if used)
+
+
+def peak_memory_mib(device: torch.device) -> float:
+    """Return the peak memory in MiB of the GPU's tensors, or of the process on another device."""
+    if device.type == "cuda":
+        return round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit, 1)
+
+
+@dataclass
+class GradientSpikeDetector:
+    """The running mean of gradient norms."""
+
+    limit: float = 0.0  # a norm above this many times the mean is a spike; with 0 no norm is
+    mean: float = 0.0  # of the norms of steps that were taken
+    count: int = 0  # of these steps
 
     def fault(self, loss: float, norm: float) -> str:
         """Return the fault of a step; an empty string if the step may be taken."""
@@ -54,7 +92,7 @@ class GradientSpikeDetector:
 
 
 def suspects(
-    batches: Sequence[tuple[Batch, Tensor]], sets: "Mapping[str, ShardSet]"
+    batches: Sequence[tuple[Batch, Tensor]], sets: Mapping[str, ShardSet]
 ) -> list[tuple[float, str]]:
     """Return the windows of this rank that may be the cause of a bad step, each with its loss.
 
@@ -62,28 +100,17 @@ def suspects(
         batches: the batches of the step, each with the loss (B,) of its windows.
         sets: shard sets by embodiment, for the episodes' names.
     """
-    found = []
+    found: list[tuple[Any, ...]] = []
     for batch, losses in batches:
-        episodes, frames = (
-            ["?"] * len(batch) if v is None else v.tolist() for v in (batch.episode, batch.frame)
-        )
+        assert batch.episode is not None and batch.frame is not None
         inside = torch.ones_like(batch.action_mask) if batch.frame_mask is None else batch.frame_mask
-        rows = zip(batch.embodiment, episodes, frames, losses.tolist(), inside.sum(1).tolist(), strict=True)
-        found += [(loss, name, episode, frame, length) for name, episode, frame, loss, length in rows]
-    told = []
-    for loss, name, episode, frame, length in _worst(found):
-        shards = sets.get(name)
-        place = f"{name} episode {episode}{_named(shards, episode)} {_span(shards, frame, length)}"
-        told.append((loss, place))
-    return told
+        places = (batch.episode, batch.frame, inside.sum(1))
+        found += zip(losses.tolist(), batch.embodiment, *(column.tolist() for column in places), strict=True)
+    return [(loss, _place(sets[name], *where)) for loss, name, *where in worst(found)]
 
 
-def culprits(suspected: Sequence[tuple[float, str]]) -> list[str]:
-    """Return the suspects of all ranks whose losses are not finite; else all, the largest losses first."""
-    return [text for _, text in _worst(suspected)]
-
-
-def _worst[Item: tuple[Any, ...]](found: Sequence[Item]) -> list[Item]:
+def worst[Item: tuple[Any, ...]](found: Sequence[Item]) -> list[Item]:
+    """Return the windows whose losses, their first items, are not finite; else all, the largest first."""
     bad = [item for item in found if not math.isfinite(item[0])]
     return bad or sorted(found, key=lambda item: -item[0])
 
@@ -94,18 +121,8 @@ def listed(windows: Sequence[str]) -> str:
     return "; ".join(windows[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _span(shards: "ShardSet | None", first: object, length: int) -> str:
-    """Return a text that names the frames of the episode that a window of `length` frames spans."""
-    if shards is None or not isinstance(first, int):
-        return f"frame {first} and on"
-    return f"frames {first} to {first + (length - 1) * shards.row_stride}"
-
-
-def _named(shards: "ShardSet | None", episode: object) -> str:
-    if shards is None:
-        return ""
-    import pyarrow.compute as pc
-
-    table = shards.episodes
-    rows = table.filter(pc.equal(table["episode_index"], episode))["id"].to_pylist()
-    return f" ({rows[0]})" if rows else ""
+def _place(shards: ShardSet, episode: int, first: int, length: int) -> str:
+    """Describe a window of `length` frames by its robot, episode and frames."""
+    rows = shards.episodes.filter(pc.equal(shards.episodes["episode_index"], episode))
+    last = first + (length - 1) * shards.row_stride
+    return f"{shards.embodiment.id} episode {episode} ({rows['id'][0]}) frames {first} to {last}"

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hma_data.errors import CheckpointError, HubError, RecipeError
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import read_json
@@ -34,17 +36,11 @@ TRAINED_BY = {
 
 @dataclass(frozen=True)
 class Start:
-    """A checkpoint from which a run starts.
+    """A checkpoint from which a run starts."""
 
-    Attributes:
-        checkpoint: the run's own copy.
-        frozen: the trunk is not trained.
-        source: the source of the checkpoint, for notes.
-    """
-
-    checkpoint: Checkpoint
-    frozen: bool
-    source: str
+    checkpoint: Checkpoint  # the run's own copy
+    frozen: bool  # the trunk is not trained
+    source: str  # where the checkpoint is from, for notes
 
     @classmethod
     def bring(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> None:
@@ -58,11 +54,11 @@ class Start:
 
         assert recipe.start is not None
         frozen, place = recipe.freeze == "trunk", out / START
-        source, revision = hub.addressed(recipe.start)
-        local = not hub.is_repository(source) and "://" not in source
         if (place / checkpoints.README).is_file():  # written last
             _require_source(recipe.start, out)
             return
+        source, revision = hub.addressed(recipe.start)
+        local = not hub.is_repository(source) and "://" not in source
         if local:
             found = Checkpoint.open(checkpoints.resolve(Path(source).expanduser()))
             require_tokenizer(found.config, _spec(sets), found.folder)
@@ -76,9 +72,8 @@ class Start:
             if local or "://" in source:
                 raise
             both = f"is no folder here; as a repository of the hub: {fault.fault}"
-            raise HubError(
-                recipe.start, both, f"give the path of a checkpoint or run, or: {fault.remedy}"
-            ) from fault
+            remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
+            raise HubError(recipe.start, both, remedy) from fault
 
     @classmethod
     def open(cls, recipe: "Recipe", sets: Mapping[str, ShardSet], out: Path) -> "Start":
@@ -103,17 +98,12 @@ class Start:
             if key in TRAINED_BY:
                 changes[key] = value
             elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
-                raise RecipeError(
-                    f"recipe: model.{key}",
-                    f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}",
-                    "leave it out: the network is the checkpoint's",
-                )
+                fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"
+                remedy = "leave it out: the network is the checkpoint's"
+                raise RecipeError(f"recipe: model.{key}", fault, remedy)
         if config.time_position == "learned" and recipe.frames > config.frames:
-            raise RecipeError(
-                "recipe: frames",
-                f"{recipe.frames} are more than the checkpoint's {config.frames}",
-                "use fewer",
-            )
+            fault = f"{recipe.frames} are more than the checkpoint's {config.frames}"
+            raise RecipeError("recipe: frames", fault, "use fewer")
         return config.replace(**changes)
 
     def stats(self, shards: ShardSet) -> dict[str, Any]:
@@ -128,12 +118,9 @@ class Start:
         theirs, ours = self.checkpoint.embodiment(name), shards.embodiment
         for key in ("action_dim", "stride", "normalize_mask"):
             a, b = getattr(theirs, key), getattr(ours, key)
-            if list(a) != list(b) if key == "normalize_mask" else a != b:
-                raise CheckpointError(
-                    self.source,
-                    f"knows {name} with {key} {a}, the shards have {b}",
-                    "give the robot of the shards another id",
-                )
+            if not np.array_equal(a, b):
+                fault = f"has {name} with {key} {a}, the shards have {b}"
+                raise CheckpointError(self.source, fault, "give the robot of the shards another id")
         return self.checkpoint.stats(name)
 
     def fill(self, model: "HMA") -> None:
@@ -152,38 +139,31 @@ class Start:
         fresh = [name for name in names if name not in known]
         notes = [f"from {self.source}: trunk {'frozen' if self.frozen else 'tuned'}"]
         if fresh:
-            notes.append(f"fresh stem and head: {', '.join(fresh)}")
+            notes.append(f"new stem and head: {', '.join(fresh)}")
         if known:
-            notes.append(f"going on from its stem and head, with its statistics: {', '.join(known)}")
+            notes.append(f"stem, head and statistics from the checkpoint: {', '.join(known)}")
         return notes
 
 
 def _require_source(source: str, out: Path) -> None:
     """Raise if a resumed run names another checkpoint than the one it was started from.
 
-    The checkpoint is the same if its trunk is, so it may have moved. A source that does not exist any more is
-    accepted.
+    The checkpoint is the same if its trunk is, so it may have moved, and it may be gone.
     """
     from hma_model.hub import publish as hub
 
-    before = _begun_from(out)
+    before = read_json(out / RECIPE).get("start") if (out / RECIPE).is_file() else None
     if before in (None, source):
         return
     address, revision = hub.addressed(source)
-    if not hub.is_repository(address) and "://" not in address:
-        path = Path(address).expanduser()
-        trunk = Checkpoint.open(checkpoints.resolve(path)).trunk_sha256 if path.exists() else None
-    else:
+    path = Path(address).expanduser()
+    if hub.is_repository(address) or "://" in address:
         trunk = hub.describe(address, revision)["trunk_sha256"]
+    else:
+        trunk = Checkpoint.open(checkpoints.resolve(path)).trunk_sha256 if path.exists() else None
     if trunk not in (None, Checkpoint.open(out / START).trunk_sha256):
-        raise RecipeError(
-            out, f"was begun from {before}, not from {source}", "train into another folder, or name the first"
-        )
-
-
-def _begun_from(out: Path) -> str | None:
-    path = out / RECIPE
-    return read_json(path).get("start") if path.is_file() else None
+        fault = f"was started from {before}, not from {source}"
+        raise RecipeError(out, fault, "train into another folder, or name the first")
 
 
 def _spec(sets: Mapping[str, ShardSet]) -> Any:

@@ -1,33 +1,37 @@
-"""Write the metrics of a training run, and show its progress.
+"""Write the metrics of a training run, show its progress, and pass the figures to trackers.
 
 `metrics.jsonl` has one line a step (`"kind": "train"`) and one line an evaluation (`"kind": "eval"`). A
-terminal shows a live table; any other output gets a plain line every few seconds.
+terminal shows a live table; any other output gets a plain line every few seconds. The recipe may name
+trackers: TensorBoard's event files in `tensorboard/` of the run's folder (`tensorboard --logdir RUN` shows
+them), trackio or wandb. An OSError is converted by the caller, see `hma_model.training.runtime.run_errors`.
 """
 
+import hashlib
+import importlib
 import json
 import math
 import os
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from hma_data.console import human_seconds
-from hma_data.errors import OutputError
+from hma_data.errors import MissingDependencyError
 from hma_data.storage.files import finite, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.metrics import perplexity
-from hma_model.evaluation.sample_images import FOLDER as PICTURES
-from hma_model.training.trackers import Tracker
+from hma_model.evaluation.rollout_video import SHEETS
+from hma_model.training.recipe import Recipe
 
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.live import Live
 
-METRICS, KINDS = "metrics.jsonl", ("train", "eval")
+METRICS, KINDS, EVENTS = "metrics.jsonl", ("train", "eval"), "tensorboard"
 PLAIN_SECONDS = 10.0
 SMOOTHING = 20  # steps over which a shown loss is averaged
 PACING = 50  # steps from which the speed and the remaining time are estimated
@@ -36,17 +40,121 @@ PACING = 50  # steps from which the speed and the remaining time are estimated
 def read_metrics(out: StrPath) -> list[dict[str, Any]]:
     """Read the complete lines of metrics.jsonl in a run's folder (str or path); none without the file."""
     path = as_path(out) / METRICS
-    if not path.is_file():
-        return []
     found: list[dict[str, Any]] = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
         try:
             values = json.loads(line)
-        except (ValueError, RecursionError):  # a killed run's last line
+        except ValueError:  # a killed run's last line
             continue
         if isinstance(values, dict) and isinstance(values.get("step"), int) and values.get("kind") in KINDS:
             found.append(values)
     return found
+
+
+def _package(tracker: str, module: str, install: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as fault:
+        where, said = f"recipe: track={tracker}", f"{tracker} is not installed"
+        raise MissingDependencyError(where, said, f"{install}, or leave it out") from fault
+
+
+class Remote:
+    """A tracker for trackio or wandb, which have the same functions.
+
+    Args:
+        name: the name of the package.
+        recipe: the recipe, which is recorded with the run.
+        out: the run's folder; its name is the name of the run.
+    """
+
+    def __init__(self, name: str, recipe: Recipe, out: Path) -> None:
+        self._package = _package(name, name, f"pip install {name}")
+        run = out.absolute().name
+        given = {"project": recipe.project, "name": run, "config": recipe.values(), "resume": "allow"}
+        if name == "wandb":  # wandb resumes a run by its id, trackio by its name
+            folder = hashlib.sha256(str(out.absolute()).encode()).hexdigest()
+            given["id"] = f"{run[:40]}-{folder[:12]}"
+        self._package.init(**given)
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Record figures of a step by tag, such as `train/loss`."""
+        self._package.log(dict(values), step=step)
+
+    def picture(self, step: int, tag: str, path: Path) -> None:
+        """Record a PNG file."""
+        self._package.log({tag: self._package.Image(str(path))}, step=step)
+
+    def close(self) -> None:
+        """End the record."""
+        self._package.finish()
+
+
+class EventFile:
+    """A TensorBoard event file, written with the protocol buffers of the `tensorboard` package.
+
+    `torch.utils.tensorboard.SummaryWriter` is not used: it imports TensorFlow wherever that is installed.
+
+    Args:
+        folder: the folder, made if it does not exist; every session adds a file.
+        step: figures of later steps in older files are superseded.
+    """
+
+    def __init__(self, folder: Path, step: int = 0) -> None:
+        install = "uv sync --extra tensorboard"
+        self._protos = _package("tensorboard", "tensorboard.compat.proto.event_pb2", install)
+        records = _package("tensorboard", "tensorboard.summary.writer.record_writer", install)
+        folder.mkdir(exist_ok=True)
+        count = len(list(folder.glob("events.out.tfevents.*")))
+        path = folder / f"events.out.tfevents.{int(time.time()):010d}.hma.{count:04d}"
+        self._records = records.RecordWriter(path.open("wb"))
+        self._write(file_version="brain.Event:2")
+        if count:  # tells readers to drop later steps of older files
+            self._write(step=step + 1, session_log={"status": self._protos.SessionLog.START})
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Record figures of a step by tag, such as `train/loss`."""
+        rows = [{"tag": tag, "simple_value": value} for tag, value in values.items()]
+        self._write(step=step, summary={"value": rows})
+
+    def picture(self, step: int, tag: str, path: Path) -> None:
+        """Record a PNG file."""
+        from PIL import Image
+
+        content = path.read_bytes()
+        with Image.open(path) as opened:
+            width, height = opened.size
+        image = {"height": height, "width": width, "colorspace": 3, "encoded_image_string": content}
+        self._write(step=step, summary={"value": [{"tag": tag, "image": image}]})
+
+    def close(self) -> None:
+        """End the record."""
+        self._records.close()
+
+    def _write(self, **fields: Any) -> None:
+        event = self._protos.Event(wall_time=time.time(), **fields)
+        self._records.write(event.SerializeToString())
+        self._records.flush()
+
+
+Tracker = EventFile | Remote
+
+
+def open_trackers(recipe: Recipe, out: Path, step: int) -> list[Tracker]:
+    """Open the trackers that a recipe names.
+
+    Args:
+        recipe: `track` names them.
+        out: the run's folder.
+        step: number of finished steps; later figures of an earlier, killed session are superseded.
+
+    Raises:
+        MissingDependencyError: a package is not installed.
+    """
+    return [
+        EventFile(out / EVENTS, step) if name == "tensorboard" else Remote(name, recipe, out)
+        for name in recipe.track
+    ]
 
 
 class RunLog:
@@ -54,8 +162,8 @@ class RunLog:
 
     Args:
         out: the run's folder.
-        steps: the number of steps of the whole run.
-        begin: the number of finished steps; later lines of an earlier, killed run are dropped.
+        steps, begin: the steps of the whole run, and how many are finished; lines of later steps, which an
+            earlier, killed session has written, are dropped.
         show: print progress to standard error.
         write: write metrics.jsonl; only the first rank does.
         trackers: the trackers that get the same figures.
@@ -74,8 +182,10 @@ class RunLog:
             write_atomic(self._path, "".join(_line(values) for values in kept))
         self._recent: dict[str, deque[float]] = {}
         self._last: dict[str, Any] = {}
-        evaluations = [line for line in kept if line["kind"] == "eval"]
-        self._evaluation: dict[str, Any] = evaluations[-1] if evaluations else {}
+        self._evaluation: dict[str, Any] = {}
+        for line in kept:
+            if line["kind"] == "eval":
+                self._evaluation = line
         self._paces: deque[float] = deque(maxlen=PACING)  # seconds of steps of this session
         self._spent, self._shown, self._said = 0.0, 0.0, ""
         self._opened = time.monotonic()
@@ -116,10 +226,10 @@ class RunLog:
         self._track("train", facts, ("loss", "lr", "grad_norm", "step_seconds", "memory_mib", "skipped"))
         self._last = facts
         self._spent += facts["step_seconds"]
-        first = facts["step"] == self._begin + 1  # it includes compilation and starting workers
-        if facts["step"] == self._begin + 2:
+        number = facts["step"] - self._begin
+        if number == 2:  # the first step of a session includes compilation and the start of the workers
             self._paces.clear()
-        self._paces.append(facts["step_seconds"] - first * facts.get("data_seconds", 0.0))
+        self._paces.append(facts["step_seconds"] - (facts.get("data_seconds", 0.0) if number == 1 else 0.0))
         for name, loss in facts["loss_by_embodiment"].items():
             recent = self._recent.setdefault(name, deque(maxlen=SMOOTHING))
             if math.isfinite(loss):  # skipped steps are counted separately
@@ -136,22 +246,16 @@ class RunLog:
 
     def sync(self) -> None:
         """Flush the lines to disk, because the checkpoint that is written next continues from them."""
-        if self._file is None:
-            return
-        try:
+        if self._file:
             os.fsync(self._file.fileno())
-        except OSError as fault:
-            raise OutputError(self._path, f"cannot be written: {fault.strerror}", "free space") from fault
 
     def pictures(self, out: Path, step: int) -> None:
         """Pass the pictures of an evaluation to the trackers."""
-        for path in sorted((out / PICTURES).glob(f"step-{step:08d}-*.png")) if self._trackers else ():
+        for path in sorted((out / SHEETS).glob(f"step-{step:08d}-*.png")):
             for tracker in self._trackers:
                 tracker.picture(step, f"rollout/{path.stem[14:]}", path)
 
     def _track(self, kind: str, facts: dict[str, Any], keys: Sequence[str]) -> None:
-        if not self._trackers:
-            return
         values = {f"{kind}/{key}": facts.get(key) for key in keys}
         for key in ("loss", "accuracy"):
             own = facts.get(f"{key}_by_embodiment", {})
@@ -161,13 +265,9 @@ class RunLog:
             tracker.scalars(facts["step"], known)
 
     def _write(self, values: dict[str, Any]) -> None:
-        if self._file is None:
-            return
-        try:
+        if self._file:
             self._file.write(_line(values))
             self._file.flush()
-        except OSError as fault:
-            raise OutputError(self._path, f"cannot be written: {fault.strerror}", "free space") from fault
 
     def _present(self, force: bool = False) -> None:
         if not self._last or not self._show:
@@ -195,7 +295,7 @@ class RunLog:
         rate, left = self._pace()
         losses = ", ".join(f"{name} {value:.3f}" for name, value in self._smooth().items())
         held = f", validation {_number(self._evaluation.get('loss'))}" if self._evaluation else ""
-        skipped = f", {self._last['skipped']} steps left out" if self._last.get("skipped") else ""
+        skipped = f", {self._last['skipped']} steps skipped" if self._last.get("skipped") else ""
         where = f"step {self._last['step']}/{self._steps}"
         return f"{where}: loss {losses}{held}, {rate:.1f} windows/s, {left} left{skipped}"
 
@@ -205,21 +305,17 @@ class RunLog:
         from rich.table import Table
 
         rate, left = self._pace()
-        table = Table("embodiment", "loss", "perplexity", "validation", "ignoring all", box=SIMPLE)
+        table = Table("embodiment", "loss", "perplexity", "validation", "baseline", box=SIMPLE)
         held = self._evaluation.get("loss_by_embodiment", {})
         ignoring = self._evaluation.get("baseline_by_embodiment", {})
         for name, loss in self._smooth().items():
             known = [_number(values.get(name)) for values in (held, ignoring)]
-            table.add_row(name, f"{loss:.3f}", _rounded(perplexity(loss)) if self._nats else "-", *known)
+            table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.1f}" if self._nats else "-", *known)
         last = self._last
         head = f"step {last['step']:,}/{self._steps:,}   {rate:.1f} windows/s   {left} left"
         rest = f"lr {last['lr']:.2e}   {last.get('memory_mib', 0):,.0f} MiB"
-        skipped = f"   {last['skipped']} steps left out" if last.get("skipped") else ""
+        skipped = f"   {last['skipped']} steps skipped" if last.get("skipped") else ""
         return Group(f"{head}   {rest}{skipped}", table)
-
-
-def _rounded(value: float) -> str:
-    return f"{value:,.1f}" if value < 100 else f"{value:,.0f}"
 
 
 def _number(value: float | None) -> str:

@@ -1,8 +1,11 @@
-"""Set up AdamW for the model: weight decay, muP's learning rates, and the learning rate schedule.
+"""Set up AdamW for the model: weight decay, muP's rates, the schedule, and the average of the weights.
 
 Matrices have weight decay; norms, biases, embeddings, positions and mask vectors have none. With muP,
 matrices of which both sides grow with the width learn at lr / (width / base_width). Their decay is multiplied
 by width / base_width, so that lr and decay found at one width suit another (Yang et al. 2022, table 8).
+
+After each step the average of the weights moves towards them by 1 - decay. In the first steps it moves by
+more, so that it soon forgets the initial weights (decay is at most (1 + step) / (10 + step)).
 """
 
 import math
@@ -12,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from hma_data.errors import CheckpointError
-from hma_model.training.parallel import is_sharded, like, whole
+from hma_model.training.parallel import gathered, is_sharded, like, local, whole
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -66,10 +68,8 @@ def parameter_groups(model: "HMA", lr: float, weight_decay: float) -> list[dict[
         decays, scaled, sharded = name not in plain, name in matrices, is_sharded(parameter)
         base_lr = lr / multiplier if scaled else lr
         decay = weight_decay * (multiplier if scaled else 1.0) if decays else 0.0
-        empty: dict[str, Any] = {"params": [], "names": []}
-        group = groups.setdefault(
-            (decays, scaled, sharded), {**empty, "lr": base_lr, "base_lr": base_lr, "weight_decay": decay}
-        )
+        fresh = {"params": [], "names": [], "lr": base_lr, "base_lr": base_lr, "weight_decay": decay}
+        group = groups.setdefault((decays, scaled, sharded), fresh)
         group["params"].append(parameter)
         group["names"].append(name)
     return list(groups.values())
@@ -114,23 +114,45 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     }
 
 
-def load_optimizer_state(
-    optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor], where: object
-) -> None:
-    """Restore a result of `optimizer_state`.
+def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, Tensor]) -> None:
+    """Restore a result of `optimizer_state`; a parameter that it does not name begins without moments."""
+    for group in optimizer.param_groups:
+        for name, parameter in zip(group["names"], group["params"]):
+            if f"{name}/step" in state:
+                moments = {key: like(state[f"{name}/{key}"].clone(), parameter) for key in _MOMENTS[:2]}
+                step_device = parameter.device if optimizer.defaults.get("fused") else "cpu"
+                step = state[f"{name}/step"].clone().to(step_device)
+                optimizer.state[parameter] = {**moments, "step": step}
 
-    Raises:
-        CheckpointError: moments are of unknown parameters, or have other shapes.
+
+class Average:
+    """A moving average of a network's parameters; each rank averages its part.
+
+    Args:
+        model: the network in training.
+        decay: the decay of the average, 0 to 1.
     """
-    known = {n: p for g in optimizer.param_groups for n, p in zip(g["names"], g["params"])}
-    for key in state:
-        name, _, moment = key.rpartition("/")
-        fits = moment == "step" or (name in known and state[key].shape == known[name].shape)
-        if name not in known or moment not in _MOMENTS or not fits:
-            raise CheckpointError(where, f"optimizer state {key!r} fits no parameter", "train from the start")
-    for name, parameter in known.items():
-        if f"{name}/step" in state:
-            moments = {key: like(state[f"{name}/{key}"].clone(), parameter) for key in _MOMENTS[:2]}
-            step_device = parameter.device if optimizer.defaults.get("fused") else "cpu"
-            step = state[f"{name}/step"].clone().to(step_device)
-            optimizer.state[parameter] = {**moments, "step": step}
+
+    def __init__(self, model: nn.Module, decay: float) -> None:
+        self.decay = decay
+        self._model = model
+        self._own = {n: p.detach().clone() for n, p in model.named_parameters() if p.requires_grad}
+
+    @torch.no_grad()
+    def update(self, step: int) -> None:
+        """Update the average with the weights after step `step`, counted from 1."""
+        weight = 1 - min(self.decay, (1 + step) / (10 + step))
+        moving = {n: p for n, p in self._model.named_parameters() if n in self._own}
+        own = [local(value) for value in self._own.values()]
+        torch._foreach_lerp_(own, [local(moving[name].detach()) for name in self._own], weight)
+
+    @torch.no_grad()
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        """Restore unsharded averages by parameter name; a parameter that is not named keeps its average."""
+        for name, own in self._own.items():
+            if name in state:
+                own.copy_(like(state[name], own))
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the unsharded state of the network with averaged parameters; every rank must call it."""
+        return {**gathered(self._model.state_dict().items()), **gathered(self._own.items())}

@@ -1,16 +1,24 @@
-"""Train on several ranks under torchrun: join them, exchange values, and distribute the network.
+"""Train on several ranks under torchrun: join them, report their errors, and distribute the network.
 
     torchrun --nproc-per-node 8 --no-python hma train discrete_base data=[…] --out runs/base
 
 A recipe states the whole step, and the ranks share its passes. Training is therefore the same on any number
 of ranks. DDP keeps the whole network on every rank. FSDP2 shards the trunk's blocks; stems, heads, embeddings
 and readouts stay whole, because the ranks may use different ones in the same step.
+
+The error that ends a run is reported exactly once. A rank that fails writes its error into the store of the
+run. A rank that has only lost the others finds it there. The first failing rank to claim the report prints
+its error; the others exit silently. A rank exits only after the report is claimed, and the reporting rank
+ignores the signal by which torchrun then ends it. The claim needs a store that outlives the ranks; torchrun
+has one. Ranks that are started in another way each print their own error.
 """
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any
@@ -19,28 +27,22 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
-from hma_model.training.rank_errors import PREFIX, read_error, write_error
+from hma_data.errors import HMAError, RecipeError, TrainingError
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 PATIENCE = timedelta(hours=2)  # rank 0 evaluates and writes while the others wait
+ANSWER = timedelta(seconds=30)  # the time limit for an answer of torchrun's store
+PREFIX, ERROR, REPORTS = "errors", "error", "reports"  # of the keys in the store
 
 
 @dataclass(frozen=True)
 class World:
-    """The ranks of a run.
-
-    Attributes:
-        rank: the number of this process, from 0.
-        size: the number of ranks.
-        local_rank: the number of this process among those of this machine.
-    """
+    """The ranks of a run: `rank` is the number of this process, from 0, and `size` their number."""
 
     rank: int = 0
     size: int = 1
-    local_rank: int = 0
 
     @property
     def main(self) -> bool:
@@ -71,22 +73,17 @@ class World:
             try:
                 outcome[0] = action()
             except Exception as fault:  # any error: the others must not wait for a rank that has ended
-                own, outcome[1] = fault, _told(fault)
+                text = f"{type(fault).__name__}: {fault}"
+                own, outcome[1] = (
+                    fault,
+                    fault if isinstance(fault, HMAError) else TrainingError("rank 0", text),
+                )
         dist.broadcast_object_list(outcome, src=0)
         if own is not None:
             raise own
         if outcome[1] is not None:
             raise outcome[1]
         return outcome[0]
-
-
-def _told(fault: Exception) -> HMAError:
-    """Convert an error of rank 0 to the one that the other ranks raise."""
-    if isinstance(fault, HMAError):
-        return fault
-    if isinstance(fault, OSError):
-        return OutputError(fault.filename or "rank 0", f"cannot be written: {fault.strerror or fault}")
-    return TrainingError("rank 0", f"{type(fault).__name__}: {fault}", "see what it has said itself")
 
 
 @contextmanager
@@ -100,13 +97,11 @@ def join(device: torch.device) -> Iterator[World]:
         RecipeError: the ranks cannot find each other.
         TrainingError: another rank has ended; it states the reason if that rank reported one.
     """
-    size = int(os.environ.get("WORLD_SIZE", "1"))
-    if size == 1 and not dist.is_initialized():
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield World()
         return
-    ours = not dist.is_initialized()
-    store = _met(device) if ours else None
-    world = World(dist.get_rank(), dist.get_world_size(), local_rank())
+    store = _met(device)
+    world = World(dist.get_rank(), dist.get_world_size())
     try:
         yield world
     except Exception as fault:
@@ -117,7 +112,7 @@ def join(device: torch.device) -> Iterator[World]:
         raise error from fault
     finally:
         waits = device.type == "cuda" and sys.exc_info()[0] is not None  # NCCL waits for ended ranks
-        if ours and dist.is_initialized() and not waits:
+        if not waits:
             dist.destroy_process_group()
 
 
@@ -130,28 +125,70 @@ def _met(device: torch.device) -> dist.Store:
         own = dist.PrefixStore("group", store)
         dist.init_process_group(backend, store=own, rank=rank, world_size=size, timeout=PATIENCE)
     except (RuntimeError, ValueError) as fault:
-        text = f"cannot find each other: {str(fault).splitlines()[0]}"
+        text = f"cannot connect to each other: {str(fault).splitlines()[0]}"
         raise RecipeError("ranks", text, "start them with torchrun") from fault
     return dist.PrefixStore(PREFIX, store)
 
 
-def _explained(fault: Exception, world: World, store: dist.Store | None) -> Exception:
+def _explained(fault: Exception, world: World, store: dist.Store) -> Exception:
     """Return the error to raise for a fault; if this rank lost the others, the error that ended them."""
     if isinstance(fault, HMAError) or not isinstance(fault, RuntimeError):
         return fault
-    said = (str(fault).splitlines() or [""])[0][:200]
+    where, said = f"rank {world.rank}", str(fault).partition("\n")[0][:200]
     if not isinstance(fault, dist.DistError) and "gloo" not in str(fault):
-        return TrainingError(f"rank {world.rank}", f"{type(fault).__name__}: {said}", "--debug shows where")
-    return read_error(store) or TrainingError(
-        f"rank {world.rank}",
-        f"has lost the others: {said}",
-        "see what ended another rank; the same command goes on from the last checkpoint",
-    )
+        return TrainingError(where, f"{type(fault).__name__}: {said}", "--debug shows where")
+    remedy = "see what ended another rank, and run the same command to continue"
+    return read_error(store) or TrainingError(where, f"has lost the other ranks: {said}", remedy)
 
 
-def local_rank() -> int:
-    """Return the number of this process among those of its machine."""
-    return int(os.environ.get("LOCAL_RANK", "0"))
+def write_error(store: dist.Store, rank: int, error: Exception) -> None:
+    """Write the error that ends a rank into the store, unless another rank has written one."""
+    kind = "" if hasattr(error, "exit_code") else f"{type(error).__name__}: "
+    with suppress(RuntimeError):  # the store is gone with the process that kept it
+        store.compare_set(ERROR, "", f"{rank} {kind}{error}")
+
+
+def read_error(store: dist.Store) -> TrainingError | None:
+    """Return the error that another rank has written, or None."""
+    try:
+        if not store.check([ERROR]):
+            return None
+        rank, _, text = store.get(ERROR).decode().partition(" ")
+    except RuntimeError:
+        return None
+    return TrainingError(f"rank {rank}", text)
+
+
+@contextmanager
+def report_once() -> Iterator[None]:
+    """Let one rank of a failed run raise its error; end the others silently with its exit code.
+
+    Raises:
+        SystemExit: another rank reports its error.
+    """
+    try:
+        yield
+    except Exception as error:
+        if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+            raise
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if _claim_report():
+            raise
+        raise SystemExit(getattr(error, "exit_code", 1)) from error
+
+
+def _claim_report() -> bool:
+    """Check whether this rank must report: it is the first to claim it, or there is no store."""
+    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
+        return True
+    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    try:
+        store = dist.TCPStore(host, port, is_master=False, wait_for_workers=False, timeout=ANSWER)
+        attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+        return bool(store.add(f"{PREFIX}/{REPORTS} {attempt}", 1) == 1)
+    except RuntimeError:  # torchrun has ended
+        return True
 
 
 # -- the distributed network
@@ -198,7 +235,7 @@ class ParallelModel:
 
     def passing(self, last: bool) -> AbstractContextManager[None]:
         """Return a context for a forward and backward pass; the last pass of a step averages gradients."""
-        if isinstance(self._call, nn.parallel.DistributedDataParallel):
+        if isinstance(self._call, _DDP):
             return nullcontext() if last else self._call.no_sync()
         if self.sharded:
             self._call.set_requires_gradient_sync(last)  # type: ignore[operator]
@@ -207,9 +244,8 @@ class ParallelModel:
     def average(self) -> None:
         """Average, after the last pass, the gradients that neither DDP nor FSDP has averaged."""
         if self.sharded:
-            _average(
-                [p for p in self.model.parameters() if p.requires_grad and not is_sharded(p)], self.world
-            )
+            trained = (p for p in self.model.parameters() if p.requires_grad)
+            _average([p for p in trained if not is_sharded(p)], self.world)
 
     def clip(self, limit: float) -> float:
         """Scale the gradients to at most this norm over all ranks, and return the norm they had."""

@@ -6,33 +6,50 @@
     lr: 1e-3
 
 A recipe refuses unknown keys. The values that the shards state (kind, grid, vocabulary, latents) are derived
-from them and cannot be given.
+from them and cannot be given. All faults are reported at once, before any shard is opened.
 """
 
-import os
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    ValidationError,
+    create_model,
+)  # fmt: skip
 
 from hma_data.errors import RecipeError, UsageError
 from hma_data.storage.paths import StrPath, as_text, shipped
 from hma_data.storage.yaml_io import parse_yaml, read_yaml
 from hma_model.config import HMAConfig
-from hma_model.training.recipe_faults import DERIVED, network_values, problem
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import TokenizerSpec
 
-MAX_EXTENDS = 8
-MAX_NAME = 200  # maximum characters of a name in an error
 # keys that may change when a run is resumed: places and intervals, but nothing that changes the weights
 _FREE = {
     *("data", "out", "start", "device", "workers", "parallel", "compile", "checkpointing"),
     *("eval_every", "eval_windows", "pictures", "pictures_share", "checkpoint_every", "keep_last"),
     *("report", "track", "project"),
+}
+_DERIVED = {"kind", "grid", "factored", "channels", "latent_scale", "frames", "objectives", "tokenizer"}
+_PLAIN = {  # pydantic's error types, or their first words, in plain English
+    "int": "must be a whole number (an integer)",
+    "float": "must be a number",
+    "bool": "must be true or false (a boolean)",
+    "string_type": "must be a text (a string)",
+    "string_pattern_mismatch": "must be auto, cpu, mps, cuda or cuda:N",  # only `device` has a pattern
+    "tuple_type": "must be a list",
+    "dict": "must be a mapping of keys to values (a dictionary)",
+    "model": "must be a mapping of keys to values (a dictionary)",
+    "invalid_key": "keys must be words",
 }
 
 
@@ -49,19 +66,41 @@ def _listed(value: Any) -> Any:
 def _named(value: str) -> str:
     if not value.strip():
         raise ValueError("must name a folder or URI")
-    # no shell expands ~ in YAML and in key=value; a URI must not go through Path
-    return str(Path(value).expanduser()) if value.startswith("~") else value
+    return str(Path(value).expanduser()) if value.startswith("~") else value  # no shell has expanded it
+
+
+def _words(value: Any) -> Any:
+    if isinstance(value, str) or (isinstance(value, list) and all(isinstance(v, str) for v in value)):
+        return value
+    raise ValueError("must be a word or a list of words")
 
 
 Count = Annotated[int, BeforeValidator(_no_bool)]
 Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
+Steps = Annotated[Count, Field(ge=0)]
+Share = Annotated[Number, Field(ge=0, le=1)]
 Beta = Annotated[Number, Field(ge=0, lt=1)]
 Cap = Annotated[Number, Field(gt=0, le=1)]
 Place = Annotated[str, AfterValidator(_named)]
+Places = Annotated[tuple[Place, ...], BeforeValidator(_listed)]
+Trackers = Annotated[tuple[Literal["tensorboard", "trackio", "wandb"], ...], BeforeValidator(_listed)]
 
 
 class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+_TYPES: dict[Any, Any] = {
+    int: Count,
+    float: Number,
+    bool: StrictBool,
+    str: str,
+    tuple[str, ...]: Annotated[Any, AfterValidator(_words)],
+}
+_NETWORK: dict[str, Any] = {
+    name: (_TYPES[kind], None) for name, kind in get_type_hints(HMAConfig).items() if name not in _DERIVED
+}
+_Network = create_model("_Network", __base__=_Settings, **_NETWORK)
 
 
 class MixtureSettings(_Settings):
@@ -78,9 +117,7 @@ class MixtureSettings(_Settings):
 class Recipe(_Settings):
     """The settings of a training run. `load_recipe` makes it and explains its errors."""
 
-    data: Annotated[tuple[Place, ...], BeforeValidator(_listed)] = Field(
-        (), description="folders of shards, one an embodiment"
-    )
+    data: Places = Field((), description="folders of shards, one an embodiment")
     mixture: MixtureSettings = MixtureSettings()
     frames: Count = Field(12, ge=2, le=4096, description="T of a window")
     short: Literal["drop", "pad"] = Field("drop", description="episodes shorter than a window")
@@ -89,37 +126,28 @@ class Recipe(_Settings):
     model: dict[str, Any] = Field({}, description="fields of HMAConfig")
     objectives: dict[str, Number] = Field({"forward": 1.0}, description="how often each is drawn")
 
-    start: Place | None = Field(None, description="a checkpoint to begin from: folder, run, URI or hub repo")
+    start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
-    readout_bias: Literal["frequencies", "zero"] = Field(
-        "frequencies", description="what the token readout begins with: the training tokens' log frequencies"
-    )
+    # what the bias of the token readout starts with: the log frequencies of the training tokens
+    readout_bias: Literal["frequencies", "zero"] = "frequencies"
 
     steps: Count = Field(1000, ge=1, le=10**12)
     lr: Number = Field(3e-4, gt=0, le=1e6)
     lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")
-    warmup: Count = Field(100, ge=0, description="steps in which lr rises from 0")
+    warmup: Steps = Field(100, description="steps in which lr rises from 0")
     schedule: Literal["constant_with_warmup", "cosine"] = "constant_with_warmup"
-    lr_end: Number = Field(0.1, ge=0, le=1, description="cosine: the last step's share of lr")
+    lr_end: Share = Field(0.1, description="cosine: the last step's share of lr")
     betas: tuple[Beta, Beta] = (0.9, 0.95)
     eps: Number = Field(1e-8, gt=0, le=1e6)
     weight_decay: Number = Field(0.05, ge=0, le=1e6)
-    clip: Number = Field(1.0, gt=0, description="of the gradient's norm")
-    nonfinite: Literal["stop", "skip"] = Field(
-        "stop", description="at a loss that is not a number, or at a spike"
-    )
-    spike: Number = Field(
-        0.0, ge=0, description="a gradient's norm above this many times its running mean; 0 never"
-    )
-    ema: Number = Field(
-        0.0, ge=0, lt=1, description="decay of averaged weights, then evaluated and saved; 0 without"
-    )
-    self_forward: Number = Field(
-        0.0, ge=0, le=1, description="share of the windows whose past is the model's own prediction"
-    )
+    clip: Number = Field(1.0, gt=0, description="limit of the gradient's norm")
+    nonfinite: Literal["stop", "skip"] = Field("stop", description="at a loss that is not finite, or a spike")
+    spike: Number = Field(0.0, ge=0, description="a gradient's norm above spike × its mean is one; 0 never")
+    ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0 without")
+    self_forward: Share = Field(0.0, description="share of windows whose past is the model's prediction")
     self_forward_frames: Count = Field(2, ge=1, description="frames in a row of such a past")
-    self_forward_from: Count = Field(0, ge=0, description="step from which that share rises,")
-    self_forward_over: Count = Field(0, ge=0, description="and in how many steps it is reached")
+    self_forward_from: Steps = Field(0, description="step from which that share rises")
+    self_forward_over: Steps = Field(0, description="number of steps in which that share rises")
 
     seed: Count = Field(42, ge=0, lt=2**63)
     precision: Literal["fp32", "bf16"] = "fp32"
@@ -128,21 +156,15 @@ class Recipe(_Settings):
     compile: bool = Field(False, description="torch.compile of the trunk's blocks")
     checkpointing: bool = Field(False, description="recompute activations: less memory, a third more time")
     workers: Count = Field(0, ge=0, le=512, description="processes that decode batches, a rank")
-    eval_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
+    eval_every: Steps = Field(250, description="steps between evaluations; 0 only at the end")
     eval_windows: Count = Field(64, ge=1, description="validation windows an embodiment")
-    pictures: Count = Field(1, ge=0, description="windows rolled out for a picture at evaluations, a robot")
-    pictures_share: Number = Field(
-        0.05, ge=0, description="of the steps' time, for pictures before the last evaluation's"
-    )
-    checkpoint_every: Count = Field(250, ge=0, description="steps; 0 only at the end")
-    keep_last: Count = Field(3, ge=1)
+    pictures: Steps = Field(1, description="windows of a robot that an evaluation rolls out for a picture")
+    pictures_share: Number = Field(0.05, ge=0, description="share of the time for pictures before the last")
+    checkpoint_every: Steps = Field(250, description="steps between checkpoints; 0 only at the end")
+    keep_last: Count = Field(3, ge=1, description="number of checkpoints that are kept")
     report: bool = Field(True, description="write report.html")
-    track: Annotated[tuple[Literal["tensorboard", "trackio", "wandb"], ...], BeforeValidator(_listed)] = (
-        Field(
-            (), description="where figures go besides metrics.jsonl and report.html; each needs its package"
-        )
-    )
-    project: str = Field("hma", description="the name trackio and wandb file the run under")
+    track: Trackers = Field((), description="trackers of the figures; each needs its package")
+    project: str = Field("hma", description="the name under which trackio and wandb file the run")
     out: Place | None = Field(None, description="the run's folder")
 
     @property
@@ -170,10 +192,7 @@ class Recipe(_Settings):
         else:
             derived.update(channels=spec.channels, latent_scale=spec.latent_scale)
         derived.update(frames=self.frames, objectives=self.objectives)
-        try:
-            return HMAConfig(**{**self.model, **derived})
-        except TypeError as fault:  # a text where the config compares numbers
-            raise RecipeError("recipe: model", f"a value is of the wrong type: {fault}") from fault
+        return HMAConfig(**{**self.model, **derived})
 
 
 def load_recipe(name_or_path: StrPath, overrides: Sequence[str] = ()) -> Recipe:
@@ -188,24 +207,28 @@ def load_recipe(name_or_path: StrPath, overrides: Sequence[str] = ()) -> Recipe:
         UsageError: an override is not key=value.
     """
     path = find_recipe(name_or_path)
-    values = merge(_extended(path, []), parse_overrides(overrides), "override")
+    values = merge(_extended(path, []), parse_overrides(overrides))
     return make_recipe(values, f"{path}" + (" with overrides" if overrides else ""))
 
 
 def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
     """Make a recipe of plain values; it raises the errors of `load_recipe`."""
-    found: list[str] = []
-    model = network_values(values.get("model", {}), values.get("objectives", {"forward": 1.0}), found)
-    given = {**values, "model": model} if isinstance(values.get("model"), dict) else dict(values)
-    try:
-        recipe = Recipe.model_validate(given)
-    except ValidationError as fault:
-        known = {"": list(Recipe.model_fields), "mixture": list(MixtureSettings.model_fields)}
-        known["model"] = [f for f in HMAConfig.__dataclass_fields__ if f not in DERIVED]
-        found += [problem(item, known) for item in fault.errors(include_url=False)]
-    if found:
-        raise RecipeError(where, "; ".join(found), "correct the recipe or the override")
-    return recipe
+    faults: list[str] = []
+    given = dict(values)
+    if isinstance(given.get("model"), dict):
+        network = _validated(_Network, given["model"], "model.", faults)
+        given["model"] = {key: getattr(network, key) for key in given["model"]} if network else {}
+    recipe = _validated(Recipe, given, "", faults)
+    if recipe is not None and not faults:
+        side = recipe.model.get("patch", 1)  # any grid that the patches divide will do for this check
+        try:
+            HMAConfig(**{"patch": 1, **recipe.model, "objectives": recipe.objectives, "grid": (side, side)})
+            return recipe
+        except RecipeError as fault:
+            faults.append(
+                f"{fault.where.replace('model.objectives', 'objectives')}: {fault.fault}: {fault.remedy}"
+            )
+    raise RecipeError(where, "; ".join(faults), "correct the recipe or the override")
 
 
 def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
@@ -218,27 +241,17 @@ def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
     Raises:
         RecipeError: there is no such recipe.
     """
-    name_or_path = as_text(name_or_path)
-    given, folder = Path(name_or_path), shipped("recipes")
-    said = name_or_path if len(name_or_path) <= MAX_NAME else f"{name_or_path[:MAX_NAME]}…"
-    for candidate in (given, folder / "train" / f"{given}.yaml", folder / f"{given}.yaml", folder / given):
-        if _is_file(candidate) and (candidate == given or not given.is_absolute()):
-            return candidate
-    fault = f"extends {said!r}: no such recipe" if where else "no such recipe"
-    if name_or_path and os.path.lexists(given) and len(said) <= MAX_NAME:
-        fault = f"extends {said!r}, which is no file" if where else "is no file of YAML"
+    name = as_text(name_or_path)
+    folder = shipped("recipes")
+    for path in (Path(name), folder / "train" / f"{name}.yaml", folder / f"{name}.yaml", folder / name):
+        if path.is_file():
+            return path
     known = sorted(path.stem for path in (folder / "train").glob("*.yaml"))
-    near = get_close_matches(given.stem.lower(), known, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    remedy = f"{hint}give a YAML file or one of {', '.join(known)}"
-    raise RecipeError(where or said or "recipe", fault, remedy)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that is too long for any file
-        return False
+    hint = _meant(Path(name).stem, known).removeprefix(", ")
+    remedy = f"{hint} Give a YAML file or one of {', '.join(known)}".lstrip()
+    if where is not None:
+        raise RecipeError(where, f"extends {name!r}: no such recipe", remedy)
+    raise RecipeError(name, "no such recipe", remedy)
 
 
 def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
@@ -256,16 +269,16 @@ def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
         nested: Any = parse_yaml(text, f"override {override!r}", UsageError)
         for part in reversed(parts):
             nested = {part: nested}
-        values = merge(values, nested, f"override {override!r}")
+        values = merge(values, nested)
     return values
 
 
-def merge(base: Mapping[str, Any], over: Mapping[str, Any], where: object) -> dict[str, Any]:
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Merge mappings key by key; other values, and objectives, of `over` replace those of `base`."""
     merged = dict(base)
     for key, value in over.items():
         if isinstance(value, dict) and isinstance(merged.get(key), dict) and key != "objectives":
-            merged[key] = merge(merged[key], value, where)
+            merged[key] = merge(merged[key], value)
         else:
             merged[key] = value
     return merged
@@ -283,12 +296,11 @@ def differences(old: Any, new: Any, path: str = "") -> list[str]:
 
 
 def _extended(path: Path, seen: list[Path]) -> dict[str, Any]:
-    if path.resolve() in seen or len(seen) >= MAX_EXTENDS:
+    """Read the values of a recipe's file, merged over those of the recipe that it extends."""
+    if path.resolve() in seen:
         chain = " -> ".join(p.name for p in [*seen, path])
-        raise RecipeError(path, f"extends itself or too deep: {chain}", "extend another recipe")
-    values = read_yaml(path, RecipeError)
-    if values is None:
-        values = {}
+        raise RecipeError(path, f"extends itself: {chain}", "extend another recipe")
+    values = read_yaml(path, RecipeError) or {}
     if not isinstance(values, dict):
         fault = f"must be a mapping, is {type(values).__name__}"
         raise RecipeError(path, fault, "write keys with values, as in steps: 1000")
@@ -296,9 +308,57 @@ def _extended(path: Path, seen: list[Path]) -> dict[str, Any]:
     if base is None:
         return values
     if not isinstance(base, str):
-        raise RecipeError(
-            path, f"extends must name a recipe, is {base!r}", "name one, as in extends: discrete_tiny"
-        )
-    beside = path.parent / (base if base.endswith((".yaml", ".yml")) else f"{base}.yaml")
-    found = next((p for p in (path.parent / base, beside) if _is_file(p)), None) or find_recipe(base, path)
-    return merge(_extended(found, [*seen, path.resolve()]), values, path)
+        fault = f"extends must name a recipe, is {base!r}"
+        raise RecipeError(path, fault, "name one, as in extends: discrete_tiny")
+    beside = (path.parent / base, path.parent / f"{base}.yaml")
+    found = next((p for p in beside if p.is_file()), None) or find_recipe(base, path)
+    return merge(_extended(found, [*seen, path.resolve()]), values)
+
+
+# -- faults of the values
+
+
+def _validated[Model: BaseModel](
+    kind: type[Model], values: Mapping[str, Any], home: str, faults: list[str]
+) -> Model | None:
+    """Return the validated values, or None after adding their faults to `faults`."""
+    try:
+        return kind.model_validate(values)
+    except ValidationError as fault:
+        faults += [_problem(item, home) for item in fault.errors(include_url=False)]
+        return None
+
+
+def _problem(item: Any, home: str) -> str:
+    """Describe one of pydantic's errors: the key, the allowed values, the value, and a likely correction."""
+    path = home + ".".join(str(part) for part in item["loc"] if part != "[key]")
+    kind, near = item["type"], ""
+    if kind == "extra_forbidden":
+        return _unknown(path)
+    text = _PLAIN.get(kind) or _PLAIN.get(kind.partition("_")[0]) or item["msg"].removeprefix("Value error, ")
+    if kind == "literal_error":
+        allowed = item["ctx"]["expected"].replace(" or ", ", ").replace("'", "").split(", ")
+        near = _meant(str(item["input"]), allowed)
+    value = repr(item["input"])
+    value = value if len(value) <= 80 else f"{value[:77]}…"
+    return f"{path}: {text.replace('Input should be', 'must be')}{near} (is {value})"
+
+
+def _unknown(path: str) -> str:
+    """Describe an unknown key, and suggest a key of the same mapping or of another one."""
+    known = {"": Recipe.model_fields, "mixture": MixtureSettings.model_fields, "model": _Network.model_fields}
+    home, _, key = path.rpartition(".")
+    if path == "extends":
+        return "extends: cannot be an override: write it in the recipe's file"
+    if home == "model" and key in _DERIVED:
+        return f"{path}: follows from the shards and the recipe, and cannot be given"
+    near = _meant(key, list(known[home]))
+    for name in ("mixture", "model") if not home and not near else ():
+        if key in known[name]:
+            near = f", did you mean {f'{name}.{key}'!r}?"
+    return f"{path}: unknown key{near}"
+
+
+def _meant(word: str, known: list[str]) -> str:
+    near = get_close_matches(word.lower(), known, n=1)
+    return f", did you mean {near[0]!r}?" if near else ""

@@ -44,38 +44,25 @@ class OtherVersionError(CheckpointError):
 
 @dataclass(frozen=True)
 class State:
-    """The state of a run when its checkpoint was written.
+    """The state of a run when its checkpoint was written."""
 
-    Attributes:
-        step: number of finished steps.
-        recipe: `Recipe.identity` of the run.
-        data: embodiment id -> digest of its shards.
-        sampler: `TrainData.state`.
-        skipped: number of steps skipped because of a bad loss or gradient.
-        seconds: time spent in steps so far.
-        evaluation: the figures of the last evaluation.
-        norms: running mean of the gradients' norms, and the number of norms.
-    """
-
-    step: int
-    recipe: dict[str, Any]
-    data: dict[str, str]
-    sampler: dict[str, Any]
-    skipped: int = 0
-    seconds: float = 0.0
-    evaluation: dict[str, Any] = field(default_factory=dict)
-    norms: list[float] = field(default_factory=list)
+    step: int  # number of finished steps
+    recipe: dict[str, Any]  # `Recipe.identity` of the run
+    data: dict[str, str]  # embodiment id -> digest of its shards
+    sampler: dict[str, Any]  # `TrainData.state`
+    skipped: int = 0  # number of steps skipped because of a bad loss or gradient
+    seconds: float = 0.0  # time spent in steps so far
+    evaluation: dict[str, Any] = field(default_factory=dict)  # the figures of the last evaluation
+    norms: list[float] = field(default_factory=list)  # running mean of the gradients' norms, and their number
 
     def require_same(self, recipe: dict[str, Any], data: dict[str, str], where: object) -> None:
         """Raise RecipeError with the differences unless recipe and shards are those of the run."""
         before = {**Recipe().identity(), **self.recipe}  # keys added by later releases had their defaults
         changed = differences(before, recipe) + differences(self.data, data, "data")
         if changed:
-            raise RecipeError(
-                where,
-                f"was begun with another recipe or other shards: {'; '.join(changed)}",
-                "train into another folder, undo the change, or accept it with --force",
-            )
+            fault = f"was started with another recipe or other shards: {'; '.join(changed)}"
+            remedy = "train into another folder, undo the change, or accept it with --force"
+            raise RecipeError(where, fault, remedy)
 
 
 def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
@@ -83,13 +70,13 @@ def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
     free = TRAINED_BY | {"objectives"} | ({"frames"} if before.time_position == "rotary" else set())
     for item in dataclasses.fields(HMAConfig):
         old, new = getattr(before, item.name), getattr(now, item.name)
-        if item.name not in free and old != new:
-            if item.name == "tokenizer":
-                old, new = (spec.get("name") for spec in (old, new))
-                fault = f"was begun with another tokenizer: {old!r}, now {new!r} or other weights of it"
-            else:
-                fault = f"was begun with another network: {item.name} is {new!r}, there it is {old!r}"
-            raise RecipeError(where, fault, "train into another folder; --force cannot accept this")
+        if item.name in free or old == new:
+            continue
+        fault = f"was started with another network: {item.name} is {new!r}, it was {old!r}"
+        if item.name == "tokenizer":
+            names = f"{old.get('name')!r}, now {new.get('name')!r}"
+            fault = f"was started with another tokenizer: {names} or other weights of it"
+        raise RecipeError(where, fault, "train into another folder; --force cannot accept this")
 
 
 def seed_for(seed: int, what: str, *index: int) -> int:
@@ -124,45 +111,25 @@ def _digest(values: Mapping[str, Any]) -> str:
 
 
 def require_version(path: Path) -> None:
-    """Raise unless this release can resume a run from the checkpoint in a folder.
-
-    Raises:
-        OtherVersionError: the checkpoint is of another version; the error names both versions.
-        CheckpointError: a file that states a version is missing or damaged.
-    """
-    checks = (
-        (path / CONFIG, "format_version", FORMAT_VERSION, None),
-        (path / TRAINING / STATE, "version", VERSION, 1),
-    )
-    for file, key, own, absent in checks:
-        found = read_json(file).get(key, absent)
-        if isinstance(found, int) and found != own:
-            newer = "update hma-toolkit, or begin" if found > own else "begin"
-            remedy = f"{newer} a new run from its weights with start={path}"
-            raise OtherVersionError(file, f"is of {key} {found}, this release trains on with {own}", remedy)
+    """Raise OtherVersionError unless this release can resume a run from the checkpoint in a folder."""
+    state = path / TRAINING / STATE
+    for file, key, own in ((path / CONFIG, "format_version", FORMAT_VERSION), (state, "version", VERSION)):
+        found = read_json(file).get(key, own)  # older releases wrote none
+        if found != own:
+            fault = f"is of {key} {found}, this release resumes from {own}"
+            remedy = "update hma-toolkit, or start" if found > own else "start"
+            raise OtherVersionError(file, fault, f"{remedy} a new run from its weights with start={path}")
 
 
 @dataclass(frozen=True)
-class OptimizerState:
-    """The content of a checkpoint for a run, read completely before the model changes.
-
-    Attributes:
-        state: the state of the run.
-        shown: the published tensors of the trunk ("") and of each embodiment's stem and head.
-        weights: the weights of training, if they differ from the published ones.
-        moments: the moments of the optimizer.
-    """
+class Kept:
+    """The content of a checkpoint for a run, read completely before the model changes."""
 
     state: State
-    shown: dict[str, tuple[dict[str, "Tensor"], ...]]
-    weights: dict[str, "Tensor"]
-    moments: dict[str, "Tensor"]
-    _averages: dict[str, "Tensor"] = field(default_factory=dict)
-
-    @property
-    def averages(self) -> dict[str, "Tensor"]:
-        """Return the averaged parameters by name; `fill` collects them."""
-        return self._averages
+    shown: dict[str, tuple[dict[str, "Tensor"], ...]]  # published tensors: trunk (""), each stem and head
+    weights: dict[str, "Tensor"]  # the weights of training, if they differ from the published ones
+    moments: dict[str, "Tensor"]  # of the optimizer
+    averages: dict[str, "Tensor"] = field(default_factory=dict)  # parameters by name; `fill` collects them
 
     def fill(self, model: "HMA") -> None:
         """Load the weights of training into an unsharded model.
@@ -175,61 +142,44 @@ class OptimizerState:
             model.load_embodiment(name, *self.shown[name])
         if not self.weights:
             return
-        self._averages.update({n: p.detach().cpu().clone() for n, p in model.named_parameters()})
-        fresh = _prefixes(model.embodiments.keys() - self.shown.keys())
+        self.averages.update({n: p.detach().cpu().clone() for n, p in model.named_parameters()})
+        new = model.embodiments.keys() - self.shown.keys()
+        fresh = tuple(f"{part}.{module_key(name)}." for name in new for part in ("stems", "heads"))
         own = {name: tensor for name, tensor in model.state_dict().items() if not name.startswith(fresh)}
         weights = {name: self.weights[name] for name in self.weights.keys() & own.keys()}
         check_fit(f"{TRAINING}/{WEIGHTS}", weights, own)
         model.load_state_dict(weights, strict=False)
 
 
-def _prefixes(embodiments: Iterable[str]) -> tuple[str, ...]:
-    return tuple(f"{part}.{module_key(name)}." for name in embodiments for part in ("stems", "heads"))
-
-
-def read_kept(checkpoint: Checkpoint, state: State, embodiments: Iterable[str]) -> OptimizerState:
+def read_kept(checkpoint: Checkpoint, embodiments: Iterable[str]) -> Kept:
     """Read the content of a checkpoint for a run; embodiments that the checkpoint lacks are left out.
 
     Raises:
         CheckpointError: parts are missing, damaged, or do not belong together.
     """
+    path = inside(checkpoint.folder, f"{TRAINING}/{STATE}")
+    values = read_json(path)
+    stated = values.pop("sha256", None)  # an older release wrote neither this nor the files' hashes
+    if stated is not None and stated != _digest(values):
+        raise CheckpointError(path, "has changed since it was written", "delete this checkpoint")
+    files = values.pop("files", None)
+    if files is None:
+        files = {name: "" for name in (OPTIMIZER, WEIGHTS) if (path.parent / name).is_file()}
+    values.pop("version", None)
+    try:
+        state = State(**values)
+    except TypeError as fault:
+        raise CheckpointError(path, f"is damaged: {fault}", "delete this checkpoint") from fault
     shown: dict[str, tuple[dict[str, Tensor], ...]] = {"": (read_tensors(checkpoint.trunk()),)}
     for name in set(embodiments) & set(checkpoint.embodiments):
         checkpoint.check(name)
         shown[name] = tuple(read_tensors(checkpoint.path(name, part)) for part in (STEM, HEAD))
-    weights = _own_file(checkpoint, WEIGHTS) if WEIGHTS in _files(checkpoint) else {}
-    moments = _own_file(checkpoint, OPTIMIZER)
-    return OptimizerState(state, shown, weights, moments)
+    weights = _own_file(checkpoint, WEIGHTS, files) if WEIGHTS in files else {}
+    return Kept(state, shown, weights, _own_file(checkpoint, OPTIMIZER, files))
 
 
-def _files(checkpoint: Checkpoint) -> dict[str, str]:
-    """Return the hashes of the files of `training/`; files of an older release have empty ones."""
-    folder = checkpoint.folder / TRAINING
-    there = {name: "" for name in (OPTIMIZER, WEIGHTS) if (folder / name).is_file()}
-    files = read_json(folder / STATE).get("files")
-    return files if isinstance(files, dict) else there
-
-
-def _own_file(checkpoint: Checkpoint, name: str) -> "dict[str, Tensor]":
+def _own_file(checkpoint: Checkpoint, name: str, hashes: Mapping[str, str]) -> "dict[str, Tensor]":
     path = inside(checkpoint.folder, f"{TRAINING}/{name}")
-    recorded = _files(checkpoint).get(name)
-    if recorded and recorded != file_sha256(path):
+    if hashes.get(name) and hashes[name] != file_sha256(path):
         raise CheckpointError(path, f"is not the file that {STATE} names", "delete this checkpoint")
     return read_tensors(path)
-
-
-def read_state(checkpoint: Checkpoint) -> State:
-    """Read the state of the run.
-
-    Raises:
-        CheckpointError: the state is missing or damaged.
-    """
-    path = inside(checkpoint.folder, f"{TRAINING}/{STATE}")
-    values = read_json(path)
-    stated = values.pop("sha256", None)
-    if stated is not None and stated != _digest(values):
-        raise CheckpointError(path, "is not what was written", "delete this checkpoint")
-    try:
-        return State(**{key: value for key, value in values.items() if key not in ("version", "files")})
-    except TypeError as fault:
-        raise CheckpointError(path, f"is damaged: {fault}", "delete this checkpoint") from fault

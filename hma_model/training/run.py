@@ -5,7 +5,7 @@ writes files.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -14,30 +14,49 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
+from hma_data.errors import CheckpointError, RecipeError, TrainingError
 from hma_data.loading.dataset import Batch, WindowDataset, open_sets
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import remove_partial, to_json, write_atomic
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.io import Checkpoint, action_stats, training_checkpoints
-from hma_model.config import ActionSpace, HMAConfig
-from hma_model.evaluation.evaluate import Means, digit_frequencies, unconditional_baseline, windows
-from hma_model.evaluation.sample_images import newest_pictures, sample_pictures
+from hma_model.config import OBJECTIVES, ActionSpace, Objective
+from hma_model.evaluation.evaluate import (
+    Means,
+    digit_frequencies,
+    unconditional_baseline,
+    validation_losses,
+    windows,
+)
+from hma_model.evaluation.metrics import perplexity
+from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
 from hma_model.network.model import HMA
 from hma_model.training.data import TrainData
-from hma_model.training.ema import Average
-from hma_model.training.guards import GradientSpikeDetector, culprits, listed, suspects
+from hma_model.training.guards import (
+    GradientSpikeDetector,
+    StepMetrics,
+    listed,
+    peak_memory_mib,
+    suspects,
+    worst,
+)
 from hma_model.training.init_from import Start
-from hma_model.training.optim import load_optimizer_state, lr_scale, make_optimizer, optimizer_state, set_lr
+from hma_model.training.optim import (
+    Average,
+    load_optimizer_state,
+    lr_scale,
+    make_optimizer,
+    optimizer_state,
+    set_lr,
+)
 from hma_model.training.parallel import ParallelModel, World, gathered
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
-    OptimizerState,
+    Kept,
     OtherVersionError,
     State,
     data_digests,
     read_kept,
-    read_state,
     require_network,
     require_version,
     seed_for,
@@ -45,8 +64,11 @@ from hma_model.training.resume import (
 )
 from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require_memory
 from hma_model.training.scheduled_sampling import forwarded, share_at
-from hma_model.training.step_metrics import StepMetrics, peak_memory_mib
-from hma_model.training.validation import main_objective, validate
+
+
+def main_objective(weights: Mapping[str, float]) -> Objective:
+    """Return the objective that is drawn most often; evaluations compute its loss."""
+    return OBJECTIVES[max(weights, key=lambda name: weights[name])]
 
 
 class Run:
@@ -61,6 +83,7 @@ class Run:
     Attributes:
         step, skipped, seconds: finished steps, how many of them were skipped, and the time they took.
         evaluation: the figures of the last evaluation.
+        notes: texts for the user that nobody has shown yet.
     """
 
     def __init__(self, recipe: Recipe, out: Path, device: torch.device, world: World | None = None) -> None:
@@ -68,56 +91,57 @@ class Run:
             raise RecipeError("recipe: data", "names no shards", "add data=[FOLDER, …]")
         self.out, self.device, self.world = out, device, world or World()
         if recipe.self_forward and recipe.parallel == "fsdp" and self.world.size > 1:
-            fault = "needs a network that each rank can call by itself"
+            fault = "does not work with parallel=fsdp on several ranks"
             raise RecipeError("recipe: self_forward", fault, "use parallel=ddp")
         self.sets = open_sets(recipe.data)
-        self.start = self._fetch(recipe)
+        self.start: Start | None = None
+        if recipe.start is not None:
+            self.world.once(lambda: Start.bring(recipe, self.sets, self.out))
+            self.start = Start.open(recipe, self.sets, self.out)
+        elif recipe.freeze == "trunk":
+            raise RecipeError(
+                "recipe: freeze",
+                "freezes a trunk that nothing has trained",
+                "name a trained checkpoint with start=…",
+            )
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
         self.recipe = recipe
         self.train_data = TrainData(recipe, self.sets, self.world)
         self.digests = data_digests(self.sets)
+        self.stats = {name: shards.manifest.stats for name, shards in self.sets.items()}
         if self.start:
             self.digests["the checkpoint it starts from"] = self.start.checkpoint.trunk_sha256[:16]
-        stats = self.start.stats if self.start else lambda shards: shards.manifest.stats
-        self.stats = {name: stats(shards) for name, shards in self.sets.items()}
+            self.stats = {name: self.start.stats(shards) for name, shards in self.sets.items()}
         torch.manual_seed(seed_for(recipe.seed, "init"))
-        self.model = self._network()
-        if self.start:
-            self.start.fill(self.model)
-        self.model.to(device).train()
-        self.model.trunk.checkpointing = recipe.checkpointing
-        self.held_out = {
-            name: s for name, s in self.sets.items() if len(WindowDataset(s, "val", recipe.frames))
-        }
+        self.model = self._fresh_model()
+        held_out = ((name, s, WindowDataset(s, "val", recipe.frames)) for name, s in self.sets.items())
+        self.held_out = {name: shards for name, shards, dataset in held_out if len(dataset)}
         self.step, self.skipped, self.seconds = 0, 0, 0.0
         self.spike_detector = GradientSpikeDetector(recipe.spike)
         self.evaluation: dict[str, Any] = {}
+        self.notes: list[str] = []
         self._baseline: Means | None = None
         self._twin: HMA | None = None
-        self._unseen, self._complained = "", False
-        self._painted, self._painting = 0.0, 0.0  # seconds for all pictures, and for the last ones
-
-    def _fetch(self, recipe: Recipe) -> Start | None:
-        if recipe.start is None:
-            if recipe.freeze == "trunk":
-                raise RecipeError("recipe: freeze", "keeps a trunk that nothing has trained", "add start=…")
-            return None
-        self.world.once(lambda: Start.bring(recipe, self.sets, self.out))
-        return Start.open(recipe, self.sets, self.out)
+        self._sheet_seconds = [0.0]  # of each evaluation's pictures
 
     def _network(self) -> HMA:
         spec = next(iter(self.sets.values())).spec
-        config: HMAConfig = self.start.network(self.recipe) if self.start else self.recipe.network(spec)
-        spread = self.world.size if self.recipe.parallel == "fsdp" else 1
-        require_memory(config, self.device, spread, bool(self.start and self.start.frozen))
+        config = self.start.network(self.recipe) if self.start else self.recipe.network(spec)
+        parts = self.world.size if self.recipe.parallel == "fsdp" else 1
+        require_memory(config, self.device, parts, bool(self.start and self.start.frozen))
         model = HMA(config)
         for name, shards in self.sets.items():
-            try:
-                space = ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name))
-            except RecipeError as fault:
-                raise RecipeError(shards.folder, f"{name}: {fault.fault}", fault.remedy) from fault
-            model.add_embodiment(space)
+            model.add_embodiment(ActionSpace.of(shards.embodiment, action_stats(self.stats[name], name)))
+        return model
+
+    def _fresh_model(self) -> HMA:
+        """Return the model as training begins: with random weights, or with those it starts from."""
+        model = self._network()
+        if self.start:
+            self.start.fill(model)
+        model.to(self.device).train()
+        model.trunk.checkpointing = self.recipe.checkpointing
         return model
 
     @property
@@ -126,21 +150,19 @@ class Run:
         video = main_objective(self.recipe.objectives).predicts_video
         return self.model.config.kind == "discrete" and video
 
-    def remarks(self) -> list[str]:
-        """Return notes for the user."""
-        missing = sorted(set(self.sets) - set(self.held_out))
-        frames = self.recipe.frames
-        notes = [f"no validation windows of {frames} frames: {', '.join(missing)}"] if missing else []
-        if self.recipe.warmup > self.recipe.steps:
-            notes.append(
-                f"lr never reaches its value: warmup {self.recipe.warmup} of {self.recipe.steps} steps"
-            )
+    def note_settings(self) -> None:
+        """Note what the user may not expect of the recipe and the data."""
+        recipe = self.recipe
+        if missing := sorted(set(self.sets) - set(self.held_out)):
+            self.notes.append(f"no validation windows of {recipe.frames} frames: {', '.join(missing)}")
+        if recipe.warmup > recipe.steps:
+            steps = f"warmup takes {recipe.warmup} of {recipe.steps} steps"
+            self.notes.append(f"the learning rate never reaches lr: {steps}")
         if self.start and not self.step:
-            notes += self.start.remarks(self.sets)
+            self.notes += self.start.remarks(self.sets)
         if self.world.size > 1:
             passes = f"{self.train_data.passes} passes a step over {self.world.size} ranks"
-            notes.append(f"{passes}, {self.recipe.parallel}")
-        return notes
+            self.notes.append(f"{passes}, {recipe.parallel}")
 
     @torch.no_grad()
     def begin(self) -> None:
@@ -148,33 +170,24 @@ class Run:
         plain = self.recipe.readout_bias == "zero" or self.model.config.kind != "discrete"
         if plain or self.start:
             return
-        shares = [
-            [p * digit for digit in digit_frequencies(shards)]
-            for p, shards in zip(self.train_data.mixture.p, self.sets.values())
-        ]
+        drawn = zip(self.train_data.mixture.p, self.sets.values())
+        shares = [[p * digit for digit in digit_frequencies(shards)] for p, shards in drawn]
         bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
 
-    def prepare(self, kept: OptimizerState | None) -> None:
-        """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given.
-
-        Raises:
-            CheckpointError: moments fit no parameter.
-        """
+    def prepare(self, kept: Kept | None) -> None:
+        """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given."""
         if self.recipe.compile:
             for block in self.model.trunk.blocks:
                 block.compile()
         self.parallel_model = ParallelModel(self.model, self.world, self.recipe.parallel)
         self.optimizer = make_optimizer(self.model, self.recipe)
         self.average = Average(self.model, self.recipe.ema) if self.recipe.ema else None
-        if kept is None:
-            return
-        own = {name for group in self.optimizer.param_groups for name in group["names"]}
-        moments = {key: value for key, value in kept.moments.items() if key.rpartition("/")[0] in own}
-        load_optimizer_state(self.optimizer, moments, self.out)
-        if self.average and kept.averages:
-            self.average.load(kept.averages)
+        if kept:
+            load_optimizer_state(self.optimizer, kept.moments)
+            if self.average:
+                self.average.load(kept.averages)
 
     # -- a step
 
@@ -183,18 +196,18 @@ class Run:
         recipe, begun = self.recipe, time.monotonic()
         lr = set_lr(self.optimizer, lr_scale(self.step, recipe))
         self.optimizer.zero_grad(set_to_none=True)
-        step_metrics, seen, waited = StepMetrics(list(self.sets), self.device), [], 0.0
+        metrics, seen, waited = StepMetrics(list(self.sets), self.device), [], 0.0
         batches = self.train_data.step()
         for _ in self.train_data.own:
             asked = time.monotonic()
             number, batch = next(batches)
             waited += time.monotonic() - asked
             output = self._pass(number, batch.to(self.device), number == self.train_data.own[-1])
-            step_metrics.add(batch.embodiment, output)
+            metrics.add(batch.embodiment, output)
             seen.append((batch, output.per_sample))
         self.parallel_model.average()
         norm = self.parallel_model.clip(recipe.clip)
-        loss, by_embodiment, objectives = step_metrics.whole(self.world, self.train_data.passes)
+        loss, by_embodiment, objectives = metrics.whole(self.world, self.train_data.passes)
         self.step += 1
         fault = self.spike_detector.fault(loss, norm)
         if fault:
@@ -222,26 +235,21 @@ class Run:
 
     def _pass(self, number: int, batch: Batch, last: bool) -> Any:
         """Run a forward and backward pass; the loss of a step is the mean over the passes of all ranks."""
-        torch.manual_seed(seed_for(self.recipe.seed, "dropout", self.step, number))
-        generator = torch.Generator().manual_seed(seed_for(self.recipe.seed, "masks", self.step, number))
+        recipe = self.recipe
+        torch.manual_seed(seed_for(recipe.seed, "dropout", self.step, number))
+        generator = torch.Generator().manual_seed(seed_for(recipe.seed, "masks", self.step, number))
         with self.parallel_model.passing(last):
             with self._autocast():
-                batch = self._past(number, batch)
+                if share := share_at(self.step, recipe):
+                    own = seed_for(recipe.seed, "self_forward", self.step, number)
+                    draws = torch.Generator().manual_seed(own)
+                    batch = forwarded(self.model, batch, share, recipe.self_forward_frames, draws)
                 output = self.parallel_model(batch, generator=generator)
             if not output.loss.requires_grad:
-                fault = f"nothing that may learn takes part in the objective {output.objective}"
+                fault = f"leaves nothing to train with the objective {output.objective}"
                 raise RecipeError("recipe: freeze", fault, "use freeze=nothing, or another objective")
             (output.loss / len(self.train_data.own)).backward()
         return output
-
-    def _past(self, number: int, batch: Batch) -> Batch:
-        """Return the batch, with frames predicted by the model itself if the recipe asks for them."""
-        share = share_at(self.step, self.recipe)
-        if not share:
-            return batch
-        seed = seed_for(self.recipe.seed, "self_forward", self.step, number)
-        draws = torch.Generator().manual_seed(seed)
-        return forwarded(self.model, batch, share, self.recipe.self_forward_frames, draws)
 
     def _autocast(self) -> AbstractContextManager[Any]:
         if self.recipe.precision == "fp32":
@@ -255,8 +263,8 @@ class Run:
         suspected = [item for part in self.world.gather(suspects(seen, self.sets)) for item in part]
         raise TrainingError(
             f"step {self.step}",
-            f"{fault}; windows: {listed(culprits(suspected))}",
-            "look at these with hma shards preview, lower lr, or go on without such steps by nonfinite=skip",
+            f"{fault}; windows: {listed([text for _, text in worst(suspected)])}",
+            "look at them with hma shards preview, lower lr, or skip such steps with nonfinite=skip",
         )
 
     # -- evaluation and checkpoints
@@ -272,50 +280,60 @@ class Run:
         return self._twin or self.model
 
     def evaluate(self) -> dict[str, Any]:
-        """Compute the validation loss and its baseline, and return the line of metrics.jsonl."""
+        """Compute the held-out loss of the main objective, and return the line of metrics.jsonl.
+
+        For forward and full it is nats a token of each fully masked frame, given the true past and actions,
+        with the loss of the training tokens' frequencies as a baseline. For passive, policy and inverse it is
+        the training loss on held-out windows, under masks that are the same at every evaluation.
+        """
         model = self.shown()
         self.evaluation = self.world.once(lambda: self._evaluated(model))
         return self.evaluation
 
     def _evaluated(self, model: HMA) -> dict[str, Any]:
-        recipe = self.recipe
-
-        def held_out() -> Iterator[Batch]:
-            for shards in self.held_out.values():
-                yield from windows(shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size)
-
-        def baseline() -> Means:
-            self._baseline = self._baseline or unconditional_baseline(self.sets, held_out())
-            return self._baseline
-
+        recipe, begun = self.recipe, time.monotonic()
+        objective = main_objective(recipe.objectives)
+        video = objective.predicts_video and objective.sees_actions
         with self._autocast(), torch.compiler.set_stance("force_eager"):
-            facts = validate(model, held_out, baseline, recipe.seed, self.step)
-            if self._picture_due():
-                begun = time.monotonic()
-                self._unseen = sample_pictures(
-                    model,
-                    self.held_out,
-                    self.out,
-                    self.step,
-                    frames=recipe.frames,
-                    count=recipe.pictures,
-                    seed=recipe.seed,
-                )
-                self._painting = time.monotonic() - begun
-                self._painted += self._painting
+            drawn = "forward" if video else objective.name
+            losses, accuracy = validation_losses(model, self._held_out_batches(), recipe.seed, drawn)
+            facts: dict[str, Any] = {
+                "step": self.step,
+                "objective": objective.name,
+                "loss": losses.mean(),
+                "loss_by_embodiment": losses.by_embodiment(),
+                "windows": sum(losses.counts.values()),
+            }
+            if video and model.config.kind == "discrete":
+                if self._baseline is None:
+                    self._baseline = unconditional_baseline(self.sets, self._held_out_batches())
+                facts["perplexity"] = perplexity(facts["loss"])
+                facts["accuracy"] = accuracy.mean()
+                facts["accuracy_by_embodiment"] = accuracy.by_embodiment()
+                facts["baseline"] = self._baseline.mean()
+                facts["baseline_by_embodiment"] = self._baseline.by_embodiment()
+            facts["seconds"] = round(time.monotonic() - begun, 3)
+            self._write_sheets(model)
         return facts
 
-    def _picture_due(self) -> bool:
-        """Check whether to make pictures: at the last evaluation always, at others if the time allows."""
-        last = self.step == self.recipe.steps
-        spare = self.recipe.pictures_share * self.seconds - self._painted - self._painting
-        return bool(self.recipe.pictures) and (last or spare > 0)
+    def _held_out_batches(self) -> Iterator[Batch]:
+        recipe = self.recipe
+        for shards in self.held_out.values():
+            yield from windows(shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size)
 
-    def complaint(self) -> str:
-        """Return the reason for missing pictures, only once; else an empty string."""
-        text = "" if self._complained else self._unseen
-        self._complained = self._complained or bool(text)
-        return text
+    def _write_sheets(self, model: HMA) -> None:
+        """Write pictures of rollouts: after the last step always, after others if the time allows."""
+        recipe, begun = self.recipe, time.monotonic()
+        spare = recipe.pictures_share * self.seconds - sum(self._sheet_seconds) - self._sheet_seconds[-1]
+        if not recipe.pictures or (self.step < recipe.steps and spare <= 0):
+            return
+        fault = write_sheets(
+            model, self.held_out, self.out, self.step,
+            frames=recipe.frames, count=recipe.pictures, seed=recipe.seed,
+        )  # fmt: skip
+        if fault and len(self._sheet_seconds) == 1:  # noted once
+            self.notes.append(fault)
+        self._sheet_seconds.append(time.monotonic() - begun)
 
     def save(self) -> Path:
         """Write checkpoints/step-N, and delete all but the last few; every rank must call it."""
@@ -343,8 +361,8 @@ class Run:
                 cards={name: self._card(name, s) for name, s in self.sets.items()},
                 tokenizer=model.config.tokenizer,
                 training=lambda folder: write_state(folder, state, moments, weights),
-                base=self.start.checkpoint if self.start and self._carries_others else None,
-                samples=newest_pictures(self.out, self.sets),
+                base=self.start.checkpoint if self.start and self.start.frozen else None,
+                samples=newest_sheets(self.out, self.sets),
             )
             for old in training_checkpoints(self.out)[: -self.recipe.keep_last]:
                 checkpoints.remove(old)
@@ -354,11 +372,8 @@ class Run:
 
     def _card(self, name: str, shards: ShardSet) -> dict[str, Any]:
         figures = (("val_loss", "loss"), ("baseline_loss", "baseline"), ("accuracy", "accuracy"))
-        metrics = {
-            ours: self.evaluation[f"{theirs}_by_embodiment"].get(name)
-            for ours, theirs in figures
-            if f"{theirs}_by_embodiment" in self.evaluation
-        }
+        found = ((ours, self.evaluation.get(f"{theirs}_by_embodiment")) for ours, theirs in figures)
+        metrics = {ours: values.get(name) for ours, values in found if values is not None}
         train = shards.manifest.splits.get("train", {})
         data: dict[str, Any] = {key: train.get(key) for key in ("episodes", "frames")}
         if "://" in shards.manifest.source:  # a path is of no use on another machine
@@ -369,11 +384,10 @@ class Run:
             training["trunk"] = "frozen" if self.start.frozen else "tuned"
         return {"data": data, "metrics": metrics, "training": training}
 
-    def resume(self, force: bool) -> tuple[OptimizerState | None, list[str]]:
-        """Load the weights and the state of the newest readable checkpoint.
+    # -- resuming
 
-        Returns:
-            The content of the checkpoint for `prepare`, or None, and notes for the user.
+    def resume(self, force: bool) -> Kept | None:
+        """Load the newest readable checkpoint, and return its content for `prepare`; None without any.
 
         Raises:
             RecipeError: the recipe or the shards differ from those of the run.
@@ -381,73 +395,60 @@ class Run:
             CheckpointError: there are checkpoints, and none can be read.
         """
         self.world.once(lambda: remove_partial(self.out / "checkpoints"))
-        notes: list[str] = []
-        kept = None
-        paths = training_checkpoints(self.out)
+        kept, paths = None, training_checkpoints(self.out)
         for path in reversed(paths):
             try:
-                require_version(path)
-                checkpoint = Checkpoint.open(path)
-                state = read_state(checkpoint)
-                if not force:
-                    state.require_same(self.recipe.identity(), self.digests, self.out)
-                require_network(checkpoint.config, self.model.config, self.out)
-                kept = read_kept(checkpoint, state, self.sets)
-                notes += self._adopt(checkpoint)
-                kept.fill(self.model)
+                kept = self._load(path, force)
+                break
             except OtherVersionError:
                 raise
             except CheckpointError as fault:
                 if path == paths[0]:
                     remedy = "no checkpoint here can be read: restore one, or train into another folder"
                     raise CheckpointError(fault.where, fault.fault, remedy) from fault
-                notes.append(f"passed over a damaged checkpoint: {fault}")
-                continue
-            notes += self._continue(state, force)
-            break
+                self.notes.append(f"skipped a damaged checkpoint: {fault}")
         self.world.once(self._describe)
-        return kept, notes
+        return kept
+
+    def _load(self, path: Path, force: bool) -> Kept:
+        require_version(path)
+        checkpoint = Checkpoint.open(path)
+        kept = read_kept(checkpoint, self.sets)
+        state = kept.state
+        if not force:
+            state.require_same(self.recipe.identity(), self.digests, self.out)
+        require_network(checkpoint.config, self.model.config, self.out)
+        notes = self._adopt(checkpoint)
+        kept.fill(self.model)
+        self.step, self.skipped, self.seconds = state.step, state.skipped, state.seconds
+        self.evaluation = state.evaluation
+        if state.norms:
+            self.spike_detector.mean, self.spike_detector.count = state.norms[0], int(state.norms[1])
+        self.notes += [*notes, f"resuming from step {state.step}"]
+        if fault := self.train_data.load_state(state.sampler, force):
+            self.notes.append(f"the sampler starts again: {fault}")
+        return kept
 
     def _adopt(self, checkpoint: Checkpoint) -> list[str]:
         """Keep the statistics that the stems were trained with, if those of the shards have changed."""
-        left = sorted(set(checkpoint.embodiments) - set(self.sets)) if not self._carries_others else []
-        notes, gone = [], [f"left out of checkpoints from here on: {', '.join(left)}"] if left else []
+        notes = []
         for name, shards in self.sets.items():
             if name not in checkpoint.embodiments:
-                notes.append(f"{name} is new here: fresh stem and head")
+                notes.append(f"{name} is new in this run and gets a new stem and head")
                 continue
             stats = checkpoint.stats(name)
             space = ActionSpace.of(shards.embodiment, action_stats(stats, name))
             if not self.model.embodiments[name].agrees_with(space):
                 self.stats[name] = stats
-                notes.append(f"{name} keeps the statistics it was begun with")
+                notes.append(f"{name} keeps the statistics that its stem was trained with")
         if notes:
-            self.model = self._network().to(self.device).train()
-            self.model.trunk.checkpointing = self.recipe.checkpointing
-            if self.start:
-                self.start.fill(self.model)
-        return notes + gone
-
-    @property
-    def _carries_others(self) -> bool:
-        """Check whether checkpoints keep untrained robots, which they do with a frozen trunk."""
-        return bool(self.start and self.start.frozen)
+            self.model = self._fresh_model()
+        left = sorted(set(checkpoint.embodiments) - set(self.sets))
+        if left and not (self.start and self.start.frozen):
+            notes.append(f"the next checkpoints leave out: {', '.join(left)}")
+        return notes
 
     def _describe(self) -> None:
         write_atomic(self.out / RECIPE, to_json(self.recipe.values()))
         facts = {**environment(self.device), "ranks": self.world.size}
         write_atomic(self.out / ENVIRONMENT, to_json(facts))
-
-    def _continue(self, state: State, force: bool) -> list[str]:
-        self.step, self.skipped, self.seconds = state.step, state.skipped, state.seconds
-        self.evaluation = state.evaluation
-        if state.norms:
-            self.spike_detector.mean, self.spike_detector.count = state.norms[0], int(state.norms[1])
-        notes = [f"going on from step {state.step}"]
-        try:
-            self.train_data.load_state(state.sampler)
-        except UsageError as fault:
-            if not force and not self.train_data.shared_otherwise(state.sampler):
-                raise
-            notes.append(f"the sampler begins anew: {fault}")
-        return notes

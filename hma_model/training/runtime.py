@@ -11,14 +11,14 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from hma_data.errors import HMAError, OutputError, RecipeError, TrainingError
-from hma_model.training.parallel import local_rank
 
 if TYPE_CHECKING:
     from hma_model.config import HMAConfig
@@ -37,23 +37,17 @@ def choose_device(name: str) -> torch.device:
     cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
     if name == "auto":
         name = "cuda" if cuda else "mps" if mps else "cpu"
-    device = torch.device(f"cuda:{local_rank()}" if name == "cuda" else name)
+    device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if name == "cuda" else name)
     there = {"cuda": cuda and (device.index or 0) < torch.cuda.device_count(), "mps": mps, "cpu": True}
     if not there[device.type]:
-        raise RecipeError("recipe: device", f"{name} is not there", "use device=auto or device=cpu")
+        raise RecipeError("recipe: device", f"this machine has no {name}", "use device=auto or device=cpu")
     return device
 
 
 def environment(device: torch.device) -> dict[str, Any]:
     """Return the facts besides the recipe on which the run's figures may depend."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        release = version("hma-toolkit")
-    except PackageNotFoundError:
-        release = ""
     return {
-        "hma_toolkit": release,
+        "hma_toolkit": version("hma-toolkit"),
         "git_revision": _git_revision(),
         "python": platform.python_version(),
         "torch": torch.__version__,
@@ -66,10 +60,9 @@ def environment(device: torch.device) -> dict[str, Any]:
 def _git_revision() -> str:
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 @contextmanager
@@ -87,73 +80,50 @@ def own_folder(out: Path) -> Iterator[None]:
         others = [path.name for path in out.iterdir() if not path.name.startswith(".")]
         if others and not (out / RECIPE).is_file():
             raise OutputError(out, f"holds {others[0]} and no {RECIPE}", "train into a folder of its own")
-        ours = not (out / LOCK).exists()
+        begun = (out / LOCK).exists()
         lock = (out / LOCK).open("a")
     except OSError as fault:
         raise OutputError(out, f"cannot be used: {fault.strerror}", "choose another folder") from fault
     with lock:
-        _hold(lock, out)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as fault:
+            raise OutputError(out, "another training uses this folder", "wait for it or stop it") from fault
+        except OSError:  # some file systems of clusters have no locks
+            pass
         try:
             yield
         except HMAError:
-            if ours and {path.name for path in out.iterdir()} <= {LOCK, START}:
-                _remove_empty(out, made)
+            if not begun and {path.name for path in out.iterdir()} <= {LOCK, START}:
+                shutil.rmtree(out / START, ignore_errors=True)
+                with suppress(OSError):  # another run has written into one of these folders
+                    (out / LOCK).unlink()
+                    for path in made:
+                        path.rmdir()
             raise
 
 
-def _hold(lock: TextIO, out: Path) -> None:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        held = os.path.samestat(os.fstat(lock.fileno()), (out / LOCK).stat())
-    except (BlockingIOError, FileNotFoundError):
-        held = False
-    except OSError:  # a file system without locks
-        return
-    if not held:
-        raise OutputError(out, "another training is at work here", "wait for it or stop it")
-
-
-def _remove_empty(out: Path, made: list[Path]) -> None:
-    with suppress(OSError):  # another process has written something there in the meantime
-        shutil.rmtree(out / START, ignore_errors=True)
-        (out / LOCK).unlink()
-        for path in made:
-            path.rmdir()
-
-
 @contextmanager
-def writable(out: Path) -> Iterator[None]:
-    """Convert an OSError of the block, which writes into a run's folder.
+def run_errors(out: Path) -> Iterator[None]:
+    """Convert errors of the block, which trains into a folder: no memory, or a file that cannot be written.
 
     Raises:
         OutputError: something cannot be written.
+        TrainingError: the block needed more memory than there is.
     """
     try:
         yield
     except OSError as fault:
         where, why = fault.filename or out, fault.strerror or str(fault)
-        remedy = "free space or choose another folder; checkpoints that are there are intact"
+        remedy = "free space or choose another folder; existing checkpoints are intact"
         raise OutputError(where, f"cannot be written: {why}", remedy) from fault
-
-
-@contextmanager
-def enough_memory() -> Iterator[None]:
-    """Convert an out-of-memory error of the block.
-
-    Raises:
-        TrainingError: the block needed more memory than there is.
-    """
-    try:
-        yield
     except (RuntimeError, MemoryError) as fault:
-        text = (str(fault).splitlines() or [""])[0]
+        text = str(fault).partition("\n")[0][:200]
         if isinstance(fault, RuntimeError) and not _NO_MEMORY.search(text):
             raise
-        raise TrainingError(
-            "memory",
-            f"there is not enough for this model and batch: {text[:200] or type(fault).__name__}",
-            "lower batch_size (accumulate makes up for it), frames or model.width, or set checkpointing=true",
-        ) from fault
+        told = f"there is not enough for this model and batch: {text}"
+        remedy = "lower batch_size (accumulate makes up for it), frames or width, or set checkpointing=true"
+        raise TrainingError("memory", told, remedy) from fault
 
 
 def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen: bool) -> None:
@@ -177,12 +147,9 @@ def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen
     else:
         there = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     if needed > there:
-        raise RecipeError(
-            "recipe: model",
-            f"{values / 1e9:,.1f} billion weights take {needed / 2**30:,.0f} GiB in training, "
-            f"here are {there / 2**30:,.0f} GiB",
-            "lower model.width or model.layers",
-        )
+        needs = f"{values / 1e9:,.1f} billion weights take {needed / 2**30:,.0f} GiB in training"
+        fault = f"{needs}, this device has {there / 2**30:,.0f} GiB"
+        raise RecipeError("recipe: model", fault, "lower model.width or model.layers")
 
 
 @contextmanager

@@ -29,13 +29,9 @@ SAMPLE_STEPS = 8  # of the diffusion head; enough for a past to learn from
 
 @dataclass
 class Forwarded(Batch):
-    """A batch in which the model sees other frames than those of the loss.
+    """A batch in which the model sees other frames than those of the loss."""
 
-    Attributes:
-        context: (B, T, h, w) tokens or (B, T, c, H, W) latents that the model sees.
-    """
-
-    context: Tensor | None = None
+    context: Tensor | None = None  # (B, T, h, w) tokens or (B, T, c, H, W) latents that the model sees
 
 
 def share_at(step: int, recipe: "Recipe") -> float:
@@ -72,11 +68,12 @@ def forwarded(
     first = 1 + (draws[1] * (frames - 1 - depth)).long()
     context, rows = true[chosen].clone(), torch.arange(int(chosen.sum()), device=true.device)
     names = [name for name, taken in zip(batch.embodiment, chosen.tolist()) if taken]
+    own = Batch(names, batch.actions[chosen], batch.action_mask[chosen])
     training = model.training
     model.eval()
     for offset in range(depth):
         at = first[chosen] + offset
-        context[rows, at] = _predicted(model, context, at, batch, chosen, names, generator)
+        context[rows, at] = _predicted(model, context, at, own, generator)
     model.train(training)
     seen = true.clone()
     seen[chosen] = context
@@ -85,20 +82,13 @@ def forwarded(
 
 
 def _predicted(
-    model: "HMA",
-    context: Tensor,
-    at: Tensor,
-    batch: Batch,
-    chosen: Tensor,
-    names: list[str],
-    generator: torch.Generator | None,
+    model: "HMA", context: Tensor, at: Tensor, batch: Batch, generator: torch.Generator | None
 ) -> Tensor:
     """Predict frame `at` (n,) of each window, wholly masked, from the frames before it."""
     config, rows = model.config, torch.arange(len(at), device=at.device)
-    actions = None
+    names, actions, known = batch.embodiment, None, None
     if any(weight and OBJECTIVES[name].sees_actions for name, weight in config.objectives.items()):
-        actions = batch.actions[chosen]
-    known = None if actions is None else batch.action_mask[chosen]
+        actions, known = batch.actions, batch.action_mask
     if config.kind == "discrete":
         hidden = context.clone()
         hidden[rows, at] = config.vocab_size
@@ -108,9 +98,8 @@ def _predicted(
     mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)
     mask[rows, at] = True
     conditions = model.video_conditions(scaled, mask, actions, names, known)[rows, at]
-    patches = model.latent_readout.diffusion.sample(
-        conditions.flatten(0, 2), steps=SAMPLE_STEPS, generator=generator
-    )
+    diffusion = model.latent_readout.diffusion
+    patches = diffusion.sample(conditions.flatten(0, 2), steps=SAMPLE_STEPS, generator=generator)
     whole = patches.view(len(at), 1, -1, config.patch_dim)
     latents = unpatchify(whole, config.patch, config.token_grid)
     return (latents[:, 0] / config.latent_scale).to(context.dtype)

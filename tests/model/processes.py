@@ -23,7 +23,7 @@ from torch.distributed import TCPStore
 
 from hma_data.errors import HMAError
 from hma_model.cli import main
-from hma_model.training.rank_errors import report_once
+from hma_model.training.parallel import report_once
 
 ROOT = Path(__file__).resolve().parents[2]
 SAFETY = 120.0  # seconds after which a process counts as hung

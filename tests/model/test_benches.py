@@ -5,7 +5,6 @@ import os
 from typing import Any
 
 import pytest
-from torch.utils.flop_counter import FlopCounterMode
 from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
@@ -13,7 +12,6 @@ from hma_model.bench import generate as bench_generate
 from hma_model.bench import train as bench_train
 from hma_model.bench import waiting as bench_waiting
 from hma_model.cli import app
-from tests.model.network_parts import small_batch, small_model
 
 SMALL = {
     "layers": 1, "width": 32, "heads": 4, "window": 3, "device": "cpu", "threads": 1, "diffusion_width": 32
@@ -82,17 +80,7 @@ def test_a_wrong_setting_is_named(change: dict[str, Any], message: str) -> None:
 def test_a_training_step_is_measured(kind: str, changes: dict[str, Any]) -> None:
     result = bench_train.measure(bench_train.DEFAULTS | SMALL | {"steps": 1} | changes, kind)
     assert result["windows_per_second"] == pytest.approx(2 / result["seconds_per_step"], rel=0.05)
-    assert result["kind"] == kind and "mfu" not in result
-
-
-def test_the_operations_of_a_step_are_those_torch_counts() -> None:
-    model = small_model(conditioning=("concat",), action_tokens=2, factored=(2,), frames=3, layers=3)
-    batch = small_batch(model.config, ["arm", "arm"])
-    with FlopCounterMode(display=False) as counter:
-        model(batch).loss.backward()
-    counts = bench_train.step_flops(model, {"batch": 2, "window": 3})
-    counted = sum(counter.get_flop_counts()["HMA.trunk"].values())
-    assert counts == pytest.approx(counted, rel=0.1)
+    assert result["kind"] == kind
 
 
 def test_ways_of_waiting_are_measured_each_in_its_own_environment(monkeypatch: pytest.MonkeyPatch) -> None:

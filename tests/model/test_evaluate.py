@@ -22,8 +22,7 @@ from hma_model.evaluation.evaluate import (
     validation_losses,
     windows,
 )
-from hma_model.evaluation.metrics import token_hits, token_nats
-from hma_model.evaluation.teacher_forcing import teacher_forced
+from hma_model.evaluation.metrics import teacher_forced, token_hits, token_nats
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, make_model
 from tests.model.shards import make_shards
@@ -258,18 +257,6 @@ def test_a_perfect_model_has_the_highest_psnr_and_loses_it_with_shuffled_actions
     assert figures["shuffled"]["psnr_last"] < 30 and figures["psnr_action_gain_last"] > 30
     assert figures["windows"] == 6 and len(figures["true"]["psnr_by_frame"]) == 3
     assert figures["copy"]["psnr"] < 60
-
-
-def test_rollouts_are_held_against_real_frames_where_they_are_given(model, data):
-    asked = []
-
-    def real(episode: int, frames: np.ndarray) -> np.ndarray:
-        asked.append((episode, frames.tolist()))
-        return np.full((len(frames), 16, 16, 3), 36, np.uint8)
-
-    figures = evaluate(model, Blocks(), data, count=2, real=real, prompt=1)
-    assert figures["against"] == "real frames"
-    assert asked == [(5, [0, 2, 4, 6]), (5, [16, 18, 20, 22])]
 
 
 def test_a_model_of_another_tokenizer_is_refused(data):

@@ -12,8 +12,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import Checkpoint
 from hma_model.hub import publish as hub
-from hma_model.training.finetune import finetune
-from hma_model.training.loop import TrainResult, train
+from hma_model.training.loop import TrainResult, finetune, train
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import run_command
 from tests.model.robots import SPEC
@@ -112,7 +111,7 @@ def test_a_known_robot_goes_on_with_its_stem_and_statistics(base, tmp_path):
 
 def test_a_known_robot_with_other_actions_is_refused(base, tmp_path):
     shards = make_shards(tmp_path / "arm", "arm", dims=5)
-    with pytest.raises(CheckpointError, match="knows arm with action_dim 2, the shards have 5"):
+    with pytest.raises(CheckpointError, match="has arm with action_dim 2, the shards have 5"):
         tune(base.out, shards, tmp_path / "run")
 
 
@@ -172,7 +171,7 @@ def test_the_command_takes_shards_overrides_and_json(base, leg, tmp_path):
     done = run_command(tmp_path, *words, "--out", str(tmp_path / "run"), "--json", *SHORT)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
-    assert facts["step"] == 4 and "trunk frozen" in done.stderr and "fresh stem and head: leg" in done.stderr
+    assert facts["step"] == 4 and "trunk frozen" in done.stderr and "new stem and head: leg" in done.stderr
     assert Checkpoint.open(facts["checkpoint"]).embodiments == ("arm", "foot", "hand", "leg")
 
 
@@ -187,7 +186,7 @@ def test_another_source_is_no_way_to_go_on_and_the_same_one_elsewhere_is(base, l
     moved = shutil.copytree(base.checkpoint, tmp_path / "moved")
     assert tune(moved, leg, tmp_path / "run").step == 4
     other = tune(base.out, leg, tmp_path / "other", freeze=False)
-    with pytest.raises(RecipeError, match=f"was begun from .*moved, not from {other.out}"):
+    with pytest.raises(RecipeError, match=f"was started from .*moved, not from {other.out}"):
         tune(other.out, leg, tmp_path / "run", force=True)
 
 

@@ -8,7 +8,7 @@ from hma_data.errors import HubError, RecipeError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.io import Checkpoint
 from hma_model.hub import publish as hub
-from hma_model.training.finetune import finetune
+from hma_model.training.loop import finetune
 from tests.hub_fixtures import REPO
 from tests.model.processes import run_command
 from tests.model.robots import make_model, save
@@ -56,7 +56,7 @@ def test_a_revision_is_the_one_that_is_fetched(published, leg, tmp_path, form):
     new = tune(REPO, leg, tmp_path / "run1")
     trunks = [Checkpoint.open(result.checkpoint).trunk_sha256 for result in (old, new)]
     assert trunks[1] == other.trunk_sha256 != trunks[0]
-    with pytest.raises(RecipeError, match=f"was begun from {REPO}, not from .*{REPO}@{first}"):
+    with pytest.raises(RecipeError, match=f"was started from {REPO}, not from .*{REPO}@{first}"):
         tune(form.format(REPO, first), leg, tmp_path / "run1")
 
 

@@ -46,7 +46,7 @@ def test_equal_pictures_have_infinite_psnr_and_ssim_one(pictures):
 
 def test_pictures_of_different_size_are_refused(pictures):
     truth, other = pictures
-    with pytest.raises(UsageError, match="must agree"):
+    with pytest.raises(UsageError, match="must both be"):
         psnr(truth, other[:, :-1])
 
 

@@ -19,8 +19,7 @@ from hma_data.errors import HMAError, ShardError, TrainingError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from hma_model.training.parallel import ParallelModel, World, join
-from hma_model.training.rank_errors import read_error, report_once, write_error
+from hma_model.training.parallel import ParallelModel, World, join, read_error, report_once, write_error
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import ROOT, errors, run_ranks
 from tests.model.runs import TINY, weights
@@ -121,7 +120,7 @@ def test_a_sharded_run_cut_on_two_ranks_goes_on_on_one(recipe, alone, tmp_path):
 def test_a_run_cut_on_one_rank_goes_on_on_two(recipe, alone, tmp_path):
     train_until(recipe(), tmp_path / "run", 3)
     told = spread(recipe(parallel="fsdp"), tmp_path / "run")
-    assert "going on from step 2" in told
+    assert "resuming from step 2" in told
     assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4)
     close(alone.checkpoint, checkpoint.resolve(tmp_path / "run"))
 
@@ -130,7 +129,7 @@ def test_a_step_shared_otherwise_goes_on_with_windows_anew_and_says_so(recipe, t
     given = recipe(accumulate=1, batch_size=4)
     train_until(given, tmp_path / "run", 3)
     told = spread(given, tmp_path / "run")
-    assert "the sampler begins anew: " in told and "is of 1 passes a step, this run has 2" in told
+    assert "the sampler starts again: " in told and "has 1 passes a step, this run has 2" in told
     assert len(curve(tmp_path / "run")) == 6
 
 
@@ -196,7 +195,7 @@ def fail(rank: int) -> None:
 
 def test_a_rank_that_has_lost_the_others_finds_their_first_error():
     store = dist.HashStore()
-    assert read_error(store) is None and read_error(None) is None
+    assert read_error(store) is None
     write_error(store, 1, ShardError("here", "is gone"))
     write_error(store, 0, TypeError("another"))
     assert str(read_error(store)) == "rank 1: here: is gone"

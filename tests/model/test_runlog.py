@@ -24,7 +24,6 @@ from hma_model.training.logging import RunLog, read_metrics
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
 from hma_model.training.report import write_report
-from hma_model.training.trackers import open_trackers
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
 
@@ -131,10 +130,12 @@ def test_without_a_package_for_it_nothing_is_tracked(data, tmp_path):
     assert not (tmp_path / "run" / "tensorboard").exists()
 
 
-def test_an_event_file_that_cannot_be_written_is_one_error(tmp_path):
-    (tmp_path / "tensorboard").write_text("a file")
-    with pytest.raises(OutputError, match="cannot be written"):
-        open_trackers(make_recipe({**TINY, "data": ["d"], "track": ["tensorboard"]}), tmp_path, 0)
+def test_an_event_file_that_cannot_be_written_is_one_error(data, tmp_path):
+    plain = make_recipe({**TINY, "data": data, "steps": 1})
+    out = train(plain, out=tmp_path / "run", show=False).out
+    (out / "tensorboard").write_text("a file")
+    with pytest.raises(OutputError, match="tensorboard: cannot be written"):
+        train(plain.model_copy(update={"track": ("tensorboard",)}), out=out, show=False)
 
 
 @pytest.fixture(params=["trackio", "wandb"])
@@ -251,7 +252,7 @@ def terminal(monkeypatch):
 def test_the_live_table_has_losses_by_robot_perplexity_speed_and_time_left(data, tmp_path, terminal):
     train(make_recipe({**TINY, "data": data}), out=tmp_path / "run")
     last = terminal[-1]
-    for text in ("step 6/6", "windows/s", "left", "MiB", "arm", "hand", "perplexity", "ignoring all"):
+    for text in ("step 6/6", "windows/s", "left", "MiB", "arm", "hand", "perplexity", "baseline"):
         assert text in last
     lines = read_metrics(tmp_path / "run")
     assert f"{lines[-1]['loss_by_embodiment']['arm']:.3f}" in last
@@ -295,7 +296,7 @@ def test_a_loss_that_is_no_number_leaves_the_shown_mean_one(tmp_path, capsys):
         log.step(facts(1))
         log.step(facts(2, loss=math.nan, skipped=1))
     last = capsys.readouterr().err.splitlines()[-1]
-    assert "loss arm 2.000" in last and "1 steps left out" in last
+    assert "loss arm 2.000" in last and "1 steps skipped" in last
 
 
 def test_a_terminal_shows_where_the_run_stands_before_the_first_step(tmp_path, monkeypatch):

@@ -71,7 +71,7 @@ def test_the_command_saves_on_sigterm_and_says_how_to_go_on(recipe, tmp_path):
         time.sleep(0.05)
     process.terminate()
     assert end([process], said) == [130]
-    assert "the same command goes on" in said.read_text() and "Traceback" not in said.read_text()
+    assert "run the same command to continue" in said.read_text() and "Traceback" not in said.read_text()
     step = int(checkpoint.resolve(tmp_path / "run").name.removeprefix("step-"))
     assert step == read_metrics(tmp_path / "run")[-1]["step"] > 0
 
@@ -136,7 +136,7 @@ def test_a_step_in_which_nothing_may_learn_is_said(recipe, tmp_path):
     skipping = recipe(steps=1, model={**TINY["model"], "absent_action": "skip"})
     base = train(skipping, out=tmp_path / "a", show=False)
     frozen = recipe(start=str(base.out), freeze="trunk", objectives={"passive": 1}, model={})
-    with pytest.raises(RecipeError, match="nothing that may learn takes part in the objective passive"):
+    with pytest.raises(RecipeError, match="leaves nothing to train with the objective passive"):
         train(frozen, out=tmp_path / "b", show=False)
 
 
@@ -227,7 +227,7 @@ def test_force_goes_on_with_other_shards_and_other_robots(recipe, tmp_path, caps
     both = recipe(steps=4, data=[str(arm), str(leg)], ema=ema)
     result = train(both, out=tmp_path / "run", force=True)
     said = capsys.readouterr().err
-    assert result.step == 4 and "arm keeps the statistics" in said and "leg is new here" in said
+    assert result.step == 4 and "arm keeps the statistics" in said and "leg is new in this run" in said
     after = checkpoint.load(tmp_path / "run").embodiments
     assert after["arm"].agrees_with(before) and set(after) == {"arm", "leg"}
     last = train(recipe(steps=5, data=[str(leg)], ema=ema), out=tmp_path / "run", force=True, show=False)

@@ -8,10 +8,10 @@ from hma_data.errors import RecipeError, TrainingError
 from hma_model.checkpoint import io as checkpoint
 from hma_model.network.model import HMA
 from hma_model.training.data import TrainData, share
-from hma_model.training.ema import Average
 from hma_model.training.guards import SETTLED, GradientSpikeDetector, listed
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
+from hma_model.training.optim import Average
 from hma_model.training.parallel import World
 from hma_model.training.recipe import make_recipe
 from hma_model.training.run import Run
