@@ -36,7 +36,7 @@ from hma_data.shards.preview import preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.hands.models import load_models
+from hma_data.sources.hands.detect import load_models
 from hma_data.sources.hands.scan import detect as detect_hands
 from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_address, as_path, as_text
@@ -392,7 +392,7 @@ PUBLIC = (
     "hma_data.loading.mixture", "hma_data.registry.catalog", "hma_data.registry.embodiment",
     "hma_data.shards.info", "hma_data.shards.manifest", "hma_data.shards.memmap", "hma_data.shards.preview",
     "hma_data.shards.reader", "hma_data.shards.verify", "hma_data.sources.bags.source",
-    "hma_data.sources.base", "hma_data.sources.hands.models", "hma_data.sources.hands.preview",
+    "hma_data.sources.base", "hma_data.sources.hands.detect",
     "hma_data.sources.hands.scan", "hma_data.sources.hands.source", "hma_data.sources.hdf5.source",
     "hma_data.sources.lerobot.source", "hma_data.sources.rlds.source", "hma_data.tokenizers.base",
     "hma_data.tokenizers.training.frames", "hma_data.tokenizers.training.recipe",
@@ -418,7 +418,7 @@ INNER = {  # take what a public function has made of a path already
     },
     "hma_data.shards.verify": {"check_rows", "check_shard"},
     "hma_data.sources.base": {"of_another_format", "local_path", "leaves", "first_bytes", "file_fingerprint"},
-    "hma_data.sources.hands.scan": {"scan_cached"},
+    "hma_data.sources.hands.scan": {"scan_cached", "inspect_videos"},
     "hma_data.tokenizers.training.frames": {"read_pictures"},
     "hma_data.tokenizers.training.train": {"Run"},
     "hma_model.checkpoint.folder": {"inside"},

@@ -109,19 +109,13 @@ def test_epic_kitchens_as_published(folder: Path, protocol: int) -> None:
     check_run(folder, made.hand_video("epic_kitchens_hand_objects"), "a.mp4#0", range(LENGTH))
 
 
-def test_epic_kitchens_as_a_stream_of_messages(folder: Path) -> None:
-    messages = made.epic_messages(LENGTH)
-    (folder / "a.pb").write_bytes(b"".join(made.varint(len(each)) + each for each in messages))
-    check_run(folder, made.hand_video("epic_kitchens_hand_objects"), "a.mp4#0", range(LENGTH))
-
-
-def test_epic_kitchens_as_a_table_counts_from_one(folder: Path) -> None:
+def test_a_table_whose_frames_count_from_one(folder: Path) -> None:
     table = [
         {"video_id": "a", "frame_number": row["frame"] + 1} | {key: row[key] for key in ("side", "x", "y")}
         for row in made.rows("a", LENGTH)
     ]
-    made.write_table(folder / "a.csv", table)
-    check_run(folder, made.hand_video("epic_kitchens_hand_objects"), "a.mp4#0", range(LENGTH))
+    made.write_table(folder / "hands.csv", table)
+    check_run(folder, made.hand_video("landmarks", first_frame="1"), "a.mp4#0", range(LENGTH))
 
 
 def test_of_two_left_hands_the_surer_counts_and_doubtful_ones_do_not(folder: Path) -> None:

@@ -35,9 +35,8 @@ def point_of(key: str, where: str) -> str:
         SourceError: it is not a key of hand videos.
     """
     if key not in KEYS:
-        near = get_close_matches(key, KEYS, n=3, cutoff=0.4)
-        hint = f"did you mean {', '.join(near)}?" if near else "keys are such as left/center/next"
-        raise SourceError(where, f"{key!r} is not a key of hand videos", hint)
+        near = get_close_matches(key, KEYS, n=3, cutoff=0.0)
+        raise SourceError(where, f"{key!r} is not a key of hand videos", f"did you mean {', '.join(near)}?")
     return key.removesuffix("/next").removesuffix("/delta")
 
 
@@ -149,8 +148,8 @@ def cut_into_runs(
         EpisodeError: the labels do not fit the video, or never have a needed point.
     """
     labels = _within(labels, video.frames, where)
-    size = (video.width, video.height)
-    labels, outside = _as_fractions(labels, needed, layout.label_size or size, where)
+    size = layout.label_size or (video.width, video.height)
+    labels, outside = _as_fractions(labels, needed, size, where)
     for point in needed:
         if not np.isfinite(labels.points[point]).any():
             have = [name for name, values in labels.points.items() if np.isfinite(values).any()]
@@ -215,7 +214,7 @@ def _within(labels: HandLabels, frames: int, where: str) -> HandLabels:
     if len(beyond) and (beyond.min() < 0 or beyond.max() > frames * (1 + LATE) + 2 or not inside.any()):
         worst = int(beyond.min() if beyond.min() < 0 else beyond.max())
         fault = f"is labelled at frame {worst:,}, and has {frames:,} frames"
-        raise EpisodeError(where, fault, "are the labels of another video, or is first_frame another?")
+        raise EpisodeError(where, fault, "check that these are its labels, and source.layout.first_frame")
     points = {point: values[inside] for point, values in labels.points.items()}
     return replace(labels, frames=labels.frames[inside], points=points)
 
@@ -233,12 +232,11 @@ def _as_fractions(
         if point in needed:
             lost |= beyond
             if beyond.sum() > seen / 2:
-                worst = raw[beyond][0, :2]
-                unit = "pixels" if labels.pixels else "of the picture's sides"
-                fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the picture, "
-                fault += f"{worst[0]:.4g}, {worst[1]:.4g} {unit} first; the picture has {size[0]}×{size[1]}"
+                x, y = raw[beyond][0, :2]
+                fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the picture of "
+                fault += f"{size[0]}×{size[1]} pixels, the first at {x:.4g}, {y:.4g}"
                 raise EpisodeError(
-                    where, fault, "are they of another video, or of another size (label_size)?"
+                    where, fault, "check that these are its labels, and source.layout.label_size"
                 )
         points[point] = np.where(beyond[:, None], np.nan, np.clip(values, 0, 1))
     return replace(labels, points=points, pixels=False), int(lost.sum())
