@@ -406,7 +406,6 @@ PUBLIC = (
 )  # fmt: skip
 INNER = {  # take what a public function has made of a path already
     "hma_data.registry.embodiment": {"todos"},
-    "hma_data.lab": {"written_beside"},
     "hma_data.registry.catalog": {"file_id"},
     "hma_data.shards.manifest": {
         "damaged_files",

@@ -78,7 +78,7 @@ def actions(length: int, seed: int) -> NDArray[np.float32]:
 
 def _rlds(size: tuple[int, int], codec: str) -> Writer:
     def write(folder: Path, episodes: int, length: int, seed: int) -> Path:
-        from hma_data.lab.write_rlds import RldsEpisode, write_rlds
+        from hma_data.lab.writers import RldsEpisode, write_rlds
 
         def made() -> Iterator[RldsEpisode]:
             for i in range(episodes):

@@ -13,7 +13,7 @@ Lengths are pixels of the 512 × 512 arena, angles radians. C contacts, N nodes,
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -228,20 +228,6 @@ def _inside(points: Floats) -> Any:
     return np.all((points > LOW) & (points < HIGH), axis=-1)
 
 
-class Policy(Protocol):
-    """A driver of the pusher's setpoint."""
-
-    def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Return the setpoint (2,) `seconds` from now, and whether the pusher is up.
-
-        Args:
-            pose: (3,) pose of the T.
-            agent: (2,) centre of the pusher.
-            seconds: time until the next call.
-        """
-        ...
-
-
 class Planned:
     """A driver that plans a push, walks, pushes, steps back, and plans again."""
 
@@ -253,7 +239,13 @@ class Planned:
         self._phases: list[tuple[Floats, bool]] = []  # remaining way points, and whether the pusher is up
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Return the setpoint and whether the pusher is up; see Policy."""
+        """Return the setpoint (2,) `seconds` from now, and whether the pusher is up.
+
+        Args:
+            pose: (3,) pose of the T.
+            agent: (2,) centre of the pusher.
+            seconds: time until the next call.
+        """
         if not self._phases:
             push = plan(self._tee, pose, self._goal, agent, self._speed, self._fly, self._rng)
             self._phases = [(push.path, self._fly), (push.end[None], False), (push.retreat[None], False)]
@@ -275,7 +267,7 @@ class Wandering:
         self._speed, self._up = 0.0, False
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Return the setpoint and whether the pusher is up; see Policy."""
+        """Return the setpoint and whether the pusher is up; see Planned.act."""
         if not len(self._way):
             near = self._rng.random() < 0.7
             point = pose[:2] + self._rng.normal(0, 60, 2) if near else self._rng.uniform(LOW, HIGH, 2)
