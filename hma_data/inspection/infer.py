@@ -2,13 +2,11 @@
 
 The YAML holds what the recording states. What the recording cannot know is written as `TODO: question`, and
 `hma registry validate` lists these questions until they are answered. `infer_choices` (for bags,
-`infer_topics`) decides which keys are taken. In the text of the YAML, each component and each camera is one
-line in braces.
+`infer_topics`) decides which keys are taken.
 """
 
 import math
 import re
-from dataclasses import replace
 from typing import Any, get_args
 
 import yaml
@@ -36,84 +34,40 @@ from hma_data.sources.base import Inspection, KeyInfo, detect, open_source
 from hma_data.storage.paths import StrPath
 
 LINE = 110
-_HALVES = re.compile(r"[\ud800-\udfff]")
-_BREAKS = re.compile(r"[\n\r\x85\u2028\u2029]")
+HIGHEST_HZ = 100_000  # of a rate in a YAML
+MEASURED_TO = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
 
 
 class _Dumper(yaml.SafeDumper):
+    """A writer of YAML in which lists of words, components and cameras are on one line each."""
+
     def ignore_aliases(self, data: Any) -> bool:
         """Return True: write no aliases, because the parser accepts none."""
         return True
 
-
-def _text(dumper: _Dumper, value: str) -> yaml.Node:
-    """Represent a text on one line, whatever it holds."""
-    value = _HALVES.sub("?", value)  # half of a surrogate pair is no text
-    style = '"' if _BREAKS.search(value) else None
-    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        """Indent the items of a list below its key."""
+        super().increase_indent(flow, False)
 
 
-_Dumper.add_representer(str, _text)
+def _mapping(dumper: _Dumper, value: dict[str, Any]) -> yaml.Node:
+    node = dumper.represent_dict(value.items())
+    parts = [item for each in value.values() for item in (each if isinstance(each, list) else [each])]
+    node.flow_style = not any(isinstance(part, dict) for part in parts) and len(repr(value)) < LINE
+    return node
 
 
-def yaml_text(values: dict[str, Any]) -> str:
-    """Return plain values as YAML, in the order given; parsing it gives the same values."""
-    return "".join(_entry(name, value, "") for name, value in values.items())
+def _list(dumper: _Dumper, value: list[Any]) -> yaml.Node:
+    flow = not any(isinstance(item, dict) for item in value)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=flow)
 
 
-def _entry(name: str, value: Any, indent: str) -> str:
-    if isinstance(value, dict):
-        braced = f"{indent}{_dump({name: value}, True)[1:-1]}"
-        if len(braced) <= LINE and all(not isinstance(item, dict | list) for item in value.values()):
-            return braced + "\n"
-        inner = "".join(_entry(key, item, indent + "  ") for key, item in value.items())
-        return f"{indent}{name}:\n{inner}"
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return f"{indent}{name}:\n" + "".join(_item(item, indent + "  ") for item in value)
-    if isinstance(value, list):
-        return _names(name, value, indent)
-    return _indented(_dump({name: value}, False), indent)
+_Dumper.add_representer(dict, _mapping)
+_Dumper.add_representer(list, _list)
 
 
-def _item(value: dict[str, Any], indent: str) -> str:
-    braced = f"{indent}- {_dump(value, True)}"
-    if len(braced) <= LINE:
-        return braced + "\n"
-    block = "".join(_entry(key, item, indent + "  ") for key, item in value.items())
-    return f"{indent}- {block[len(indent) + 2 :]}"
-
-
-def _names(name: str, value: list[Any], indent: str) -> str:
-    """Return a list in brackets, broken into lines where it is long."""
-    whole = f"{indent}{_dump({name: value}, True)[1:-1]}"
-    if len(whole) <= LINE:
-        return whole + "\n"
-    lines, line = [], f"{indent}  "
-    for item in [_dump([item], True)[1:-1] for item in value]:
-        if len(line) + len(item) + 2 > LINE and line.strip():
-            lines.append(line.rstrip())
-            line = f"{indent}  "
-        line += f"{item}, "
-    return "\n".join([f"{indent}{name}: [", *lines, line.rstrip()[:-1] + "]"]) + "\n"
-
-
-def _dump(value: Any, flow: bool) -> str:
-    return yaml.dump(
-        value,
-        Dumper=_Dumper,
-        default_flow_style=flow,
-        allow_unicode=True,
-        width=float("inf"),
-        sort_keys=False,
-    ).rstrip("\n")
-
-
-def _indented(text: str, indent: str) -> str:
-    return "".join(f"{indent}{line}\n" if line else "\n" for line in text.split("\n"))
-
-
-HIGHEST_HZ = 100_000  # of a rate in a YAML
-MEASURED_TO = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
+def _yaml_text(values: dict[str, Any]) -> str:
+    return yaml.dump(values, Dumper=_Dumper, allow_unicode=True, width=LINE, sort_keys=False)
 
 
 def infer(uri: StrPath, embodiment_id: str) -> str:
@@ -136,25 +90,13 @@ def infer(uri: StrPath, embodiment_id: str) -> str:
 
 def from_inspection(found: Inspection, embodiment_id: str) -> str:
     """Return the YAML of an embodiment from an inspection; see `infer`."""
-    if found.format == "hands":
-        return _of_hands(found, embodiment_id)
-    readable = replace(found, keys=tuple(key for key in found.keys if _is_text(key.key)))
-    text = yaml_text(_Draft(readable).values(embodiment_id))
-    where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
+    where = shown([found.uri])
+    if found.format == "hands":  # videos hold nothing that could be an action
+        values = find("hand_video").to_dict() | {"id": embodiment_id}
+        head = "a copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
+        return f"# For the videos of {where}: {head}\n{_yaml_text(values)}"
+    text = _yaml_text(_Draft(found).values(embodiment_id))
     return f"# Inferred from {where}; answer every {TODO}, then: hma registry validate FILE\n{text}"
-
-
-def _of_hands(found: Inspection, embodiment_id: str) -> str:
-    """Return a copy of the embodiment `hand_video`: videos hold nothing that could be an action."""
-    where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
-    values = find("hand_video").to_dict() | {"id": embodiment_id}
-    head = "a copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
-    return f"# For the videos of {where}: {head}\n{yaml_text(values)}"
-
-
-def _is_text(text: str) -> bool:
-    """Check whether a YAML can hold a text; file formats let through bytes that it cannot hold."""
-    return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 class _Draft:
