@@ -155,7 +155,9 @@ def needs_receive_times(keys: Iterable[KeyInfo]) -> str:
     return ""
 
 
-def max_skew_ms(cameras: list[KeyInfo], actions: Iterable[KeyInfo], states: Iterable[KeyInfo]) -> int | None:
+def max_skew_ms(
+    cameras: Iterable[KeyInfo], actions: Iterable[KeyInfo], states: Iterable[KeyInfo]
+) -> int | None:
     """Return how many ms values may be moved: the longest interval measured, with a margin; None without any.
 
     A held command may be as old as one interval. A nearest or interpolated value is off by half of one.
