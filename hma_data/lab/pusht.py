@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hma_data.lab import imported
 from hma_data.lab.pusher import Floats, Planned, Tee, Wandering, rotation
-from hma_data.lab.writers import Demo, Message, joints, picture, twist, write_hdf5, write_mcap
+from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
 
 TICK_S = 0.01  # step of the physics
 LAG_S = 0.2  # delay of the pusher's spring (k_v / k_p of the environment) behind a moving target
@@ -213,6 +213,8 @@ def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
 
 
 def _slow_bag(path: Path, seed: int, episode: int) -> None:
+    import cv2
+
     arena, policy, rng = _begin(SLOW_LOOK, 1, seed, episode, fly=True)
     setpoint, stop = arena.agent, SLOW_TICKS
     velocity: Floats = np.zeros(2)
@@ -230,17 +232,32 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
         stamp = EPOCH_NS + episode * 60_000_000_000 + tick * round(TICK_S * 1e9)
         if event == "camera":
             late = stamp + int(rng.integers(12_000_000, 20_000_000))
-            messages.append(picture("/camera/image/compressed", stamp, late, arena.picture(), "camera"))
+            _, png = cv2.imencode(".png", arena.picture()[..., ::-1])
+            fields = {"format": "png", "data": png.reshape(-1)}
+            kind = "sensor_msgs/msg/CompressedImage"
+            messages.append(Message("/camera/image/compressed", stamp, late, kind, "camera", fields))
         elif event == "joints":
             late = stamp + int(rng.integers(500_000, 2_000_000))
             place, motion = np.append(arena.agent, arena.raised), np.append(arena.velocity, 0.0)
-            messages.append(joints("/joint_states", stamp, late, ("x", "y", "lift"), place, motion, "arena"))
+            fields = {
+                "name": ["x", "y", "lift"],
+                "position": place,
+                "velocity": motion,
+                "effort": np.empty(0),
+            }
+            kind = "sensor_msgs/msg/JointState"
+            messages.append(Message("/joint_states", stamp, late, kind, "arena", fields))
         else:
             ahead, up = policy.act(arena.pose, arena.agent, 0.2)
             velocity = np.zeros(2) if arena.success else (ahead - setpoint) / 0.2
             up = up and not arena.success
             arena.lift(up)
             late = stamp + int(rng.integers(500_000, 2_000_000))
-            messages.append(twist("/command", stamp, late, np.append(velocity, up), "arena"))
+            vector = "geometry_msgs/msg/Vector3"
+            linear = ros_value(vector, *np.append(velocity, up).tolist())
+            turn = ros_value(vector, 0.0, 0.0, 0.0)
+            fields = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
+            kind = "geometry_msgs/msg/TwistStamped"
+            messages.append(Message("/command", stamp, late, kind, "arena", fields))
     facts = {"success": str(arena.success).lower(), "start": STARTS[episode % len(STARTS)], "seed": str(seed)}
     write_mcap(path, messages, {"robot": "pusht_slow", **facts})

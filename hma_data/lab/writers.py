@@ -274,51 +274,22 @@ class Message:
         topic: name with leading slash.
         stamp_ns: time of the event, in the message's header; nanoseconds since 1970.
         received_ns: the later time at which the recorder received it.
-        type: e.g. sensor_msgs/msg/JointState.
-        content: value of that type, from `picture`, `joints` or `twist`.
+        type: e.g. sensor_msgs/msg/JointState; a type with a header.
+        frame: frame_id of the header.
+        fields: values of the other fields.
     """
 
     topic: str
     stamp_ns: int
     received_ns: int
     type: str
-    content: Any
+    frame: str
+    fields: Mapping[str, Any]
 
 
-def picture(topic: str, stamp_ns: int, received_ns: int, image: NDArray[np.uint8], frame: str) -> Message:
-    """Return a sensor_msgs/CompressedImage; image (H, W, 3) RGB is stored as PNG, without loss."""
-    import cv2
-
-    _, png = cv2.imencode(".png", image[..., ::-1])
-    kind = "sensor_msgs/msg/CompressedImage"
-    content = _types().types[kind](header=_header(stamp_ns, frame), format="png", data=png.reshape(-1))
-    return Message(topic, stamp_ns, received_ns, kind, content)
-
-
-def joints(
-    topic: str,
-    stamp_ns: int,
-    received_ns: int,
-    names: Sequence[str],
-    position: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-    frame: str,
-) -> Message:
-    """Return a sensor_msgs/JointState of (n,) positions and velocities."""
-    kind, head = "sensor_msgs/msg/JointState", _header(stamp_ns, frame)
-    content = _types().types[kind](head, list(names), position, velocity, effort=np.empty(0))
-    return Message(topic, stamp_ns, received_ns, kind, content)
-
-
-def twist(topic: str, stamp_ns: int, received_ns: int, linear: NDArray[np.float64], frame: str) -> Message:
-    """Return a geometry_msgs/TwistStamped with linear (3,) and no rotation."""
-    kind, types = "geometry_msgs/msg/TwistStamped", _types().types
-    vector = types["geometry_msgs/msg/Vector3"]
-    motion = types["geometry_msgs/msg/Twist"](
-        linear=vector(*(float(value) for value in linear)), angular=vector(0.0, 0.0, 0.0)
-    )
-    content = types[kind](header=_header(stamp_ns, frame), twist=motion)
-    return Message(topic, stamp_ns, received_ns, kind, content)
+def ros_value(kind: str, *values: Any, **named: Any) -> Any:
+    """Return a value of a ROS 2 type, such as geometry_msgs/msg/Vector3."""
+    return _types().types[kind](*values, **named)
 
 
 def write_mcap(path: Path, messages: Sequence[Message], facts: Mapping[str, str]) -> None:
@@ -346,10 +317,13 @@ def write_mcap(path: Path, messages: Sequence[Message], facts: Mapping[str, str]
                     message.topic, "cdr", schemas[message.type], {"offered_qos_profiles": ""}
                 )
             sequence[message.topic] = sequence.get(message.topic, 0) + 1
+            stamp = ros_value("builtin_interfaces/msg/Time", *divmod(message.stamp_ns, 1_000_000_000))
+            header = ros_value("std_msgs/msg/Header", stamp=stamp, frame_id=message.frame)
+            content = ros_value(message.type, header=header, **message.fields)
             writer.add_message(
                 channels[message.topic],
                 log_time=message.received_ns,
-                data=bytes(store.serialize_cdr(message.content, message.type)),
+                data=bytes(store.serialize_cdr(content, message.type)),
                 publish_time=message.stamp_ns,
                 sequence=sequence[message.topic],
             )
@@ -361,10 +335,3 @@ def _types() -> Any:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores(f"ros2_{DISTRO}"))
-
-
-def _header(stamp_ns: int, frame: str) -> Any:
-    types = _types().types
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-    return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)

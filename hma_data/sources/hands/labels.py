@@ -30,7 +30,7 @@ from hma_data.sources.base import first_bytes, local_path
 from hma_data.sources.hands.layout import HandsLayout, Video
 from hma_data.sources.hands.runs import SIDES, HandLabels, labels_from_rows
 
-PICKLES, TABLES = (".pkl", ".pickle"), (".parquet", ".csv", ".json")
+PICKLES, TABLES = (".pkl", ".pickle"), (".parquet", ".csv")
 _FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 JOINTS = ("wrist", *(f"{finger}_{i}" for finger in _FINGERS for i in (1, 2, 3, 4)))
 _FHO = "give fho_main.json of the annotations that Ego4D's command fetches (benchmark FHO)"
@@ -105,7 +105,6 @@ def _label_files(root: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
 _ALIASES = {"video_id": "video", "frame_number": "frame"}
 _SIDES = {"left": 0, "l": 0, "right": 1, "r": 1}
 _FORMS: dict[str, tuple[str, ...]] = {
-    "landmarks": tuple(f"{axis}{i}" for i in range(21) for axis in "xy"),
     "box": ("left", "top", "right", "bottom"),
     "center": ("x", "y"),
     "wrist": ("wrist_x", "wrist_y"),
@@ -113,7 +112,7 @@ _FORMS: dict[str, tuple[str, ...]] = {
 
 
 class HandTable:
-    """A table of hands, by video: parquet, CSV or a JSON list of rows; one row a hand.
+    """A table of hands, by video: parquet or CSV, one row a hand.
 
     | column | meaning |
     |---|---|
@@ -127,7 +126,6 @@ class HandTable:
     | columns | gives |
     |---|---|
     | landmarks | 42 numbers, x and y of MediaPipe's 21 points (0 is the wrist): landmarks, center, wrist |
-    | x0, y0, … x20, y20 | the same, one column a number, for CSV |
     | left, top, right, bottom | a box: center |
     | x, y | center; with wrist_x, wrist_y beside them or alone: wrist |
 
@@ -179,19 +177,14 @@ def _read_columns(path: Path) -> dict[str, Any]:
 
     text = dict.fromkeys(("video", "video_id", "side"), pa.string())
     try:
-        if path.suffix.lower() == ".parquet":
-            table = pq.read_table(path)
-        elif path.suffix.lower() == ".csv":
+        if path.suffix.lower() == ".csv":
             options = pyarrow.csv.ConvertOptions(column_types=text)
             table = pyarrow.csv.read_csv(path, convert_options=options)
         else:
-            rows = json.loads(path.read_bytes())
-            if not isinstance(rows, list):
-                raise SourceError(path, "is not a list of rows", "give [{video, frame, side, x, y}, …]")
-            table = pa.Table.from_pylist(rows)
-    except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError) as fault:
+            table = pq.read_table(path)
+    except (pa.ArrowException, OSError) as fault:
         said = " ".join(f"cannot be read: {fault}".split())
-        raise SourceError(path, said, "write the table again as parquet, CSV or JSON") from fault
+        raise SourceError(path, said, "write the table again as parquet or CSV") from fault
     if not table.num_rows:
         raise SourceError(path, "has no rows")
     return {_ALIASES.get(name, name): table.column(name) for name in table.column_names}
@@ -229,8 +222,6 @@ def _parts(columns: dict[str, Any], path: Path) -> dict[str, NDArray[np.float64]
         for part, names in _FORMS.items()
         if all(name in columns for name in names)
     }
-    if "landmarks" in found:
-        return {"landmarks": found["landmarks"]}
     if "box" in found:
         box = found.pop("box")
         found["center"] = (box[:, :2] + box[:, 2:]) / 2

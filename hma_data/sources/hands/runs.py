@@ -200,8 +200,7 @@ def values_of(key: str, points: dict[str, Floats], span: tuple[int, int]) -> Flo
 
     The last label serves only as a next value.
     """
-    start, stop = span
-    values = points[point_of(key, key)][start:stop]
+    values = points[point_of(key, key)][slice(*span)]
     if key.endswith("/next"):
         return values[1:]
     return np.diff(values, axis=0) if key.endswith("/delta") else values[:-1]

@@ -111,29 +111,21 @@ class HandsSource:
             SourceError: no such episode, or a key that hand videos do not have.
             RegistryError: the YAML's layout is wrong.
         """
-        uri, layout = as_text(uri), layout_of(embodiment)
-        video, number = self._place(uri, episode_id)
-        file, runs = self.runs(uri, video.name, embodiment)
-        if not runs.spans:
-            fault = f"has no run of {layout.min_frames} frames with {', '.join(_needed(embodiment))}: "
-            fault += f"{runs.counts['without_hands']:,} of {runs.counts['labelled']:,} frames lack one"
-            raise EpisodeError(video.path, fault, _MORE_RUNS)
-        alone = number is None
-        number = runs.longest() if number is None else number
-        if number >= len(runs.spans):
-            raise EpisodeError(video.path, f"has {len(runs.spans)} runs, no run {number}")
-        return _episode(episode_id, file, runs, number, embodiment, alone)
-
-    def runs(self, uri: StrPath, name: str, embodiment: Embodiment) -> tuple[VideoFile, Runs]:
-        """Return a video and all its runs; see read."""
         uri, layout, needed = as_text(uri), layout_of(embodiment), _needed(embodiment)
-        video = self._place(uri, name)[0]
+        video, number = self._place(uri, episode_id)
         labels = self._labels_of(uri, video, layout)
         file = VideoFile(video.path)
         table = file.table
         hz = table.hz or _measured_hz(table.times)
         header = Header(len(table), hz, table.width, table.height, table.codec)
-        return file, cut_into_runs(labels, needed, layout, header, str(video.path))
+        runs = cut_into_runs(labels, needed, layout, header, str(video.path))
+        if not runs.spans:
+            fault = f"has no run of {layout.min_frames} frames with {', '.join(needed)}: "
+            fault += f"{runs.counts['without_hands']:,} of {runs.counts['labelled']:,} frames lack one"
+            raise EpisodeError(video.path, fault, _MORE_RUNS)
+        if number is not None and number >= len(runs.spans):
+            raise EpisodeError(video.path, f"has {len(runs.spans)} runs, no run {number}")
+        return _episode(episode_id, file, runs, number, embodiment)
 
     def _find(self, uri: str) -> dict[str, Video]:
         self._videos[uri] = videos_of(uri)
@@ -170,12 +162,7 @@ class HandsSource:
 
 
 class _Pictures:
-    """The Stream of a run: chosen frames of a video.
-
-    Args:
-        file: the video.
-        indices: (T,) of its frames.
-    """
+    """The Stream of a run: the frames of a video with the indices (T,)."""
 
     def __init__(self, file: VideoFile, indices: NDArray[np.int64]) -> None:
         self.timestamps = file.timestamps[indices]
@@ -208,7 +195,7 @@ def _whole(video: Video, digest: str) -> EpisodeRef:
         mark = f"{file_fingerprint(video.path)} {digest}"
     except EpisodeError as fault:  # `read` raises it again
         frames, mark = 1, str(fault)
-    return EpisodeRef(video.name, max(1, frames), None, _digest(mark))
+    return EpisodeRef(video.name, max(1, frames), None, _digest(mark.encode()))
 
 
 def _runs_of(
@@ -225,7 +212,7 @@ def _runs_of(
         runs = cut_into_runs(found, needed, layout, header_of(video.path), str(video.path))
         mark = file_fingerprint(video.path)
     except EpisodeError as fault:
-        return [EpisodeRef(video.name, 1, None, _digest(str(fault)))]
+        return [EpisodeRef(video.name, 1, None, _digest(str(fault).encode()))]
     refs = []
     for number, span in enumerate(runs.spans):
         values = [runs.labels.points[point][slice(*span)].tobytes() for point in needed]
@@ -235,11 +222,8 @@ def _runs_of(
     return refs
 
 
-def _digest(*parts: str | bytes) -> str:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part.encode() if isinstance(part, str) else part)
-    return digest.hexdigest()[:16]
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
 def _measured_hz(times: Floats) -> float:
@@ -248,21 +232,31 @@ def _measured_hz(times: Floats) -> float:
 
 
 def _episode(
-    episode_id: str, file: VideoFile, runs: Runs, number: int, embodiment: Embodiment, alone: bool
+    episode_id: str, file: VideoFile, runs: Runs, number: int | None, embodiment: Embodiment
 ) -> Episode:
-    """Make the episode of run `number`; `alone` says that it is the only episode of its video."""
-    span, labels, layout = runs.spans[number], runs.labels, layout_of(embodiment)
-    marks = labels.frames[span[0] : span[1]]
+    """Make the episode of run `number`; None makes that of the longest run, as the only one of its video."""
+    labels, layout, counts = runs.labels, layout_of(embodiment), runs.counts
+    chosen = runs.longest() if number is None else number
+    span = start, stop = runs.spans[chosen]
+    marks = labels.frames[start:stop]
     every = layout.pictures == "every"
     stream = _Pictures(file, np.arange(marks[0], marks[-1]) if every else marks[:-1])
-    at = file.timestamps[marks[:-1]]
-    steady = not every and embodiment.sync.rate_hz is None and _regular(at)
+    steps = np.diff(file.timestamps[marks[:-1]])
+    regular = not len(steps) or (np.abs(steps - np.median(steps)) <= REGULAR * np.median(steps)).all()
+    steady = bool(regular) and not every and embodiment.sync.rate_hz is None
     if steady and not labels.irregular:
-        _check_rate(file.path, at, embodiment)
+        _check_rate(file.path, _measured_hz(file.timestamps[marks[:-1]]), embodiment)
     text = "; ".join(dict.fromkeys(words for frame, words in labels.texts if marks[0] <= frame < marks[-1]))
     state: tuple[Signal, ...] = ()
     if embodiment.state:
         state = (_signal(embodiment.state, file, labels, span, to_last=not steady),)
+    # Frames in no run count in the first run, or in the only one that is read.
+    left = len(labels) - (stop - start - 1) if number is None else counts["dropped"] if number == 0 else 0
+    flags = {
+        "held_frames": int(runs.held[start : stop - 1].sum()),
+        "masked_frames": int(runs.missing[start : stop - 1].sum()),
+        "dropped_frames": left,
+    }
     return Episode(
         id=episode_id,
         streams={camera.name: stream for camera in embodiment.cameras},
@@ -271,28 +265,10 @@ def _episode(
         rate_stamped=steady,
         instruction=text,
         source=str(file.path),
-        metadata={"labels": layout.labels, "run": number, "runs": len(runs.spans)}
-        | {"first_frame": int(marks[0]), "video_frames": len(file), **runs.counts}
-        | {"flags": _flags(runs, number, alone)},
+        metadata={"labels": layout.labels, "run": chosen, "runs": len(runs.spans)}
+        | {"first_frame": int(marks[0]), "video_frames": len(file), **counts}
+        | {"flags": {name: count for name, count in flags.items() if count}},
     )
-
-
-def _flags(runs: Runs, number: int, alone: bool) -> dict[str, int]:
-    """Return the counts that are summed over episodes.
-
-    Frames in no run count in the first run, or in the run that is `alone`.
-    """
-    start, stop = runs.spans[number]
-    own = slice(start, stop - 1)
-    dropped = 0 if number else runs.counts["dropped"]
-    if alone:
-        dropped = len(runs.labels) - (stop - start - 1)
-    counts = {
-        "held_frames": int(runs.held[own].sum()),
-        "masked_frames": int(runs.missing[own].sum()),
-        "dropped_frames": dropped,
-    }
-    return {name: count for name, count in counts.items() if count}
 
 
 def _signal(
@@ -312,13 +288,8 @@ def _signal(
     return Signal(times, np.where(known[:, None], values, np.float32(0)), known)
 
 
-def _regular(times: Floats) -> bool:
-    steps = np.diff(times)
-    return len(steps) == 0 or bool((np.abs(steps - np.median(steps)) <= REGULAR * np.median(steps)).all())
-
-
-def _check_rate(path: Path, times: Floats, embodiment: Embodiment) -> None:
-    stated, measured = embodiment.frequency_hz, _measured_hz(times)
+def _check_rate(path: Path, measured: float, embodiment: Embodiment) -> None:
+    stated = embodiment.frequency_hz
     if isinstance(stated, float) and measured and abs(stated - measured) > RATE_TOLERANCE * measured:
         raise EpisodeError(
             path,
