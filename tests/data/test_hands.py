@@ -108,10 +108,7 @@ def test_epic_kitchens_as_published(folder: Path, protocol: int) -> None:
 
 
 def test_a_table_whose_frames_count_from_one(folder: Path) -> None:
-    table = [
-        {"video_id": "a", "frame_number": row["frame"] + 1} | {key: row[key] for key in ("side", "x", "y")}
-        for row in made.rows("a", LENGTH)
-    ]
+    table = [row | {"frame": row["frame"] + 1} for row in made.rows("a", LENGTH)]
     made.write_table(folder / "hands.csv", table)
     check_run(folder, made.hand_video("landmarks", first_frame="1"), "a.mp4#0", range(LENGTH))
 

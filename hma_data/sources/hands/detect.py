@@ -270,11 +270,7 @@ class MediaPipeHands:
 
 
 def choose_sides(p_right: Sequence[float]) -> list[str | None]:
-    """Return a side for each hand, with at most one hand a side; None for a surplus hand.
-
-    Args:
-        p_right: P(right) of at most two hands.
-    """
+    """Return a side for P(right) of each of at most two hands; None for the surplus hand of one side."""
     sides: list[str | None] = ["right" if p >= 0.5 else "left" for p in p_right]
     if len(sides) == 2 and sides[0] == sides[1]:
         doubtful = int(abs(p_right[1] - 0.5) <= abs(p_right[0] - 0.5))

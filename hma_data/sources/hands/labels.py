@@ -102,8 +102,6 @@ def _label_files(root: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
 
 # -- the toolkit's own table
 
-_ALIASES = {"video_id": "video", "frame_number": "frame"}
-_SIDES = {"left": 0, "l": 0, "right": 1, "r": 1}
 _FORMS: dict[str, tuple[str, ...]] = {
     "box": ("left", "top", "right", "bottom"),
     "center": ("x", "y"),
@@ -118,7 +116,7 @@ class HandTable:
     |---|---|
     | video | the video's path below the folder, with or without its suffix, or its bare name |
     | frame | index of the frame in the video, from 0 (or from source.layout.first_frame) |
-    | side | left or right, the person's own hand; also L and R, in upper or lower case |
+    | side | left or right, the person's own hand |
     | score | optional: rows below source.layout.min_score are ignored |
 
     and one of these, as fractions of the picture's width and height (x to the right, y down):
@@ -129,8 +127,7 @@ class HandTable:
     | left, top, right, bottom | a box: center |
     | x, y | center; with wrist_x, wrist_y beside them or alone: wrist |
 
-    `video_id` and `frame_number` are accepted for `video` and `frame`. A value that is not finite says that
-    there is no hand.
+    A value that is not finite says that there is no hand.
 
     Args:
         path: of the file.
@@ -141,14 +138,32 @@ class HandTable:
     """
 
     def __init__(self, path: Path, layout: HandsLayout) -> None:
-        columns = _read_columns(path)
-        for name in ("video", "frame", "side"):
-            if name not in columns:
-                raise SourceError(path, f"has no column {name!r}", f"its columns: {', '.join(columns)}")
-        self._parts = _parts(columns, path)
-        self._sides = _side_numbers(columns["side"], path)
-        numbers = _numbers(columns, "frame", path)
-        self._scores = _numbers(columns, "score", path) if "score" in columns else np.ones(len(numbers))
+        import pyarrow as pa
+        import pyarrow.csv
+        import pyarrow.parquet as pq
+
+        try:
+            if path.suffix.lower() == ".csv":
+                text = dict.fromkeys(("video", "side"), pa.string())
+                options = pyarrow.csv.ConvertOptions(column_types=text)
+                table = pyarrow.csv.read_csv(path, convert_options=options)
+            else:
+                table = pq.read_table(path)
+            columns = dict(zip(table.column_names, table.columns, strict=True))
+            absent = [name for name in ("video", "frame", "side") if name not in columns]
+            if absent or not table.num_rows:
+                fault = f"has no column {absent[0]!r}" if absent else "has no rows"
+                raise SourceError(path, fault, f"its columns: {', '.join(columns)}")
+            numbers = _numbers(columns["frame"])
+            self._scores = _numbers(columns["score"]) if "score" in columns else np.ones(len(numbers))
+            self._parts = _parts(columns, path)
+        except (pa.ArrowException, OSError, ValueError) as fault:
+            said = " ".join(f"cannot be read: {fault}".split())
+            raise SourceError(path, said, "write the table again as parquet or CSV") from fault
+        sides = columns["side"].to_pylist()
+        if unknown := set(sides) - set(SIDES):
+            raise SourceError(path, f"column 'side' holds {unknown.pop()!r}", "allowed: left, right")
+        self._sides = np.array([SIDES.index(side) for side in sides], np.int64)
         good = np.isfinite(numbers) & ~(self._scores < layout.min_score)
         self._frames = np.where(good, numbers, 0).astype(np.int64) - layout.frame_offset
         names, number = np.unique(np.array(columns["video"].to_pylist(), str), return_inverse=True)
@@ -160,7 +175,7 @@ class HandTable:
         self.known = list(self._rows)
 
     def of(self, video: Video) -> HandLabels | None:
-        """Return the hands of a video; None where the table does not have it."""
+        """See LabelSet."""
         name = next((alias for alias in video.aliases if alias in self._rows), None)
         if name is None:
             return None
@@ -169,56 +184,18 @@ class HandTable:
         return labels_from_rows(self._frames[rows], self._sides[rows], self._scores[rows], parts)
 
 
-def _read_columns(path: Path) -> dict[str, Any]:
-    """Return the columns of a parquet, CSV or JSON file by name, as arrow's."""
-    import pyarrow as pa
-    import pyarrow.csv
-    import pyarrow.parquet as pq
-
-    text = dict.fromkeys(("video", "video_id", "side"), pa.string())
-    try:
-        if path.suffix.lower() == ".csv":
-            options = pyarrow.csv.ConvertOptions(column_types=text)
-            table = pyarrow.csv.read_csv(path, convert_options=options)
-        else:
-            table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as fault:
-        said = " ".join(f"cannot be read: {fault}".split())
-        raise SourceError(path, said, "write the table again as parquet or CSV") from fault
-    if not table.num_rows:
-        raise SourceError(path, "has no rows")
-    return {_ALIASES.get(name, name): table.column(name) for name in table.column_names}
-
-
-def _numbers(columns: dict[str, Any], name: str, path: Path) -> NDArray[np.float64]:
-    import pyarrow as pa
-
-    try:
-        found = columns[name].cast(pa.float64()).to_numpy()
-    except pa.ArrowException as fault:
-        raise SourceError(path, f"column {name!r} holds something that is no number: {fault}") from fault
-    return np.where(np.abs(found) < 1e9, found, np.nan)
-
-
-def _side_numbers(column: Any, path: Path) -> NDArray[np.int64]:
-    words = [str(value).strip().lower() for value in column.to_pylist()]
-    unknown = next((word for word in words if word not in _SIDES), None)
-    if unknown is not None:
-        raise SourceError(path, f"column 'side' holds {unknown!r}", "allowed: left, right")
-    return np.array([_SIDES[word] for word in words], np.int64)
+def _numbers(column: Any) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = column.cast("float64").to_numpy()
+    return np.where(np.abs(values) < 1e9, values, np.nan)
 
 
 def _parts(columns: dict[str, Any], path: Path) -> dict[str, NDArray[np.float64]]:
     """Return center, wrist or landmarks -> (R, 2 or 42), by the columns there are."""
     if "landmarks" in columns:
         rows = [[np.nan] * 42 if row is None else row for row in columns["landmarks"].to_pylist()]
-        try:
-            return {"landmarks": np.array(rows, np.float64).reshape(len(rows), 42)}
-        except (TypeError, ValueError) as fault:
-            remedy = "give x and y of 21 points in each row"
-            raise SourceError(path, f"landmarks are not 42 numbers: {fault}", remedy) from fault
+        return {"landmarks": np.array(rows, np.float64).reshape(len(rows), 42)}
     found = {
-        part: np.stack([_numbers(columns, name, path) for name in names], axis=1)
+        part: np.stack([_numbers(columns[name]) for name in names], axis=1)
         for part, names in _FORMS.items()
         if all(name in columns for name in names)
     }
@@ -226,7 +203,7 @@ def _parts(columns: dict[str, Any], path: Path) -> dict[str, NDArray[np.float64]
         box = found.pop("box")
         found["center"] = (box[:, :2] + box[:, 2:]) / 2
     if not found:
-        forms = "; ".join(", ".join(names[:4]) for names in _FORMS.values())
+        forms = "; ".join(", ".join(names) for names in _FORMS.values())
         raise SourceError(path, "has no columns that place a hand", f"give landmarks, or one of: {forms}")
     return found
 
