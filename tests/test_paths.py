@@ -22,9 +22,8 @@ from hma_data.conversion.recipe import load_jobs
 from hma_data.conversion.restat import restat
 from hma_data.conversion.rewrite import merge, split
 from hma_data.errors import HMAError, UsageError
-from hma_data.inspection.inspect import examine
 from hma_data.inspection.infer import infer
-from hma_data.inspection.inspect import inspect_recording
+from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.lab import record
 from hma_data.loading import dataset as loader
 from hma_data.registry import catalog as registry
@@ -387,7 +386,7 @@ def test_home_is_meant_by_a_tilde_in_any_form(tmp_path: Path, monkeypatch: pytes
 
 PUBLIC = (
     "hma_data.conversion.estimate", "hma_data.conversion.job", "hma_data.conversion.recipe",
-    "hma_data.conversion.restat", "hma_data.conversion.rewrite", "hma_data.inspection.inspect",
+    "hma_data.conversion.restat", "hma_data.conversion.rewrite",
     "hma_data.inspection.infer", "hma_data.inspection.inspect", "hma_data.lab", "hma_data.loading.dataset",
     "hma_data.loading.mixture", "hma_data.registry.catalog", "hma_data.registry.embodiment",
     "hma_data.shards.info", "hma_data.shards.manifest", "hma_data.shards.memmap", "hma_data.shards.preview",

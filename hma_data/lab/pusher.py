@@ -126,12 +126,10 @@ def plan(
     One push in ten is a blunder: any that is reachable.
 
     Args:
-        tee: the T.
         pose, goal: (3,) x, y, angle of the T's frame.
         agent: (2,) centre of the pusher.
         speed: px/s.
         fly: whether the pusher passes over the T instead of round it.
-        rng: generator of the blunders.
     """
     turn = rotation(pose[2])
     standoffs = tee.standoffs @ turn.T + pose[:2]

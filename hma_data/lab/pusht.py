@@ -33,12 +33,7 @@ EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episode
 
 @dataclass(frozen=True)
 class Look:
-    """The colours and the size of a robot's pictures.
-
-    Attributes:
-        size: side of the square pictures in px.
-        block, pusher, raised: colour names.
-    """
+    """The side of a robot's square pictures in px, and the names of their colours."""
 
     size: int
     block: str

@@ -225,12 +225,12 @@ def test_a_mirrored_picture_gives_the_same_points_of_the_other_hand(
 @pytest.mark.real
 def test_no_frame_of_the_clip_loses_both_hands(real_data: Path, finder: MediaPipeHands) -> None:
     file = VideoFile(real_data / "hands" / "demo3.mp4")
-    found = hands_scan.scan(file, finder, range(120, 150))
-    each = [np.sum(found.frames == i) for i in range(120, 150)]
+    found = hands_scan.scan("demo3.mp4", file, finder, range(120, 150))
+    each = [np.sum(found["frame"].to_numpy() == i) for i in range(120, 150)]
     assert min(each) >= 1 and np.mean(each) > 1.8
-    wrists = found.landmarks.reshape(-1, 21, 2)[:, 0]
-    for side in (0, 1):  # a hand goes on from frame to frame
-        mine = wrists[found.sides == side]
+    wrists = np.array(found["landmarks"].to_pylist()).reshape(-1, 21, 2)[:, 0]
+    for side in ("left", "right"):  # a hand goes on from frame to frame
+        mine = wrists[np.array(found["side"].to_pylist()) == side]
         assert np.linalg.norm(np.diff(mine, axis=0), axis=1).max() < 0.1
 
 

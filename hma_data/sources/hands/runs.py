@@ -7,7 +7,7 @@ N labelled frames of a video, n of a run, w values of a point (2, or 42 for land
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -72,16 +72,21 @@ def labels_from_rows(
 ) -> HandLabels:
     """Make labels from one row a hand; of two hands of one side in a frame, the higher score counts.
 
+    Landmarks alone, as fractions, give center and wrist too. The center is that of the points' box; points
+    outside the picture are moved to its edge.
+
     Args:
         frames: (R,) index of the frame.
         sides: (R,) 0 left, 1 right.
         scores: (R,).
-        parts: center, wrist or landmarks -> (R, w); landmarks alone, as fractions, give all three.
+        parts: center, wrist or landmarks -> (R, w).
         looked_at: frames that were labelled, with or without a hand.
         facts: further attributes of HandLabels.
     """
     if set(parts) == {"landmarks"}:
-        parts = parts_of_landmarks(parts["landmarks"])
+        inside = np.clip(parts["landmarks"].astype(np.float64).reshape(-1, 21, 2), 0, 1)
+        center = (inside.min(axis=1) + inside.max(axis=1)) / 2
+        parts = {"center": center, "wrist": inside[:, 0], "landmarks": inside.reshape(-1, 42)}
     order = np.argsort(scores, kind="stable")
     every = np.unique(np.concatenate([frames, np.fromiter(looked_at, np.int64)]).astype(np.int64))
     row = np.searchsorted(every, frames[order])
@@ -95,19 +100,6 @@ def labels_from_rows(
             values[~np.isfinite(values).all(axis=1)] = np.nan
             points[f"{side}/{part}"] = values
     return HandLabels(every, points, **facts)
-
-
-def parts_of_landmarks(landmarks: NDArray[Any]) -> dict[str, Floats]:
-    """Return the center, wrist and landmarks of landmarks (R, 42).
-
-    Points outside the picture are moved to its edge. The center is that of the points' box.
-    """
-    inside = np.clip(landmarks.astype(np.float64).reshape(-1, 21, 2), 0, 1)
-    return {
-        "center": (inside.min(axis=1) + inside.max(axis=1)) / 2,
-        "wrist": inside[:, 0],
-        "landmarks": inside.reshape(-1, 42),
-    }
 
 
 @dataclass(frozen=True)
@@ -126,12 +118,7 @@ class Runs:
     spans: tuple[tuple[int, int], ...]
     missing: NDArray[np.bool_]
     held: NDArray[np.bool_]
-    counts: dict[str, int] = field(default_factory=dict)
-
-    def longest(self) -> int:
-        """Return the index of the longest run, the first of equals."""
-        lengths = [stop - start for start, stop in self.spans]
-        return lengths.index(max(lengths))
+    counts: dict[str, int]
 
 
 def cut_into_runs(

@@ -10,11 +10,10 @@ R hands found.
 import hashlib
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError, OutputError
 from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint
@@ -32,41 +31,21 @@ BATCH = 8  # frames decoded together: 200 MB of 4K pictures
 LOOKED_AT, FRAMES = 5, 12  # most videos that are searched for hands by an inspection, and frames of each
 
 
-@dataclass(frozen=True)
-class Found:
-    """Hands found in one video, one row a hand.
-
-    Attributes:
-        length: frames of the video.
-        frames: (R,) int64.
-        sides: (R,) int64, 0 left, 1 right.
-        scores: (R,) float32.
-        landmarks: (R, 42) float32, fractions; may lie outside the picture.
-    """
-
-    length: int
-    frames: NDArray[np.int64]
-    sides: NDArray[np.int64]
-    scores: NDArray[np.float32]
-    landmarks: NDArray[np.float32]
-
-    def labels(self, least: float = 0.0) -> HandLabels:
-        """Return labels of every frame, without hands below a score."""
-        good = self.scores >= least
-        parts = {"landmarks": self.landmarks[good]}
-        every = range(self.length)
-        return labels_from_rows(self.frames[good], self.sides[good], self.scores[good], parts, every)
-
-
-def scan(video: VideoFile, detector: MediaPipeHands, frames: Iterable[int] | None = None) -> Found:
+def scan(name: str, video: VideoFile, detector: MediaPipeHands, frames: Iterable[int] | None = None) -> Any:
     """Run a detector over a video's frames in order.
 
     Args:
+        name: of the video, for the table.
         frames: which frames, all by default; the detector treats them as consecutive.
+
+    Returns:
+        an arrow table of R rows as `labels: landmarks` reads it: video, frame, side, score, landmarks.
 
     Raises:
         EpisodeError: a frame cannot be decoded.
     """
+    import pyarrow as pa
+
     chosen = np.fromiter(range(len(video)) if frames is None else frames, np.int64)
     hands: list[tuple[int, Hand]] = []
     detector.reset()
@@ -74,12 +53,15 @@ def scan(video: VideoFile, detector: MediaPipeHands, frames: Iterable[int] | Non
         batch = chosen[start : start + BATCH]
         for index, picture in zip(batch.tolist(), video.frames(batch), strict=True):
             hands += [(index, hand) for hand in detector.detect(picture)]
-    return Found(
-        len(video),
-        np.array([index for index, _ in hands], np.int64),
-        np.array([SIDES.index(hand.side) for _, hand in hands], np.int64),
-        np.array([hand.score for _, hand in hands], np.float32),
-        np.array([hand.points.reshape(-1) for _, hand in hands], np.float32).reshape(-1, 42),
+    points = np.array([hand.points for _, hand in hands], np.float32).reshape(-1)
+    return pa.table(
+        {
+            "video": pa.array([name] * len(hands), pa.string()),
+            "frame": pa.array([index for index, _ in hands], pa.int64()),
+            "side": pa.array([hand.side for _, hand in hands], pa.string()),
+            "score": pa.array([hand.score for _, hand in hands], pa.float32()),
+            "landmarks": pa.FixedSizeListArray.from_arrays(pa.array(points), 42),
+        }
     )
 
 
@@ -99,64 +81,47 @@ def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrore
         SourceError: no videos, no models.
         EpisodeError: a video is damaged.
     """
+    import pyarrow as pa
+
     final = as_path(out)
     if final.suffix != ".parquet":
         raise OutputError(final, "is no name of a parquet file", "let it end in .parquet")
     detector = MediaPipeHands(load_models(models), mirrored=mirrored)
     videos = videos_of(as_text(folder))
-    found = {name: scan(VideoFile(video.path), detector) for name, video in videos.items()}
-    _write(final, found)
-    return sum(len(each.frames) for each in found.values())
+    found = [scan(name, VideoFile(video.path), detector) for name, video in videos.items()]
+    _write(final, pa.concat_tables(found))
+    return sum(len(each) for each in found)
 
 
-def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout: HandsLayout) -> Found:
+def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout: HandsLayout) -> HandLabels:
     """Return the hands of a video; run the detector only where they are not cached.
 
     Raises:
         EpisodeError: the video is damaged.
     """
+    import pyarrow.parquet as pq
+
     video = VideoFile(path)
     facts = (VERSION, file_fingerprint(path), len(video), models.digest, layout.mirrored)
     key = hashlib.sha256(repr(facts).encode()).hexdigest()[:32]
     kept = cache_folder() / "hands" / f"{key}.parquet"
     if not kept.is_file():
-        _write(kept, {path.name: scan(video, detector)})
-    return _read(kept, len(video))
+        _write(kept, scan(path.name, video, detector))
+    table = pq.read_table(kept)
+    scores = table["score"].to_numpy()
+    good = scores >= layout.min_score
+    sides = np.array([SIDES.index(side) for side in table["side"].to_pylist()], np.int64)
+    landmarks = table["landmarks"].combine_chunks().flatten().to_numpy().reshape(-1, 42)
+    every = range(len(video))
+    frames = table["frame"].to_numpy()
+    return labels_from_rows(frames[good], sides[good], scores[good], {"landmarks": landmarks[good]}, every)
 
 
-def _write(final: Path, found: dict[str, Found]) -> None:
-    import pyarrow as pa
+def _write(final: Path, table: Any) -> None:
     import pyarrow.parquet as pq
 
-    joined = {
-        field: np.concatenate([getattr(each, field) for each in found.values()])
-        for field in ("frames", "sides", "scores", "landmarks")
-    }
-    names = [name for name, each in found.items() for _ in each.frames]
-    table = pa.table(
-        {
-            "video": pa.array(names, pa.string()),
-            "frame": pa.array(joined["frames"]),
-            "side": pa.array([SIDES[side] for side in joined["sides"]], pa.string()),
-            "score": pa.array(joined["scores"]),
-            "landmarks": pa.FixedSizeListArray.from_arrays(pa.array(joined["landmarks"].reshape(-1)), 42),
-        }
-    )
     with atomic_path(final) as part:
         pq.write_table(table, part, compression="zstd")
-
-
-def _read(path: Path, length: int) -> Found:
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(path)
-    return Found(
-        length,
-        table["frame"].to_numpy(),
-        np.array([SIDES.index(side) for side in table["side"].to_pylist()], np.int64),
-        table["score"].to_numpy(),
-        table["landmarks"].combine_chunks().flatten().to_numpy().reshape(-1, 42),
-    )
 
 
 # -- inspection
@@ -241,13 +206,13 @@ def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> di
             file = VideoFile(videos[name].path)
             frames = np.unique(np.linspace(0, len(file) - 1, FRAMES).astype(np.int64))
             # The frames are far apart, so each is scanned alone and no hand is tracked between them.
-            seen = [tuple(scan(file, detector, [index]).sides.tolist()) for index in frames.tolist()]
+            seen = [scan(name, file, detector, [index])["side"].to_pylist() for index in frames.tolist()]
         except EpisodeError as fault:
             survey.fault(name, fault)
             continue
         looked += len(seen)
-        sides["left hand"] += sum(0 in each for each in seen)
-        sides["right hand"] += sum(1 in each for each in seen)
+        sides["left hand"] += sum("left" in each for each in seen)
+        sides["right hand"] += sum("right" in each for each in seen)
         sides["both"] += sum(len(each) == 2 for each in seen)
         if not any(seen):
             said = f"{name}: no hand in {len(seen)} frames looked at"

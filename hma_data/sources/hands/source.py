@@ -11,9 +11,8 @@ picture as it is decoded, before any flip, rotation or crop of the YAML:
 A key ends in `/next` for the value at the next labelled frame, in `/delta` for next minus current, and has no
 ending for the current value. Left and right are the person's own.
 
-Labels come from a detector or from annotations (`source.layout.labels`, see hands_layout).
-`source.layout.missing` says what a frame without a needed hand does: it ends the run (split), the hand's last
-position is held (hold), or the run goes on and the values that need the hand are unknown (mask).
+Labels come from a detector or from annotations. `source.layout` says from which, and what a frame without a
+needed hand does: see the module `layout`.
 
 With annotations, each run of at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain
 name `clip.mp4` is the longest run. Runs of one video share a group, so that they come into one split. The
@@ -143,7 +142,7 @@ class HandsSource:
     def _labels_of(self, uri: str, video: Video, layout: HandsLayout) -> HandLabels:
         if layout.labels == "detector":
             detector, models = self._models(layout)
-            return scan_cached(video.path, detector, models, layout).labels(layout.min_score)
+            return scan_cached(video.path, detector, models, layout)
         labels = self._labels.get((uri, layout))
         if labels is None:
             labels = self._labels[uri, layout] = open_labels(layout, uri)
@@ -236,7 +235,8 @@ def _episode(
 ) -> Episode:
     """Make the episode of run `number`; None makes that of the longest run, as the only one of its video."""
     labels, layout, counts = runs.labels, layout_of(embodiment), runs.counts
-    chosen = runs.longest() if number is None else number
+    longest = int(np.argmax([stop - start for start, stop in runs.spans]))
+    chosen = longest if number is None else number
     span = start, stop = runs.spans[chosen]
     marks = labels.frames[start:stop]
     every = layout.pictures == "every"
