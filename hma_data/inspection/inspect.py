@@ -245,7 +245,12 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
         said = f"the grid ticks at {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
         yield Finding("rate", "error", said, "correct frequency_hz, or sync.rate_hz")
     if hz and (steps > 3 / hz).any():
-        yield Finding("gaps", "warn", f"frames pause for up to {steps.max():.3g} s", "split or trim there")
+        yield Finding(
+            "gaps",
+            "warn",
+            f"frames pause for up to {steps.max():.3g} s",
+            "split or trim the episodes at the pauses",
+        )
     needed = (WINDOW - 1) * robot.stride + 1
     short = sum(len(clip) < needed for clip in clips)
     if short:
@@ -263,7 +268,7 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
     spread = actions.std(axis=0)
     if constant := _constant(spread, robot):
         said = f"never change in the episodes looked at: {', '.join(constant)}"
-        yield Finding("constant", "warn", said, "leave them out, if they never do")
+        yield Finding("constant", "warn", said, "remove them from the YAML if they never change")
     with np.errstate(divide="ignore", invalid="ignore"):
         far = (np.abs(actions - np.median(actions, axis=0)) / spread > 30).any(axis=0)
     wild = [f"{names[i]} {actions[:, i].min():.4g} to {actions[:, i].max():.4g}" for i in np.flatnonzero(far)]
@@ -276,7 +281,7 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
         low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
         if part.range and values.size and not part.range[0] <= low <= high <= part.range[1]:
             said = f"{part.key} lies in {low:.4g} to {high:.4g}, its range says {list(part.range)}"
-            yield Finding("range", "warn", said, "correct range, or slice and key")
+            yield Finding("range", "warn", said, "correct the range, or the slice and key")
         if part.unit == "rad" and max(-low, high) > 4 * np.pi:
             said = f"{part.key} in rad reaches {max(-low, high):.4g}"
             yield Finding("unit", "warn", said, "are these degrees?")

@@ -61,7 +61,9 @@ def record(
             import_module(module).record(Path(folder) / name, robot, _counted(episodes, on_progress), seed)
             (Path(folder) / name).rename(final)
     except OSError as fault:
-        raise OutputError(final, f"cannot be written: {fault}", "check space and rights") from fault
+        raise OutputError(
+            final, f"cannot be written: {fault}", "check the free space and the permissions"
+        ) from fault
     return final
 
 

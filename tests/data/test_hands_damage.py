@@ -81,7 +81,11 @@ BAD_LABELS = {
     "other videos": ("landmarks", {"hands.csv": "video,frame,side,x,y\nz,1,left,1,1\n"}, "labels are of z"),
     "ego4d none": ("ego4d_fho", {}, "holds no labels"),
     "ego4d other": ("ego4d_fho", {"fho_main.json": '{"clips": []}'}, "is not Ego4D's fho_main.json"),
-    "ego4d cut": ("ego4d_fho", {"fho_main.json": '{"videos": [{"video_'}, "is no JSON"),
+    "ego4d cut": (
+        "ego4d_fho",
+        {"fho_main.json": '{"videos": [{"video_'},
+        "is not Ego4D's fho_main.json: JSONDecodeError",
+    ),
     "ego4d empty": (
         "ego4d_fho",
         {"fho_main.json": '{"videos": [{"video_uid": "a", "annotated_intervals": []}]}'},
@@ -110,6 +114,7 @@ def test_a_take_with_labels_of_another_form_is_quarantined(folder: Path) -> None
         ('{"frames": []}', "is not Ego-Exo4D's hand pose"),
         (made.egoexo(3, camera="cam05"), "no hands in camera a.*cam05"),
         ("[]", "is not Ego-Exo4D's hand pose"),
+        (made.egoexo(3, camera="a")[:500], "is not Ego-Exo4D's hand pose"),
         ('{"1": {"annotation2D": 3}}', "is not Ego-Exo4D's hand pose"),
     ):
         (folder / "a.json").write_text(text)

@@ -19,7 +19,7 @@ import math
 import os
 import zipfile
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -85,26 +85,20 @@ def load_models(place: StrPath | None = None) -> HandModels:
         raise SourceError("hand models", "are not given", _REMEDY)
     path = Path(as_text(place).removeprefix("file://")).expanduser()
     try:
-        if path.is_dir():
-            names = {item.name for item in path.iterdir()}
-            bundles = sorted(path.glob("*.task"))
-            if not bundles or names & {*_PALM, *_HAND}:
-                palm, hand = ((path / _first(path, known, names)).read_bytes() for known in (_PALM, _HAND))
-                return HandModels(palm, hand, str(path))
-            path = bundles[0]
-        with zipfile.ZipFile(path) as bundle:
-            inside = {Path(name).name: name for name in bundle.namelist()}
-            palm, hand = (bundle.read(inside[_first(path, known, inside)]) for known in (_PALM, _HAND))
+        entries = path.iterdir() if path.is_dir() else zipfile.Path(path).iterdir()
+        files: dict[str, Any] = {item.name: item for item in entries}
+        bundle = next((name for name in sorted(files) if name.endswith(".task")), None)
+        if bundle and not files.keys() & {*_PALM, *_HAND}:
+            return load_models(path / bundle)
+        models = []
+        for names in (_PALM, _HAND):
+            name = next((name for name in names if name in files), None)
+            if name is None:
+                raise SourceError(path, f"has none of {', '.join(names)}", _REMEDY)
+            models.append(files[name].read_bytes())
     except (OSError, zipfile.BadZipFile) as fault:
         raise SourceError(path, f"holds no hand models: {fault}", _REMEDY) from fault
-    return HandModels(palm, hand, str(path))
-
-
-def _first(place: Path, wanted: Sequence[str], there: Collection[str]) -> str:
-    for name in wanted:
-        if name in there:
-            return name
-    raise SourceError(place, f"has none of {', '.join(wanted)}", _REMEDY)
+    return HandModels(*models, where=str(path))
 
 
 class Network:

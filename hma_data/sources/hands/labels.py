@@ -17,7 +17,7 @@ R rows of a table, one a hand.
 import json
 import pickletools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, cast
@@ -298,7 +298,7 @@ class Ego4dFho:
 
     def __init__(self, path: Path, layout: HandsLayout) -> None:
         try:
-            videos = _read_json(path, _compact)["videos"]
+            videos = json.loads(path.read_bytes(), object_hook=_compact)["videos"]
             labels = {str(item["uid"]): _labels_of_actions(item["actions"], layout) for item in videos}
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise SourceError(path, f"is not Ego4D's fho_main.json: {fault!r}", _FHO) from fault
@@ -373,8 +373,13 @@ class EgoExoHands:
     def __init__(self, files: dict[str, Path], layout: HandsLayout, root: Path) -> None:
         self._layout = layout
         self._files = {stem: path for stem, path in files.items() if stem != "takes"}
-        takes = [path for path in (root / "takes.json", root.parent / "takes.json") if path.is_file()]
-        names = {take["take_uid"]: take["take_name"] for take in (_read_json(takes[0]) if takes else [])}
+        names: dict[str, str] = {}
+        for path in (root.parent / "takes.json", root / "takes.json"):
+            try:
+                takes = json.loads(path.read_bytes()) if path.is_file() else []
+                names |= {take["take_uid"]: take["take_name"] for take in takes}
+            except (KeyError, TypeError, ValueError) as fault:
+                raise SourceError(path, f"is not Ego-Exo4D's takes.json: {fault!r}") from fault
         self._uids = {uid: uid for uid in self._files}
         self._uids |= {names.get(uid) or _take_name(path): uid for uid, path in self._files.items()}
         self.known = list(self._uids)
@@ -397,7 +402,7 @@ def _take_name(path: Path) -> str:
 def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
     frames, sides, joints, cameras = [], [], [], set()
     try:
-        content = _read_json(path)
+        content = json.loads(path.read_bytes())
         looked_at = [int(number) - layout.frame_offset for number in content]
         for index, people in zip(looked_at, content.values(), strict=True):
             views = (people[0].get("annotation2D") or {}) if people else {}
@@ -422,11 +427,3 @@ def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
     }
     scores = np.ones(len(frames))
     return labels_from_rows(np.array(frames), np.array(sides), scores, parts, looked_at, pixels=True)
-
-
-def _read_json(path: Path, keep: Callable[[dict[str, Any]], Any] | None = None) -> Any:
-    """Return the content of a JSON file; `keep` is called with each object, and its result replaces it."""
-    try:
-        return json.loads(path.read_bytes(), object_hook=keep)
-    except ValueError as fault:
-        raise SourceError(path, f"is no JSON, or cut off: {fault}", "fetch the file again") from fault

@@ -85,7 +85,7 @@ def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrore
 
     final = as_path(out)
     if final.suffix != ".parquet":
-        raise OutputError(final, "is no name of a parquet file", "let it end in .parquet")
+        raise OutputError(final, "does not end in .parquet", "name a .parquet file")
     detector = MediaPipeHands(load_models(models), mirrored=mirrored)
     videos = videos_of(as_text(folder))
     found = [scan(name, VideoFile(video.path), detector) for name, video in videos.items()]

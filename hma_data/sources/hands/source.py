@@ -97,7 +97,7 @@ class HandsSource:
         if refs:
             return refs
         if all(runs is None for runs in found.values()):
-            fault = f"has no video that the labels know: videos {listed(list(videos), 3)}"
+            fault = f"has no labels for any of its videos: {listed(list(videos), 3)}"
             raise SourceError(uri, fault, f"labels are of {listed(labels.known, 3)}")
         fault = f"has no run of {layout.min_frames} frames with the needed hands in its labelled videos"
         raise SourceError(uri, fault, _MORE_RUNS)
@@ -182,7 +182,7 @@ def _needed(embodiment: Embodiment) -> tuple[str, ...]:
     where = f"embodiment {embodiment.id}"
     for camera in embodiment.cameras:
         if camera.key != CAMERA:
-            raise SourceError(where, f"camera key {camera.key!r} is none of hand videos", f"it is {CAMERA!r}")
+            raise SourceError(where, f"camera key {camera.key!r} is not in hand videos", f"use {CAMERA!r}")
     vectors = [embodiment.action, *([embodiment.state] if embodiment.state else [])]
     keys = [part.key for vector in vectors for part in vector.components]
     return tuple(dict.fromkeys(point_of(key, where) for key in keys))
