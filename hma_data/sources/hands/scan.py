@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError, OutputError
-from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint
+from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint, local_path
 from hma_data.sources.common import image_checks, timestamp_checks
 from hma_data.sources.common.findings import Finding
+from hma_data.sources.common.links import unfollowed
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands, load_models
@@ -131,6 +132,8 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     """Inspect hand videos: sizes, rates, codecs, and the share of frames that show hands."""
     videos = videos_of(uri)
     survey = Survey(len(videos))
+    for link in unfollowed(local_path(uri)):
+        survey.note(link)
     headers: dict[str, Header] = {}
     for name, video in videos.items():
         try:
