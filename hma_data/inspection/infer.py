@@ -59,7 +59,7 @@ def _mapping(dumper: _Dumper, value: dict[str, Any]) -> yaml.Node:
 
 
 def _list(dumper: _Dumper, value: list[Any]) -> yaml.Node:
-    flow = not any(isinstance(item, dict) for item in value)
+    flow = not any(isinstance(item, dict) for item in value) and len(repr(value)) < LINE
     return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=flow)
 
 
@@ -68,7 +68,8 @@ _Dumper.add_representer(list, _list)
 
 
 def _yaml_text(values: dict[str, Any]) -> str:
-    return yaml.dump(values, Dumper=_Dumper, allow_unicode=True, width=LINE, sort_keys=False)
+    # A question stays on one line, so that an editor or a script can answer it there.
+    return yaml.dump(values, Dumper=_Dumper, allow_unicode=True, width=float("inf"), sort_keys=False)
 
 
 def infer(uri: StrPath, embodiment_id: str) -> str:
