@@ -98,7 +98,8 @@ def load_models(place: StrPath | None = None) -> HandModels:
             models.append(files[name].read_bytes())
     except (OSError, zipfile.BadZipFile) as fault:
         raise SourceError(path, f"holds no hand models: {fault}", _REMEDY) from fault
-    return HandModels(*models, where=str(path))
+    palm, hand = models
+    return HandModels(palm, hand, str(path))
 
 
 class Network:
