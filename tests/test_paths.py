@@ -20,9 +20,8 @@ from hma_data.conversion.plan import Settings, estimate
 from hma_data.conversion.recipe import load_jobs
 from hma_data.conversion.rewrite import merge, restat, split
 from hma_data.errors import HMAError, UsageError
-from hma_data.inspection.doctor import examine
 from hma_data.inspection.infer import infer
-from hma_data.inspection.inspect import inspect_recording
+from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.lab import record
 from hma_data.loading import dataset as loader
 from hma_data.registry import catalog as registry
@@ -33,7 +32,7 @@ from hma_data.shards.preview import describe, preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.hands.models import load_models
+from hma_data.sources.hands.detect import load_models
 from hma_data.sources.hands.scan import detect as detect_hands
 from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_address, as_path, as_text
@@ -383,12 +382,12 @@ def test_home_is_meant_by_a_tilde_in_any_form(tmp_path: Path, monkeypatch: pytes
 
 PUBLIC = (
     "hma_data.conversion.job", "hma_data.conversion.recipe",
-    "hma_data.conversion.plan", "hma_data.conversion.rewrite", "hma_data.inspection.doctor",
+    "hma_data.conversion.plan", "hma_data.conversion.rewrite",
     "hma_data.inspection.infer", "hma_data.inspection.inspect", "hma_data.lab", "hma_data.loading.dataset",
     "hma_data.loading.mixture", "hma_data.registry.catalog", "hma_data.registry.embodiment",
     "hma_data.shards.manifest", "hma_data.shards.memmap", "hma_data.shards.preview",
     "hma_data.shards.reader", "hma_data.shards.verify", "hma_data.sources.bags.source",
-    "hma_data.sources.base", "hma_data.sources.hands.models", "hma_data.sources.hands.preview",
+    "hma_data.sources.base", "hma_data.sources.hands.detect",
     "hma_data.sources.hands.scan", "hma_data.sources.hands.source", "hma_data.sources.hdf5.source",
     "hma_data.sources.lerobot.source", "hma_data.sources.rlds.source", "hma_data.tokenizers.base",
     "hma_data.tokenizers.training.frames", "hma_data.tokenizers.training.recipe",
@@ -403,7 +402,6 @@ PUBLIC = (
 INNER = {  # take what a public function has made of a path already
     "hma_data.registry.embodiment": {"todos"},
     "hma_data.conversion.plan": {"make_plan"},
-    "hma_data.lab": {"written_beside"},
     "hma_data.registry.catalog": {"file_id"},
     "hma_data.shards.manifest": {
         "damaged_files",
@@ -416,7 +414,7 @@ INNER = {  # take what a public function has made of a path already
     },
     "hma_data.shards.verify": {"check_rows", "check_shard"},
     "hma_data.sources.base": {"of_another_format", "local_path", "leaves", "first_bytes", "file_fingerprint"},
-    "hma_data.sources.hands.scan": {"scan_cached"},
+    "hma_data.sources.hands.scan": {"scan_cached", "inspect_videos"},
     "hma_data.tokenizers.training.frames": {"read_pictures", "load_pools"},
     "hma_data.tokenizers.training.train": {"Run"},
     "hma_model.checkpoint.folder": {"inside"},

@@ -17,7 +17,7 @@ import numpy as np
 
 from hma_data.bench import make_robot
 from hma_data.bench.sources import HZ, TASK, scene
-from hma_data.lab.write_lerobot import LeRobotEpisode, write_lerobot
+from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
 
 ABOUT = "a LeRobotDataset read by our source and by lerobot's own reader"

@@ -253,7 +253,7 @@ def _video(path: Path, size: tuple[int, int], pictures: Iterator[Images], encode
 
 
 def _rlds(size: tuple[int, int], codec: str, folder: Path, episodes: int, length: int, seed: int) -> Path:
-    from hma_data.lab.write_rlds import RldsEpisode, write_rlds
+    from hma_data.lab.writers import RldsEpisode, write_rlds
 
     def made() -> Iterator[RldsEpisode]:
         for i in range(episodes):

@@ -2,12 +2,12 @@
 
 The YAML holds what the recording states. What the recording cannot know is written as `TODO: question`, and
 `hma registry validate` lists these questions until they are answered. `infer_choices` (for bags,
-`infer_topics`) decides which keys are taken. In the text of the YAML, each component and each camera is one
-line in braces.
+`infer_topics`) decides which keys are taken.
 """
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -16,7 +16,6 @@ import yaml
 from hma_data.errors import SourceError, UsageError
 from hma_data.inspection import infer_topics
 from hma_data.inspection.infer_choices import (
-    Choice,
     actions,
     camera_names,
     cameras,
@@ -36,84 +35,41 @@ from hma_data.sources.base import Inspection, KeyInfo, detect, open_source
 from hma_data.storage.paths import StrPath
 
 LINE = 110
-_HALVES = re.compile(r"[\ud800-\udfff]")
-_BREAKS = re.compile(r"[\n\r\x85\u2028\u2029]")
+HIGHEST_HZ = 100_000  # of a rate in a YAML
+MEASURED_TO = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
 
 
 class _Dumper(yaml.SafeDumper):
+    """A writer of YAML in which lists of words, components and cameras are on one line each."""
+
     def ignore_aliases(self, data: Any) -> bool:
         """Return True: write no aliases, because the parser accepts none."""
         return True
 
-
-def _text(dumper: _Dumper, value: str) -> yaml.Node:
-    """Represent a text on one line, whatever it holds."""
-    value = _HALVES.sub("?", value)  # half of a surrogate pair is no text
-    style = '"' if _BREAKS.search(value) else None
-    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        """Indent the items of a list below its key."""
+        super().increase_indent(flow, False)
 
 
-_Dumper.add_representer(str, _text)
+def _mapping(dumper: _Dumper, value: dict[str, Any]) -> yaml.Node:
+    node = dumper.represent_dict(value.items())
+    parts = [item for each in value.values() for item in (each if isinstance(each, list) else [each])]
+    node.flow_style = not any(isinstance(part, dict) for part in parts) and len(repr(value)) < LINE
+    return node
 
 
-def yaml_text(values: dict[str, Any]) -> str:
-    """Return plain values as YAML, in the order given; parsing it gives the same values."""
-    return "".join(_entry(name, value, "") for name, value in values.items())
+def _list(dumper: _Dumper, value: list[Any]) -> yaml.Node:
+    flow = not any(isinstance(item, dict) for item in value) and len(repr(value)) < LINE
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=flow)
 
 
-def _entry(name: str, value: Any, indent: str) -> str:
-    if isinstance(value, dict):
-        braced = f"{indent}{_dump({name: value}, True)[1:-1]}"
-        if len(braced) <= LINE and all(not isinstance(item, dict | list) for item in value.values()):
-            return braced + "\n"
-        inner = "".join(_entry(key, item, indent + "  ") for key, item in value.items())
-        return f"{indent}{name}:\n{inner}"
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return f"{indent}{name}:\n" + "".join(_item(item, indent + "  ") for item in value)
-    if isinstance(value, list):
-        return _names(name, value, indent)
-    return _indented(_dump({name: value}, False), indent)
+_Dumper.add_representer(dict, _mapping)
+_Dumper.add_representer(list, _list)
 
 
-def _item(value: dict[str, Any], indent: str) -> str:
-    braced = f"{indent}- {_dump(value, True)}"
-    if len(braced) <= LINE:
-        return braced + "\n"
-    block = "".join(_entry(key, item, indent + "  ") for key, item in value.items())
-    return f"{indent}- {block[len(indent) + 2 :]}"
-
-
-def _names(name: str, value: list[Any], indent: str) -> str:
-    """Return a list in brackets, broken into lines where it is long."""
-    whole = f"{indent}{_dump({name: value}, True)[1:-1]}"
-    if len(whole) <= LINE:
-        return whole + "\n"
-    lines, line = [], f"{indent}  "
-    for item in [_dump([item], True)[1:-1] for item in value]:
-        if len(line) + len(item) + 2 > LINE and line.strip():
-            lines.append(line.rstrip())
-            line = f"{indent}  "
-        line += f"{item}, "
-    return "\n".join([f"{indent}{name}: [", *lines, line.rstrip()[:-1] + "]"]) + "\n"
-
-
-def _dump(value: Any, flow: bool) -> str:
-    return yaml.dump(
-        value,
-        Dumper=_Dumper,
-        default_flow_style=flow,
-        allow_unicode=True,
-        width=float("inf"),
-        sort_keys=False,
-    ).rstrip("\n")
-
-
-def _indented(text: str, indent: str) -> str:
-    return "".join(f"{indent}{line}\n" if line else "\n" for line in text.split("\n"))
-
-
-HIGHEST_HZ = 100_000  # of a rate in a YAML
-MEASURED_TO = 5e-4  # relative error of a measured rate; the doubt from jittering stamps is added
+def _yaml_text(values: dict[str, Any]) -> str:
+    # A question stays on one line, so that an editor or a script can answer it there.
+    return yaml.dump(values, Dumper=_Dumper, allow_unicode=True, width=float("inf"), sort_keys=False)
 
 
 def infer(uri: StrPath, embodiment_id: str) -> str:
@@ -136,25 +92,12 @@ def infer(uri: StrPath, embodiment_id: str) -> str:
 
 def from_inspection(found: Inspection, embodiment_id: str) -> str:
     """Return the YAML of an embodiment from an inspection; see `infer`."""
-    if found.format == "hands":
-        return _of_hands(found, embodiment_id)
-    readable = replace(found, keys=tuple(key for key in found.keys if _is_text(key.key)))
-    text = yaml_text(_Draft(readable).values(embodiment_id))
-    where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
-    return f"# Inferred from {where}; answer every {TODO}, then: hma registry validate FILE\n{text}"
-
-
-def _of_hands(found: Inspection, embodiment_id: str) -> str:
-    """Return a copy of the embodiment `hand_video`: videos hold nothing that could be an action."""
-    where = "".join(letter if letter.isprintable() else "?" for letter in found.uri)
-    values = find("hand_video").to_dict() | {"id": embodiment_id}
-    head = "a copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
-    return f"# For the videos of {where}: {head}\n{yaml_text(values)}"
-
-
-def _is_text(text: str) -> bool:
-    """Check whether a YAML can hold a text; file formats let through bytes that it cannot hold."""
-    return not any("\ud800" <= letter <= "\udfff" for letter in text)
+    if found.format == "hands":  # videos hold nothing that could be an action
+        values = find("hand_video").to_dict() | {"id": embodiment_id}
+        head = "A copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
+        return f"# {head}\n{_yaml_text(values)}"
+    text = _yaml_text(_Draft(found).values(embodiment_id))
+    return f"# Inferred from source.uri; answer every {TODO}, then: hma registry validate FILE\n{text}"
 
 
 class _Draft:
@@ -169,52 +112,43 @@ class _Draft:
         self.bag = found.format == "rosbag"
         self.seen = cameras(found.keys)
         if not self.seen.keys:
-            raise _no_camera(found)
+            raise _lacks(found, "has no colour camera", [key for key in found.keys if key.kind == "camera"])
         numbers = vectors(found.keys)
-        if found.format == "hdf5":
-            numbers = self._of_one_length(numbers)
-        self.action, self.states = self._bag_choice(numbers) if self.bag else self._step_choice(numbers)
+        if found.format == "hdf5":  # it has other arrays too: take those with one row per picture
+            lengths = [key.count for key in self.seen.keys]
+            length = max(set(lengths), key=lengths.count)
+            self.seen = replace(self.seen, keys=tuple(key for key in self.seen.keys if key.count == length))
+            numbers = [key for key in numbers if key.count == length]
+        if self.bag:
+            running = tuple(key for key in self.seen.keys if infer_topics.runs(key))
+            self.seen = replace(self.seen, keys=running or self.seen.keys)
+            self.action = infer_topics.actions(numbers)
+            self.states = infer_topics.states(numbers, self.action.keys)
+        else:
+            action = actions(numbers)
+            self.action = action if action.keys else likely(numbers)
+            self.states = states(numbers, self.action.keys)
         if not self.action.keys:
-            raise _no_action(found, self.seen.keys)
-        self.hz = self.seen.keys[0].hz if self.bag else found.hz
-        if self.hz is not None and not 0 < self.hz <= HIGHEST_HZ:
-            self.hz = None
-
-    def _of_one_length(self, numbers: list[KeyInfo]) -> list[KeyInfo]:
-        """Return the arrays with one row per picture; HDF5 files have other arrays too."""
-        lengths = [key.count for key in self.seen.keys]
-        length = max(set(lengths), key=lengths.count)
-        self.seen = Choice(tuple(key for key in self.seen.keys if key.count == length), self.seen.question)
-        return [key for key in numbers if key.count == length]
-
-    @staticmethod
-    def _step_choice(numbers: list[KeyInfo]) -> tuple[Choice, tuple[KeyInfo, ...]]:
-        action = actions(numbers)
-        action = action if action.keys else likely(numbers)
-        return action, states(numbers, action.keys)
-
-    def _bag_choice(self, numbers: list[KeyInfo]) -> tuple[Choice, tuple[KeyInfo, ...]]:
-        running = tuple(key for key in self.seen.keys if infer_topics.runs(key))
-        self.seen = Choice(running or self.seen.keys, self.seen.question)
-        action = infer_topics.actions(numbers)
-        return action, infer_topics.states(numbers, action.keys)
-
-    # -- the YAML
+            raise _lacks(found, "has nothing that could be an action", self.seen.keys)
+        hz = self.seen.keys[0].hz if self.bag else found.hz
+        self.hz = hz if hz is not None and 0 < hz <= HIGHEST_HZ else None
+        self.used = [*self.seen.keys, *self.action.keys, *self.states]
 
     def values(self, embodiment_id: str) -> dict[str, Any]:
         """Return the YAML's plain values, in the order of the registry's YAMLs."""
-        found = self.found
-        name = found.facts.get("dataset") or found.uri.rstrip("/").rsplit("/", 1)[-1]
+        found, facts = self.found, self.found.facts
+        name = facts.get("dataset") or found.uri.rstrip("/").rsplit("/", 1)[-1]
+        spaces = get_args(Space)
+        space = space_of(self.action.keys, facts)
         values: dict[str, Any] = {
             "id": embodiment_id,
             "description": f"{found.robot or 'robot'} as recorded in {name}",
             "robot": found.robot or f"{TODO}: which robot is it?",
-            "kind": "simulation" if found.facts.get("simulator") else f"{TODO}: real, simulation or human?",
+            "kind": "simulation" if facts.get("simulator") else f"{TODO}: real, simulation or human?",
             "frequency_hz": self._rate() or f"{TODO}: at how many Hz were actions recorded?",
             "target_hz": 2,
             "action": {
-                "space": space_of(self.action.keys, found.facts)
-                or f"{TODO}: one of {_listed(get_args(Space))}?",
+                "space": space or f"{TODO}: one of {', '.join(spaces[:-1])} or {spaces[-1]}?",
                 "components": [self._component(key) for key in self.action.keys],
             },
         }
@@ -225,9 +159,14 @@ class _Draft:
             values["sync"] = self._sync(values["cameras"][0]["name"])
         elif self.action.measured:
             values["sync"] = {"action_shift": 1}
-        values["source"] = self._source()
-        values["provenance"] = self._provenance()
-        unused = self._unused()
+        source = {"format": found.format, "uri": found.uri, "episodes": max(found.episodes, 1)}
+        said = self._instruction()
+        source |= {"instruction": said} if said else {}
+        source |= {"layout": {"timestamps": facts["timestamps"]}} if facts.get("timestamps") else {}
+        values |= {"source": source, "provenance": self._provenance()}
+        taken = {key.key for key in self.used} | {said, ""}
+        left = [key for key in found.keys if key.key not in taken and key.kind != "text"]
+        unused = shown([key.key for key in left if not key.key.endswith(".layout.data_offset")], 20)
         return values | ({"notes": f"recorded and not used: {unused}"} if unused else {})
 
     def _rate(self) -> float | int | None:
@@ -249,38 +188,22 @@ class _Draft:
 
     def _cameras(self) -> list[dict[str, Any]]:
         doubtful = "layout" in self.found.facts and "simulator" not in self.found.facts
-        listed = []
-        for name, key in zip(camera_names(self.seen.keys), self.seen.keys, strict=True):
-            camera: dict[str, Any] = {
+        asked = {"color": f"{TODO}: rgb or bgr? arrays that went through OpenCV are often bgr"}
+        return [
+            {
                 "name": name,
                 "key": key.key,
-                "size": [int(side) for side in key.shape[:2]],
+                "size": list(map(int, key.shape[:2])),
+                **(asked if doubtful else {}),
             }
-            if doubtful:
-                camera["color"] = f"{TODO}: rgb or bgr? arrays that went through OpenCV are often bgr"
-            listed.append(camera)
-        return listed
+            for name, key in zip(camera_names(self.seen.keys), self.seen.keys, strict=True)
+        ]
 
     def _sync(self, primary: str) -> dict[str, Any]:
         sync = {"primary": primary, "images": "nearest", "actions": "hold", "states": "interpolate"}
-        skew = infer_topics.max_skew_ms(list(self.seen.keys[1:]), self.action.keys, self.states)
-        late = infer_topics.needs_receive_times(self._used())
+        skew = infer_topics.max_skew_ms(self.seen.keys[1:], self.action.keys, self.states)
+        late = infer_topics.needs_receive_times(self.used)
         return sync | ({"max_skew_ms": skew} if skew else {}) | ({"stamp": "receive"} if late else {})
-
-    def _used(self) -> list[KeyInfo]:
-        return [*self.seen.keys, *self.action.keys, *self.states]
-
-    def _source(self) -> dict[str, Any]:
-        found = self.found
-        source: dict[str, Any] = {
-            "format": found.format,
-            "uri": found.uri,
-            "episodes": max(found.episodes, 1),
-        }
-        said = self._instruction()
-        times = found.facts.get("timestamps")
-        source |= {"instruction": said} if said else {}
-        return source | ({"layout": {"timestamps": times}} if times else {})
 
     def _instruction(self) -> str | None:
         facts = self.found.facts
@@ -300,37 +223,25 @@ class _Draft:
         if self.seen.question:
             said["cameras"] = f"{TODO}: {self.seen.question}"
         if self.bag:
-            said |= self._clocks()
+            topics = infer_topics.about(self.used)
+            gaps = shown(f"{topic.name} {topic.gap_ms:.0f} ms" for topic in topics if topic.gap_ms)
+            if gaps:
+                factor = f"{infer_topics.MARGIN:g} times the longest interval held"
+                said["max_skew_ms"] = f"{factor}; intervals, measured: {gaps}"
+            if late := infer_topics.needs_receive_times(self.used):
+                said["stamp"] = late
         return said
 
-    def _clocks(self) -> dict[str, str]:
-        """Return the provenance of a bag's max_skew_ms and stamp."""
-        topics = infer_topics.about(self._used())
-        gaps = shown(f"{topic.name} {topic.gap_ms:.0f} ms" for topic in topics if topic.gap_ms)
-        late = infer_topics.needs_receive_times(self._used())
-        skew = f"{infer_topics.MARGIN:g} times the longest interval held; intervals, measured: {gaps}"
-        return ({"max_skew_ms": skew} if gaps else {}) | ({"stamp": late} if late else {})
-
     def _rate_from(self) -> str:
-        found = self.found
-        if found.format == "lerobot":
+        if self.found.format == "lerobot":
             return "fps of the recording's meta/info.json"
         if not self.bag:
-            return found.facts.get("rate") or "the recording"
+            return self.found.facts.get("rate") or "the recording"
         camera = self.seen.keys[0]
         moved = [key for key in (*self.action.keys, *self.states) if key.hz]
         rates = dict.fromkeys(f"{key.topic.name if key.topic else key.key} {_hz(key)}" for key in moved)
         beside = f"; beside it {shown(rates)}" if rates else ""
         return f"measured: {camera.key} {_hz(camera)}{beside}"
-
-    def _unused(self) -> str:
-        used = {key.key for key in self._used()} | {self._instruction()}
-        left = [
-            key
-            for key in self.found.keys
-            if key.key not in used and key.kind != "text" and not key.key.endswith(".layout.data_offset")
-        ]
-        return shown([key.key for key in left if key.key], 20)
 
 
 def _hz(key: KeyInfo) -> str:
@@ -341,37 +252,16 @@ def _hz(key: KeyInfo) -> str:
 def _named(key: KeyInfo, names: tuple[str, ...] | None) -> dict[str, Any]:
     """Return a component, with names where there is one for each value."""
     count = dims(key)
-    told = names if names and len(names) == count and len(set(names)) == count else None
+    told = names if names and len(names) == count == len(set(names)) else None
     return {"key": key.key, "dims": count} | ({"names": list(told)} if told else {})
 
 
-def _listed(allowed: tuple[str, ...]) -> str:
-    return f"{', '.join(allowed[:-1])} or {allowed[-1]}"
-
-
-def _no_camera(found: Inspection) -> SourceError:
-    pictures = [f"{key.key} {key.shape}" for key in found.keys if key.kind == "camera"]
-    others = [key.key for key in found.keys if key.kind != "camera"]
-    there = f"; its pictures, {shown(pictures)}, look like depth, masks or features" if pictures else ""
-    return SourceError(
-        shown([found.uri]),
-        f"has no colour camera{there}; it has {shown(others) or 'no other keys'}",
-        "record a camera with it, or render one; hma inspect lists every key",
-    )
-
-
-def _no_action(found: Inspection, pictures: tuple[KeyInfo, ...]) -> SourceError:
-    length = pictures[0].count if pictures else None
-    numbers = [
-        f"{key.key} ({key.count} rows)" if found.format == "hdf5" and key.count != length else key.key
-        for key in found.keys
-        if key.kind == "vector"
+def _lacks(found: Inspection, fault: str, pictures: Sequence[KeyInfo]) -> SourceError:
+    rows = found.format == "hdf5"  # an action has as many rows as the camera
+    others = [
+        f"{key.key} ({key.count} rows)" if rows else key.key for key in found.keys if key.kind == "vector"
     ]
-    camera = shown((key.key for key in pictures), 4) + (
-        f" of {length} rows" if found.format == "hdf5" else ""
-    )
-    return SourceError(
-        shown([found.uri]),
-        f"has the camera {camera} but nothing that could be an action; numbers: {shown(numbers) or 'none'}",
-        "record the robot's commands or joint states with it; hma inspect lists every key",
-    )
+    seen = [f"{key.key} of {key.count} rows" if rows else f"{key.key} {key.shape}" for key in pictures]
+    said = f"{fault}; pictures: {shown(seen, 4) or 'none'}; numbers: {shown(others) or 'none'}"
+    remedy = "record cameras and the robot's commands or joint states together; hma inspect lists every key"
+    return SourceError(shown([found.uri]), said, remedy)

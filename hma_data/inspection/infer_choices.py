@@ -6,6 +6,7 @@ do not decide, the choice carries a question, which becomes a TODO in the YAML. 
 topics of bags.
 """
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -61,17 +62,15 @@ def words(key: str) -> list[str]:
     return re.findall(r"[a-z]+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", key).lower())
 
 
-def snake(key: str) -> str:
-    """Return the words of a key joined by underscores."""
+def _snake(key: str) -> str:
     return "_".join(words(key))
 
 
-def last(key: str) -> str:
-    """Return the part of a key after the last separator."""
+def _last(key: str) -> str:
     return re.split(r"[/.]", key)[-1]
 
 
-def natural(text: str) -> list[tuple[int, str]]:
+def _natural(text: str) -> list[tuple[int, str]]:
     """Return a sort key that puts image before image_2 before image_10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
@@ -84,19 +83,15 @@ def shown(keys: Iterable[str], most: int = 12) -> str:
 
 def dims(key: KeyInfo) -> int:
     """Return the number of values a sample; 0 where a component could not hold the key."""
-    count = 1
-    for side in key.shape:
-        count *= max(side, 0)
-    return count if key.key and count <= MAX_DIMS else 0
+    count = math.prod(key.shape)
+    return count if key.key and min(key.shape, default=1) > 0 and count <= MAX_DIMS else 0
 
 
-def is_next(key: str) -> bool:
-    """Check whether a key belongs to the following step: robomimic's next_obs, LeRobot's next.reward."""
+def _is_next(key: str) -> bool:  # robomimic's next_obs, LeRobot's next.reward
     return bool(_NEXT.search(key))
 
 
-def is_observed(key: str) -> bool:
-    """Check whether a key lies under observations."""
+def _is_observed(key: str) -> bool:
     return bool(_OBSERVED.search(key))
 
 
@@ -106,9 +101,8 @@ def is_gripper(key: str) -> bool:
     return bool(said & _GRIPPER or ("effector" in said and "end" not in said))
 
 
-def is_whole_state(key: str) -> bool:
-    """Check whether a key's name says that it is the whole state of the robot."""
-    return bool(_WHOLE_STATE.fullmatch(snake(last(key))))
+def _is_whole_state(key: str) -> bool:
+    return bool(_WHOLE_STATE.fullmatch(_snake(_last(key))))
 
 
 def strength(said: Iterable[str]) -> int:
@@ -119,11 +113,11 @@ def strength(said: Iterable[str]) -> int:
 
 def vectors(keys: Iterable[KeyInfo]) -> list[KeyInfo]:
     """Return the keys of numbers that could be part of an action or a state."""
-    numbers = [key for key in keys if key.kind == "vector" and dims(key) and not is_next(key.key)]
+    numbers = [key for key in keys if key.kind == "vector" and dims(key) and not _is_next(key.key)]
     return [
         key
         for key in numbers
-        if not NOISE & set(words(key.key)) and snake(key.key)[-4:] not in ("_cos", "_sin")
+        if not NOISE & set(words(key.key)) and _snake(key.key)[-4:] not in ("_cos", "_sin")
     ]
 
 
@@ -150,7 +144,7 @@ def _controller(facts: Mapping[str, str]) -> tuple[str | None, tuple[str, ...]]:
 def names_of(key: KeyInfo, facts: Mapping[str, str]) -> tuple[str, ...] | None:
     """Return the names of an action's values by the controller that takes them; None where it is unknown."""
     names = _controller(facts)[1]
-    if not names or snake(key.key) not in ("action", "actions"):
+    if not names or _snake(key.key) not in ("action", "actions"):
         return None
     return {len(names): names, len(names) + 1: (*names, "gripper")}.get(dims(key))
 
@@ -159,14 +153,12 @@ def space_of(keys: Iterable[KeyInfo], facts: Mapping[str, str]) -> str | None:
     """Return the action's space where it is stated; None where it would be a guess."""
     keys = list(keys)
     stated = _controller(facts)[0]
-    if stated and all(snake(key.key) in ("action", "actions") for key in keys):
+    if stated and all(_snake(key.key) in ("action", "actions") for key in keys):
         return stated
     arms = [key for key in keys if not is_gripper(key.key)]
-    moved = any(
-        {"rotation", "delta"} <= set(words(key.key)) for key in keys
-    )  # then a world_vector beside it is a change
-    spaces = {
-        "eef_delta" if moved and snake(key.key).endswith("world_vector") else _space(key) for key in arms
+    moved = any({"rotation", "delta"} <= set(words(key.key)) for key in keys)
+    spaces = {  # beside a change of rotation, a world_vector is a change too
+        "eef_delta" if moved and _snake(key.key).endswith("world_vector") else _space(key) for key in arms
     }
     if not spaces or None in spaces:
         return None
@@ -174,7 +166,7 @@ def space_of(keys: Iterable[KeyInfo], facts: Mapping[str, str]) -> str | None:
 
 
 def _space(key: KeyInfo) -> str | None:
-    said, text = set(words(key.key)), snake(key.key)
+    said, text = set(words(key.key)), _snake(key.key)
     if key.topic and re.search(r"Joint(State|Trajectory)$", key.topic.type):
         said = said | {"joint"}
     if "cmd_vel" in text or "cmdvel" in text or "base_velocity" in text:
@@ -241,7 +233,7 @@ def cameras(keys: Iterable[KeyInfo]) -> Choice:
     usable = [key for key in keys if _is_camera(key)]
     colour = _one_of_twins([key for key in usable if key.shape[2] == 3])
     grey = _one_of_twins([key for key in usable if key.shape[2] == 1])
-    ordered = tuple(sorted(colour or grey, key=lambda key: (_rank(key.key), natural(key.key))))
+    ordered = tuple(sorted(colour or grey, key=lambda key: (_rank(key.key), _natural(key.key))))
     asked = "only grey pictures are recorded; are these cameras, not depth or masks?"
     return Choice(ordered, asked if grey and not colour else "")
 
@@ -250,7 +242,7 @@ def _is_camera(key: KeyInfo) -> bool:
     if key.kind != "camera" or len(key.shape) != 3 or key.shape[2] not in (1, 3) or not key.key:
         return False
     short, long = sorted(key.shape[:2])
-    named_so = _NOT_CAMERA.search(snake(key.key)) or is_next(key.key)
+    named_so = _NOT_CAMERA.search(_snake(key.key)) or _is_next(key.key)
     return short >= MIN_SIDE and long <= MAX_RATIO * short and not named_so
 
 
@@ -269,7 +261,7 @@ def _one_of_twins(found: list[KeyInfo]) -> list[KeyInfo]:
 def _rank(key: str) -> int:
     if _WRIST.search(key):
         return 2
-    return 0 if _THIRD.search(key) or not _is_telling(last(key)) else 1
+    return 0 if _THIRD.search(key) or not _is_telling(_last(key)) else 1
 
 
 def _is_telling(part: str) -> bool:
@@ -291,8 +283,8 @@ def camera_names(found: Iterable[KeyInfo]) -> list[str]:
 def _short_name(key: str) -> str:
     telling = [part for part in re.split(r"[/.]", key) if _is_telling(part)]
     if not telling:
-        number = re.search(r"\d", last(key))
-        return _plain(last(key)) if number else "primary"
+        number = re.search(r"\d", _last(key))
+        return _plain(_last(key)) if number else "primary"
     said = [word for word in re.split(r"[_-]", telling[-1]) if not _PICTURE.fullmatch(word.lower())]
     return _plain("_".join(said).removeprefix("robot0_"))[:40]
 
@@ -306,20 +298,24 @@ def _plain(key: str) -> str:
 
 def actions(found: list[KeyInfo]) -> Choice:
     """Choose the action among the vectors of RLDS, HDF5 or LeRobot; empty when no name says action."""
-    outside = [key for key in found if not is_observed(key.key)]
-    whole = [key for key in outside if last(key.key).lower() in ("action", "actions")]
+    outside = [key for key in found if not _is_observed(key.key)]
+    whole = [key for key in outside if _last(key.key).lower() in ("action", "actions")]
     if whole:
         chosen = min(whole, key=lambda key: len(re.split(r"[/.]", key.key)))
-        return Choice((chosen,), _asked((chosen,), [key for key in outside if _is_beside(key, chosen)]))
+        beside = [key for key in outside if _is_beside(key, chosen)]
+        return Choice((chosen,), question((chosen,), beside) if beside else "")
     group = [key for key in outside if re.match(r"(actions?|action_dict)[/.]", key.key, re.IGNORECASE)]
-    group = [key for key in group if "robot_state" not in snake(key.key)]
+    group = [key for key in group if "robot_state" not in _snake(key.key)]
     if group:
         moved = [key for key in group if not (key.constant and BASE & set(words(key.key)))]
-        parts = ordered_parts(moved or group)
-        asked = _asked(parts, [key for key in group if key not in parts and key in moved])
-        still = shown(key.key for key in group if moved and key not in moved)
-        moves = f"{still} never changes in the episode looked at and is left out; does it in others?"
-        return Choice(parts, " ".join([asked, moves] if asked and still else [moves if still else asked]))
+        parts = _ordered_parts(moved or group)
+        others = [key for key in moved if key not in parts]
+        asked = [question(parts, others)] if others else []
+        if still := shown(key.key for key in group if moved and key not in moved):
+            asked.append(
+                f"{still} never changes in the episode looked at and is left out; does it in others?"
+            )
+        return Choice(parts, " ".join(asked))
     for pool in (outside, found):
         named = [key for key in pool if strength(words(key.key)) and not MEASURED & set(words(key.key))]
         if named:
@@ -332,7 +328,7 @@ def _is_beside(key: KeyInfo, chosen: KeyInfo) -> bool:
     said = set(words(key.key))
     if key == chosen or not said & {"action", "actions"} or "dict" in said:
         return False
-    group = chosen.key[: -len(last(chosen.key))]
+    group = chosen.key[: -len(_last(chosen.key))]
     same_group = bool(group) and key.key.startswith(group)
     return same_group or is_gripper(key.key) or bool(said & (BASE | SIDES))
 
@@ -342,12 +338,12 @@ def _called_otherwise(named: list[KeyInfo], found: list[KeyInfo]) -> Choice:
     strongest = max(strength(words(key.key)) for key in named)
     chosen = [key for key in named if strength(words(key.key)) == strongest]
     if all(is_gripper(key.key) for key in chosen):  # some other key must move the arm
-        chosen += [key for key in found if MOTION & set(words(key.key)) and not is_observed(key.key)]
-    parts = ordered_parts(chosen)
+        chosen += [key for key in found if MOTION & set(words(key.key)) and not _is_observed(key.key)]
+    parts = _ordered_parts(chosen)
     return Choice(parts, question(parts, [key for key in found if key not in parts]))
 
 
-def ordered_parts(parts: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
+def _ordered_parts(parts: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
     """Return each quantity once: translations or joints, then rotations, base, and the gripper last."""
     return tuple(sorted(_each_once(list(parts)), key=_place))
 
@@ -368,14 +364,10 @@ def _each_once(parts: list[KeyInfo]) -> list[KeyInfo]:
 
 
 def _place(key: KeyInfo) -> int:
-    said = set(words(last(key.key)))
+    said = set(words(_last(key.key)))
     if is_gripper(key.key):
         return 3
     return 2 if said & BASE else 1 if said & ROTATION else 0
-
-
-def _asked(chosen: Iterable[KeyInfo], others: list[KeyInfo]) -> str:
-    return question(chosen, others) if others else ""
 
 
 def question(chosen: Iterable[KeyInfo], others: Iterable[KeyInfo]) -> str:
@@ -391,14 +383,16 @@ def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...
     """Choose the robot's own state: the key of the whole state, else every position of the robot."""
     taken = list(taken)
     named = [key for key in found if key not in taken and _is_state(key)]
-    named = [key for key in named if is_observed(key.key)] or named
-    whole = [key for key in named if is_whole_state(key.key)]
+    named = [key for key in named if _is_observed(key.key)] or named
+    whole = [key for key in named if _is_whole_state(key.key)]
     if whole:
         return (whole[0],)
-    names = {snake(last(key.key)) for key in named}
-    if "ee_states" in names:  # LIBERO repeats its parts
-        named = [key for key in named if snake(last(key.key)) not in ("ee_pos", "ee_ori")]
-    own = [key for key in named if is_observed(key.key) or snake(last(key.key)) != "states"]  # of a simulator
+    names = {_snake(_last(key.key)) for key in named}
+    repeated = ("ee_pos", "ee_ori") if "ee_states" in names else ()  # in LIBERO
+    named = [key for key in named if _snake(_last(key.key)) not in repeated]
+    own = [
+        key for key in named if _is_observed(key.key) or _snake(_last(key.key)) != "states"
+    ]  # of a simulator
     return tuple(sorted(own, key=_place))
 
 
@@ -409,7 +403,7 @@ def _is_state(key: KeyInfo) -> bool:
         return False
     if strength(said) or said & (MOTION | GIVEN):
         return False
-    return grips or bool(said & (STATES | ROTATION)) or is_whole_state(key.key)
+    return grips or bool(said & (STATES | ROTATION)) or _is_whole_state(key.key)
 
 
 def likely(found: list[KeyInfo]) -> Choice:
@@ -431,10 +425,8 @@ def instruction(keys: Iterable[KeyInfo]) -> str | None:
     for key in keys:
         said = words(key.key)
         rank = next((i for i, name in enumerate(_INSTRUCTION) if name in said), None)
-        spelled = key.kind == "text" or (
-            snake(last(key.key)) == "instruction" and key.dtype.startswith("int")
-        )
-        if key.key and rank is not None and spelled and not is_next(key.key):
+        letters = _snake(_last(key.key)) == "instruction" and key.dtype.startswith("int")
+        if key.key and rank is not None and (letters or key.kind == "text") and not _is_next(key.key):
             second = bool({"embedding", "id", "type", "structured"} & set(said))
             ranked.append((second, rank, len(key.key), key.key))
     return min(ranked)[3] if ranked else None

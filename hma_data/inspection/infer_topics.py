@@ -31,7 +31,7 @@ MARGIN = 1.5  # factor on the longest interval measured
 Topic = tuple[KeyInfo, ...]
 
 
-def topics(found: Iterable[KeyInfo]) -> list[Topic]:
+def _topics(found: Iterable[KeyInfo]) -> list[Topic]:
     """Return the vectors of each topic that is a stream or whose rate is unknown."""
     groups: dict[str, list[KeyInfo]] = defaultdict(list)
     for key in found:
@@ -47,18 +47,21 @@ def runs(key: KeyInfo) -> bool:
 
 def actions(found: list[KeyInfo]) -> Choice:
     """Choose the topics that command the robot; where there are none, what is measured, with a question."""
-    ranked = [(_rank(topic), topic) for topic in topics(found)]
+    ranked = [(_rank(topic), topic) for topic in _topics(found)]
     commanding = sorted((pair for pair in ranked if pair[0][0] > 0), key=lambda pair: pair[0], reverse=True)
     if not commanding:
         return _measured(found)
     best = commanding[0][1]
-    chosen = [topic for _, topic in commanding if _other_side(topic, best)] + [
-        topic for _, topic in commanding if is_gripper(_name(topic)) and not is_gripper(_name(best))
+    chosen = [
+        topic
+        for _, topic in commanding
+        if topic == best
+        or _other_side(topic, best)
+        or (is_gripper(_name(topic)) and not is_gripper(_name(best)))
     ]
-    distinct = list(dict.fromkeys([best, *chosen]))
-    ordered = sorted(distinct, key=lambda topic: (is_gripper(_name(topic)), _name(topic)))
-    keys = tuple(key for topic in ordered for key in commanded_fields(topic))
-    others = [topic[0] for _, topic in commanding if topic not in distinct]
+    chosen.sort(key=lambda topic: (is_gripper(_name(topic)), _name(topic)))
+    keys = tuple(key for topic in chosen for key in _commanded_fields(topic))
+    others = [topic[0] for _, topic in commanding if topic not in chosen]
     (clear, ticks, *_), _ = commanding[0]
     if clear <= WEAK or not ticks:
         others += [key for key in found if key not in keys and key not in others]
@@ -72,8 +75,8 @@ def _measured(found: list[KeyInfo]) -> Choice:
     joints = [key for key in own if JOINT & set(words(key.key))] or list(own)
     if not joints:
         return likely(found)
-    named = {_name((key,)): key for key in joints}
     first = joints[0]
+    named = {_name((key,)): key for key in joints}  # one key a topic
     chosen = tuple(key for key in named.values() if key == first or _other_side((key,), (first,)))
     others = shown(key.key for key in found if key not in chosen)
     asked = f"no topic commands the robot; may {shown(key.key for key in chosen)}, as measured, stand for it"
@@ -111,7 +114,7 @@ def _other_side(topic: Topic, best: Topic) -> bool:
     return topic != best and rests[0] == rests[1] and bool(sides[0] and sides[1]) and sides[0] != sides[1]
 
 
-def commanded_fields(topic: Topic) -> list[KeyInfo]:
+def _commanded_fields(topic: Topic) -> list[KeyInfo]:
     """Return the fields of a topic that are the command: desired values, and of these positions, if any."""
     desired = [key for key in topic if {"desired", "reference"} & set(words(_path(key)))]
     return _positions(desired or list(topic))
@@ -126,7 +129,7 @@ def _positions(fields: list[KeyInfo]) -> list[KeyInfo]:
 def states(found: list[KeyInfo], taken: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
     """Return what topics measure of the robot: joints and poses, not velocities or commands."""
     used = {_name((key,)) for key in taken}
-    own = [topic for topic in topics(found) if _name(topic) not in used and not _rank(topic)[0]]
+    own = [topic for topic in _topics(found) if _name(topic) not in used and not _rank(topic)[0]]
     keys: list[KeyInfo] = []
     for topic in own:
         fields = [key for key in topic if not {"desired", "reference", "error"} & set(words(_path(key)))]
@@ -155,7 +158,9 @@ def needs_receive_times(keys: Iterable[KeyInfo]) -> str:
     return ""
 
 
-def max_skew_ms(cameras: list[KeyInfo], actions: Iterable[KeyInfo], states: Iterable[KeyInfo]) -> int | None:
+def max_skew_ms(
+    cameras: Iterable[KeyInfo], actions: Iterable[KeyInfo], states: Iterable[KeyInfo]
+) -> int | None:
     """Return how many ms values may be moved: the longest interval measured, with a margin; None without any.
 
     A held command may be as old as one interval. A nearest or interpolated value is off by half of one.

@@ -1,21 +1,44 @@
-"""Inspect a recording: report what is in it, and whether an embodiment fits it."""
+"""Check recordings and shard sets: what is in them, whether an embodiment fits, what will hurt training.
 
-from collections.abc import Iterable
+`inspect_recording` reports what a recording holds, and tries one episode as an embodiment's. `examine`
+returns findings by severity: for a recording those of its inspection and, with an embodiment, those of a
+sample of episodes read and aligned as this robot's; for a shard set those of its integrity and statistics.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.errors import HMAError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
-from hma_data.sources.common.findings import SEVERITIES, Finding
-from hma_data.sources.common.survey import CHECKS
+from hma_data.sources.common.findings import SEVERITIES, Finding, Severity
+from hma_data.sources.common.survey import CHECKS, sampled
 from hma_data.storage.paths import StrPath, as_text
+from hma_data.storage.remote import is_remote, place
 
 TRIED = 20  # episodes tried until one can be read
+WINDOW = 12  # frames of the model's window, by default
+LOOKS = ("blank", "still", "colour", "size")  # checks of pictures; they count only for cameras that are used
+
+
+def _inspected(uri: str, robot: Embodiment | None, episodes: int) -> tuple[Source, Inspection]:
+    format_name = robot.source.format if robot else detect(uri)
+    source = open_source(format_name)
+    try:
+        return source, source.inspect(uri, episodes)
+    except SourceError as fault:
+        raise of_another_format(uri, format_name, fault) from fault
+
+
+# -- hma inspect
 
 
 def inspect_recording(
@@ -32,23 +55,18 @@ def inspect_recording(
         SourceError: the recording cannot be read at all.
     """
     uri, robot = as_text(uri), find(embodiment) if embodiment else None
-    source = open_source(robot.source.format if robot else detect(uri))
-    try:
-        inspection = source.inspect(uri, episodes)
-    except SourceError as fault:
-        raise of_another_format(uri, robot.source.format if robot else detect(uri), fault) from fault
+    source, inspection = _inspected(uri, robot, episodes)
     found = list(inspection.findings)
-    facts: dict[str, str] = {}
-    if robot:
-        facts = _fit(uri, robot, source, inspection, found)
     report = inspection.to_json()
+    if robot:
+        report["embodiment"] = _fit(uri, robot, source, inspection, found)
     report["findings"] = [finding.to_json() for finding in found]
     report["problems"] = [str(finding) for finding in found if finding.severity != "info"]
-    report["checks"] = results(inspection.checks, found)
-    return report | ({"embodiment": facts} if robot else {})
+    report["checks"] = _results(inspection.checks, found)
+    return report
 
 
-def results(made: Iterable[str], found: Iterable[Finding]) -> dict[str, str]:
+def _results(made: Iterable[str], found: Iterable[Finding]) -> dict[str, str]:
     """Return the result of each check: ok, the worst severity found, or "not looked at" where impossible."""
     told = dict.fromkeys(CHECKS, "not looked at") | dict.fromkeys(made, "ok")
     for finding in sorted(found, key=lambda one: SEVERITIES.index(one.severity)):
@@ -84,7 +102,16 @@ def _fit(
         found.append(Finding("usable", "warn", said, numbers={"refused": len(faults)}))
     facts["first episode"] = f"{name}: {len(clip)} frames on the grid, {clip.trimmed} trimmed at its ends"
     facts["pictures"] = "×".join(map(str, pictures.shape[1:]))
-    return facts | _measured(clip, robot, found)
+    hz = _median_hz(np.diff(clip.timestamps))
+    facts["rate on the grid"] = f"{hz:.3g} Hz" if hz else "unknown"
+    for stream, skew in clip.skew_ms.items():
+        p50, p95, most = np.percentile(skew, [50, 95, 100])
+        facts[f"skew of {stream}"] = f"p50 {p50:.1f} ms, p95 {p95:.1f} ms, max {most:.1f} ms"
+    if hz and isinstance(robot.frequency_hz, float) and abs(hz / robot.rate_hz - 1) > 0.1:
+        said = f"{robot.id} says {robot.rate_hz:g} Hz, the recording's grid ticks at {hz:.3g} Hz"
+        found.append(Finding("rate", "warn", said, numbers={"hz": hz, "stated_hz": robot.rate_hz}))
+    constant = _constant(clip.actions.std(axis=0), robot)
+    return facts | ({"constant in it": "action " + ", ".join(constant)} if constant else {})
 
 
 def _alike(robot: Embodiment, inspection: Inspection) -> str:
@@ -96,19 +123,188 @@ def _alike(robot: Embodiment, inspection: Inspection) -> str:
     return f" (recorded keys like it: {', '.join(near)})" if near else ""
 
 
-def _measured(clip: Clip, robot: Embodiment, found: list[Finding]) -> dict[str, str]:
-    """Return rate, skew and constant actions of the clip; add a rate other than the YAML's to `found`."""
-    intervals = np.diff(clip.timestamps)
-    measured = 1 / float(np.median(intervals)) if len(intervals) and np.median(intervals) > 0 else None
-    facts = {"rate on the grid": f"{measured:.3g} Hz" if measured else "unknown"}
-    for stream, skew in clip.skew_ms.items():
-        p50, p95, most = np.percentile(skew, [50, 95, 100])
-        facts[f"skew of {stream}"] = f"p50 {p50:.1f} ms, p95 {p95:.1f} ms, max {most:.1f} ms"
-    if measured and isinstance(robot.frequency_hz, float) and abs(measured / robot.rate_hz - 1) > 0.1:
-        said = f"{robot.id} says {robot.rate_hz:g} Hz, the recording's grid ticks at {measured:.3g} Hz"
-        found.append(Finding("rate", "warn", said, numbers={"hz": measured, "stated_hz": robot.rate_hz}))
-    constant = np.flatnonzero(clip.actions.std(axis=0) == 0)
-    if len(constant):
-        names = robot.action.names()
-        facts["constant in it"] = "action " + ", ".join(names[i] for i in constant)
-    return facts
+def _median_hz(steps: NDArray[np.float64]) -> float | None:
+    period = float(np.median(steps)) if len(steps) else 0.0
+    return 1 / period if period > 0 else None
+
+
+def _constant(deviations: NDArray[Any], robot: Embodiment) -> list[str]:
+    """Return the names of actions that never change; in a chunk, one name stands for several columns."""
+    names = robot.action.names()
+    return list(dict.fromkeys(names[i % len(names)] for i in np.flatnonzero(deviations == 0)))
+
+
+# -- hma doctor
+
+
+def examine(target: StrPath, embodiment: StrPath | None = None, sample: int = SAMPLE) -> list[Finding]:
+    """Return all findings of the checks, worst first.
+
+    Args:
+        target: str or path (or URI) of a recording, or of the folder of a shard set.
+        embodiment: id, or str or path of a YAML; with it a recording's episodes are read and aligned as this
+            robot's.
+        sample: number of episodes to look into, evenly spaced.
+
+    Raises:
+        RegistryError: there is no such embodiment.
+    """
+    target = as_text(target)
+    if _is_shard_set(target):
+        found = list(_shard_set(place(target)))
+    else:
+        found = list(_recording(target, find(embodiment) if embodiment else None, sample))
+    return sorted(found, key=lambda finding: -SEVERITIES.index(finding.severity))
+
+
+def _is_shard_set(target: str) -> bool:
+    try:
+        folder = place(target)
+        if (folder / "manifest.json").is_file():
+            return True
+        return not is_remote(folder) and any(folder.glob("train/shard-*.parquet"))  # an unfinished set
+    except HMAError:
+        return False  # a scheme that only a source knows
+
+
+def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Finding]:
+    try:
+        source, inspection = _inspected(uri, robot, sample)
+    except HMAError as fault:
+        yield Finding("readable", "error", str(fault))
+        return
+    if not inspection.episodes:
+        yield Finding("episodes", "error", "the recording has no episodes")
+    elif robot is None:
+        yield from inspection.findings
+    else:
+        yield from _for_robot(inspection, robot)
+        yield from _episodes(uri, robot, source, sample, inspection)
+
+
+def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
+    """Yield the inspection's findings that concern what this robot uses.
+
+    Findings on constants are left out: `_numbers` reports them later, with the robot's names.
+    """
+    cameras = {camera.key: camera for camera in robot.cameras}
+    for finding in inspection.findings:
+        if finding.check == "constant":
+            continue
+        if finding.check in LOOKS:
+            camera = cameras.get(finding.key)
+            if camera is None or (finding.check == "colour" and camera.color == "bgr"):
+                continue
+            finding = replace(finding, message=f"camera {camera.name}, {finding.message}")
+        yield replace(finding, severity="warn") if finding.check == "blank" else finding
+    for info in inspection.keys:
+        camera = cameras.get(info.key)
+        if camera and camera.size and len(info.shape) == 3 and tuple(info.shape[:2]) != tuple(camera.size):
+            size, stated = list(info.shape[:2]), list(camera.size)
+            said = f"camera {camera.name} is {size} pixels, its YAML says {stated}"
+            yield Finding("size", "info", said, key=camera.key)
+        if camera and camera.color == "bgr" and info.swapped == "no":
+            said = f"camera {camera.name} is stored with red first, its YAML says bgr"
+            yield Finding("colour", "warn", said, "set color: rgb", camera.key)
+
+
+def _episodes(
+    uri: str, robot: Embodiment, source: Source, sample: int, inspection: Inspection
+) -> Iterator[Finding]:
+    try:
+        names = [ref.id for ref in source.index(uri, robot)]
+    except HMAError as fault:
+        yield Finding("usable", "error", f"none of its episodes: {fault.fault}", fault.remedy)
+        return
+    chosen = [names[i] for i in sampled(len(names), sample)]
+    refused: dict[tuple[str, str], list[str]] = {}
+    clips: list[Clip] = []
+    for name in chosen:
+        try:
+            clip = to_clip(source.read(uri, name, robot), robot)
+            for camera in robot.cameras:  # can they be decoded? the inspection judged the pictures
+                clip.frames_at(camera.name, np.array([len(clip) - 1]))
+            clips.append(clip)
+        except HMAError as fault:
+            refused.setdefault((fault.fault, fault.remedy), []).append(name)
+    for (reason, remedy), which in sorted(refused.items(), key=lambda item: -len(item[1]))[:5]:
+        severity: Severity = "warn" if clips else "error"
+        said = f"{len(which)} of {len(chosen)} episodes looked at, such as {which[0]}: {reason}"
+        numbers = {"refused": len(which), "looked_at": len(chosen)}
+        yield Finding("usable", severity, said, remedy, numbers=numbers)
+    if clips:
+        told = any(one.check == "gaps" and one.key == robot.primary_camera.key for one in inspection.findings)
+        yield from (one for one in _times(clips, robot) if not (told and one.check == "gaps"))
+        yield from _numbers(np.concatenate([clip.actions for clip in clips]), robot)
+
+
+def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
+    steps = np.concatenate([np.diff(clip.timestamps) for clip in clips])
+    hz = _median_hz(steps)
+    if hz and abs(robot.rate_hz / hz - 1) > 0.1:
+        said = f"the grid ticks at {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
+        yield Finding("rate", "error", said, "correct frequency_hz, or sync.rate_hz")
+    if hz and (steps > 3 / hz).any():
+        yield Finding(
+            "gaps",
+            "warn",
+            f"frames pause for up to {steps.max():.3g} s",
+            "split or trim the episodes at the pauses",
+        )
+    needed = (WINDOW - 1) * robot.stride + 1
+    short = sum(len(clip) < needed for clip in clips)
+    if short:
+        said = f"{short} of {len(clips)} episodes are shorter than a window, {needed} frames"
+        yield Finding("length", "warn", said, "set a higher target_hz, or fewer frames a window")
+    for stream in dict.fromkeys(name for clip in clips for name in clip.skew_ms):
+        moved = [clip.skew_ms[stream] for clip in clips if stream in clip.skew_ms]
+        late = float(np.percentile(np.concatenate(moved), 95))
+        if hz and late > 1e3 / hz:
+            yield Finding("skew", "warn", f"{stream} was moved by {late:.1f} ms or more in 5 % of frames")
+
+
+def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Finding]:
+    names = robot.action.names()
+    spread = actions.std(axis=0)
+    if constant := _constant(spread, robot):
+        said = f"never change in the episodes looked at: {', '.join(constant)}"
+        yield Finding("constant", "warn", said, "remove them from the YAML if they never change")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = (np.abs(actions - np.median(actions, axis=0)) / spread > 30).any(axis=0)
+    wild = [f"{names[i]} {actions[:, i].min():.4g} to {actions[:, i].max():.4g}" for i in np.flatnonzero(far)]
+    if wild:
+        yield Finding("outliers", "warn", f"values more than 30 deviations off: {', '.join(wild)}")
+    at = 0
+    for part in robot.action.components:
+        values = actions[:, at : at + part.dims]
+        at += part.dims
+        low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
+        if part.range and values.size and not part.range[0] <= low <= high <= part.range[1]:
+            said = f"{part.key} lies in {low:.4g} to {high:.4g}, its range says {list(part.range)}"
+            yield Finding("range", "warn", said, "correct the range, or the slice and key")
+        if part.unit == "rad" and max(-low, high) > 4 * np.pi:
+            said = f"{part.key} in rad reaches {max(-low, high):.4g}"
+            yield Finding("unit", "warn", said, "are these degrees?")
+
+
+def _shard_set(folder: Path) -> Iterator[Finding]:
+    from hma_data.shards.manifest import Manifest
+    from hma_data.shards.verify import verify
+
+    wrong = verify(folder)
+    for problem in wrong:
+        yield Finding("integrity", "error", problem)
+    if wrong:
+        return
+    manifest = Manifest.load(folder)
+    kept = sum(split["episodes"] for split in manifest.splits.values())
+    if manifest.quarantined:
+        said = f"{manifest.quarantined:,} episodes beside {kept:,} kept; reasons in quarantine.jsonl"
+        yield Finding("quarantine", "warn", said)
+    if not manifest.splits["train"]["episodes"]:
+        yield Finding("split", "error", "no episode is in the train split")
+    if not manifest.splits["val"]["episodes"]:
+        yield Finding("split", "warn", "no episode is in the val split", "convert more than one episode")
+    deviations = np.asarray(manifest.stats["action"]["std"], np.float64)
+    if constant := _constant(deviations, manifest.embodiment):
+        yield Finding("constant", "warn", f"never change: {', '.join(constant)}")

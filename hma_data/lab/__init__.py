@@ -1,7 +1,8 @@
 """Record third-party simulators as if they were robots, for the demo, tests and experiments.
 
-A recorder is a module with `record(out, robot, episodes, seed, on_progress)`; it is imported on use.
-Every robot of RECORDERS has its embodiment in the registry under the same id.
+A recorder is a module with `record(part, robot, episodes, seed)`, which writes the episodes of those numbers
+to the path `part`; it is imported on use. Every robot of RECORDERS has its embodiment in the registry under
+the same id.
 """
 
 import os
@@ -17,12 +18,12 @@ from hma_data.storage.paths import StrPath, as_path
 
 Progress = Callable[[int, int], None]
 
-RECORDERS = {
-    "pusht_fast": "hma_data.lab.pusht",
-    "pusht_slow": "hma_data.lab.pusht",
-    "pendulum": "hma_data.lab.pendulum",
-    "planar_arm": "hma_data.lab.planar_arm",
-    "planar_arm_lerobot": "hma_data.lab.planar_arm",
+RECORDERS = {  # robot -> its module, and the name of its recording
+    "pusht_fast": ("hma_data.lab.pusht", "pusht_fast.hdf5"),
+    "pusht_slow": ("hma_data.lab.pusht", "pusht_slow"),
+    "pendulum": ("hma_data.lab.pendulum", "pendulum"),
+    "planar_arm": ("hma_data.lab.planar_arm", "planar_arm.hdf5"),
+    "planar_arm_lerobot": ("hma_data.lab.planar_arm", "planar_arm_lerobot"),
 }
 
 
@@ -35,7 +36,7 @@ def record(
         robot: a key of RECORDERS.
         out: str or path of the folder to put the recording in; made if it does not exist.
         episodes: number of episodes, at least one.
-        seed: the same seed gives the same recording.
+        seed: the same seed gives the same bytes.
         on_progress: called after each episode with (episodes done, episodes in all).
 
     Returns:
@@ -50,27 +51,28 @@ def record(
         raise UsageError(robot, "is not a laboratory robot", f"known: {', '.join(RECORDERS)}")
     if episodes < 1:
         raise UsageError("episodes", f"{episodes} asked for", "ask for at least one")
-    recording: Path = import_module(RECORDERS[robot]).record(as_path(out), robot, episodes, seed, on_progress)
-    return recording
-
-
-@contextmanager
-def written_beside(final: Path) -> Iterator[Path]:
-    """Give a path to write a file or folder to; rename it to `final` at the end, or delete it on failure.
-
-    Raises:
-        OutputError: `final` is already there, or cannot be written.
-    """
+    module, name = RECORDERS[robot]
+    final = as_path(out) / name
     if final.exists():
         raise OutputError(final, "exists already", "remove it or record into another folder")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=final.parent, prefix=f".{final.name}-") as folder:
-            part = Path(folder) / final.name
-            yield part
-            part.rename(final)
+        with tempfile.TemporaryDirectory(dir=final.parent, prefix=f".{name}-") as folder:
+            import_module(module).record(Path(folder) / name, robot, _counted(episodes, on_progress), seed)
+            (Path(folder) / name).rename(final)
     except OSError as fault:
-        raise OutputError(final, f"cannot be written: {fault}", "check space and rights") from fault
+        raise OutputError(
+            final, f"cannot be written: {fault}", "check the free space and the permissions"
+        ) from fault
+    return final
+
+
+def _counted(episodes: int, on_progress: Progress | None) -> Iterator[int]:
+    """Yield the number of each episode, and report it when the next one is asked for."""
+    for episode in range(episodes):
+        yield episode
+        if on_progress:
+            on_progress(episode + 1, episodes)
 
 
 @contextmanager

@@ -10,44 +10,26 @@ and speeds and last 5 s.
 Angles are radians from upright, speeds rad/s, torques N·m. T frames.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
-from hma_data.lab import Progress, imported, written_beside
-from hma_data.lab.write_rlds import RldsEpisode, write_rlds
+from hma_data.lab import imported
+from hma_data.lab.writers import RldsEpisode, write_rlds
 
 Floats = NDArray[np.float64]
 Driver = Callable[[float, float], float]  # (angle, speed) -> torque
 
-ROBOT = "pendulum"
 STEPS, PERIOD_S = 100, 0.05
 TORQUE = 2.0  # the environment's limit
 SIZE, ZOOMED, DRAWN = 128, 256, 464  # pixels: the picture, the square that it shows, the whole drawing
 
 
-def record(out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
-    """Record the pendulum as the TFDS folder `out/pendulum`.
-
-    The same arguments give the same bytes. See `hma_data.lab.record`.
-    """
-    if robot != ROBOT:
-        raise UsageError(robot, "is not this recorder's robot", f"known: {ROBOT}")
-
-    def made() -> Iterator[RldsEpisode]:
-        for episode in range(episodes):
-            yield _episode(seed, episode)
-            if on_progress:
-                on_progress(episode + 1, episodes)
-
-    final = Path(out) / ROBOT
-    with written_beside(final) as part:
-        write_rlds(part, ROBOT, {"observation/image": (SIZE, SIZE)}, "png", made())
-    return final
+def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
+    """Record the pendulum as a TFDS folder; see `hma_data.lab`."""
+    write_rlds(part, robot, {"observation/image": (SIZE, SIZE)}, "png", (_episode(seed, i) for i in episodes))
 
 
 class Pendulum:
@@ -61,10 +43,13 @@ class Pendulum:
     """
 
     def __init__(self, angle: float, speed: float) -> None:
-        environment, surface, clock = _simulator()
-        self._env = environment(render_mode="rgb_array")
+        with imported("gymnasium's Pendulum-v1", "pip install gymnasium pygame"):
+            from gymnasium.envs.classic_control.pendulum import PendulumEnv
+            from pygame import Surface
+            from pygame.time import Clock
+        self._env = PendulumEnv(render_mode="rgb_array")
         self._env.screen_dim = DRAWN
-        self._env.screen, self._env.clock = surface((DRAWN, DRAWN)), clock()  # or it looks for a display
+        self._env.screen, self._env.clock = Surface((DRAWN, DRAWN)), Clock()  # or it looks for a display
         self._env.reset(seed=0)
         self._env.state = np.array([angle, speed])
 
@@ -122,15 +107,6 @@ def _episode(seed: int, episode: int) -> RldsEpisode:
         world.advance(actions[-1])
     vectors = {"action": np.stack(actions), "observation/state": np.stack(observations)}
     return RldsEpisode({"observation/image": pictures}, vectors, instruction)
-
-
-def _simulator() -> tuple[Any, Any, Any]:
-    """Return the environment's class, pygame's Surface and its Clock."""
-    with imported("gymnasium's Pendulum-v1", "pip install gymnasium pygame"):
-        from gymnasium.envs.classic_control.pendulum import PendulumEnv
-        from pygame import Surface
-        from pygame.time import Clock
-    return PendulumEnv, Surface, Clock
 
 
 # -- drivers

@@ -15,21 +15,19 @@ Lengths are pixels of the 512 × 512 arena with y downward, angles radians (the 
 +x, the elbow's from the upper arm on), velocities rad/s. J = 2 joints, B = 3 blocks, T frames.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
-from hma_data.lab import Progress, imported, written_beside
+from hma_data.lab import imported
+from hma_data.lab.writers import Demo, LeRobotEpisode, write_hdf5, write_lerobot
+from hma_data.registry.embodiment import find
 
 if TYPE_CHECKING:
     import pymunk
-
-    from hma_data.lab.write_hdf5 import Demo
-    from hma_data.lab.write_lerobot import LeRobotEpisode
 
 Floats = NDArray[np.float64]
 Manoeuvre = Callable[["Arm"], Floats]  # returns velocities (J,)
@@ -49,51 +47,19 @@ UPPER_COLOR, FORE_COLOR = (40, 90, 200), (240, 145, 30)
 BLOCK_COLORS = ((200, 40, 50), (30, 150, 90), (140, 60, 170))
 
 
-def record(out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None) -> Path:
-    """Record the arm as `out/planar_arm.hdf5`, or as the LeRobotDataset `out/planar_arm_lerobot`.
-
-    The same arguments give the same bytes. See `hma_data.lab.record`.
-    """
-    if robot not in _WRITERS:
-        raise UsageError(robot, "is not this recorder's robot", f"known: {', '.join(_WRITERS)}")
-    name, write = _WRITERS[robot]
-
-    def demos() -> "Iterator[Demo]":
-        for episode in range(episodes):
-            yield _demo(seed, episode)
-            if on_progress:
-                on_progress(episode + 1, episodes)
-
-    with written_beside(Path(out) / name) as part:
-        write(part, demos())
-    return Path(out) / name
+def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
+    """Record the arm as a file of robomimic's layout, or as a LeRobotDataset; see `hma_data.lab`."""
+    demos = (_demo(seed, episode) for episode in episodes)
+    if robot == "planar_arm":
+        write_hdf5(part, demos, {"env_name": robot, "type": 2, "env_kwargs": {"control_freq": HZ}})
+    else:
+        write_lerobot(part, find(robot), map(_as_lerobot, demos))
 
 
-def _write_hdf5(part: Path, demos: "Iterator[Demo]") -> None:
-    from hma_data.lab.write_hdf5 import write_demos
-
-    write_demos(part, demos, {"env_name": "planar_arm", "type": 2, "env_kwargs": {"control_freq": HZ}})
-
-
-def _write_lerobot(part: Path, demos: "Iterator[Demo]") -> None:
-    from hma_data.lab.write_lerobot import write_lerobot
-    from hma_data.registry.embodiment import find
-
-    write_lerobot(part, find("planar_arm_lerobot"), map(_as_lerobot, demos))
-
-
-def _as_lerobot(demo: "Demo") -> "LeRobotEpisode":
-    from hma_data.lab.write_lerobot import LeRobotEpisode
-
+def _as_lerobot(demo: Demo) -> LeRobotEpisode:
     seen = demo.observations
     state = np.concatenate([seen["joint_pos"], seen["joint_vel"]], axis=1).astype(np.float32)
     return LeRobotEpisode({"observation.images.top": seen["image"]}, demo.actions, state, TASK)
-
-
-_WRITERS: dict[str, tuple[str, "Callable[[Path, Iterator[Demo]], None]"]] = {
-    "planar_arm": ("planar_arm.hdf5", _write_hdf5),
-    "planar_arm_lerobot": ("planar_arm_lerobot", _write_lerobot),
-}
 
 
 class Arm:
@@ -108,8 +74,10 @@ class Arm:
     """
 
     def __init__(self, joints: Floats, blocks: Floats) -> None:
-        munk = _pymunk()
-        self._space = munk.Space()
+        with imported("pymunk", "pip install pymunk"):
+            import pymunk
+        self._munk: Any = pymunk
+        self._space = pymunk.Space()
         self._space.iterations = 20
         self._space.damping = 0.02
         elbow, _ = elbow_and_tip(joints)
@@ -117,10 +85,12 @@ class Arm:
         self._fore = self._link(elbow, joints[0] + joints[1], FORE)
         self._motors = self._joints()
         self._blocks = [self._block(pose) for pose in blocks]
-        self._walls()
+        corners = [(0.0, 0.0), (ARENA, 0.0), (ARENA, ARENA), (0.0, ARENA)]
+        for here, there in zip(corners, corners[1:] + corners[:1], strict=True):
+            self._space.add(pymunk.Segment(self._space.static_body, here, there, 4))
 
     def _link(self, start: Floats, angle: float, length: float) -> "pymunk.Body":
-        munk = _pymunk()
+        munk = self._munk
         body = munk.Body(1.0, munk.moment_for_segment(1.0, (-length / 2, 0), (length / 2, 0), RADIUS))
         body.center_of_gravity = (length / 2, 0)  # rotation is about it, so the position is set last
         body.angle, body.position = float(angle), (float(start[0]), float(start[1]))
@@ -130,7 +100,7 @@ class Arm:
         return body
 
     def _joints(self) -> "list[pymunk.SimpleMotor]":
-        munk, ground = _pymunk(), self._space.static_body
+        munk, ground = self._munk, self._space.static_body
         shoulder = munk.PivotJoint(ground, self._upper, tuple(BASE), (0, 0))
         elbow = munk.PivotJoint(self._upper, self._fore, (UPPER, 0), (0, 0))
         stop = munk.RotaryLimitJoint(self._upper, self._fore, -ELBOW_STOP, ELBOW_STOP)
@@ -141,19 +111,13 @@ class Arm:
         return motors
 
     def _block(self, pose: Floats) -> "pymunk.Body":
-        munk = _pymunk()
+        munk = self._munk
         body = munk.Body(0.05, munk.moment_for_box(0.05, (BLOCK, BLOCK)))
         body.position, body.angle = (float(pose[0]), float(pose[1])), float(pose[2])
         shape = munk.Poly.create_box(body, (BLOCK, BLOCK))
         shape.friction = 0.4
         self._space.add(body, shape)
         return body
-
-    def _walls(self) -> None:
-        munk = _pymunk()
-        corners = [(0.0, 0.0), (ARENA, 0.0), (ARENA, ARENA), (0.0, ARENA)]
-        for here, there in zip(corners, corners[1:] + corners[:1], strict=True):
-            self._space.add(munk.Segment(self._space.static_body, here, there, 4))
 
     @property
     def joints(self) -> Floats:
@@ -235,32 +199,23 @@ def start(seed: int, episode: int) -> tuple[Arm, np.random.Generator]:
     return Arm(joints, np.stack(blocks)), rng
 
 
-def _demo(seed: int, episode: int) -> "Demo":
-    from hma_data.lab.write_hdf5 import Demo
-
+def _demo(seed: int, episode: int) -> Demo:
     arm, rng = start(seed, episode)
     drive = _driver(rng)
-    images, joints, velocities, states, rewards = [], [], [], [], []
-    actions: list[NDArray[np.float32]] = []
     lay = arm.blocks
+    rows: list[tuple[Any, ...]] = []
     for _ in range(STEPS):
-        images.append(arm.picture())
-        joints.append(arm.joints)
-        velocities.append(arm.velocities)
-        states.append(arm.state)
+        seen = arm.picture(), arm.joints, arm.velocities, arm.state
         before = arm.blocks
-        actions.append(drive(arm).astype(np.float32))
-        arm.advance(actions[-1])
-        rewards.append(float(_distances(before, arm.blocks).sum()))
+        action = drive(arm).astype(np.float32)
+        arm.advance(action)
+        rows.append((*seen, action, _distances(before, arm.blocks).sum()))
+    images, joints, velocities, states, actions, rewards = map(np.stack, zip(*rows, strict=True))
     return Demo(
-        actions=np.stack(actions),
-        observations={
-            "image": np.stack(images),
-            "joint_pos": np.stack(joints),
-            "joint_vel": np.stack(velocities),
-        },
-        states=np.stack(states),
-        rewards=np.array(rewards),
+        actions=actions,
+        observations={"image": images, "joint_pos": joints, "joint_vel": velocities},
+        states=states,
+        rewards=rewards,
         success=bool(_distances(lay, arm.blocks).max() >= MOVED),
         facts={"seed": seed},
     )
@@ -285,12 +240,6 @@ def _draw_link(image: NDArray[np.uint8], here: Floats, there: Floats, color: tup
     cv2.fillConvexPoly(image, _fixed(outline), color, cv2.LINE_AA, SHIFT)
     for end in (here, there):
         cv2.circle(image, _fixed(end), int(_fixed(RADIUS)), color, -1, cv2.LINE_AA, SHIFT)
-
-
-def _pymunk() -> Any:
-    with imported("pymunk", "pip install pymunk"):
-        import pymunk
-    return pymunk
 
 
 # -- driver

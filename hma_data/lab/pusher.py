@@ -13,7 +13,7 @@ Lengths are pixels of the 512 × 512 arena, angles radians. C contacts, N nodes,
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,35 +115,21 @@ class Tee:
         return self.keypoints @ rotation(pose[2]).T + pose[:2]
 
 
-@dataclass(frozen=True)
-class Push:
-    """A walk and a push at its end.
-
-    Attributes:
-        path: (n, 2) way points; the last is the standoff.
-        end: (2,) place of the pusher's centre at the end of the push.
-        retreat: (2,) place to which the pusher steps back.
-    """
-
-    path: Floats
-    end: Floats
-    retreat: Floats
+Phases = list[tuple[Floats, bool]]  # way points (n, 2), and whether the pusher is up
 
 
 def plan(
     tee: Tee, pose: Floats, goal: Floats, agent: Floats, speed: float, fly: bool, rng: np.random.Generator
-) -> Push:
-    """Return the next push: the one with the most progress for its time.
+) -> Phases:
+    """Return the next push, the one with the most progress for its time: walk, push, step back.
 
     One push in ten is a blunder: any that is reachable.
 
     Args:
-        tee: the T.
         pose, goal: (3,) x, y, angle of the T's frame.
         agent: (2,) centre of the pusher.
         speed: px/s.
         fly: whether the pusher passes over the T instead of round it.
-        rng: generator of the blunders.
     """
     turn = rotation(pose[2])
     standoffs = tee.standoffs @ turn.T + pose[:2]
@@ -154,8 +140,8 @@ def plan(
     lengths = np.where(_inside(standoffs), lengths, np.inf)
     reachable = np.flatnonzero(np.isfinite(lengths))
     if not len(reachable):  # no standoff is reachable: go somewhere else first
-        away = rng.uniform(LOW, HIGH, 2)
-        return Push(away[None], away, away)
+        away = rng.uniform(LOW, HIGH, (1, 2))
+        return [(away, fly), (away, False), (away, False)]
 
     now = np.linalg.norm(tee.placed(pose) - tee.placed(goal), axis=-1).mean()
     seconds = (lengths[:, None] + 3 * GAP + LENGTHS) / speed + 0.4
@@ -167,7 +153,12 @@ def plan(
     corners = [] if before is None else [tee.corners[i] @ turn.T + pose[:2] for i in before(contact)]
     inward = tee.contacts[1][contact] @ turn.T
     end = np.clip(standoffs[contact] + inward * (GAP + LENGTHS[length]), LOW, HIGH)
-    return Push(np.array([*corners, standoffs[contact]]), end, np.clip(end - inward * 2 * GAP, LOW, HIGH))
+    retreat = np.clip(end - inward * 2 * GAP, LOW, HIGH)
+    return [
+        (np.array([*corners, standoffs[contact]]), fly),
+        (end[None], False),
+        (retreat[None], False),
+    ]
 
 
 def predicted_costs(tee: Tee, pose: Floats, goal: Floats) -> Floats:
@@ -228,8 +219,15 @@ def _inside(points: Floats) -> Any:
     return np.all((points > LOW) & (points < HIGH), axis=-1)
 
 
-class Policy(Protocol):
-    """A driver of the pusher's setpoint."""
+class Planned:
+    """A driver that plans a push, walks, pushes, steps back, and plans again."""
+
+    def __init__(
+        self, tee: Tee, goal: Floats, agent: Floats, speed: float, fly: bool, rng: np.random.Generator
+    ) -> None:
+        self._tee, self._goal, self._speed, self._fly, self._rng = tee, goal, speed, fly, rng
+        self._setpoint = agent.copy()
+        self._phases: Phases = []
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
         """Return the setpoint (2,) `seconds` from now, and whether the pusher is up.
@@ -239,24 +237,8 @@ class Policy(Protocol):
             agent: (2,) centre of the pusher.
             seconds: time until the next call.
         """
-        ...
-
-
-class Planned:
-    """A driver that plans a push, walks, pushes, steps back, and plans again."""
-
-    def __init__(
-        self, tee: Tee, goal: Floats, agent: Floats, speed: float, fly: bool, rng: np.random.Generator
-    ) -> None:
-        self._tee, self._goal, self._speed, self._fly, self._rng = tee, goal, speed, fly, rng
-        self._setpoint = agent.copy()
-        self._phases: list[tuple[Floats, bool]] = []  # remaining way points, and whether the pusher is up
-
-    def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Return the setpoint and whether the pusher is up; see Policy."""
         if not self._phases:
-            push = plan(self._tee, pose, self._goal, agent, self._speed, self._fly, self._rng)
-            self._phases = [(push.path, self._fly), (push.end[None], False), (push.retreat[None], False)]
+            self._phases = plan(self._tee, pose, self._goal, agent, self._speed, self._fly, self._rng)
         way, up = self._phases[0]
         self._setpoint, way = advance(self._setpoint, way, self._speed * seconds)
         if len(way):
@@ -275,7 +257,7 @@ class Wandering:
         self._speed, self._up = 0.0, False
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Return the setpoint and whether the pusher is up; see Policy."""
+        """Return the setpoint and whether the pusher is up; see Planned.act."""
         if not len(self._way):
             near = self._rng.random() < 0.7
             point = pose[:2] + self._rng.normal(0, 60, 2) if near else self._rng.uniform(LOW, HIGH, 2)

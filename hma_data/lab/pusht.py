@@ -12,7 +12,7 @@ at random. Success is the environment's own: the T covers more than 95 % of the 
 after success, or else after a fixed time.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
-from hma_data.lab import Progress, imported, written_beside
-from hma_data.lab.pusher import Floats, Planned, Policy, Tee, Wandering, rotation
+from hma_data.lab import imported
+from hma_data.lab.pusher import Floats, Planned, Tee, Wandering, rotation
+from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
 
 TICK_S = 0.01  # step of the physics
 LAG_S = 0.2  # delay of the pusher's spring (k_v / k_p of the environment) behind a moving target
@@ -33,12 +33,7 @@ EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episode
 
 @dataclass(frozen=True)
 class Look:
-    """The colours and the size of a robot's pictures.
-
-    Attributes:
-        size: side of the square pictures in px.
-        block, pusher, raised: colour names.
-    """
+    """The side of a robot's square pictures in px, and the names of their colours."""
 
     size: int
     block: str
@@ -52,22 +47,19 @@ FAST_STEPS, SLOW_TICKS = 80, 720
 LEAST_S, REST_S = 4.0, 0.6  # shortest episode, and time recorded after success
 
 
-def record_pusht(
-    out: Path, robot: str, episodes: int, seed: int = 0, on_progress: Progress | None = None
-) -> Path:
-    """Record `pusht_fast` as `out/pusht_fast.hdf5`, or `pusht_slow` as MCAP files in `out/pusht_slow/`.
+def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
+    """Record `pusht_fast` as a file of robomimic's layout, `pusht_slow` as a folder of MCAP files.
 
-    The same arguments give the same bytes. See `hma_data.lab.record`.
+    See `hma_data.lab`.
     """
-    if robot not in _WRITERS:
-        raise UsageError(robot, "is not a robot of gym-pusht", f"known: {', '.join(_WRITERS)}")
-    name, write = _WRITERS[robot]
-    with written_beside(Path(out) / name) as part:
-        write(part, episodes, seed, on_progress)
-    return Path(out) / name
-
-
-record = record_pusht
+    if robot == "pusht_fast":
+        kwargs = {"observation_width": FAST_LOOK.size, "observation_height": FAST_LOOK.size}
+        env_args = {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs}
+        write_hdf5(part, (_fast_demo(seed, episode) for episode in episodes), env_args)
+    else:
+        part.mkdir()
+        for episode in episodes:
+            _slow_bag(part / f"episode_{episode:04d}.mcap", seed, episode)
 
 
 class Arena:
@@ -83,9 +75,11 @@ class Arena:
     """
 
     def __init__(self, look: Look, start: str, rng: np.random.Generator) -> None:
-        environment, color = _environment()
-        self._env = environment(obs_type="state", observation_width=look.size, observation_height=look.size)
-        self._colors = {True: color(look.raised), False: color(look.pusher)}
+        with imported("gym-pusht", "pip install 'gym-pusht>=0.1.8'"):
+            from gym_pusht.envs.pusht import PushTEnv
+            from pygame import Color
+        self._env = PushTEnv(obs_type="state", observation_width=look.size, observation_height=look.size)
+        self._colors = {True: Color(look.raised), False: Color(look.pusher)}
         self._env.reset(seed=int(rng.integers(2**31)))
         bars = sorted(sorted(shape.get_vertices()) for shape in self._env.block.shapes)  # a set has no order
         boxes = [(np.min(corners, axis=0), np.max(corners, axis=0)) for corners in bars]
@@ -97,7 +91,7 @@ class Arena:
         if start == "near":
             self._env.reset(options={"reset_to_state": self._near_goal(rng)})
         for shape in self._env.block.shapes:
-            shape.color = color(look.block)
+            shape.color = Color(look.block)
         self.raised = False
         self.lift(False)
         self.ticks, self.reward, self.success = 0, 0.0, False
@@ -156,17 +150,9 @@ class Arena:
         self.success = self.success or bool(info["is_success"])
 
 
-def _environment() -> tuple[Any, Any]:
-    """Return the environment's class and pygame's Color."""
-    with imported("gym-pusht", "pip install 'gym-pusht>=0.1.8'"):
-        from gym_pusht.envs.pusht import PushTEnv
-        from pygame import Color
-    return PushTEnv, Color
-
-
 def _begin(
     look: Look, robot: int, seed: int, episode: int, fly: bool
-) -> tuple[Arena, Policy, np.random.Generator]:
+) -> tuple[Arena, Planned | Wandering, np.random.Generator]:
     rng = np.random.default_rng((seed, robot, episode))
     start = STARTS[episode % len(STARTS)]
     arena = Arena(look, start, rng)
@@ -182,61 +168,35 @@ def _within(target: Floats) -> Floats:
 # -- pusht_fast
 
 
-def _write_fast(path: Path, episodes: int, seed: int, on_progress: Progress | None) -> None:
-    from hma_data.lab.write_hdf5 import Demo, write_demos
-
-    def demos() -> Iterator[Demo]:
-        for episode in range(episodes):
-            yield _fast_demo(seed, episode)
-            if on_progress:
-                on_progress(episode + 1, episodes)
-
-    kwargs = {"observation_width": FAST_LOOK.size, "observation_height": FAST_LOOK.size}
-    write_demos(path, demos(), {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs})
-
-
-def _fast_demo(seed: int, episode: int) -> Any:
-    from hma_data.lab.write_hdf5 import Demo
-
+def _fast_demo(seed: int, episode: int) -> Demo:
     arena, policy, _ = _begin(FAST_LOOK, 0, seed, episode, fly=False)
     period, setpoint, stop = 0.1, arena.agent, FAST_STEPS
-    images, positions, states, rewards = [], [], [], []
-    actions: list[NDArray[np.float32]] = []
-    while len(actions) < stop:
-        images.append(arena.picture())
-        positions.append(arena.agent)
-        states.append(arena.state)
+    rows: list[tuple[Any, ...]] = []
+    while len(rows) < stop:
+        seen = arena.picture(), arena.agent, arena.state
         if arena.success:
             action = _within(setpoint).astype(np.float32)
         else:
             ahead, _ = policy.act(arena.pose, arena.agent, period)
             action = _within(ahead + (ahead - setpoint) * ((LAG_S - period / 2) / period)).astype(np.float32)
             setpoint = ahead
-        actions.append(action)
         before = arena.success
         arena.advance(action.astype(np.float64), 10)
-        rewards.append(arena.reward)
+        rows.append((*seen, action, arena.reward))
         if arena.success and not before:
-            stop = min(stop, max(round(LEAST_S / period), len(actions) + round(REST_S / period)))
+            stop = min(stop, max(round(LEAST_S / period), len(rows) + round(REST_S / period)))
+    images, positions, states, actions, rewards = map(np.stack, zip(*rows, strict=True))
     return Demo(
-        actions=np.stack(actions),
-        observations={"image": np.stack(images), "agent_pos": np.stack(positions)},
-        states=np.stack(states),
-        rewards=np.array(rewards),
+        actions=actions,
+        observations={"image": images, "agent_pos": positions},
+        states=states,
+        rewards=rewards,
         success=arena.success,
         facts={"start": STARTS[episode % len(STARTS)], "seed": seed},
     )
 
 
 # -- pusht_slow
-
-
-def _write_slow(path: Path, episodes: int, seed: int, on_progress: Progress | None) -> None:
-    path.mkdir()
-    for episode in range(episodes):
-        _slow_bag(path / f"episode_{episode:04d}.mcap", seed, episode)
-        if on_progress:
-            on_progress(episode + 1, episodes)
 
 
 def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
@@ -248,7 +208,7 @@ def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
 
 
 def _slow_bag(path: Path, seed: int, episode: int) -> None:
-    from hma_data.lab.write_mcap import Message, joints, picture, twist, write_messages
+    import cv2
 
     arena, policy, rng = _begin(SLOW_LOOK, 1, seed, episode, fly=True)
     setpoint, stop = arena.agent, SLOW_TICKS
@@ -267,23 +227,32 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
         stamp = EPOCH_NS + episode * 60_000_000_000 + tick * round(TICK_S * 1e9)
         if event == "camera":
             late = stamp + int(rng.integers(12_000_000, 20_000_000))
-            messages.append(picture("/camera/image/compressed", stamp, late, arena.picture(), "camera"))
+            _, png = cv2.imencode(".png", arena.picture()[..., ::-1])
+            fields = {"format": "png", "data": png.reshape(-1)}
+            kind = "sensor_msgs/msg/CompressedImage"
+            messages.append(Message("/camera/image/compressed", stamp, late, kind, "camera", fields))
         elif event == "joints":
             late = stamp + int(rng.integers(500_000, 2_000_000))
             place, motion = np.append(arena.agent, arena.raised), np.append(arena.velocity, 0.0)
-            messages.append(joints("/joint_states", stamp, late, ("x", "y", "lift"), place, motion, "arena"))
+            fields = {
+                "name": ["x", "y", "lift"],
+                "position": place,
+                "velocity": motion,
+                "effort": np.empty(0),
+            }
+            kind = "sensor_msgs/msg/JointState"
+            messages.append(Message("/joint_states", stamp, late, kind, "arena", fields))
         else:
             ahead, up = policy.act(arena.pose, arena.agent, 0.2)
             velocity = np.zeros(2) if arena.success else (ahead - setpoint) / 0.2
             up = up and not arena.success
             arena.lift(up)
             late = stamp + int(rng.integers(500_000, 2_000_000))
-            messages.append(twist("/command", stamp, late, np.append(velocity, up), "arena"))
+            vector = "geometry_msgs/msg/Vector3"
+            linear = ros_value(vector, *np.append(velocity, up).tolist())
+            turn = ros_value(vector, 0.0, 0.0, 0.0)
+            fields = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
+            kind = "geometry_msgs/msg/TwistStamped"
+            messages.append(Message("/command", stamp, late, kind, "arena", fields))
     facts = {"success": str(arena.success).lower(), "start": STARTS[episode % len(STARTS)], "seed": str(seed)}
-    write_messages(path, messages, {"robot": "pusht_slow", **facts})
-
-
-_WRITERS: dict[str, tuple[str, Callable[[Path, int, int, Progress | None], None]]] = {
-    "pusht_fast": ("pusht_fast.hdf5", _write_fast),
-    "pusht_slow": ("pusht_slow", _write_slow),
-}
+    write_mcap(path, messages, {"robot": "pusht_slow", **facts})

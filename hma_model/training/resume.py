@@ -122,7 +122,7 @@ def require_version(path: Path) -> None:
 
 
 @dataclass(frozen=True)
-class Kept:
+class TrainingState:
     """The content of a checkpoint for a run, read completely before the model changes."""
 
     state: State
@@ -151,7 +151,7 @@ class Kept:
         model.load_state_dict(weights, strict=False)
 
 
-def read_kept(checkpoint: Checkpoint, embodiments: Iterable[str]) -> Kept:
+def read_training_state(checkpoint: Checkpoint, embodiments: Iterable[str]) -> TrainingState:
     """Read the content of a checkpoint for a run; embodiments that the checkpoint lacks are left out.
 
     Raises:
@@ -175,7 +175,7 @@ def read_kept(checkpoint: Checkpoint, embodiments: Iterable[str]) -> Kept:
         checkpoint.check(name)
         shown[name] = tuple(read_tensors(checkpoint.path(name, part)) for part in (STEM, HEAD))
     weights = _own_file(checkpoint, WEIGHTS, files) if WEIGHTS in files else {}
-    return Kept(state, shown, weights, _own_file(checkpoint, OPTIMIZER, files))
+    return TrainingState(state, shown, weights, _own_file(checkpoint, OPTIMIZER, files))
 
 
 def _own_file(checkpoint: Checkpoint, name: str, hashes: Mapping[str, str]) -> "dict[str, Tensor]":

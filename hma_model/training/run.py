@@ -52,11 +52,11 @@ from hma_model.training.optim import (
 from hma_model.training.parallel import ParallelModel, World, gathered
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
-    Kept,
     OtherVersionError,
     State,
+    TrainingState,
     data_digests,
-    read_kept,
+    read_training_state,
     require_network,
     require_version,
     seed_for,
@@ -176,7 +176,7 @@ class Run:
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
 
-    def prepare(self, kept: Kept | None) -> None:
+    def prepare(self, kept: TrainingState | None) -> None:
         """Distribute the model over the ranks, and make its optimizer and average, from `kept` if given."""
         if self.recipe.compile:
             for block in self.model.trunk.blocks:
@@ -386,7 +386,7 @@ class Run:
 
     # -- resuming
 
-    def resume(self, force: bool) -> Kept | None:
+    def resume(self, force: bool) -> TrainingState | None:
         """Load the newest readable checkpoint, and return its content for `prepare`; None without any.
 
         Raises:
@@ -410,10 +410,10 @@ class Run:
         self.world.once(self._describe)
         return kept
 
-    def _load(self, path: Path, force: bool) -> Kept:
+    def _load(self, path: Path, force: bool) -> TrainingState:
         require_version(path)
         checkpoint = Checkpoint.open(path)
-        kept = read_kept(checkpoint, self.sets)
+        kept = read_training_state(checkpoint, self.sets)
         state = kept.state
         if not force:
             state.require_same(self.recipe.identity(), self.digests, self.out)

@@ -70,11 +70,9 @@ def rows(video: str, length: int, seen: Seen = always) -> list[dict[str, Any]]:
 
 
 def write_table(path: Path, table: list[dict[str, Any]]) -> Path:
-    """A table as parquet, CSV or JSON, by the file's name."""
+    """A table as parquet or CSV, by the file's name."""
     if path.suffix == ".parquet":
         pq.write_table(pa.Table.from_pylist(table), path)
-    elif path.suffix == ".json":
-        path.write_text(json.dumps(table))
     else:
         lines = [",".join(table[0]), *(",".join(map(str, row.values())) for row in table)]
         path.write_text("\n".join(lines) + "\n")

@@ -11,8 +11,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hma_data.errors import EpisodeError
-from hma_data.inspection.doctor import examine
-from hma_data.inspection.inspect import inspect_recording
+from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.training.frames import recording_frames

@@ -11,7 +11,7 @@ from skimage import data as skimage_data
 from typer.testing import CliRunner
 
 from hma_data.conversion.job import convert
-from hma_data.inspection.doctor import Finding, examine
+from hma_data.inspection.inspect import Finding, examine
 from hma_model.cli import app
 from tests.conftest import ARM_YAML
 

@@ -14,7 +14,7 @@ from hma_data.conversion.job import Summary, convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import restat
 from hma_data.errors import OutputError
-from hma_data.inspection.doctor import examine
+from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, Manifest
 from hma_data.shards.verify import verify

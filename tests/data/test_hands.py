@@ -63,7 +63,7 @@ def check_run(folder: Path, robot, episode_id: str, frames: range) -> None:
 # -- every form of label gives the same episode
 
 
-@pytest.mark.parametrize("name", ["hands.parquet", "hands.csv", "hands.json", "landmarks.parquet"])
+@pytest.mark.parametrize("name", ["hands.parquet", "hands.csv", "landmarks.parquet"])
 def test_a_table_in_any_form(folder: Path, name: str) -> None:
     made.write_table(folder / name, made.rows("a.mp4", LENGTH))
     check_run(folder, made.hand_video("landmarks"), "a.mp4#0", range(LENGTH))
@@ -85,11 +85,9 @@ def test_boxes_and_landmarks_of_a_table_give_centres_and_wrists(folder: Path) ->
         x, y = row.pop("x"), row.pop("y")
         points = np.array([[x + 0.01 * ((i % 5) - 2), y + 0.02 * ((i % 3) - 1)] for i in range(21)])
         box = dict(zip(("left", "top", "right", "bottom"), (x - 0.02, y - 0.02, x + 0.02, y + 0.02)))
-        spread = {f"{axis}{i}": points[i, j] for i in range(21) for j, axis in enumerate("xy")}
-        table.append((row | box, row | {"landmarks": points.reshape(-1).tolist()}, row | spread))
+        table.append((row | box, row | {"landmarks": points.reshape(-1).tolist()}))
     read = []
-    for number, name in enumerate(("boxes.csv", "lists.parquet", "lists.json", "columns.csv")):
-        form = (0, 1, 1, 2)[number]
+    for form, name in enumerate(("boxes.csv", "lists.parquet")):
         made.write_table(folder / name, [forms[form] for forms in table])
         robot = made.hand_video("landmarks", annotations=name)
         check_run(folder, robot, "a.mp4#0", range(LENGTH))
@@ -109,19 +107,10 @@ def test_epic_kitchens_as_published(folder: Path, protocol: int) -> None:
     check_run(folder, made.hand_video("epic_kitchens_hand_objects"), "a.mp4#0", range(LENGTH))
 
 
-def test_epic_kitchens_as_a_stream_of_messages(folder: Path) -> None:
-    messages = made.epic_messages(LENGTH)
-    (folder / "a.pb").write_bytes(b"".join(made.varint(len(each)) + each for each in messages))
-    check_run(folder, made.hand_video("epic_kitchens_hand_objects"), "a.mp4#0", range(LENGTH))
-
-
-def test_epic_kitchens_as_a_table_counts_from_one(folder: Path) -> None:
-    table = [
-        {"video_id": "a", "frame_number": row["frame"] + 1} | {key: row[key] for key in ("side", "x", "y")}
-        for row in made.rows("a", LENGTH)
-    ]
-    made.write_table(folder / "a.csv", table)
-    check_run(folder, made.hand_video("epic_kitchens_hand_objects"), "a.mp4#0", range(LENGTH))
+def test_a_table_whose_frames_count_from_one(folder: Path) -> None:
+    table = [row | {"frame": row["frame"] + 1} for row in made.rows("a", LENGTH)]
+    made.write_table(folder / "hands.csv", table)
+    check_run(folder, made.hand_video("landmarks", first_frame="1"), "a.mp4#0", range(LENGTH))
 
 
 def test_of_two_left_hands_the_surer_counts_and_doubtful_ones_do_not(folder: Path) -> None:

@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from hma_data.errors import MissingDependencyError, OutputError, UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
-from hma_data.lab.pusht import SLOW_LOOK, Arena, record_pusht
+from hma_data.lab.pusht import SLOW_LOOK, Arena
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import shipped
@@ -283,8 +283,6 @@ def test_folder_that_cannot_be_made_is_an_output_error(tmp_path: Path) -> None:
 def test_unknown_robot_names_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="pusht_fast, pusht_slow"):
         record("pusht_medium", tmp_path, 1)
-    with pytest.raises(UsageError, match="pusht_fast, pusht_slow"):
-        record_pusht(tmp_path, "pusht_medium", 1)
 
 
 def test_no_episodes_is_refused(tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ from typer.testing import CliRunner
 
 from hma_data.conversion.job import convert
 from hma_data.errors import HMAError, OutputError, SourceError, StorageError, UsageError
-from hma_data.inspection.doctor import examine
-from hma_data.inspection.inspect import inspect_recording
+from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import detect, of_another_format, open_source
 from hma_model.cli import app

@@ -1,10 +1,11 @@
-"""Find hands in pictures: the contract of a detector, and MediaPipe's pipeline over LiteRT.
+"""Find hands in pictures with MediaPipe's two models, run by LiteRT on one thread.
 
-The palm model searches the whole picture. Each palm gives a rotated square for the landmark model, and the
-landmarks give the square of the next picture. So the palm model runs only while fewer than two hands are
-tracked. The constants are those of MediaPipe's published graphs (palm_detection_cpu,
-palm_detection_detection_to_roi, hand_landmark_cpu, hand_landmark_landmarks_to_roi,
-hand_landmark_tracking_cpu).
+The palm model searches the whole picture (192×192) and gives 2016 × 18 values and 2016 scores. Each palm
+gives a rotated square for the landmark model (224×224), which gives 21 points, the presence of a hand and its
+handedness. The points give the square of the next picture, so the palm model runs only while fewer than two
+hands are tracked. The constants are those of MediaPipe's published graphs: palm_detection_cpu,
+palm_detection_detection_to_roi, hand_landmark_cpu, hand_landmark_landmarks_to_roi and
+hand_landmark_tracking_cpu.
 
 Left and right are the person's own hands in a picture that is not mirrored. MediaPipe's graph assumes
 mirrored pictures, as front cameras show them, and so calls a right hand in a plain picture "Left". The
@@ -13,32 +14,136 @@ model's number itself is the probability of a right hand in a plain picture.
 Geometry is in pixels, angles in radians, x to the right and y down.
 """
 
+import hashlib
 import math
+import os
+import zipfile
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import Images, opencv
-from hma_data.sources.hands.models import (
-    ANCHORS,
-    HAND_SIDE,
-    PALM_SIDE,
-    HandModels,
-    hand_network,
-    load_models,
-    palm_network,
-)
+from hma_data.errors import MissingDependencyError, SourceError
+from hma_data.storage.paths import StrPath, as_text
 
 Floats = NDArray[np.float64]
 
+ENVIRONMENT = "HMA_HAND_MODELS"
+PALM_SIDE, HAND_SIDE = 192, 224  # pixels of each model's input
+ANCHORS = 2016
 HANDS = 2  # tracked at most
 PALM_SCORE, SUPPRESSION, PRESENCE, SAME = 0.5, 0.3, 0.5, 0.5
 VERSION = 1  # part of the key of cached detections: raise it when the same picture may give other points
 _KNUCKLES = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # the points that give the next picture's square
 _SURE = 0.8  # probability of a side; a second hand of that side with less becomes the other hand
+_PALM = ("palm_detection_full.tflite", "palm_detection_lite.tflite", "hand_detector.tflite")
+_HAND = ("hand_landmark_full.tflite", "hand_landmark_lite.tflite", "hand_landmarks_detector.tflite")
+_REMEDY = (
+    "give source.layout.models (or the environment variable HMA_HAND_MODELS) a folder with MediaPipe's "
+    "palm_detection_full.tflite and hand_landmark_full.tflite, or the path of hand_landmarker.task"
+)
+
+# -- the models
+
+
+@dataclass(frozen=True)
+class HandModels:
+    """The bytes of both models.
+
+    Attributes:
+        palm, hand: content of the .tflite files.
+        where: what they were read from.
+    """
+
+    palm: bytes
+    hand: bytes
+    where: str
+
+    @property
+    def digest(self) -> str:
+        """Return 16 hex digits hashed from both."""
+        return hashlib.sha256(hashlib.sha256(self.palm).digest() + self.hand).hexdigest()[:16]
+
+
+def load_models(place: StrPath | None = None) -> HandModels:
+    """Return the models in a folder or a bundle (a zip file of both); full ones are preferred to lite ones.
+
+    Args:
+        place: str or path of a folder or .task file; None takes $HMA_HAND_MODELS.
+
+    Raises:
+        SourceError: none are given, or none are there.
+    """
+    place = place or os.environ.get(ENVIRONMENT)
+    if not place:
+        raise SourceError("hand models", "are not given", _REMEDY)
+    path = Path(as_text(place).removeprefix("file://")).expanduser()
+    try:
+        entries = path.iterdir() if path.is_dir() else zipfile.Path(path).iterdir()
+        files: dict[str, Any] = {item.name: item for item in entries}
+        bundle = next((name for name in sorted(files) if name.endswith(".task")), None)
+        if bundle and not files.keys() & {*_PALM, *_HAND}:
+            return load_models(path / bundle)
+        models = []
+        for names in (_PALM, _HAND):
+            name = next((name for name in names if name in files), None)
+            if name is None:
+                raise SourceError(path, f"has none of {', '.join(names)}", _REMEDY)
+            models.append(files[name].read_bytes())
+    except (OSError, zipfile.BadZipFile) as fault:
+        raise SourceError(path, f"holds no hand models: {fault}", _REMEDY) from fault
+    palm, hand = models
+    return HandModels(palm, hand, str(path))
+
+
+class Network:
+    """One model, ready to run.
+
+    Args:
+        content: of the .tflite file.
+        side: pixels of its square input.
+        widths: of the wanted outputs, each the product of its shape; equal ones in the order of names.
+        where: for errors.
+
+    Raises:
+        SourceError: it is another model.
+        MissingDependencyError: LiteRT is not installed.
+    """
+
+    def __init__(self, content: bytes, side: int, widths: Sequence[int], where: str) -> None:
+        try:
+            interpreter = import_module("ai_edge_litert.interpreter").Interpreter
+        except ImportError as fault:
+            remedy = "pip install 'hma-toolkit[hands]'"
+            raise MissingDependencyError("ai-edge-litert", f"is not installed ({fault})", remedy) from fault
+        try:
+            self._interpreter = interpreter(model_content=content, num_threads=1)
+            self._interpreter.allocate_tensors()
+        except (ValueError, RuntimeError) as fault:
+            raise SourceError(where, f"cannot be run: {fault}", _REMEDY) from fault
+        (given, *_) = self._interpreter.get_input_details()
+        outputs: dict[int, list[int]] = defaultdict(list)
+        for item in sorted(self._interpreter.get_output_details(), key=lambda item: str(item["name"])):
+            outputs[math.prod(item["shape"].tolist())].append(item["index"])
+        if given["shape"].tolist() != [1, side, side, 3] or not set(widths) <= set(outputs):
+            fault_text = f"is another model: takes {given['shape'].tolist()}, gives {sorted(outputs)} values"
+            raise SourceError(where, fault_text, _REMEDY)
+        self._input, self._outputs = given["index"], [outputs[width].pop(0) for width in widths]
+
+    def __call__(self, picture: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        """Return the flat outputs for a picture (side, side, 3) of values 0..1."""
+        self._interpreter.set_tensor(self._input, picture[None])
+        self._interpreter.invoke()
+        return [self._interpreter.get_tensor(index).reshape(-1) for index in self._outputs]
+
+
+# -- tracking
 
 
 @dataclass(frozen=True)
@@ -57,18 +162,6 @@ class Hand:
     points: Floats
 
 
-class Detector(Protocol):
-    """Find at most one left and one right hand in each picture of a video, in order."""
-
-    def reset(self) -> None:
-        """Forget the pictures before: the next one is of another video."""
-        ...
-
-    def detect(self, picture: Images) -> list[Hand]:
-        """Return the hands in a picture (H, W, 3) RGB."""
-        ...
-
-
 @dataclass(frozen=True)
 class Square:
     """A rotated square of a picture: centre, side and clockwise angle."""
@@ -83,15 +176,10 @@ class Square:
         scale = self.side / size
         cos, sin = math.cos(self.angle) * scale, math.sin(self.angle) * scale
         half = size / 2
-        return np.array(
-            [
-                [cos, -sin, self.x - half * (cos - sin)],
-                [sin, cos, self.y - half * (sin + cos)],
-            ]
-        )
+        return np.array([[cos, -sin, self.x - half * (cos - sin)], [sin, cos, self.y - half * (sin + cos)]])
 
 
-@dataclass
+@dataclass(frozen=True)
 class Track:
     """A tracked hand.
 
@@ -105,18 +193,12 @@ class Track:
     right: float = 0.0
     seen: int = 0
 
-    @property
-    def p_right(self) -> float:
-        """Return the mean P(right) over all pictures so far, because single values flicker."""
-        return self.right / self.seen if self.seen else 0.5
-
 
 class MediaPipeHands:
-    """Run MediaPipe's palm and landmark models.
+    """A detector of at most one left and one right hand in each picture of a video, in order.
 
     Args:
         models: their files; None takes $HMA_HAND_MODELS.
-        presence: least score of a hand.
         mirrored: the pictures are mirrored, as front cameras show them.
 
     Raises:
@@ -124,46 +206,47 @@ class MediaPipeHands:
         MissingDependencyError: LiteRT is not installed.
     """
 
-    def __init__(
-        self, models: HandModels | None = None, presence: float = PRESENCE, mirrored: bool = False
-    ) -> None:
+    def __init__(self, models: HandModels | None = None, mirrored: bool = False) -> None:
         models = models or load_models()
-        self._palm, self._hand = palm_network(models), hand_network(models)
-        self._presence, self._mirrored = presence, mirrored
+        widths = (ANCHORS * 18, ANCHORS)
+        self._palm = Network(models.palm, PALM_SIDE, widths, f"{models.where}: palm model")
+        self._hand = Network(models.hand, HAND_SIDE, (63, 1, 1), f"{models.where}: landmark model")
+        self._mirrored = mirrored
         self._anchors = palm_anchors()
         self._tracks: list[Track] = []
 
     def reset(self) -> None:
-        """See Detector."""
+        """Forget the pictures before: the next one is of another video."""
         self._tracks = []
 
     def detect(self, picture: Images) -> list[Hand]:
-        """See Detector."""
+        """Return the hands in a picture (H, W, 3) RGB."""
         height, width = picture.shape[:2]
-        tracks = list(self._tracks)
+        tracks = self._tracks
         if len(tracks) < HANDS:
-            tracks += self._new_tracks(picture, [track.square for track in tracks])
+            tracks = tracks + self._new_tracks(picture, [track.square for track in tracks])
         found: list[tuple[Track, float, Floats]] = []
         for track in tracks:
             score, points, p_right = self._look(picture, track.square)
-            if score < self._presence or any(_same(points, other) for _, _, other in found):
+            if score < PRESENCE or any(_same(points, other) for _, _, other in found):
                 continue
             square = square_of_points(points)
             found.append((Track(square, track.right + p_right, track.seen + 1), score, points))
         found = found[:HANDS]
         self._tracks = [track for track, _, _ in found]
-        sides = choose_sides([track.p_right for track in self._tracks])
+        # A hand's side is the mean over all pictures so far, because single values flicker.
+        sides = choose_sides([track.right / track.seen for track in self._tracks])
         return [
             Hand(side, score, points / (width, height))
-            for side, (_, score, points) in zip(sides, found)
+            for side, (_, score, points) in zip(sides, found, strict=True)
             if side
         ]
 
     def _new_tracks(self, picture: Images, known: list[Square]) -> list[Track]:
-        squares = [square_of_palm(palm) for palm in self.palms(picture)[:HANDS]]
+        squares = [square_of_palm(palm) for palm in self._palms(picture)[:HANDS]]
         return [Track(square) for square in squares if not any(_overlap(square, old) > SAME for old in known)]
 
-    def palms(self, picture: Images) -> list[Floats]:
+    def _palms(self, picture: Images) -> list[Floats]:
         """Return the palms in a picture, the surest first: (9, 2) two corners and seven points in pixels."""
         height, width = picture.shape[:2]
         whole = Square(width / 2, height / 2, max(width, height), 0.0)
@@ -182,11 +265,7 @@ class MediaPipeHands:
 
 
 def choose_sides(p_right: Sequence[float]) -> list[str | None]:
-    """Return a side for each hand, with at most one hand a side; None for a surplus hand.
-
-    Args:
-        p_right: P(right) of at most two hands.
-    """
+    """Return a side for P(right) of each of at most two hands; None for the surplus hand of one side."""
     sides: list[str | None] = ["right" if p >= 0.5 else "left" for p in p_right]
     if len(sides) == 2 and sides[0] == sides[1]:
         doubtful = int(abs(p_right[1] - 0.5) <= abs(p_right[0] - 0.5))

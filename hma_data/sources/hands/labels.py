@@ -1,43 +1,49 @@
 """Read annotations of hands in videos, by video.
 
-- `landmarks`: the toolkit's own table, see hands_table.
-- `epic_kitchens_hand_objects`: EPIC-KITCHENS-100, one file a video, see hands_epic.
+- `landmarks`: the toolkit's own table, see HandTable.
+- `epic_kitchens_hand_objects`: EPIC-KITCHENS-100's published hand-object detections, one pickle a video.
 - `ego4d_fho`: Ego4D's fho_main.json. Boxes (x, y, width, height in pixels) of left_hand and
   right_hand in a few frames of each narrated action; rejected and invalid actions are left out.
 - `egoexo4d_hand_pose`: Ego-Exo4D's ego_pose/<split>/hand/{automatic,annotation}/<take>.json: frame number ->
   joints of one camera in pixels. A take's videos lie in a folder with the take's name.
 
-A file of another form raises one clear error. JSON is parsed once, and only arrays stay in memory.
+A file of another form raises one clear error. JSON is parsed once, and only arrays stay in memory. Nothing is
+unpickled: the instructions of EPIC-KITCHENS's files are read one by one, and only a list of byte strings is
+accepted.
+
+R rows of a table, one a hand.
 """
 
 import json
+import pickletools
 import re
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import first_bytes, local_path
-from hma_data.sources.hands.epic import PICKLES, STREAMS, epic_labels
 from hma_data.sources.hands.layout import HandsLayout, Video
 from hma_data.sources.hands.runs import SIDES, HandLabels, labels_from_rows
-from hma_data.sources.hands.table import SUFFIXES, HandTable
 
-LARGEST = 8 << 30  # bytes of a JSON file; fho_main.json has several hundred MB
-_FHO = "give fho_main.json of the annotations that Ego4D's command fetches (benchmark FHO)"
+PICKLES, TABLES = (".pkl", ".pickle"), (".parquet", ".csv")
 _FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 JOINTS = ("wrist", *(f"{finger}_{i}" for finger in _FINGERS for i in (1, 2, 3, 4)))
+_FHO = "give fho_main.json of the annotations that Ego4D's command fetches (benchmark FHO)"
 
 
 class LabelSet(Protocol):
-    """The labels of a set of videos."""
+    """The labels of a set of videos.
 
-    def known(self) -> list[str]:
-        """Return the names that the labels use for their videos."""
-        ...
+    Attributes:
+        known: the names that the labels use for their videos.
+    """
+
+    known: list[str]
 
     def of(self, video: Video) -> HandLabels | None:
         """Return the labels of a video; None where it has none.
@@ -60,26 +66,23 @@ def open_labels(layout: HandsLayout, uri: str) -> LabelSet:
     if not root.exists():
         raise SourceError(root, "does not exist", "correct source.layout.annotations")
     if layout.labels == "landmarks":
-        return HandTable(_one_file(root, ("hands", "landmarks"), SUFFIXES), layout)
+        names = [stem + suffix for stem in ("hands", "landmarks") for suffix in TABLES]
+        return HandTable(_one_file(root, names), layout)
     if layout.labels == "ego4d_fho":
-        return Ego4dFho(_one_file(root, ("fho_main",), (".json",)), layout)
+        return Ego4dFho(_one_file(root, ["fho_main.json"]), layout)
     if layout.labels == "egoexo4d_hand_pose":
         return EgoExoHands(_label_files(root, (".json",)), layout, root)
-    if root.is_file() and root.suffix.lower() in SUFFIXES:
-        return HandTable(root, layout)
-    return EpicHands(_label_files(root, (*PICKLES, *STREAMS, *SUFFIXES)), layout, root)
+    return EpicHands(_label_files(root, PICKLES), layout)
 
 
-def _one_file(root: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Path:
+def _one_file(root: Path, names: list[str]) -> Path:
     if root.is_file():
         return root
-    names = [f"{stem}{suffix}" for stem in stems for suffix in suffixes]
     found = sorted(path for path in root.rglob("*") if path.name in names and path.is_file())
     if len(found) != 1:
-        fault = f"holds {len(found)} files called {' or '.join(names)}" if found else "holds no labels"
-        raise SourceError(
-            root, fault, f"give source.layout.annotations; looked for {', '.join(names)} in all folders"
-        )
+        fault = f"holds {len(found)} files of labels" if found else "holds no labels"
+        remedy = f"give source.layout.annotations; looked for {', '.join(names)} in all folders"
+        raise SourceError(root, fault, remedy)
     return found[0]
 
 
@@ -92,51 +95,217 @@ def _label_files(root: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     for path in sorted(hands or files, key=lambda item: "automatic" not in item.parts):
         found.setdefault(path.stem, path)
     if not found:
-        raise SourceError(
-            root, "holds no labels", f"looked for {', '.join(suffixes)}; give source.layout.annotations"
-        )
+        remedy = f"give source.layout.annotations; looked for {', '.join(suffixes)}"
+        raise SourceError(root, "holds no labels", remedy)
     return found
 
 
-class EpicHands:
-    """Labels of EPIC-KITCHENS-100: `P01_01.MP4` has its labels in `P01_01.pkl`."""
+# -- the toolkit's own table
 
-    def __init__(self, files: dict[str, Path], layout: HandsLayout, root: Path) -> None:
-        self._files, self._layout = files, layout
+_FORMS: dict[str, tuple[str, ...]] = {
+    "box": ("left", "top", "right", "bottom"),
+    "center": ("x", "y"),
+    "wrist": ("wrist_x", "wrist_y"),
+}
 
-    def known(self) -> list[str]:
-        """See LabelSet."""
-        return list(self._files)
+
+class HandTable:
+    """A table of hands, by video: parquet or CSV, one row a hand.
+
+    | column | meaning |
+    |---|---|
+    | video | the video's path below the folder, with or without its suffix, or its bare name |
+    | frame | index of the frame in the video, from 0 (or from source.layout.first_frame) |
+    | side | left or right, the person's own hand |
+    | score | optional: rows below source.layout.min_score are ignored |
+
+    and one of these, as fractions of the picture's width and height (x to the right, y down):
+
+    | columns | gives |
+    |---|---|
+    | landmarks | 42 numbers, x and y of MediaPipe's 21 points (0 is the wrist): landmarks, center, wrist |
+    | left, top, right, bottom | a box: center |
+    | x, y | center; with wrist_x, wrist_y beside them or alone: wrist |
+
+    A value that is not finite says that there is no hand.
+
+    Args:
+        path: of the file.
+        layout: of the source.
+
+    Raises:
+        SourceError: it cannot be read, lacks a column, or has another kind of value.
+    """
+
+    def __init__(self, path: Path, layout: HandsLayout) -> None:
+        import pyarrow as pa
+        import pyarrow.csv
+        import pyarrow.parquet as pq
+
+        try:
+            if path.suffix.lower() == ".csv":
+                text = dict.fromkeys(("video", "side"), pa.string())
+                options = pyarrow.csv.ConvertOptions(column_types=text)
+                table = pyarrow.csv.read_csv(path, convert_options=options)
+            else:
+                table = pq.read_table(path)
+            columns = dict(zip(table.column_names, table.columns, strict=True))
+            absent = [name for name in ("video", "frame", "side") if name not in columns]
+            if absent or not table.num_rows:
+                fault = f"has no column {absent[0]!r}" if absent else "has no rows"
+                raise SourceError(path, fault, f"its columns: {', '.join(columns)}")
+            numbers = _numbers(columns["frame"])
+            self._scores = _numbers(columns["score"]) if "score" in columns else np.ones(len(numbers))
+            self._parts = _parts(columns, path)
+        except (pa.ArrowException, OSError, ValueError) as fault:
+            said = " ".join(f"cannot be read: {fault}".split())
+            raise SourceError(path, said, "write the table again as parquet or CSV") from fault
+        sides = columns["side"].to_pylist()
+        if unknown := set(sides) - set(SIDES):
+            raise SourceError(path, f"column 'side' holds {unknown.pop()!r}", "allowed: left, right")
+        self._sides = np.array([SIDES.index(side) for side in sides], np.int64)
+        good = np.isfinite(numbers) & ~(self._scores < layout.min_score)
+        self._frames = np.where(good, numbers, 0).astype(np.int64) - layout.frame_offset
+        names, number = np.unique(np.array(columns["video"].to_pylist(), str), return_inverse=True)
+        order = np.argsort(number, kind="stable")
+        ends = np.cumsum(np.bincount(number))
+        self._rows = {
+            str(name): rows[good[rows]] for name, rows in zip(names, np.split(order, ends[:-1]), strict=True)
+        }
+        self.known = list(self._rows)
 
     def of(self, video: Video) -> HandLabels | None:
         """See LabelSet."""
+        name = next((alias for alias in video.aliases if alias in self._rows), None)
+        if name is None:
+            return None
+        rows = self._rows[name]
+        parts = {part: values[rows] for part, values in self._parts.items()}
+        return labels_from_rows(self._frames[rows], self._sides[rows], self._scores[rows], parts)
+
+
+def _numbers(column: Any) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = column.cast("float64").to_numpy()
+    return np.where(np.abs(values) < 1e9, values, np.nan)
+
+
+def _parts(columns: dict[str, Any], path: Path) -> dict[str, NDArray[np.float64]]:
+    """Return center, wrist or landmarks -> (R, 2 or 42), by the columns there are."""
+    if "landmarks" in columns:
+        rows = [[np.nan] * 42 if row is None else row for row in columns["landmarks"].to_pylist()]
+        return {"landmarks": np.array(rows, np.float64).reshape(len(rows), 42)}
+    found = {
+        part: np.stack([_numbers(columns[name]) for name in names], axis=1)
+        for part, names in _FORMS.items()
+        if all(name in columns for name in names)
+    }
+    if "box" in found:
+        box = found.pop("box")
+        found["center"] = (box[:, :2] + box[:, 2:]) / 2
+    if not found:
+        forms = "; ".join(", ".join(names) for names in _FORMS.values())
+        raise SourceError(path, "has no columns that place a hand", f"give landmarks, or one of: {forms}")
+    return found
+
+
+# -- EPIC-KITCHENS-100
+
+
+class EpicHands:
+    """Labels of EPIC-KITCHENS-100: `P01_01.MP4` has its labels in `P01_01.pkl`.
+
+    A file is a pickled list of byte strings, each a protobuf message of one frame (types.proto of
+    epic-kitchens/epic-kitchens-100-hand-object-bboxes). Boxes are fractions of the picture.
+    """
+
+    def __init__(self, files: dict[str, Path], layout: HandsLayout) -> None:
+        self._files, self._layout = files, layout
+        self.known = list(files)
+
+    def of(self, video: Video) -> HandLabels | None:
+        """See LabelSet."""
+        from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+
         path = self._files.get(PurePosixPath(video.name).stem)
         if path is None:
             return None
-        if path.suffix.lower() in SUFFIXES:
-            return HandTable(path, self._layout).of(video)
-        return epic_labels(path, self._layout)
+        looked_at, rows = [], []
+        try:
+            for message in _byte_strings(path.read_bytes(), path):
+                frame = _message_class().FromString(message)
+                index = frame.frame_number - self._layout.frame_offset
+                looked_at.append(index)
+                for hand in frame.hands:
+                    if hand.score >= self._layout.min_score:
+                        box = hand.bbox
+                        centre = ((box.left + box.right) / 2, (box.top + box.bottom) / 2)
+                        rows.append((index, hand.side, hand.score, *centre))
+        except (ValueError, DecodeError) as fault:
+            raise EpisodeError(path, f"is damaged: {fault}", "fetch the file again") from fault
+        table = np.array(rows, np.float64).reshape(-1, 5)
+        frames, sides = table[:, :2].astype(np.int64).T
+        return labels_from_rows(frames, sides, table[:, 2], {"center": table[:, 3:]}, looked_at)
+
+
+def _byte_strings(content: bytes, path: Path) -> Iterator[bytes]:
+    """Yield the byte strings of a pickled list by reading its instructions; nothing in it is run."""
+    kept: dict[int, Any] = {}  # the pickle's memo: values that later instructions refer to
+    last: Any = None
+    for instruction, given, _ in pickletools.genops(content):
+        name, value = instruction.name, cast(Any, given)
+        if name in ("SHORT_BINBYTES", "BINBYTES", "BINBYTES8"):
+            last = value
+            yield value
+        elif name == "EMPTY_LIST":
+            last = None
+        elif name in ("MEMOIZE", "BINPUT", "LONG_BINPUT"):
+            kept[len(kept) if value is None else value] = last
+        elif name in ("BINGET", "LONG_BINGET") and isinstance(kept.get(value), bytes):
+            yield kept[value]
+        elif name not in ("PROTO", "FRAME", "MARK", "APPEND", "APPENDS", "STOP"):
+            fault = f"holds more than byte strings ({name}), and is not opened"
+            raise EpisodeError(path, fault, "write its hands as a table, and set labels: landmarks")
+
+
+@cache
+def _message_class() -> Any:
+    """Return the class of a frame's detections; its field numbers are those of types.proto."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # type: ignore[import-untyped]
+
+    kinds = descriptor_pb2.FieldDescriptorProto
+    real, whole, message = kinds.TYPE_FLOAT, kinds.TYPE_INT32, kinds.TYPE_MESSAGE
+    file = descriptor_pb2.FileDescriptorProto(name="hands.proto", package="hands", syntax="proto3")
+    fields: dict[str, list[tuple[str, int, Any, str]]] = {  # name, number, type, its message
+        "Box": [(side, i, real, "") for i, side in enumerate(("left", "top", "right", "bottom"), start=1)],
+        "Hand": [("bbox", 1, message, ".hands.Box"), ("score", 2, real, ""), ("side", 5, whole, "")],
+        "Frame": [("frame_number", 2, whole, ""), ("hands", 3, message, ".hands.Hand")],
+    }
+    for owner, listed in fields.items():
+        made = file.message_type.add(name=owner)
+        for name, number, kind, of in listed:
+            label = kinds.LABEL_REPEATED if name == "hands" else kinds.LABEL_OPTIONAL
+            made.field.add(name=name, number=number, type=kind, type_name=of or None, label=label)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("hands.Frame"))
+
+
+# -- Ego4D
 
 
 class Ego4dFho:
     """Labels of Ego4D; a video's name is its uid."""
 
     def __init__(self, path: Path, layout: HandsLayout) -> None:
-        content = read_json(path, _compact)
-        videos = content.get("videos") if isinstance(content, dict) else None
-        if not isinstance(videos, list) or not any(isinstance(item, dict) for item in videos):
-            raise SourceError(path, "is not Ego4D's fho_main.json: it has no list of videos", _FHO)
-        self._videos = {}
-        for item in videos:
-            labels = _labels_of_actions(item.get("actions", []), layout) if isinstance(item, dict) else None
-            if labels is not None:
-                self._videos[str(item["uid"])] = labels
+        try:
+            videos = json.loads(path.read_bytes(), object_hook=_compact)["videos"]
+            labels = {str(item["uid"]): _labels_of_actions(item["actions"], layout) for item in videos}
+        except (AttributeError, KeyError, TypeError, ValueError) as fault:
+            raise SourceError(path, f"is not Ego4D's fho_main.json: {fault!r}", _FHO) from fault
+        self._videos = {uid: found for uid, found in labels.items() if found}
         if not self._videos:
             raise SourceError(path, "has no boxes of hands", _FHO)
-
-    def known(self) -> list[str]:
-        """See LabelSet."""
-        return list(self._videos)
+        self.known = list(self._videos)
 
     def of(self, video: Video) -> HandLabels | None:
         """See LabelSet."""
@@ -150,42 +319,38 @@ def _compact(item: dict[str, Any]) -> Any:
     """
     if "object_type" in item:
         box, kind = item.get("bbox"), item["object_type"]
-        if not isinstance(box, dict) or kind not in ("left_hand", "right_hand"):
-            return None
-        return kind, *(box.get(key) for key in ("x", "y", "width", "height"))
+        sides = ("x", "y", "width", "height")
+        return (kind, *(box[side] for side in sides)) if box and kind in ("left_hand", "right_hand") else None
     if "boxes" in item and "frame_number" in item:
-        return item["frame_number"], [box for box in item["boxes"] or [] if isinstance(box, tuple)]
+        return item["frame_number"], [box for box in item["boxes"] or [] if box]
     if "narration_text" in item and "frames" in item:
         refused = item.get("is_rejected") or item.get("is_invalid_annotation")
         frames = [frame for frame in item["frames"] or [] if isinstance(frame, tuple)]
         return None if refused or not frames else (str(item["narration_text"] or ""), frames)
     if "narrated_actions" in item:
-        return [action for action in item["narrated_actions"] or [] if isinstance(action, tuple)]
+        return [action for action in item["narrated_actions"] or [] if action]
     if "annotated_intervals" in item and "video_uid" in item:
         intervals = item["annotated_intervals"] or []
-        actions = [action for part in intervals if isinstance(part, list) for action in part]
-        return {"uid": item["video_uid"], "actions": actions}
+        return {"uid": item["video_uid"], "actions": [action for part in intervals for action in part]}
     return item
 
 
 def _labels_of_actions(actions: list[Any], layout: HandsLayout) -> HandLabels | None:
     rows, looked_at, texts = [], [], []
-    try:
-        for text, frames in actions:
-            numbers = [int(frame) - layout.frame_offset for frame, _ in frames]
-            looked_at += numbers
-            texts.append((min(numbers), text))
-            for number, (_, boxes) in zip(numbers, frames):
-                for kind, x, y, width, height in boxes:
-                    rows.append((number, kind == "right_hand", x + width / 2, y + height / 2))
-    except (TypeError, ValueError) as fault:
-        raise SourceError("fho_main.json", f"has a box or frame that is no number: {fault}") from fault
+    for text, frames in actions:
+        numbers = [int(frame) - layout.frame_offset for frame, _ in frames]
+        looked_at += numbers
+        texts.append((min(numbers), text))
+        for number, (_, boxes) in zip(numbers, frames, strict=True):
+            for kind, x, y, width, height in boxes:
+                rows.append((number, kind == "right_hand", x + width / 2, y + height / 2))
     if not rows:
         return None
     table = np.array(rows, np.float64)
+    frames, sides = table[:, :2].astype(np.int64).T
     return labels_from_rows(
-        table[:, 0].astype(np.int64),
-        table[:, 1].astype(np.int64),
+        frames,
+        sides,
         np.ones(len(table)),
         {"center": table[:, 2:]},
         looked_at,
@@ -193,6 +358,9 @@ def _labels_of_actions(actions: list[Any], layout: HandsLayout) -> HandLabels | 
         irregular=True,
         texts=tuple(sorted(texts)),
     )
+
+
+# -- Ego-Exo4D
 
 
 class EgoExoHands:
@@ -205,23 +373,16 @@ class EgoExoHands:
     def __init__(self, files: dict[str, Path], layout: HandsLayout, root: Path) -> None:
         self._layout = layout
         self._files = {stem: path for stem, path in files.items() if stem != "takes"}
-        takes = next(
-            (path for path in (root / "takes.json", root.parent / "takes.json") if path.is_file()), None
-        )
-        listed = read_json(takes) if takes else []
-        names = {
-            item["take_uid"]: item["take_name"]
-            for item in (listed if isinstance(listed, list) else [])
-            if isinstance(item, dict) and {"take_uid", "take_name"} <= set(item)
-        }
-        self._uids: dict[str, str] = {}
-        for uid, path in self._files.items():
-            self._uids[uid] = uid
-            self._uids[str(names.get(uid) or _take_name(path))] = uid
-
-    def known(self) -> list[str]:
-        """See LabelSet."""
-        return list(self._uids)
+        names: dict[str, str] = {}
+        for path in (root.parent / "takes.json", root / "takes.json"):
+            try:
+                takes = json.loads(path.read_bytes()) if path.is_file() else []
+                names |= {take["take_uid"]: take["take_name"] for take in takes}
+            except (KeyError, TypeError, ValueError) as fault:
+                raise SourceError(path, f"is not Ego-Exo4D's takes.json: {fault!r}") from fault
+        self._uids = {uid: uid for uid in self._files}
+        self._uids |= {names.get(uid) or _take_name(path): uid for uid, path in self._files.items()}
+        self.known = list(self._uids)
 
     def of(self, video: Video) -> HandLabels | None:
         """See LabelSet."""
@@ -229,69 +390,40 @@ class EgoExoHands:
         called = next((part for part in (place.stem, *place.parts[:-1]) if part in self._uids), None)
         if called is None or (called != place.stem and place.stem != self._layout.camera):
             return None
-        return egoexo_labels(self._files[self._uids[called]], self._layout)
+        return _joints_of(self._files[self._uids[called]], self._layout)
 
 
 def _take_name(path: Path) -> str:
     """Return the take's name, as its first labelled frame states it; else the file's own name."""
-    stated = re.search(rb'"take_name"\s*:\s*"([^"]{1,200})"', first_bytes(path, 1 << 16))
+    stated = re.search(rb'"take_name"\s*:\s*"([^"]+)"', first_bytes(path, 1 << 16))
     return stated[1].decode(errors="replace") if stated else path.stem
 
 
-def egoexo_labels(path: Path, layout: HandsLayout) -> HandLabels:
-    """Return the hands of one take in one camera.
-
-    Raises:
-        EpisodeError: the file is damaged, of another form, or has no such camera.
-    """
-    content = read_json(path)
-    if not isinstance(content, dict) or not all(number.isdecimal() for number in content):
-        raise EpisodeError(path, "is not Ego-Exo4D's hand pose: its keys are no frame numbers")
+def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
     frames, sides, joints, cameras = [], [], [], set()
     try:
-        for number, people in content.items():
+        content = json.loads(path.read_bytes())
+        looked_at = [int(number) - layout.frame_offset for number in content]
+        for index, people in zip(looked_at, content.values(), strict=True):
             views = (people[0].get("annotation2D") or {}) if people else {}
             cameras |= set(views)
             named = views.get(layout.camera) or {}
             for side, name in enumerate(SIDES):
                 mine = [named.get(f"{name}_{joint}") for joint in JOINTS]
                 if any(mine):
-                    frames.append(int(number) - layout.frame_offset)
+                    frames.append(index)
                     sides.append(side)
                     joints.append([(at["x"], at["y"]) if at else (np.nan, np.nan) for at in mine])
         points = np.array(joints, np.float64).reshape(-1, 21, 2)
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as fault:
         raise EpisodeError(path, f"is not Ego-Exo4D's hand pose: {fault!r}") from fault
     if not frames:
-        raise EpisodeError(
-            path,
-            f"has no hands in camera {layout.camera}",
-            f"its cameras: {', '.join(sorted(cameras)) or 'none'}",
-        )
+        remedy = f"its cameras: {', '.join(sorted(cameras)) or 'none'}"
+        raise EpisodeError(path, f"has no hands in camera {layout.camera}", remedy)
     parts = {
         "wrist": points[:, 0],
         "center": (points.min(axis=1) + points.max(axis=1)) / 2,
         "landmarks": points.reshape(-1, 42),
     }
-    looked_at = [int(number) - layout.frame_offset for number in content]
     scores = np.ones(len(frames))
     return labels_from_rows(np.array(frames), np.array(sides), scores, parts, looked_at, pixels=True)
-
-
-def read_json(path: Path, keep: Callable[[dict[str, Any]], Any] | None = None) -> Any:
-    """Return the content of a JSON file.
-
-    Args:
-        keep: called with each parsed object; its result replaces the object.
-
-    Raises:
-        SourceError: it is too large, damaged, or not JSON.
-    """
-    size = path.stat().st_size
-    if size > LARGEST:
-        raise SourceError(path, f"has {size:,} bytes, more than {LARGEST:,}")
-    parse = partial(json.loads, object_hook=keep) if keep else json.loads
-    try:
-        return parse(path.read_bytes())
-    except (ValueError, RecursionError, MemoryError) as fault:
-        raise SourceError(path, f"is no JSON, or cut off: {fault}", "fetch the file again") from fault

@@ -23,44 +23,49 @@ ends the run. `mask` continues the run: the values that need the hand are unknow
 held first, and unknown after that.
 """
 
-import os
 import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
 
-from hma_data.errors import EpisodeError, RegistryError, SourceError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
+
+from hma_data.errors import RegistryError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import leaves, local_path
+from hma_data.sources.base import local_path
 from hma_data.sources.common.links import nothing_there
+from hma_data.sources.common.video_file import opened
 from hma_data.sources.hands import VIDEO_SUFFIXES
 
-LABELS = ("detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose")
-_CHOICES = {
-    "labels": LABELS,
-    "missing": ("split", "hold", "mask"),
-    "pictures": ("labelled", "every"),
-    "mirrored": ("true", "false"),
-}
-_NUMBERS = {"max_hold": int, "min_frames": int, "first_frame": int, "min_score": float, "max_gap_s": float}
-_TEXTS = ("annotations", "models", "label_size", "camera")
+
+def _width_and_height(value: Any) -> Any:
+    if isinstance(value, str):
+        sides = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", value)
+        if not sides:
+            raise ValueError("give WIDTHxHEIGHT, such as 1920x1080")
+        return int(sides[1]), int(sides[2])
+    return value
 
 
-@dataclass(frozen=True)
-class HandsLayout:
+class HandsLayout(BaseModel):
     """The values of `source.layout`; see the module."""
 
-    labels: str = "detector"
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    labels: Literal[
+        "detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose"
+    ] = "detector"
     annotations: str | None = None
     models: str | None = None
-    missing: str = "split"
-    max_hold: int | None = None
-    min_frames: int = 12
-    min_score: float = 0.5
-    max_gap_s: float = 3.0
-    pictures: str = "labelled"
-    first_frame: int | None = None
-    label_size: tuple[int, int] | None = None
+    missing: Literal["split", "hold", "mask"] = "split"
+    max_hold: int | None = Field(None, ge=0)
+    min_frames: int = Field(12, ge=0)
+    min_score: FiniteFloat = Field(0.5, ge=0)
+    max_gap_s: FiniteFloat = Field(3.0, ge=0)
+    pictures: Literal["labelled", "every"] = "labelled"
+    first_frame: int | None = Field(None, ge=0)
+    label_size: Annotated[tuple[int, int] | None, BeforeValidator(_width_and_height)] = None
     camera: str = "cam01"
     mirrored: bool = False
 
@@ -80,40 +85,16 @@ def layout_of(embodiment: Embodiment | None) -> HandsLayout:
     """
     if embodiment is None:
         return HandsLayout()
-    where = f"embodiment {embodiment.id}: source.layout"
-    values: dict[str, object] = {}
-    for key, text in (embodiment.source.layout or {}).items():
-        if key in _CHOICES:
-            if text not in _CHOICES[key]:
-                raise RegistryError(f"{where}.{key}", f"is {text!r}", f"allowed: {', '.join(_CHOICES[key])}")
-            values[key] = text == "true" if key == "mirrored" else text
-        elif key in _NUMBERS:
-            values[key] = _number(text, _NUMBERS[key], f"{where}.{key}")
-        elif key == "label_size":
-            values[key] = _size(text, f"{where}.{key}")
-        elif key in _TEXTS:
-            values[key] = text
-        else:
-            known = ", ".join([*_CHOICES, *_NUMBERS, *_TEXTS])
-            raise RegistryError(f"{where}.{key}", "is not a key of hand videos", f"allowed: {known}")
-    return HandsLayout(**values)  # type: ignore[arg-type]
-
-
-def _number(text: str, kind: type, where: str) -> float:
     try:
-        value = kind(text)
-    except ValueError as fault:
-        raise RegistryError(where, f"is {text!r}", "a number is wanted") from fault
-    if not 0 <= value < 1e9:
-        raise RegistryError(where, f"is {text}", "a number from 0 up is wanted")
-    return float(value) if kind is float else int(value)
-
-
-def _size(text: str, where: str) -> tuple[int, int]:
-    sides = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
-    if not sides or not int(sides[1]) * int(sides[2]):
-        raise RegistryError(where, f"is {text!r}", "WIDTHxHEIGHT is wanted, such as 1920x1080")
-    return int(sides[1]), int(sides[2])
+        return HandsLayout.model_validate(embodiment.source.layout or {})
+    except ValidationError as fault:
+        first = fault.errors()[0]
+        where = f"embodiment {embodiment.id}: source.layout.{first['loc'][0]}"
+        if first["type"] == "extra_forbidden":
+            known = ", ".join(HandsLayout.model_fields)
+            raise RegistryError(where, "is not a key of hand videos", f"allowed: {known}") from fault
+        said = first["msg"].removeprefix("Value error, ")
+        raise RegistryError(where, f"is {first['input']!r}", said) from fault
 
 
 @dataclass(frozen=True)
@@ -135,35 +116,25 @@ def videos_of(uri: str) -> dict[str, Video]:
     """Return the videos of a file or folder by name, in natural order.
 
     Raises:
-        SourceError: there are none, or a link leaves the folder.
+        SourceError: there are none.
     """
     root = local_path(uri)
-    if root.is_file():
-        if root.suffix.lower() not in VIDEO_SUFFIXES:
-            raise SourceError(root, "is not a video file", f"looked for {', '.join(VIDEO_SUFFIXES)}")
-        return {root.name: Video(root, root.name, (root.name, root.stem))}
-    paths: dict[str, Path] = {}
-    for folder, _, files in os.walk(root):
-        for file in files:
-            path = Path(folder, file)
-            if path.suffix.lower() not in VIDEO_SUFFIXES or file.startswith(".") or not path.is_file():
-                continue
-            if leaves(path, root):
-                raise SourceError(
-                    path, "is a link that leaves the folder", "copy the file in, or convert its folder"
-                )
-            paths[path.relative_to(root).as_posix()] = path
+    files = [root] if root.is_file() else sorted(root.rglob("*"), key=lambda path: _natural_order(str(path)))
+    folder = root.parent if root.is_file() else root
+    paths = {
+        path.relative_to(folder).as_posix(): path
+        for path in files
+        if path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+    }
     if not paths:
         raise nothing_there(uri, root, "holds no videos", f"looked for {', '.join(VIDEO_SUFFIXES)}")
     short = Counter(alias for name in paths for alias in _short_names(name))
-    return {
-        name: Video(paths[name], name, _aliases(name, short)) for name in sorted(paths, key=natural_order)
-    }
+    return {name: Video(path, name, _aliases(name, short)) for name, path in paths.items()}
 
 
-def natural_order(name: str) -> list[tuple[int, int, str]]:
+def _natural_order(name: str) -> list[tuple[int, int, str]]:
     """Return a sort key that puts clip_2 before clip_10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"([0-9]+)", name)]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _short_names(name: str) -> set[str]:
@@ -199,10 +170,6 @@ def header_of(path: Path) -> Header:
     Raises:
         EpisodeError: it is not a video, or it is damaged.
     """
-    from hma_data.sources.common.video_file import opened
-
-    if not path.is_file():
-        raise EpisodeError(path, "no such video file")
     with opened(path) as (container, stream):
         hz = float(stream.average_rate or 0)
         seconds = float(stream.duration * stream.time_base) if stream.duration else 0.0

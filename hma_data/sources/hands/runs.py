@@ -7,7 +7,7 @@ N labelled frames of a video, n of a run, w values of a point (2, or 42 for land
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -35,9 +35,8 @@ def point_of(key: str, where: str) -> str:
         SourceError: it is not a key of hand videos.
     """
     if key not in KEYS:
-        near = get_close_matches(key, KEYS, n=3, cutoff=0.4)
-        hint = f"did you mean {', '.join(near)}?" if near else "keys are such as left/center/next"
-        raise SourceError(where, f"{key!r} is not a key of hand videos", hint)
+        near = get_close_matches(key, KEYS, n=3, cutoff=0.0)
+        raise SourceError(where, f"{key!r} is not a key of hand videos", f"did you mean {', '.join(near)}?")
     return key.removesuffix("/next").removesuffix("/delta")
 
 
@@ -73,16 +72,21 @@ def labels_from_rows(
 ) -> HandLabels:
     """Make labels from one row a hand; of two hands of one side in a frame, the higher score counts.
 
+    Landmarks alone, as fractions, give center and wrist too. The center is that of the points' box; points
+    outside the picture are moved to its edge.
+
     Args:
         frames: (R,) index of the frame.
         sides: (R,) 0 left, 1 right.
         scores: (R,).
-        parts: center, wrist or landmarks -> (R, w); landmarks alone, as fractions, give all three.
+        parts: center, wrist or landmarks -> (R, w).
         looked_at: frames that were labelled, with or without a hand.
         facts: further attributes of HandLabels.
     """
     if set(parts) == {"landmarks"}:
-        parts = parts_of_landmarks(parts["landmarks"])
+        inside = np.clip(parts["landmarks"].astype(np.float64).reshape(-1, 21, 2), 0, 1)
+        center = (inside.min(axis=1) + inside.max(axis=1)) / 2
+        parts = {"center": center, "wrist": inside[:, 0], "landmarks": inside.reshape(-1, 42)}
     order = np.argsort(scores, kind="stable")
     every = np.unique(np.concatenate([frames, np.fromiter(looked_at, np.int64)]).astype(np.int64))
     row = np.searchsorted(every, frames[order])
@@ -96,19 +100,6 @@ def labels_from_rows(
             values[~np.isfinite(values).all(axis=1)] = np.nan
             points[f"{side}/{part}"] = values
     return HandLabels(every, points, **facts)
-
-
-def parts_of_landmarks(landmarks: NDArray[Any]) -> dict[str, Floats]:
-    """Return the center, wrist and landmarks of landmarks (R, 42).
-
-    Points outside the picture are moved to its edge. The center is that of the points' box.
-    """
-    inside = np.clip(landmarks.astype(np.float64).reshape(-1, 21, 2), 0, 1)
-    return {
-        "center": (inside.min(axis=1) + inside.max(axis=1)) / 2,
-        "wrist": inside[:, 0],
-        "landmarks": inside.reshape(-1, 42),
-    }
 
 
 @dataclass(frozen=True)
@@ -127,12 +118,7 @@ class Runs:
     spans: tuple[tuple[int, int], ...]
     missing: NDArray[np.bool_]
     held: NDArray[np.bool_]
-    counts: dict[str, int] = field(default_factory=dict)
-
-    def longest(self) -> int:
-        """Return the index of the longest run, the first of equals."""
-        lengths = [stop - start for start, stop in self.spans]
-        return lengths.index(max(lengths))
+    counts: dict[str, int]
 
 
 def cut_into_runs(
@@ -149,8 +135,8 @@ def cut_into_runs(
         EpisodeError: the labels do not fit the video, or never have a needed point.
     """
     labels = _within(labels, video.frames, where)
-    size = (video.width, video.height)
-    labels, outside = _as_fractions(labels, needed, layout.label_size or size, where)
+    size = layout.label_size or (video.width, video.height)
+    labels, outside = _as_fractions(labels, needed, size, where)
     for point in needed:
         if not np.isfinite(labels.points[point]).any():
             have = [name for name, values in labels.points.items() if np.isfinite(values).any()]
@@ -201,8 +187,7 @@ def values_of(key: str, points: dict[str, Floats], span: tuple[int, int]) -> Flo
 
     The last label serves only as a next value.
     """
-    start, stop = span
-    values = points[point_of(key, key)][start:stop]
+    values = points[point_of(key, key)][slice(*span)]
     if key.endswith("/next"):
         return values[1:]
     return np.diff(values, axis=0) if key.endswith("/delta") else values[:-1]
@@ -215,7 +200,7 @@ def _within(labels: HandLabels, frames: int, where: str) -> HandLabels:
     if len(beyond) and (beyond.min() < 0 or beyond.max() > frames * (1 + LATE) + 2 or not inside.any()):
         worst = int(beyond.min() if beyond.min() < 0 else beyond.max())
         fault = f"is labelled at frame {worst:,}, and has {frames:,} frames"
-        raise EpisodeError(where, fault, "are the labels of another video, or is first_frame another?")
+        raise EpisodeError(where, fault, "check that these are its labels, and source.layout.first_frame")
     points = {point: values[inside] for point, values in labels.points.items()}
     return replace(labels, frames=labels.frames[inside], points=points)
 
@@ -233,12 +218,11 @@ def _as_fractions(
         if point in needed:
             lost |= beyond
             if beyond.sum() > seen / 2:
-                worst = raw[beyond][0, :2]
-                unit = "pixels" if labels.pixels else "of the picture's sides"
-                fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the picture, "
-                fault += f"{worst[0]:.4g}, {worst[1]:.4g} {unit} first; the picture has {size[0]}×{size[1]}"
+                x, y = raw[beyond][0, :2]
+                fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the picture of "
+                fault += f"{size[0]}×{size[1]} pixels, the first at {x:.4g}, {y:.4g}"
                 raise EpisodeError(
-                    where, fault, "are they of another video, or of another size (label_size)?"
+                    where, fault, "check that these are its labels, and source.layout.label_size"
                 )
         points[point] = np.where(beyond[:, None], np.nan, np.clip(values, 0, 1))
     return replace(labels, points=points, pixels=False), int(lost.sum())

@@ -1,86 +1,73 @@
-"""Run a detector over whole videos, and store what it finds.
+"""Run the detector over whole videos: for labels, for a table of labels, and for `hma inspect`.
 
 `detect` writes a table for a folder once, and `labels: landmarks` then reads it: all runs become episodes,
 and the table can be corrected by hand. `scan_cached` is used by `labels: detector` while it reads: detections
 are cached by the content of the video and the models, so a second conversion does not run the detector again.
+
+R hands found.
 """
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.errors import OutputError, SourceError
-from hma_data.sources.base import file_fingerprint
+from hma_data.errors import EpisodeError, HMAError, OutputError
+from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint, local_path
+from hma_data.sources.common import image_checks, timestamp_checks
+from hma_data.sources.common.findings import Finding
+from hma_data.sources.common.links import unfollowed
+from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
-from hma_data.sources.hands.detect import VERSION, Detector, Hand, MediaPipeHands
-from hma_data.sources.hands.layout import HandsLayout, videos_of
-from hma_data.sources.hands.models import HandModels, load_models
-from hma_data.sources.hands.runs import SIDES, HandLabels, labels_from_rows
-from hma_data.sources.hands.table import read_columns
+from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands, load_models
+from hma_data.sources.hands.layout import HandsLayout, Header, Video, header_of, videos_of
+from hma_data.sources.hands.runs import POINTS, SIDES, HandLabels, labels_from_rows
 from hma_data.storage.files import atomic_path, cache_folder
 from hma_data.storage.paths import StrPath, as_path, as_text
 
 BATCH = 8  # frames decoded together: 200 MB of 4K pictures
-_LEAST = 0.5  # least presence of a hand that is stored
+LOOKED_AT, FRAMES = 5, 12  # most videos that are searched for hands by an inspection, and frames of each
 
 
-@dataclass(frozen=True)
-class Found:
-    """Hands found in one video, one row a hand.
-
-    Attributes:
-        length: frames of the video.
-        frames: (R,) int64.
-        sides: (R,) int64, 0 left, 1 right.
-        scores: (R,) float32.
-        landmarks: (R, 42) float32, fractions; may lie outside the picture.
-    """
-
-    length: int
-    frames: NDArray[np.int64]
-    sides: NDArray[np.int64]
-    scores: NDArray[np.float32]
-    landmarks: NDArray[np.float32]
-
-    def labels(self, least: float = 0.0) -> HandLabels:
-        """Return labels of every frame, without hands below a score."""
-        good = self.scores >= least
-        parts = {"landmarks": self.landmarks[good]}
-        every = range(self.length)
-        return labels_from_rows(self.frames[good], self.sides[good], self.scores[good], parts, every)
-
-
-def scan(video: VideoFile, detector: Detector, frames: Iterable[int] | None = None) -> Found:
+def scan(name: str, video: VideoFile, detector: MediaPipeHands, frames: Iterable[int] | None = None) -> Any:
     """Run a detector over a video's frames in order.
 
     Args:
+        name: of the video, for the table.
         frames: which frames, all by default; the detector treats them as consecutive.
+
+    Returns:
+        an arrow table of R rows as `labels: landmarks` reads it: video, frame, side, score, landmarks.
 
     Raises:
         EpisodeError: a frame cannot be decoded.
     """
+    import pyarrow as pa
+
     chosen = np.fromiter(range(len(video)) if frames is None else frames, np.int64)
     hands: list[tuple[int, Hand]] = []
     detector.reset()
     for start in range(0, len(chosen), BATCH):
         batch = chosen[start : start + BATCH]
-        for index, picture in zip(batch.tolist(), video.frames(batch)):
+        for index, picture in zip(batch.tolist(), video.frames(batch), strict=True):
             hands += [(index, hand) for hand in detector.detect(picture)]
-    return Found(
-        len(video),
-        np.array([index for index, _ in hands], np.int64),
-        np.array([SIDES.index(hand.side) for _, hand in hands], np.int64),
-        np.array([hand.score for _, hand in hands], np.float32),
-        np.array([hand.points.reshape(-1) for _, hand in hands], np.float32).reshape(-1, 42),
+    points = np.array([hand.points for _, hand in hands], np.float32).reshape(-1)
+    return pa.table(
+        {
+            "video": pa.array([name] * len(hands), pa.string()),
+            "frame": pa.array([index for index, _ in hands], pa.int64()),
+            "side": pa.array([hand.side for _, hand in hands], pa.string()),
+            "score": pa.array([hand.score for _, hand in hands], pa.float32()),
+            "landmarks": pa.FixedSizeListArray.from_arrays(pa.array(points), 42),
+        }
     )
 
 
 def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrored: bool = False) -> int:
-    """Find the hands in all videos of a folder and write them as a table; see hands_table.
+    """Find the hands in all videos of a folder and write them as a table; see HandTable.
 
     Args:
         folder: str or path of a folder of videos, or of one video.
@@ -95,75 +82,146 @@ def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrore
         SourceError: no videos, no models.
         EpisodeError: a video is damaged.
     """
+    import pyarrow as pa
+
     final = as_path(out)
     if final.suffix != ".parquet":
-        raise OutputError(final, "is no name of a parquet file", "let it end in .parquet")
+        raise OutputError(final, "does not end in .parquet", "name a .parquet file")
     detector = MediaPipeHands(load_models(models), mirrored=mirrored)
-    found = {
-        name: scan(VideoFile(video.path), detector) for name, video in videos_of(as_text(folder)).items()
-    }
-    _write(final, found)
-    return sum(len(each.frames) for each in found.values())
+    videos = videos_of(as_text(folder))
+    found = [scan(name, VideoFile(video.path), detector) for name, video in videos.items()]
+    _write(final, pa.concat_tables(found))
+    return sum(len(each) for each in found)
 
 
-def scan_cached(path: Path, detector: Detector, models: HandModels, layout: HandsLayout) -> Found:
+def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout: HandsLayout) -> HandLabels:
     """Return the hands of a video; run the detector only where they are not cached.
 
     Raises:
         EpisodeError: the video is damaged.
     """
+    import pyarrow.parquet as pq
+
     video = VideoFile(path)
     facts = (VERSION, file_fingerprint(path), len(video), models.digest, layout.mirrored)
     key = hashlib.sha256(repr(facts).encode()).hexdigest()[:32]
     kept = cache_folder() / "hands" / f"{key}.parquet"
-    if kept.is_file():
-        try:
-            return _read(kept, len(video))
-        except (SourceError, KeyError, ValueError):
-            kept.unlink(missing_ok=True)  # damaged: it is made again
-    found = scan(video, detector)
-    try:
-        _write(kept, {path.name: found})
-    except OutputError:
-        return found  # the cache cannot be written: continue without it
-    return found
+    if not kept.is_file():
+        _write(kept, scan(path.name, video, detector))
+    table = pq.read_table(kept)
+    scores = table["score"].to_numpy()
+    good = scores >= layout.min_score
+    sides = np.array([SIDES.index(side) for side in table["side"].to_pylist()], np.int64)
+    landmarks = table["landmarks"].combine_chunks().flatten().to_numpy().reshape(-1, 42)
+    every = range(len(video))
+    frames = table["frame"].to_numpy()
+    return labels_from_rows(frames[good], sides[good], scores[good], {"landmarks": landmarks[good]}, every)
 
 
-def _write(final: Path, found: dict[str, Found]) -> None:
-    import pyarrow as pa
+def _write(final: Path, table: Any) -> None:
     import pyarrow.parquet as pq
 
-    rows = [(name, each) for name, each in found.items() if len(each.frames)]
-    names = np.repeat([name for name, _ in rows], [len(each.frames) for _, each in rows])
-    joined = {
-        field: np.concatenate([getattr(each, field) for each in found.values()])
-        for field in ("frames", "sides", "scores", "landmarks")
-    }
-    table = pa.table(
-        {
-            "video": pa.array(names.tolist(), pa.string()),
-            "frame": pa.array(joined["frames"]),
-            "side": pa.array([SIDES[side] for side in joined["sides"]], pa.string()),
-            "score": pa.array(joined["scores"]),
-            "landmarks": pa.FixedSizeListArray.from_arrays(pa.array(joined["landmarks"].reshape(-1)), 42),
-        }
-    )
     with atomic_path(final) as part:
         pq.write_table(table, part, compression="zstd")
 
 
-def _read(path: Path, length: int) -> Found:
+# -- inspection
+
+
+def inspect_videos(uri: str, episodes: int) -> Inspection:
+    """Inspect hand videos: sizes, rates, codecs, and the share of frames that show hands."""
+    videos = videos_of(uri)
+    survey = Survey(len(videos))
+    for link in unfollowed(local_path(uri)):
+        survey.note(link)
+    headers: dict[str, Header] = {}
+    for name, video in videos.items():
+        try:
+            headers[name] = header_of(video.path)
+        except EpisodeError as fault:
+            survey.fault(name, fault)
+    chosen = [list(headers)[i] for i in sampled(len(headers), episodes)] if headers else []
+    for name in chosen:
+        _look(name, videos[name], headers[name], survey, max(1, image_checks.PAIRS // len(chosen)))
+    facts = {"keys": "each point also with /next (value at the next labelled frame) and /delta"}
+    kinds = Counter((each.height, each.width, round(each.hz, 2), each.codec) for each in headers.values())
+    if len(kinds) > 1:
+        facts["videos"] = ", ".join(
+            f"{count} of {width}×{height} at {hz:g} Hz {codec}"
+            for (height, width, hz, codec), count in kinds.most_common(10)
+        )
     try:
-        columns = read_columns(path)
-    except SourceError as fault:
-        if fault.fault != "has no rows":
-            raise
-        nothing = np.zeros(0, np.int64)
-        return Found(length, nothing, nothing, np.zeros(0, np.float32), np.zeros((0, 42), np.float32))
-    return Found(
-        length,
-        np.asarray(columns["frame"], np.int64),
-        np.array([SIDES.index(side) for side in columns["side"]], np.int64),
-        np.asarray(columns["score"], np.float32),
-        np.array(columns["landmarks"], np.float32).reshape(-1, 42),
+        facts |= _hands_in(videos, chosen[:LOOKED_AT], survey)
+    except HMAError as fault:
+        facts["hands"] = f"not looked for: {fault}"
+    first = next(iter(headers.values()), Header(0, 0.0, 0, 0, ""))
+    hz, size = first.hz or None, (first.height, first.width, 3)
+    keys = [KeyInfo("video", "camera", size, "uint8", hz, codec=first.codec or None)]
+    for point, width in POINTS.items():
+        keys.append(KeyInfo(point, "vector", (width,), "float32", hz, ("x", "y") if width == 2 else None))
+    lengths = [each.frames for each in headers.values()]
+    measured = tuple(survey.key(key) for key in keys)
+    return Inspection(
+        format="hands",
+        uri=uri,
+        episodes=len(videos),
+        keys=measured,
+        frames=sum(lengths),
+        lengths=tuple(lengths[:1_000]),
+        hz=hz,
+        robot="human hands",
+        facts=facts,
+        looked_at=len(survey.looked),
+        findings=survey.findings(measured),
+        checks=survey.checks(),
     )
+
+
+def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -> None:
+    """Hand one video's times and some pictures to the survey; compare its packets with its header."""
+    survey.made |= {"frames", "rate"}
+    try:
+        file = VideoFile(video.path)
+        survey.episode(name)
+        clock = survey.times(name, "video", file.timestamps, camera=True)
+        source = "measured over its whole length"  # few containers state a rate
+        for found in timestamp_checks.drift(f"{name}: video", clock.hz, header.hz or None, source):
+            survey.note(found)
+        if header.frames and abs(len(file) - header.frames) > 1:
+            said = f"{name}: holds {len(file):,} frames, its header states {header.frames:,}"
+            numbers = {"frames": len(file), "stated": header.frames}
+            survey.note(Finding("frames", "warn", said, key="video", numbers=numbers))
+        for run in image_checks.runs(image_checks.choose(len(file), pairs, file.table.keys)):
+            survey.pictures(name, "video", file.frames(run), run, header.codec)
+        file.close()
+    except EpisodeError as fault:
+        survey.fault(name, fault)
+
+
+def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> dict[str, str]:
+    """Return the shares of sampled frames with hands; note the sampled videos that show none."""
+    detector = MediaPipeHands()
+    survey.made.add("hands")
+    looked = 0
+    sides: Counter[str] = Counter()
+    for name in chosen:
+        try:
+            file = VideoFile(videos[name].path)
+            frames = np.unique(np.linspace(0, len(file) - 1, FRAMES).astype(np.int64))
+            # The frames are far apart, so each is scanned alone and no hand is tracked between them.
+            seen = [scan(name, file, detector, [index])["side"].to_pylist() for index in frames.tolist()]
+        except EpisodeError as fault:
+            survey.fault(name, fault)
+            continue
+        looked += len(seen)
+        sides["left hand"] += sum("left" in each for each in seen)
+        sides["right hand"] += sum("right" in each for each in seen)
+        sides["both"] += sum(len(each) == 2 for each in seen)
+        if not any(seen):
+            said = f"{name}: no hand in {len(seen)} frames looked at"
+            survey.note(Finding("hands", "warn", said, key="video", numbers={"frames": len(seen)}))
+    return {
+        f"frames with {side}": f"{sides[side] / looked:.0%} of {looked} looked at"
+        for side in ("left hand", "right hand", "both")
+        if looked
+    }

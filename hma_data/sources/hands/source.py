@@ -11,9 +11,8 @@ picture as it is decoded, before any flip, rotation or crop of the YAML:
 A key ends in `/next` for the value at the next labelled frame, in `/delta` for next minus current, and has no
 ending for the current value. Left and right are the person's own.
 
-Labels come from a detector or from annotations (`source.layout.labels`, see hands_layout).
-`source.layout.missing` says what a frame without a needed hand does: it ends the run (split), the hand's last
-position is held (hold), or the run goes on and the values that need the hand are unknown (mask).
+Labels come from a detector or from annotations. `source.layout` says from which, and what a frame without a
+needed hand does: see the module `layout`.
 
 With annotations, each run of at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain
 name `clip.mp4` is the longest run. Runs of one video share a group, so that they come into one split. The
@@ -28,22 +27,21 @@ import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode, Floats, Signal
 from hma_data.episodes.images import Images
-from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
-from hma_data.sources.common.video_file import FrameTable, VideoFile
-from hma_data.sources.hands.inspect import inspect_videos
+from hma_data.sources.common.survey import listed
+from hma_data.sources.common.video_file import VideoFile
+from hma_data.sources.hands.detect import HandModels, MediaPipeHands, load_models
 from hma_data.sources.hands.labels import LabelSet, open_labels
 from hma_data.sources.hands.layout import HandsLayout, Header, Video, header_of, layout_of, videos_of
-from hma_data.sources.hands.models import HandModels, load_models
 from hma_data.sources.hands.runs import (
     POINTS,
     HandLabels,
@@ -53,7 +51,7 @@ from hma_data.sources.hands.runs import (
     point_of,
     values_of,
 )
-from hma_data.sources.hands.scan import detect, scan_cached
+from hma_data.sources.hands.scan import detect, inspect_videos, scan_cached
 from hma_data.storage.paths import StrPath, as_text
 
 __all__ = ["CAMERA", "HandsSource", "detect", "open"]
@@ -61,6 +59,7 @@ __all__ = ["CAMERA", "HandsSource", "detect", "open"]
 CAMERA = "video"
 RATE_TOLERANCE = 0.01  # of the rate
 REGULAR = 0.1  # share of the median interval by which the others of a regular video may differ
+_MORE_RUNS = "lower source.layout.min_frames, or set source.layout.missing: hold"
 
 
 class HandsSource:
@@ -69,7 +68,7 @@ class HandsSource:
     def __init__(self) -> None:
         self._videos: dict[str, dict[str, Video]] = {}
         self._labels: dict[tuple[str, HandsLayout], LabelSet] = {}
-        self._detector: tuple[int, HandsLayout, Any, HandModels] | None = None
+        self._detector: tuple[int, HandsLayout, MediaPipeHands, HandModels] | None = None
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """Return the videos, and where there are models, the hands in a small sample of frames."""
@@ -77,7 +76,7 @@ class HandsSource:
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """Return the videos' names; each stands for the longest run of its video."""
-        return list(self._find(as_text(uri), again=True))
+        return list(self._find(as_text(uri)))
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """Return the videos, or their runs where there are annotations; no picture is decoded.
@@ -87,17 +86,21 @@ class HandsSource:
             RegistryError: the YAML's layout is wrong.
         """
         uri, layout = as_text(uri), layout_of(embodiment)
-        videos = self._find(uri, again=True)
+        videos = self._find(uri)
         needed = _needed(embodiment) if embodiment else ("left/center", "right/center")
         if layout.labels == "detector":
             digest = self._models(layout)[1].digest if embodiment else ""
             return [_whole(video, digest) for video in videos.values()]
-        self._labels.clear()
-        labels = self._open_labels(uri, layout)
-        found = [ref for video in videos.values() for ref in _runs_of(video, labels, needed, layout)]
-        if not found:
-            raise SourceError(uri, *_nothing(videos, labels, layout))
-        return found
+        labels = self._labels[uri, layout] = open_labels(layout, uri)
+        found = {name: _runs_of(video, labels, needed, layout) for name, video in videos.items()}
+        refs = [ref for runs in found.values() for ref in runs or ()]
+        if refs:
+            return refs
+        if all(runs is None for runs in found.values()):
+            fault = f"has no labels for any of its videos: {listed(list(videos), 3)}"
+            raise SourceError(uri, fault, f"labels are of {listed(labels.known, 3)}")
+        fault = f"has no run of {layout.min_frames} frames with the needed hands in its labelled videos"
+        raise SourceError(uri, fault, _MORE_RUNS)
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
         """Return one run of a video; its pictures are decoded on demand.
@@ -107,34 +110,28 @@ class HandsSource:
             SourceError: no such episode, or a key that hand videos do not have.
             RegistryError: the YAML's layout is wrong.
         """
-        uri, layout = as_text(uri), layout_of(embodiment)
-        video, number = self._place(uri, episode_id)
-        file, runs = self.runs(uri, video.name, embodiment)
-        if not runs.spans:
-            raise EpisodeError(video.path, *_no_run(runs, _needed(embodiment), layout))
-        alone = number is None
-        number = runs.longest() if number is None else number
-        if number >= len(runs.spans):
-            raise EpisodeError(video.path, f"has {len(runs.spans)} runs, no run {number}")
-        return _episode(episode_id, file, runs, number, embodiment, alone)
-
-    def runs(self, uri: StrPath, name: str, embodiment: Embodiment) -> tuple[VideoFile, Runs]:
-        """Return a video and all its runs; see read."""
         uri, layout, needed = as_text(uri), layout_of(embodiment), _needed(embodiment)
-        video = self._place(uri, name)[0]
-        if layout.labels == "detector":
-            self._models(layout)  # missing models are reported before the video is opened
-        file = VideoFile(video.path)
+        video, number = self._place(uri, episode_id)
         labels = self._labels_of(uri, video, layout)
-        return file, cut_into_runs(labels, needed, layout, _header(file.table), str(video.path))
+        file = VideoFile(video.path)
+        table = file.table
+        hz = table.hz or _measured_hz(table.times)
+        header = Header(len(table), hz, table.width, table.height, table.codec)
+        runs = cut_into_runs(labels, needed, layout, header, str(video.path))
+        if not runs.spans:
+            fault = f"has no run of {layout.min_frames} frames with {', '.join(needed)}: "
+            fault += f"{runs.counts['without_hands']:,} of {runs.counts['labelled']:,} frames lack one"
+            raise EpisodeError(video.path, fault, _MORE_RUNS)
+        if number is not None and number >= len(runs.spans):
+            raise EpisodeError(video.path, f"has {len(runs.spans)} runs, no run {number}")
+        return _episode(episode_id, file, runs, number, embodiment)
 
-    def _find(self, uri: str, again: bool = False) -> dict[str, Video]:
-        if again or uri not in self._videos:
-            self._videos[uri] = videos_of(uri)
+    def _find(self, uri: str) -> dict[str, Video]:
+        self._videos[uri] = videos_of(uri)
         return self._videos[uri]
 
     def _place(self, uri: str, episode_id: str) -> tuple[Video, int | None]:
-        videos = self._find(uri)
+        videos = self._videos.get(uri) or self._find(uri)
         if episode_id in videos:
             return videos[episode_id], None
         name, _, number = episode_id.rpartition("#")
@@ -142,25 +139,20 @@ class HandsSource:
             raise SourceError(uri, f"has no episode {episode_id!r}", "hma inspect lists what it has")
         return videos[name], int(number)
 
-    def _open_labels(self, uri: str, layout: HandsLayout) -> LabelSet:
-        if (uri, layout) not in self._labels:
-            self._labels[uri, layout] = open_labels(layout, uri)
-        return self._labels[uri, layout]
-
     def _labels_of(self, uri: str, video: Video, layout: HandsLayout) -> HandLabels:
         if layout.labels == "detector":
             detector, models = self._models(layout)
-            return scan_cached(video.path, detector, models, layout).labels(layout.min_score)
-        labels = self._open_labels(uri, layout)
+            return scan_cached(video.path, detector, models, layout)
+        labels = self._labels.get((uri, layout))
+        if labels is None:
+            labels = self._labels[uri, layout] = open_labels(layout, uri)
         found = labels.of(video)
         if found is None:
-            raise EpisodeError(video.path, "has no labels", f"there are labels of {_some(labels.known())}")
+            raise EpisodeError(video.path, "has no labels", f"there are labels of {listed(labels.known, 3)}")
         return found
 
-    def _models(self, layout: HandsLayout) -> tuple[Any, HandModels]:
+    def _models(self, layout: HandsLayout) -> tuple[MediaPipeHands, HandModels]:
         """Return the detector, made once in each process, and its models."""
-        from hma_data.sources.hands.detect import MediaPipeHands
-
         if self._detector is None or self._detector[:2] != (os.getpid(), layout):
             models = load_models(layout.models)
             made = MediaPipeHands(models, mirrored=layout.mirrored)
@@ -169,12 +161,7 @@ class HandsSource:
 
 
 class _Pictures:
-    """The Stream of a run: chosen frames of a video.
-
-    Args:
-        file: the video.
-        indices: (T,) of its frames.
-    """
+    """The Stream of a run: the frames of a video with the indices (T,)."""
 
     def __init__(self, file: VideoFile, indices: NDArray[np.int64]) -> None:
         self.timestamps = file.timestamps[indices]
@@ -195,7 +182,7 @@ def _needed(embodiment: Embodiment) -> tuple[str, ...]:
     where = f"embodiment {embodiment.id}"
     for camera in embodiment.cameras:
         if camera.key != CAMERA:
-            raise SourceError(where, f"camera key {camera.key!r} is none of hand videos", f"it is {CAMERA!r}")
+            raise SourceError(where, f"camera key {camera.key!r} is not in hand videos", f"use {CAMERA!r}")
     vectors = [embodiment.action, *([embodiment.state] if embodiment.state else [])]
     keys = [part.key for vector in vectors for part in vector.components]
     return tuple(dict.fromkeys(point_of(key, where) for key in keys))
@@ -205,23 +192,26 @@ def _whole(video: Video, digest: str) -> EpisodeRef:
     try:
         frames = header_of(video.path).frames
         mark = f"{file_fingerprint(video.path)} {digest}"
-    except (HMAError, OSError) as fault:  # `read` raises it again
+    except EpisodeError as fault:  # `read` raises it again
         frames, mark = 1, str(fault)
-    return EpisodeRef(video.name, max(1, frames), None, _digest(mark))
+    return EpisodeRef(video.name, max(1, frames), None, _digest(mark.encode()))
 
 
 def _runs_of(
     video: Video, labels: LabelSet, needed: tuple[str, ...], layout: HandsLayout
-) -> list[EpisodeRef]:
-    """Return one ref a run; a video with damaged labels becomes one ref, which `read` refuses."""
+) -> list[EpisodeRef] | None:
+    """Return one ref a run; None for a video without labels.
+
+    A video with damaged labels becomes one ref, which `read` refuses.
+    """
     try:
         found = labels.of(video)
         if found is None:
-            return []
+            return None
         runs = cut_into_runs(found, needed, layout, header_of(video.path), str(video.path))
         mark = file_fingerprint(video.path)
     except EpisodeError as fault:
-        return [EpisodeRef(video.name, 1, None, _digest(str(fault)))]
+        return [EpisodeRef(video.name, 1, None, _digest(str(fault).encode()))]
     refs = []
     for number, span in enumerate(runs.spans):
         values = [runs.labels.points[point][slice(*span)].tobytes() for point in needed]
@@ -231,15 +221,8 @@ def _runs_of(
     return refs
 
 
-def _digest(*parts: str | bytes) -> str:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part.encode() if isinstance(part, str) else part)
-    return digest.hexdigest()[:16]
-
-
-def _header(table: FrameTable) -> Header:
-    return Header(len(table), table.hz or _measured_hz(table.times), table.width, table.height, table.codec)
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
 def _measured_hz(times: Floats) -> float:
@@ -247,46 +230,33 @@ def _measured_hz(times: Floats) -> float:
     return 1 / step if step > 0 else 0.0
 
 
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3:,} more" if len(names) > 3 else "")
-
-
-def _nothing(videos: dict[str, Video], labels: LabelSet, layout: HandsLayout) -> tuple[str, str]:
-    """Return why no video gave an episode, and what to do."""
-    labelled = 0
-    for video in videos.values():
-        labelled += labels.of(video) is not None
-    if not labelled:
-        fault = f"has no video that the labels know: videos {_some(list(videos))}"
-        return fault, f"labels are of {_some(labels.known())}"
-    fault = f"has no run of {layout.min_frames} frames with the needed hands in {labelled} labelled videos"
-    return fault, "lower source.layout.min_frames, or set source.layout.missing: hold"
-
-
-def _no_run(runs: Runs, needed: tuple[str, ...], layout: HandsLayout) -> tuple[str, str]:
-    without, labelled = runs.counts["without_hands"], runs.counts["labelled"]
-    fault = f"has no run of {layout.min_frames} frames with {', '.join(needed)}: "
-    fault += f"{without:,} of {labelled:,} frames lack one"
-    return fault, "lower source.layout.min_frames, or set source.layout.missing: hold"
-
-
 def _episode(
-    episode_id: str, file: VideoFile, runs: Runs, number: int, embodiment: Embodiment, alone: bool
+    episode_id: str, file: VideoFile, runs: Runs, number: int | None, embodiment: Embodiment
 ) -> Episode:
-    """Make the episode of run `number`; `alone` says that it is the only episode of its video."""
-    span, labels, layout = runs.spans[number], runs.labels, layout_of(embodiment)
-    marks = labels.frames[span[0] : span[1]]
+    """Make the episode of run `number`; None makes that of the longest run, as the only one of its video."""
+    labels, layout, counts = runs.labels, layout_of(embodiment), runs.counts
+    longest = int(np.argmax([stop - start for start, stop in runs.spans]))
+    chosen = longest if number is None else number
+    span = start, stop = runs.spans[chosen]
+    marks = labels.frames[start:stop]
     every = layout.pictures == "every"
-    shown = np.arange(marks[0], marks[-1]) if every else marks[:-1]
-    stream = _Pictures(file, shown)
-    at = file.timestamps[marks[:-1]]
-    steady = not every and embodiment.sync.rate_hz is None and _regular(at)
+    stream = _Pictures(file, np.arange(marks[0], marks[-1]) if every else marks[:-1])
+    steps = np.diff(file.timestamps[marks[:-1]])
+    regular = not len(steps) or (np.abs(steps - np.median(steps)) <= REGULAR * np.median(steps)).all()
+    steady = bool(regular) and not every and embodiment.sync.rate_hz is None
     if steady and not labels.irregular:
-        _check_rate(file.path, at, embodiment)
+        _check_rate(file.path, _measured_hz(file.timestamps[marks[:-1]]), embodiment)
     text = "; ".join(dict.fromkeys(words for frame, words in labels.texts if marks[0] <= frame < marks[-1]))
     state: tuple[Signal, ...] = ()
     if embodiment.state:
         state = (_signal(embodiment.state, file, labels, span, to_last=not steady),)
+    # Frames in no run count in the first run, or in the only one that is read.
+    left = len(labels) - (stop - start - 1) if number is None else counts["dropped"] if number == 0 else 0
+    flags = {
+        "held_frames": int(runs.held[start : stop - 1].sum()),
+        "masked_frames": int(runs.missing[start : stop - 1].sum()),
+        "dropped_frames": left,
+    }
     return Episode(
         id=episode_id,
         streams={camera.name: stream for camera in embodiment.cameras},
@@ -295,28 +265,10 @@ def _episode(
         rate_stamped=steady,
         instruction=text,
         source=str(file.path),
-        metadata={"labels": layout.labels, "run": number, "runs": len(runs.spans)}
-        | {"first_frame": int(marks[0]), "video_frames": len(file), **runs.counts}
-        | {"flags": _flags(runs, number, alone)},
+        metadata={"labels": layout.labels, "run": chosen, "runs": len(runs.spans)}
+        | {"first_frame": int(marks[0]), "video_frames": len(file), **counts}
+        | {"flags": {name: count for name, count in flags.items() if count}},
     )
-
-
-def _flags(runs: Runs, number: int, alone: bool) -> dict[str, int]:
-    """Return the counts that are summed over episodes.
-
-    Frames in no run count in the first run, or in the run that is `alone`.
-    """
-    start, stop = runs.spans[number]
-    own = slice(start, stop - 1)
-    dropped = 0 if number else runs.counts["dropped"]
-    if alone:
-        dropped = len(runs.labels) - (stop - start - 1)
-    counts = {
-        "held_frames": int(runs.held[own].sum()),
-        "masked_frames": int(runs.missing[own].sum()),
-        "dropped_frames": dropped,
-    }
-    return {name: count for name, count in counts.items() if count}
 
 
 def _signal(
@@ -336,13 +288,8 @@ def _signal(
     return Signal(times, np.where(known[:, None], values, np.float32(0)), known)
 
 
-def _regular(times: Floats) -> bool:
-    steps = np.diff(times)
-    return len(steps) == 0 or bool((np.abs(steps - np.median(steps)) <= REGULAR * np.median(steps)).all())
-
-
-def _check_rate(path: Path, times: Floats, embodiment: Embodiment) -> None:
-    stated, measured = embodiment.frequency_hz, _measured_hz(times)
+def _check_rate(path: Path, measured: float, embodiment: Embodiment) -> None:
+    stated = embodiment.frequency_hz
     if isinstance(stated, float) and measured and abs(stated - measured) > RATE_TOLERANCE * measured:
         raise EpisodeError(
             path,

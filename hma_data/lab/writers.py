@@ -1,0 +1,337 @@
+"""Write recordings in four formats, as their own recorders write them.
+
+Episodes are read one by one, so that only one is in memory.
+
+T frames of an episode, A action dims, S state dims.
+"""
+
+import json
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.lab import imported
+from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.export import lerobot_features
+from hma_data.sources.rlds.records import masked_crc
+
+DISTRO = "jazzy"  # of ROS
+_CORE = "tensorflow_datasets.core.features"
+
+# -- HDF5
+
+
+@dataclass(frozen=True)
+class Demo:
+    """One episode of T frames for HDF5.
+
+    Attributes:
+        actions: (T, A) float32.
+        observations: key -> (T, …); uint8 (T, H, W, 3) are pictures.
+        states: (T, S) float64, the states of the simulator.
+        rewards: (T,) float64.
+        success: whether the task was done at the end.
+        facts: plain values that are stored as attributes.
+    """
+
+    actions: NDArray[np.float32]
+    observations: Mapping[str, NDArray[Any]]
+    states: NDArray[np.float64]
+    rewards: NDArray[np.float64]
+    success: bool
+    facts: Mapping[str, str | int | float]
+
+
+def write_hdf5(path: Path, demos: Iterable[Demo], env_args: Mapping[str, Any]) -> None:
+    """Write one file in robomimic's layout.
+
+        data                    attrs: env_args (JSON), total (frames in all)
+          demo_0                attrs: num_samples, and plain facts of the episode
+            actions             (T, A) float32
+            obs/<key>           (T, …), pictures (T, H, W, 3) uint8, one compressed chunk a frame
+            states rewards dones
+        mask/train mask/valid   names of demos
+
+    `obs` at index t was observed before `actions[t]`; `rewards[t]` and `dones[t]` came after it. Every tenth
+    demo is for validation; with two to nine demos, the last one is.
+    """
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        total, count = 0, 0
+        for count, demo in enumerate(demos, start=1):
+            _write_demo(data.create_group(f"demo_{count - 1}"), demo)
+            total += len(demo.actions)
+        data.attrs["total"] = total
+        data.attrs["env_args"] = json.dumps(env_args, sort_keys=True)
+        valid = set(range(9, count, 10)) or ({count - 1} if count > 1 else set())
+        for name, chosen in (("train", set(range(count)) - valid), ("valid", valid)):
+            file.create_dataset(f"mask/{name}", data=np.array([f"demo_{i}" for i in sorted(chosen)], "S"))
+
+
+def _write_demo(group: h5py.Group, demo: Demo) -> None:
+    length = len(demo.actions)
+    group.create_dataset("actions", data=demo.actions)
+    for key, values in demo.observations.items():
+        pictures = values.dtype == np.uint8 and values.ndim == 4
+        packing = {"chunks": (1, *values.shape[1:]), "compression": "gzip", "compression_opts": 1}
+        group.create_dataset(f"obs/{key}", data=values, **(packing if pictures else {}))
+    group.create_dataset("states", data=demo.states)
+    group.create_dataset("rewards", data=demo.rewards)
+    group.create_dataset("dones", data=(np.arange(length) == length - 1).astype(np.int64))
+    for name, value in {"num_samples": length, "success": demo.success, **demo.facts}.items():
+        group.attrs[name] = value
+
+
+# -- RLDS
+
+
+@dataclass(frozen=True)
+class RldsEpisode:
+    """One episode of T steps for RLDS.
+
+    Attributes:
+        pictures: path inside a step -> T files, JPEG or PNG.
+        vectors: path inside a step -> (T, A) float32.
+        instruction: the task in words.
+    """
+
+    pictures: Mapping[str, list[bytes]]
+    vectors: Mapping[str, NDArray[np.float32]]
+    instruction: str
+
+
+def write_rlds(
+    folder: Path, name: str, sizes: Mapping[str, tuple[int, int]], codec: str, episodes: Iterable[RldsEpisode]
+) -> None:
+    """Write a folder as TFDS does: one split of one shard, a TFRecord file of tf.train.Example.
+
+        features.json dataset_info.json <name>-train.tfrecord-00000-of-00001
+
+    Args:
+        folder: folder to make.
+        name: name of the dataset.
+        sizes: path of each camera -> (height, width).
+        codec: jpeg or png.
+        episodes: the episodes; all have the same keys.
+    """
+    folder.mkdir(parents=True)
+    count, widths = 0, {}
+    with (folder / f"{name}-train.tfrecord-00000-of-00001").open("wb") as file:
+        for episode in episodes:
+            file.write(_record(_example(episode)))
+            widths = {key: values.shape[1] for key, values in episode.vectors.items()}
+            count += 1
+    (folder / "features.json").write_text(json.dumps(_features(sizes, codec, widths)))
+    splits = [{"name": "train", "shardLengths": [str(count)]}]
+    info = {"name": name, "version": "1.0.0", "fileFormat": "tfrecord", "splits": splits}
+    (folder / "dataset_info.json").write_text(json.dumps(info))
+
+
+def _features(sizes: Mapping[str, tuple[int, int]], codec: str, widths: Mapping[str, int]) -> dict[str, Any]:
+    leaves: dict[str, Any] = {"language_instruction": {"pythonClassName": f"{_CORE}.Text", "text": {}}}
+    for key, (height, width) in sizes.items():
+        shape = {"dimensions": [str(height), str(width), "3"]}
+        image = {"shape": shape, "dtype": "uint8", "encodingFormat": codec}
+        leaves[key] = {"pythonClassName": f"{_CORE}.Image", "image": image}
+    for key, width in widths.items():
+        tensor = {"shape": {"dimensions": [str(width)]}, "dtype": "float32", "encoding": "none"}
+        leaves[key] = {"pythonClassName": f"{_CORE}.Tensor", "tensor": tensor}
+    nested: dict[str, Any] = {}
+    for path, leaf in leaves.items():
+        *parents, last = path.split("/")
+        at = nested
+        for parent in parents:
+            at = at.setdefault(parent, {})
+        at[last] = leaf
+    steps = {"feature": _dict(nested), "length": "-1"}
+    return _dict({"steps": {"pythonClassName": f"{_CORE}.Dataset", "sequence": steps}})
+
+
+def _dict(items: dict[str, Any]) -> dict[str, Any]:
+    known = {key: value if "pythonClassName" in value else _dict(value) for key, value in items.items()}
+    return {"pythonClassName": f"{_CORE}.FeaturesDict", "featuresDict": {"features": known}}
+
+
+def _example(episode: RldsEpisode) -> bytes:
+    """Return a tf.train.Example, a map from names to lists, in protobuf's wire format."""
+    length = len(next(iter(episode.pictures.values())))
+    lists: dict[str, bytes] = {
+        f"steps/{key}": _field(1, b"".join(_field(1, data) for data in files))
+        for key, files in episode.pictures.items()
+    }
+    for key, values in episode.vectors.items():
+        lists[f"steps/{key}"] = _field(2, _field(1, np.ascontiguousarray(values, "<f4").tobytes()))
+    lists["steps/language_instruction"] = _field(1, _field(1, episode.instruction.encode()) * length)
+    entries = (_field(1, name.encode()) + _field(2, content) for name, content in lists.items())
+    return _field(1, b"".join(_field(1, entry) for entry in entries))
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """Return a field of bytes: its number and type, the length as a varint, the content."""
+    head, length = bytearray([number << 3 | 2]), len(content)
+    while length > 0x7F:
+        head.append(length & 0x7F | 0x80)
+        length >>= 7
+    return bytes(head) + bytes([length]) + content
+
+
+def _record(data: bytes) -> bytes:
+    length = struct.pack("<Q", len(data))
+    return length + struct.pack("<I", masked_crc(length)) + data + struct.pack("<I", masked_crc(data))
+
+
+# -- LeRobot
+
+
+@dataclass(frozen=True)
+class LeRobotEpisode:
+    """One episode of T frames for LeRobot.
+
+    Attributes:
+        pictures: camera feature -> (T, H, W, 3) uint8 RGB.
+        action: (T, A) float32, the command issued at each frame.
+        state: (T, S) float32, seen at each frame.
+        task: the task in words.
+    """
+
+    pictures: Mapping[str, NDArray[np.uint8]]
+    action: NDArray[np.float32]
+    state: NDArray[np.float32]
+    task: str
+
+
+def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRobotEpisode]) -> None:
+    """Write a LeRobotDataset v3.0 with lerobot's own writer; videos are H.264.
+
+    The features are those that `hma registry export --to lerobot-features` prints for the embodiment.
+
+    Args:
+        folder: folder to make.
+        embodiment: an embodiment that has a state, and a whole number of frames a second.
+        episodes: the episodes; each has the embodiment's cameras and widths.
+
+    Raises:
+        MissingDependencyError: lerobot cannot be imported.
+    """
+    assert embodiment.frequency_hz and embodiment.frequency_hz == int(embodiment.frequency_hz)
+    with imported("lerobot", "pip install 'lerobot[dataset]'"):
+        from lerobot.configs.video import RGBEncoderConfig
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    writer = LeRobotDataset.create(
+        f"lab/{embodiment.id}",
+        int(embodiment.frequency_hz),
+        lerobot_features(embodiment),
+        root=folder,
+        robot_type=embodiment.robot,
+        video_backend="pyav",
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=18),
+        encoder_threads=1,  # the output bytes depend on the number of threads
+    )
+    with _quiet():
+        try:
+            for episode in episodes:
+                for row, (action, state) in enumerate(zip(episode.action, episode.state, strict=True)):
+                    pictures = {key: images[row] for key, images in episode.pictures.items()}
+                    numbers = {"action": action, "observation.state": state}
+                    writer.add_frame({**pictures, **numbers, "task": episode.task})
+                writer.save_episode(parallel_encoding=False)  # otherwise it forks this process, once a camera
+        finally:
+            writer.finalize()  # after a failure too; else it would write to a removed folder when collected
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Hide FFmpeg's report on each video and the progress bar of `datasets`."""
+    import av.logging
+    import datasets
+
+    datasets.disable_progress_bars()
+    av.logging.set_libav_level(av.logging.ERROR)
+    try:
+        yield
+    finally:
+        datasets.enable_progress_bars()
+        av.logging.set_libav_level(av.logging.INFO)
+
+
+# -- MCAP
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message for MCAP.
+
+    Attributes:
+        topic: name with leading slash.
+        stamp_ns: time of the event, in the message's header; nanoseconds since 1970.
+        received_ns: the later time at which the recorder received it.
+        type: e.g. sensor_msgs/msg/JointState; a type with a header.
+        frame: frame_id of the header.
+        fields: values of the other fields.
+    """
+
+    topic: str
+    stamp_ns: int
+    received_ns: int
+    type: str
+    frame: str
+    fields: Mapping[str, Any]
+
+
+def ros_value(kind: str, *values: Any, **named: Any) -> Any:
+    """Return a value of a ROS 2 type, such as geometry_msgs/msg/Vector3."""
+    return _types().types[kind](*values, **named)
+
+
+def write_mcap(path: Path, messages: Sequence[Message], facts: Mapping[str, str]) -> None:
+    """Write one MCAP file as a ROS 2 recorder would: CDR messages, and the definitions of their types.
+
+    Messages are in the file in the order of receipt; `facts` become its metadata record "episode".
+    """
+    from mcap.writer import CompressionType, Writer
+
+    store = _types()
+    channels: dict[str, int] = {}
+    schemas: dict[str, int] = {}
+    sequence: dict[str, int] = {}
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=256 * 1024, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="hma_data.lab")
+        writer.add_metadata("rosbag2", {"ROS_DISTRO": DISTRO})
+        writer.add_metadata("episode", dict(facts))
+        for message in sorted(messages, key=lambda item: (item.received_ns, item.topic)):
+            if message.type not in schemas:
+                definition, _ = store.generate_msgdef(message.type, ros_version=2)
+                schemas[message.type] = writer.register_schema(message.type, "ros2msg", definition.encode())
+            if message.topic not in channels:
+                channels[message.topic] = writer.register_channel(
+                    message.topic, "cdr", schemas[message.type], {"offered_qos_profiles": ""}
+                )
+            sequence[message.topic] = sequence.get(message.topic, 0) + 1
+            stamp = ros_value("builtin_interfaces/msg/Time", *divmod(message.stamp_ns, 1_000_000_000))
+            header = ros_value("std_msgs/msg/Header", stamp=stamp, frame_id=message.frame)
+            content = ros_value(message.type, header=header, **message.fields)
+            writer.add_message(
+                channels[message.topic],
+                log_time=message.received_ns,
+                data=bytes(store.serialize_cdr(content, message.type)),
+                publish_time=message.stamp_ns,
+                sequence=sequence[message.topic],
+            )
+        writer.finish()
+
+
+@cache
+def _types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores(f"ros2_{DISTRO}"))
