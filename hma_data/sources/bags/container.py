@@ -1,19 +1,24 @@
-"""Define what the three kinds of bag file share: the contract, records, chunks, binary fields.
+"""Define what the three kinds of bag file share: the contract, records, the index by time, chunks.
 
 A container is one file. It yields the messages of wanted topics in the file's order. Where it has an index,
 it counts the messages without reading them. It finds a message again by its place, so for pictures only
 places are kept in memory. No container holds an open file between calls.
+
+A piece is a run of a file's records: one chunk, or messages outside of chunks. Its topics and its times of
+receipt are known, so a time range is read without the rest. A file has some thousands of pieces.
 """
 
 import bz2
 import sqlite3
 import struct
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
+
+from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
 
@@ -23,11 +28,11 @@ FOREVER = 2**64
 HEAD = 64  # bytes: the stamp of a message is within them
 FAULTS = (
     struct.error, ValueError, LookupError, OverflowError, RecursionError, EOFError, OSError, RuntimeError,
-    MemoryError, sqlite3.Error,
+    MemoryError, sqlite3.Error, McapError,
 )  # fmt: skip
 
 Data = bytes | memoryview
-Place = tuple[int, int]
+FilePlace = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -54,11 +59,11 @@ class Record(NamedTuple):
     channel: Channel
     log_ns: int
     data: Data
-    place: Place
+    place: FilePlace
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RecordFilter:
     """The messages that a container is asked for.
 
     Attributes:
@@ -72,11 +77,6 @@ class Wanted:
     last_ns: int = FOREVER
     heads: frozenset[str] = frozenset()
 
-    @property
-    def bounded(self) -> bool:
-        """Check whether only a part of the recording's time is asked for."""
-        return self.first_ns > 0 or self.last_ns < FOREVER
-
     def topic(self, name: str) -> bool:
         """Check whether messages of that topic are asked for."""
         return self.topics is None or name in self.topics
@@ -84,6 +84,9 @@ class Wanted:
     def time(self, log_ns: int) -> bool:
         """Check whether a message received at that time is asked for."""
         return self.first_ns <= log_ns <= self.last_ns
+
+
+ALL = RecordFilter()
 
 
 class Container(Protocol):
@@ -95,7 +98,7 @@ class Container(Protocol):
         """Count the messages of each channel, from the index if there is one; also of empty channels."""
         ...
 
-    def records(self, wanted: Wanted) -> Iterator[Record]:
+    def records(self, wanted: RecordFilter) -> Iterator[Record]:
         """Yield the wanted messages, in the file's order."""
         ...
 
@@ -103,7 +106,7 @@ class Container(Protocol):
         """Return each topic's last message before a time; topics without one are left out."""
         ...
 
-    def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
+    def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
         """Yield the data of the messages at those places."""
         ...
 
@@ -123,6 +126,109 @@ def damaged(path: Path, fault: str) -> EpisodeError:
     return EpisodeError(
         path, fault, "copy it again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
     )
+
+
+class Piece(NamedTuple):
+    """The records from offset `at` to `end`: one chunk, or messages outside of chunks.
+
+    Attributes:
+        first_ns, last_ns: earliest and latest receipt of its messages.
+        topics: of its messages.
+    """
+
+    at: int
+    end: int
+    first_ns: int
+    last_ns: int
+    topics: frozenset[str]
+
+    def holds(self, topics: frozenset[str] | None) -> bool:
+        """Check whether it can hold a message of those topics."""
+        return topics is None or not self.topics.isdisjoint(topics)
+
+
+@dataclass
+class FileIndex:
+    """The channels of a file by number, its pieces in their order, and what else a walk over it shows.
+
+    Attributes:
+        counts: messages of each channel, where the walk counts them.
+        notes: entries of MCAP's metadata records.
+    """
+
+    channels: dict[int, Channel] = field(default_factory=dict)
+    pieces: list[Piece] = field(default_factory=list)
+    counts: Counter[Channel] = field(default_factory=Counter)
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def channel(self, number: int) -> Channel:
+        """Return the channel of that number.
+
+        Raises:
+            ValueError: the file does not declare it.
+        """
+        if number not in self.channels:
+            raise ValueError(f"a message is on channel {number}, which is not declared")
+        return self.channels[number]
+
+
+class IndexedFile:
+    """A bag file that is read piece by piece; its unpacked chunks are kept in `chunks`. See Container."""
+
+    def __init__(self, path: Path, chunks: "ChunkCache | None" = None) -> None:
+        self.path = path
+        self._chunks = chunks or ChunkCache()
+        self._indexed: FileIndex | None = None
+
+    def records(self, wanted: RecordFilter) -> Iterator[Record]:
+        """See Container; pieces without a wanted message are not read."""
+        with reading(self.path), self.path.open("rb") as file:
+            index = self._index(file)
+            for piece in index.pieces:
+                within = piece.first_ns <= wanted.last_ns and piece.last_ns >= wanted.first_ns
+                if within and piece.holds(wanted.topics):
+                    yield from self._in_piece(file, index, piece, wanted)
+
+    def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
+        """See Container; it looks back no further than needed."""
+        found: dict[str, Record] = {}
+        with reading(self.path), self.path.open("rb") as file:
+            index = self._index(file)
+            earlier = (piece for piece in index.pieces if piece.first_ns < log_ns and piece.holds(topics))
+            for piece in sorted(earlier, key=lambda piece: piece.last_ns, reverse=True):
+                newest = min(piece.last_ns, log_ns - 1)
+                missing = frozenset(t for t in topics if t not in found or found[t].log_ns < newest)
+                if not missing:
+                    break
+                if piece.holds(missing):
+                    wanted = RecordFilter(missing, last_ns=log_ns - 1)
+                    take_last(found, self._in_piece(file, index, piece, wanted))
+        return found
+
+    def _index(self, file: BinaryIO) -> FileIndex:
+        if self._indexed is None:
+            self._indexed = self._make_index(file)
+        return self._indexed
+
+    def _make_index(self, file: BinaryIO) -> FileIndex:
+        raise NotImplementedError
+
+    def _in_piece(
+        self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
+    ) -> Iterator[Record]:
+        raise NotImplementedError
+
+
+def take_last(found: dict[str, Record], records: Iterable[Record]) -> None:
+    """Put the last message of each topic into `found`, with a copy of its bytes."""
+    newest: dict[str, Record] = {}
+    for record in records:
+        topic = record.channel.topic
+        if topic not in newest or newest[topic].log_ns <= record.log_ns:
+            newest[topic] = record
+    for topic, record in newest.items():
+        if topic not in found or found[topic].log_ns <= record.log_ns:
+            found[topic] = record._replace(data=bytes(record.data))
 
 
 class ChunkCache:
@@ -186,36 +292,6 @@ def unzstd(data: Data, limit: int) -> bytes:
     except zstandard.ZstdError as fault:
         raise ValueError(str(fault)) from fault
     return unpacked
-
-
-class Fields:
-    """Read little-endian fields from bytes; raise ValueError where the bytes end too soon."""
-
-    def __init__(self, data: Data) -> None:
-        self._data = memoryview(data)
-        self._at = 0
-
-    def take(self, size: int) -> memoryview:
-        """Take the next `size` bytes."""
-        if self._at + size > len(self._data):
-            raise ValueError("a record ends too soon")
-        self._at += size
-        return self._data[self._at - size : self._at]
-
-    def number(self, size: int) -> int:
-        """Read an unsigned number of `size` bytes."""
-        return int.from_bytes(self.take(size), "little")
-
-    def block(self) -> memoryview:
-        """Take the bytes that follow their 32-bit length."""
-        return self.take(self.number(4))
-
-    def text(self) -> str:
-        """Read UTF-8 text that follows its 32-bit length."""
-        return str(self.block(), "utf-8")
-
-    def __bool__(self) -> bool:
-        return self._at < len(self._data)
 
 
 def read_exact(file: BinaryIO, size: int) -> bytes:

@@ -51,29 +51,27 @@ class Field:
         Raises:
             EpisodeError: there is none; the error names the fields that are there.
         """
-        for i, step in enumerate(self.steps):
-            message = self._step(message, step, i, where)
+        for step in self.steps:
+            if isinstance(step, str):
+                try:
+                    message = child(message, step)
+                except KeyError as fault:
+                    known = ", ".join(field_names(message)) or "none, it is not a message"
+                    raise EpisodeError(
+                        where, f"{self.key}: there is no field {step!r}", f"the fields there: {known}"
+                    ) from fault
+                continue
+            if not is_list(message):
+                raise EpisodeError(where, f"{self.key}: what is before [ is not a list")
+            if (step + 1 if isinstance(step, int) else step.stop or 0) > len(message):
+                fault_of = f"{self.key}: the list has {len(message)} values in one of the messages"
+                raise EpisodeError(where, fault_of)
+            message = message[step]
         return message
 
     def owner(self, message: Any, where: str) -> Any:
         """Return the message that holds the last field."""
         return Field(self.key, self.topic, self.steps[:-1]).value(message, where)
-
-    def _step(self, value: Any, step: Step, i: int, where: str) -> Any:
-        if isinstance(step, str):
-            try:
-                return child(value, step)
-            except KeyError as fault:
-                known = ", ".join(field_names(value)) or "none, it is not a message"
-                raise EpisodeError(
-                    where, f"{self.key}: there is no field {step!r}", f"the fields there: {known}"
-                ) from fault
-        if not is_list(value):
-            raise EpisodeError(where, f"{self.key}: what is before [ is not a list")
-        end = step + 1 if isinstance(step, int) else step.stop or 0
-        if end > len(value):
-            raise EpisodeError(where, f"{self.key}: the list has {len(value)} values in one of the messages")
-        return value[step]
 
 
 def parse_key(key: str, topics: Iterable[str], where: str) -> Field:
@@ -120,7 +118,7 @@ def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
 
 
 class Column:
-    """Gather the values of one component, message by message.
+    """The values of one component, gathered message by message.
 
     Where the message that holds the field also has a list `name` (JointState), the component's `names` select
     and order the values, unless the key or the YAML slices. Messages of another publisher, with none of those
@@ -130,13 +128,11 @@ class Column:
     def __init__(self, component: Component, field: Field, where: str) -> None:
         self.component, self.field = component, field
         self._where = where
-        self._values = array("d")
-        self._rows = array("q")
+        self._values, self._rows = array("d"), array("q")
         self._width: int | None = None
         self._picks: dict[tuple[str, ...], list[int] | None] = {}
-        self._selects = bool(
-            component.names and not component.slice and field.steps and isinstance(field.steps[-1], str)
-        )
+        whole = not component.slice and field.steps and isinstance(field.steps[-1], str)
+        self._selects = bool(component.names and whole)
 
     def add(self, message: Any, row: int) -> None:
         """Add the values of message `row`."""
@@ -155,7 +151,12 @@ class Column:
             if picks is None:
                 return
             values = [values[i] for i in picks]
-        self._check_width(len(values), row)
+        if not values:
+            raise EpisodeError(self._where, f"{self.field.key} is empty in message {row}")
+        self._width = self._width or len(values)
+        if len(values) != self._width:
+            said = f"{self.field.key} has {self._width} values, then {len(values)} in message {row}"
+            raise EpisodeError(self._where, said)
         self._values.extend(values)
         self._rows.append(row)
 
@@ -180,12 +181,10 @@ class Column:
     def _pick(self, message: Any, width: int) -> list[int] | None:
         """Return the indices of the wanted names; None where the message has none of them."""
         owner = self.field.owner(message, self._where)
-        try:
-            names = tuple(child(owner, "name"))
-        except (KeyError, TypeError):
-            names = ()
-        if not names or isinstance(child(owner, "name"), str):
+        stated = child(owner, "name") if "name" in field_names(owner) else ()
+        if not is_list(stated) or not len(stated):
             return list(range(width))
+        names = tuple(stated)
         if names not in self._picks:
             self._picks[names] = self._indices(names)
         picks = self._picks[names]
@@ -206,17 +205,6 @@ class Column:
             )
         return [names.index(name) for name in wanted]
 
-    def _check_width(self, width: int, row: int) -> None:
-        if self._width is None:
-            self._width = width
-        if width != self._width or not width:
-            raise EpisodeError(
-                self._where,
-                f"{self.field.key} has {self._width} values, then {width} in message {row}"
-                if width
-                else f"{self.field.key} is empty in message {row}",
-            )
-
 
 # -- dtypes
 
@@ -233,60 +221,42 @@ def stated_dtype(channel: Channel, message: Any, steps: Sequence[Step]) -> str |
         numpy's name of the dtype; for a message of several dtypes, one that holds all; None where none
         is stated.
     """
+    names: Iterator[str] = iter(())
     try:
         if channel.encoding in ("ros1", "cdr"):
+            from rosbags.interfaces import Nodetype
+
             store, kind = ros_store(channel)
-            names = set(_ros_dtypes(store, _ros_field(store, kind, steps)))
+            names = _ros_dtypes(store, (Nodetype.NAME, kind), steps)
         elif channel.encoding == "protobuf":
-            names = set(_protobuf_at(message.DESCRIPTOR, steps))
-        else:
-            return None
-        return str(np.result_type(*sorted(names))) if names else None
+            path = [step for step in steps if isinstance(step, str)]
+            names = _protobuf_dtypes(message.DESCRIPTOR, path)
+        found = sorted(set(names))
+        return str(np.result_type(*found)) if found else None
     except (KeyError, TypeError, AttributeError, RecursionError):  # not a numpy number, or a recursive type
         return None
 
 
-def _ros_field(store: Any, kind: str, steps: Sequence[Step]) -> Any:
-    """Return rosbags's (node type, content) of the field at a path."""
-    from rosbags.interfaces import Nodetype
-
-    found: Any = (Nodetype.NAME, kind)
-    for step in steps:
-        if isinstance(step, str):
-            found = dict(store.fielddefs[found[1]][1])[step]
-        elif isinstance(step, int):
-            found = found[1][0]
-    return found
-
-
-def _ros_dtypes(store: Any, field: Any) -> Iterator[str]:
+def _ros_dtypes(store: Any, field: Any, steps: Sequence[Step]) -> Iterator[str]:
+    """Yield the dtypes at a path below one of rosbags's fields, (node type, content)."""
     from rosbags.interfaces import Nodetype
 
     node, content = field
     if node == Nodetype.BASE:
         yield ROS_BYTES.get(content[0], content[0])
     elif node == Nodetype.NAME:
-        for _, inner in store.fielddefs[content][1]:
-            yield from _ros_dtypes(store, inner)
-    else:
-        yield from _ros_dtypes(store, content[0])
+        for name, inner in store.fielddefs[content][1]:
+            if not steps or name == steps[0]:
+                yield from _ros_dtypes(store, inner, steps[1:])
+    else:  # a list
+        yield from _ros_dtypes(store, content[0], steps[1:])
 
 
-def _protobuf_at(kind: Any, steps: Sequence[Step]) -> Iterator[str]:
-    field: Any = None
-    for step in steps:
-        if isinstance(step, str):
-            field = kind.fields_by_name[step]
-            kind = field.message_type
-    if kind is None:
-        yield PROTOBUF[field.type]
-    else:
-        yield from _protobuf_dtypes(kind)
-
-
-def _protobuf_dtypes(kind: Any) -> Iterator[str]:
+def _protobuf_dtypes(kind: Any, path: Sequence[str]) -> Iterator[str]:
     for field in kind.fields:
+        if path and field.name != path[0]:
+            continue
         if field.message_type is None:
             yield PROTOBUF[field.type]
         else:
-            yield from _protobuf_dtypes(field.message_type)
+            yield from _protobuf_dtypes(field.message_type, path[1:])

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Marker, Segments
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.bags.bag import Bag, Place
-from hma_data.sources.bags.container import FAULTS, Channel, Record, Wanted
+from hma_data.sources.bags.bag import Bag, BagPlace
+from hma_data.sources.bags.container import FAULTS, Channel, Record, RecordFilter
 from hma_data.sources.bags.fields import Field, missing_topic, parse_key
 from hma_data.sources.bags.images import VIDEO, picture_kind
 from hma_data.sources.bags.messages import (
@@ -184,8 +184,8 @@ class _Pass:
         markers = self._markers()
         marked = frozenset(marker.track.topic for marker in markers)
         short = (heads(self._channels) & self._cameras.keys()) - marked
-        wanted = Wanted(frozenset(self._cameras) | marked, heads=short)
-        for place, record in self._bag.wanted(wanted):
+        wanted = RecordFilter(frozenset(self._cameras) | marked, heads=short)
+        for place, record in self._bag.records(wanted):
             topic = record.channel.topic
             if topic in self._cameras:
                 track = self._cameras[topic]
@@ -290,7 +290,7 @@ class MarkerTrack:
         self._service = False
         self._seen: dict[str, None] = {}
 
-    def add(self, place: Place, record: Record) -> None:
+    def add(self, place: BagPlace, record: Record) -> None:
         """Add the next message of the topic."""
         self._service = self._service or is_service_event(record.channel)
         message = None

@@ -20,8 +20,8 @@ from hma_data.episodes.episode import Episode, Floats, Signal, Stream
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Camera, Component, Segments
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.bags.bag import Bag, Place, find_bags
-from hma_data.sources.bags.container import Channel, Record, Wanted, damaged
+from hma_data.sources.bags.bag import Bag, BagPlace, find_bags
+from hma_data.sources.bags.container import Channel, Record, RecordFilter, damaged
 from hma_data.sources.bags.fields import Column, Field, missing_topic, parse_key
 from hma_data.sources.bags.images import picture_kind
 from hma_data.sources.bags.inspect import report
@@ -237,22 +237,22 @@ class _EpisodeReading:
                 self._tracks[topic].add(record.channel, record.log_ns, place, message)
         self._check()
 
-    def _records(self, topics: frozenset[str], short: frozenset[str]) -> Iterator[tuple[Place, Record]]:
+    def _records(self, topics: frozenset[str], short: frozenset[str]) -> Iterator[tuple[BagPlace, Record]]:
         segment, table = self._segment, self._table
         if segment is None or table is None:
-            return self._bag.wanted(Wanted(topics, heads=short))
+            return self._bag.records(RecordFilter(topics, heads=short))
         first_ns, last_ns = segment.first_ns - table.reach_ns, segment.last_ns + table.reach_ns
         first_ns = max(first_ns, 0)
         videos = topics & table.keyframes.keys()
         plain = topics - videos
         held = plain - {self._embodiment.primary_camera.key}
-        within = Wanted(plain, first_ns, last_ns, short)
-        parts = [iter(self._bag.before(held, first_ns)), self._bag.wanted(within)]
+        within = RecordFilter(plain, first_ns, last_ns, short)
+        parts = [iter(self._bag.before(held, first_ns)), self._bag.records(within)]
         for topic in sorted(videos):
             keyframes = table.keyframes[topic]
             at = int(np.searchsorted(keyframes, first_ns, side="right")) - 1
             begin = int(keyframes[at]) if at >= 0 else 0
-            parts.append(self._bag.wanted(Wanted(frozenset({topic}), begin, last_ns)))
+            parts.append(self._bag.records(RecordFilter(frozenset({topic}), begin, last_ns)))
         return chain.from_iterable(parts)
 
     def _hear(self, log_ns: int, text: str) -> None:

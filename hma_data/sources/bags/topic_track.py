@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Floats, Stream
 from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.bag import Bag, Place
+from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.container import Channel, Data
 from hma_data.sources.bags.fields import Column
 from hma_data.sources.bags.images import (
@@ -53,7 +53,7 @@ class TopicTrack:
     def __len__(self) -> int:
         return len(self._log_ns)
 
-    def add_head(self, channel: Channel, log_ns: int, place: Place, data: Data) -> None:
+    def add_head(self, channel: Channel, log_ns: int, place: BagPlace, data: Data) -> None:
         """Add the next message, of which only the time in its first bytes is needed.
 
         Raises:
@@ -68,7 +68,7 @@ class TopicTrack:
             ) from fault
         self._take(channel, log_ns, place, own_ns)
 
-    def add(self, channel: Channel, log_ns: int, place: Place, message: Any) -> None:
+    def add(self, channel: Channel, log_ns: int, place: BagPlace, message: Any) -> None:
         """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt."""
         for column in self.columns:
             column.add(message, len(self))
@@ -76,7 +76,7 @@ class TopicTrack:
             self._keyframes.append(self._is_keyframe(message))
         self._take(channel, log_ns, place, stamp_ns(message))
 
-    def _take(self, channel: Channel, log_ns: int, place: Place, own_ns: int) -> None:
+    def _take(self, channel: Channel, log_ns: int, place: BagPlace, own_ns: int) -> None:
         if channel not in self.channels:
             self.channels.append(channel)
         self._log_ns.append(min(log_ns, INT64.max))
@@ -199,7 +199,7 @@ class Messages:
     def read(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[object]:
         """Yield the decoded messages of those indices, in that order."""
         rows = self._places[np.asarray(indices, np.int64)].tolist()
-        places = [Place(file, first, second) for file, first, second, _ in rows]
+        places = [(file, first, second) for file, first, second, _ in rows]
         for row, data in zip(rows, self._bag.payloads(places), strict=True):
             yield decode(self._channels[row[3]], data, self.where)
 
