@@ -25,8 +25,7 @@ from hma_data.plugins import SOURCE_GROUP, installed
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.registry.formats import FORMATS, MORE, known_formats
-from hma_data.sources.common.findings import Finding
-from hma_data.sources.common.links import nothing_there
+from hma_data.sources.common.findings import Finding, nothing_there
 from hma_data.storage.paths import StrPath, as_text
 
 SAMPLE = 20  # episodes that inspect looks into

@@ -17,7 +17,7 @@ from hma_data.sources.base import Inspection, open_source
 from hma_data.sources.common import timestamp_checks
 from hma_data.sources.common.image_checks import Look, choose, ycbcr_share
 from hma_data.sources.common.survey import CHECKS
-from hma_data.sources.common.timestamp_checks import clock_of
+from hma_data.sources.common.timestamp_checks import measure
 from tests.data.bag_files import make_recording, write_ros1, write_ros2
 from tests.data.rlds_files import TEXT, image, png, tensor, write
 from tests.data.videos import encode as encode_video
@@ -292,21 +292,21 @@ def test_a_clock_counts_what_was_done_to_it() -> None:
     times = np.arange(300) / 30 + draw.normal(scale=0.001, size=300)
     kept = np.delete(times, [50, 120, 121, 122, 200])
     kept[20] = kept[19]
-    clock = clock_of(kept)
+    clock = measure(kept)
     assert (clock.lost, clock.repeated, clock.back) == (5, 1, 0)
     assert clock.hz == pytest.approx(30, rel=0.02)
 
 
 def test_lost_frames_are_told_for_cameras_alone() -> None:
     times = np.delete(np.arange(100) / 10, [20, 40, 41, 60])
-    (finding,) = timestamp_checks.findings("cam", clock_of(times), camera=True)
+    (finding,) = timestamp_checks.findings("cam", measure(times), camera=True)
     assert finding.check == "frames" and finding.numbers["lost"] == 4
-    assert not list(timestamp_checks.findings("arm", clock_of(times)))
+    assert not list(timestamp_checks.findings("arm", measure(times)))
 
 
 def test_events_have_no_pauses() -> None:
     times = np.cumsum(np.random.default_rng(0).exponential(5.0, 200) ** 2)
-    assert not list(timestamp_checks.findings("/button", clock_of(times)))
+    assert not list(timestamp_checks.findings("/button", measure(times)))
 
 
 def test_skew_is_the_distance_to_the_nearest_sample() -> None:

@@ -80,9 +80,10 @@ class Bag:
         """Count the messages of each channel, from indexes where there are any."""
         if self._counts is None:
             packed = any(path.suffix == ".zstd" for path in self._paths)
-            self._counts = self._stated_counts() if packed else Counter()
+            counts = self._stated_counts() if packed else Counter[Channel]()
             for file in () if packed else self.files():
-                self._counts.update(file.counts())
+                counts.update(file.counts())
+            self._counts = counts
         return self._counts
 
     def records(self, wanted: RecordFilter = ALL) -> Iterator[tuple[BagPlace, Record]]:

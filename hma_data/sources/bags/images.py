@@ -15,10 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import MAX_PIXELS, Images, decode_image, opencv
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.messages import child, field_names
-from hma_data.sources.common.dtype_hints import one_channel
+from hma_data.sources.bags.bag import Bag
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.messages import child, decode, field_names
+from hma_data.sources.common.image_checks import one_channel
 from hma_data.sources.common.video_file import is_spoilt
 
 RAW, STILL, VIDEO = "raw", "still", "video"
@@ -43,6 +46,7 @@ ENCODINGS = {  # of raw pictures: bytes of a pixel, OpenCV's conversion to RGB
 }  # fmt: skip
 CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}  # Foxglove's and FFmpeg's names
 ENCODERS = (("264", "h264"), ("265", "h265"), ("hevc", "h265"), ("vp9", "vp9"), ("av1", "av1"))
+BLOCK = 64  # video messages fetched at a time
 NAL_UNIT = re.compile(b"\x00\x00\x01(.)", re.DOTALL)
 AV1_SEQUENCE = 1  # type of the unit that holds a sequence header
 # What FFmpeg logs where a reference picture is missing, and the level of that message.
@@ -323,3 +327,98 @@ def _missing_references(codec: str) -> Iterator[list[str]]:
             log.set_level(level)
             log.set_skip_repeated(skip)
             missing += [message for _, _, message in said if text in message]
+
+
+# -- streams
+
+
+class Messages:
+    """The messages of one topic, read again by index.
+
+    Args:
+        places: (T, 4) as TopicTrack keeps them, in order of receipt.
+        channels: the channels that the last number of a place points into.
+    """
+
+    def __init__(self, bag: Bag, channels: list[Channel], places: NDArray[np.int64], where: str) -> None:
+        self.where = where
+        self._bag, self._channels, self._places = bag, channels, places
+
+    def read(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[object]:
+        """Yield the decoded messages of those indices, in that order."""
+        rows = self._places[np.asarray(indices, np.int64)].tolist()
+        places = [(file, first, second) for file, first, second, _ in rows]
+        for row, data in zip(rows, self._bag.payloads(places), strict=True):
+            yield decode(self._channels[row[3]], data, self.where)
+
+
+class StillStream:
+    """A camera of raw or still pictures; see episode.Stream."""
+
+    def __init__(self, timestamps: Floats, messages: Messages, kind: str) -> None:
+        self.timestamps = timestamps
+        self._messages, self._kind = messages, kind
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """See episode.Stream."""
+        distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
+        stacked = _stack(self.each(distinct), len(distinct))
+        return stacked if np.array_equal(inverse, np.arange(len(stacked))) else stacked[inverse]
+
+    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[Images]:
+        """See episode.OneByOne."""
+        where = self._messages.where
+        return _of_one_size((picture(m, self._kind, where) for m in self._messages.read(indices)), where)
+
+
+class VideoStream:
+    """A camera of video; see episode.Stream.
+
+    Args:
+        timestamps: (T,) of the pictures shown, which are the last T messages.
+        keyframes: (M,) of all messages; the messages before those shown serve only for decoding.
+    """
+
+    def __init__(
+        self, timestamps: Floats, messages: Messages, keyframes: NDArray[np.bool_], codec: str
+    ) -> None:
+        self.timestamps = timestamps
+        self._messages, self._count = messages, len(keyframes)
+        self._lead = len(keyframes) - len(timestamps)
+        self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where)
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """See episode.Stream."""
+        wanted = [int(i) + self._lead for i in indices]
+        found = self._decoder.frames(wanted)
+        distinct = list(found)
+        stacked = _stack(_of_one_size(iter(found.values()), self._messages.where), len(found))
+        return stacked[[distinct.index(i) for i in wanted]]
+
+    def _from(self, start: int) -> Iterator[bytes]:
+        for block in range(start, self._count, BLOCK):
+            for message in self._messages.read(range(block, min(block + BLOCK, self._count))):
+                yield payload(message)
+
+
+def _of_one_size(pictures: Iterator[Images], where: str) -> Iterator[Images]:
+    """Yield the pictures; raise EpisodeError at the first whose size differs."""
+    first: tuple[int, ...] = ()
+    for item in pictures:
+        first = first or item.shape
+        if item.shape != first:
+            shapes = sorted({first, item.shape})
+            raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
+        yield item
+
+
+def _stack(pictures: Iterator[Images], count: int) -> Images:
+    """Stack pictures to (count, H, W, 3), one at a time, so that only one picture is in memory twice."""
+    first = next(pictures, None)
+    if first is None:
+        return np.zeros((0, 1, 1, 3), np.uint8)
+    stacked = np.empty((count, *first.shape), np.uint8)
+    stacked[0] = first
+    for i, item in enumerate(pictures, start=1):
+        stacked[i] = item
+    return stacked

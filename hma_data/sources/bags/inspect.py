@@ -16,16 +16,22 @@ from hma_data.episodes.episode import Floats
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
-from hma_data.sources.bags.fields import Field, parse_key, stated_dtype
 from hma_data.sources.bags.images import VIDEO, codec, is_grey, picture_kind
-from hma_data.sources.bags.messages import child, decode, field_names, is_list, is_message, numbers
-from hma_data.sources.bags.topic_track import TopicTrack, camera_stream
+from hma_data.sources.bags.messages import (
+    child,
+    decode,
+    field_names,
+    is_list,
+    is_message,
+    numbers,
+    stated_dtype,
+)
+from hma_data.sources.bags.topic_track import Field, TopicTrack, camera_stream, parse_key
 from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
 from hma_data.sources.common import image_checks
-from hma_data.sources.common.findings import Finding
-from hma_data.sources.common.links import unfollowed
+from hma_data.sources.common.findings import Finding, unfollowed
 from hma_data.sources.common.survey import Survey, sampled
-from hma_data.sources.common.timestamp_checks import Clock, clock_of, skew
+from hma_data.sources.common.timestamp_checks import StreamTimes, measure, skew
 
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
@@ -226,7 +232,7 @@ class _Telling:
         stated = topic.track.channels[0]
         kind = picture_kind(stated.type)
         times = topic.track.seconds("header")[topic.track.order()]
-        clock = clock_of(times) if topic.track.topic in LOGS else self._times(topic, times, bool(kind))
+        clock = measure(times) if topic.track.topic in LOGS else self._times(topic, times, bool(kind))
         found: list[KeyInfo] = []
         if not topic.fault:
             found = [self._camera(topic, kind)] if kind else _recorded(topic)
@@ -239,7 +245,7 @@ class _Telling:
             for key in found
         ]
 
-    def _times(self, topic: _Topic, times: Floats, camera: bool) -> Clock:
+    def _times(self, topic: _Topic, times: Floats, camera: bool) -> StreamTimes:
         """Hand the times to the survey; check what only messages with two times can show."""
         track, name = topic.track, topic.track.topic
         self._survey.made.add("stamps")

@@ -23,6 +23,7 @@ PIXELS = 4096  # pixels of a picture whose colours are checked
 DISTINCT = 1_000  # least number of distinct colours for the YCbCr sign
 SURE, CHANCE = 0.98, 0.6  # share of colours that YCbCr gives: least in the right order, most in the other
 COLD = 0.15  # share of cold pixels (saturated, blue > green > red) above which a hint is given
+JPEG_HEAD = 65536  # bytes that are searched for a JPEG's start of frame
 STILL, BLANK = 0.5, 2.0  # limits: share of equal neighbours; standard deviation of all values
 
 
@@ -172,6 +173,19 @@ def stacked(pictures: list[Images]) -> Iterator[tuple[int, Images]]:
         if i == len(pictures) or pictures[i].shape != pictures[start].shape:
             yield start, np.stack(pictures[start:i])
             start = i
+
+
+def one_channel(data: bytes) -> bool:
+    """Check whether a JPEG or PNG is grey, by its header."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return data[25:26] in (b"\0", b"\4")
+    at, head = 2, data[:JPEG_HEAD]
+    while head[:2] == b"\xff\xd8" and at + 10 <= len(head) and head[at] == 0xFF:
+        marker = head[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            return head[at + 9] == 1
+        at += 2 + (0 if marker == 0xFF else int.from_bytes(head[at + 2 : at + 4], "big"))
+    return False
 
 
 def findings(looks: dict[str, Look]) -> Iterator[Finding]:

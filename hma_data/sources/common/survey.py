@@ -22,7 +22,7 @@ from hma_data.sources.base import KeyInfo
 from hma_data.sources.common import image_checks, timestamp_checks
 from hma_data.sources.common.findings import Finding, Severity
 from hma_data.sources.common.image_checks import Look
-from hma_data.sources.common.timestamp_checks import Clock
+from hma_data.sources.common.timestamp_checks import StreamTimes
 
 CHECKS = {  # the checks of an inspection, in the order they are printed
     "readable": "episodes that can be read",
@@ -69,7 +69,7 @@ class _Numbers:
 class _Times:
     """The clock of one key over the episodes."""
 
-    met: dict[str, Clock] = field(default_factory=dict)
+    met: dict[str, StreamTimes] = field(default_factory=dict)
     camera: bool = False
     skew: tuple[float, float, float] | None = None
 
@@ -158,11 +158,11 @@ class Survey:
         look.add(frames, indices, again=self._shown.get(key) == name)
         self._shown[key] = name
 
-    def times(self, name: str, key: str, seconds: Floats, camera: bool = False) -> Clock:
+    def times(self, name: str, key: str, seconds: Floats, camera: bool = False) -> StreamTimes:
         """Add the times (T,) of one key of an episode, in the order of receipt; return their clock."""
         self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
         held = self._times.setdefault(key, _Times(camera=camera))
-        held.met[name] = timestamp_checks.clock_of(seconds)
+        held.met[name] = timestamp_checks.measure(seconds)
         return held.met[name]
 
     def skew(self, key: str, found: tuple[float, float, float] | None, period_s: float) -> None:

@@ -7,8 +7,7 @@ import numpy as np
 from hma_data.errors import EpisodeError, HMAError, MissingDependencyError
 from hma_data.sources.base import Inspection, KeyInfo, local_path
 from hma_data.sources.common import image_checks, timestamp_checks
-from hma_data.sources.common.findings import Finding
-from hma_data.sources.common.links import unfollowed
+from hma_data.sources.common.findings import Finding, unfollowed
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.layout import Header, Video, header_of, videos_of

@@ -13,10 +13,9 @@ from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.sources.base import Inspection, KeyInfo, local_path
 from hma_data.sources.common import image_checks, timestamp_checks
-from hma_data.sources.common.dtype_hints import is_times, one_channel, seconds_a_unit, seconds_of
-from hma_data.sources.common.findings import Finding
-from hma_data.sources.common.links import unfollowed
+from hma_data.sources.common.findings import Finding, unfollowed
 from hma_data.sources.common.survey import MAX_VALUES, Survey, listed, sampled
+from hma_data.sources.common.timestamp_checks import is_times, seconds_a_unit, seconds_of
 from hma_data.sources.hdf5.file import (
     MAX_BYTES,
     MAX_ROW,
@@ -259,7 +258,11 @@ def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | N
         codec = "jpeg" if start[:2] == b"\xff\xd8" else "png" if start[:4] == b"\x89PNG" else None
         if codec:
             shape = decode_image(encoded(first), where).shape
-            return "camera", (*shape[:2], 1) if one_channel(bytes(encoded(first))) else shape, codec
+            return (
+                "camera",
+                (*shape[:2], 1) if image_checks.one_channel(bytes(encoded(first))) else shape,
+                codec,
+            )
     if item.dtype.kind in "OS":
         return "text", shape[1:], None
     if item.dtype.kind in "fiub" and 1 <= len(shape) <= 3:

@@ -5,9 +5,9 @@ import math
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import EpisodeRef, Inspection, KeyInfo
 from hma_data.sources.common import image_checks
-from hma_data.sources.common.dtype_hints import is_times, seconds_of
 from hma_data.sources.common.findings import Finding
 from hma_data.sources.common.survey import Survey, sampled
+from hma_data.sources.common.timestamp_checks import is_times, seconds_of
 from hma_data.sources.rlds.folder import Folder, open_folder
 from hma_data.sources.rlds.steps import MAX_VECTOR, Steps, is_camera
 
