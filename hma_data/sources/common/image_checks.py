@@ -76,8 +76,9 @@ class Look:
         self.same += sum(np.array_equal(frames[i], frames[i + 1]) for i in pairs)
         if self._blank and float(frames.std()) >= BLANK:
             self.blank, self._blank = self.blank - 1, False
+        step = max(1, int(np.sqrt(size[0] * size[1] / PIXELS)))
         for frame in frames:
-            pixels = _some(frame)
+            pixels = frame[::step, ::step].reshape(-1, 3)  # on a grid over the picture
             self.red += float(pixels[:, 0].mean())
             self.blue += float(pixels[:, 2].mean())
             warm, cold = _tones(pixels)
@@ -105,12 +106,6 @@ class Look:
         if cold > COLD and cold > 4 * warm and self.blue > 1.25 * self.red:
             return "hint", f"{cold:.0%} of its pixels are cold, {warm:.0%} warm; a blue scene looks the same"
         return "", ""
-
-
-def _some(frame: Images) -> NDArray[np.uint8]:
-    """Return (m, 3) pixels on a grid over the picture."""
-    step = max(1, int(np.sqrt(frame.shape[0] * frame.shape[1] / PIXELS)))
-    return frame[::step, ::step].reshape(-1, 3)
 
 
 def _tones(pixels: NDArray[np.uint8]) -> tuple[float, float]:
@@ -200,9 +195,8 @@ def findings(looks: dict[str, Look]) -> Iterator[Finding]:
             yield Finding("size", worst, f"{key}: pictures of several sizes, {said}{part}", key=key)
         if look.blank:
             said = f"{key}: shows nothing (one colour) in {look.blank} of {look.episodes} episodes looked at"
-            severity: Severity = (
-                "info" if look.blank == look.episodes else "warn"
-            )  # info where every episode is blank: the camera was never plugged in
+            # Where every episode is blank, the camera was never plugged in.
+            severity: Severity = "info" if look.blank == look.episodes else "warn"
             yield Finding("blank", severity, said, "is it another camera's key?", key)
         share = look.same / max(look.neighbours, 1)
         if share > STILL and look.blank < look.episodes:
