@@ -294,6 +294,23 @@ def unzstd(data: Data, limit: int) -> bytes:
     return unpacked
 
 
+class FileView:
+    """A part of a file whose slices are read when they are taken, like a memoryview of its bytes."""
+
+    def __init__(self, file: BinaryIO, begin: int, end: int) -> None:
+        self._file, self._begin, self._size = file, begin, end - begin
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        self._file.seek(self._begin + part.start)
+        return read_exact(self._file, part.stop - part.start)
+
+
+View = memoryview | FileView
+
+
 def read_exact(file: BinaryIO, size: int) -> bytes:
     """Read exactly `size` bytes.
 

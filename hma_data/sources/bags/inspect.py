@@ -23,7 +23,6 @@ from hma_data.sources.bags.messages import (
     is_list,
     is_message,
     numbers,
-    stated_dtype,
 )
 from hma_data.sources.bags.topic_track import Field, TopicTrack, camera_stream, parse_key
 from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
@@ -225,7 +224,7 @@ class _BagInspection:
         measured = measure(times) if name in LOGS else self._times(track, times, bool(kind))
         found: list[KeyInfo] = []
         if not topic.fault:
-            found = [self._camera(topic, kind)] if kind else _recorded(topic)
+            found = [self._camera(topic, kind)] if kind else _values(name, topic.sample)
         found = found or [KeyInfo(name, "other", (), stated.type or stated.encoding)]
         for value in topic.values:
             value.hand_on(self._survey, self._name)
@@ -296,20 +295,6 @@ def _starts(keyframes: Any) -> Any:
 
 
 # -- keys
-
-
-def _recorded(topic: _Topic) -> list[KeyInfo]:
-    """Return the keys of a topic without pictures, with the dtypes that their definition states."""
-    name, channel = topic.track.topic, topic.track.channels[0]
-    found = _values(name, topic.sample)
-    if channel.encoding == "json":
-        return found
-    steps = [parse_key(key.key, (name,), name).steps for key in found]
-    stated = [stated_dtype(channel, topic.sample, path) for path in steps]
-    return [
-        replace(key, dtype=dtype) if dtype and key.kind == "vector" else key
-        for key, dtype in zip(found, stated, strict=True)
-    ]
 
 
 def _values(key: str, value: Any) -> list[KeyInfo]:

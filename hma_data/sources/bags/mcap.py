@@ -31,10 +31,12 @@ from hma_data.sources.bags.container import (
     Data,
     FileIndex,
     FilePlace,
+    FileView,
     IndexedFile,
     Piece,
     Record,
     RecordFilter,
+    View,
     damaged,
     decompress,
     read_exact,
@@ -49,7 +51,6 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish ti
 CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, unpacked size, checksum, length of the codec
 INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
 SIZE = struct.Struct("<Q")
-LOOSE = -1  # the chunk's offset in the place of a message that is in no chunk
 FOOTER_SIZE = FRAME.size + 20
 NOTE_BYTES = 1 << 20  # most bytes of a metadata record that is read as a note about the episode
 RUN_BYTES = 1 << 20  # most bytes of messages outside of chunks that make one piece
@@ -113,27 +114,28 @@ class McapFile(IndexedFile):
     def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
-            heads: dict[int, ChunkHead] = {}
+            size, last, view = file.seek(0, 2), -1, memoryview(b"")
             for offset, at in places:
-                if offset == LOOSE:
-                    yield _message(file, at)
-                    continue
-                if offset not in heads:
-                    heads = {offset: _chunk_at(file, offset)}
-                if heads[offset].plain and offset in self._checked:
-                    yield _message(file, heads[offset].at + at)
-                else:
-                    yield _message_in(self._chunk(file, offset, heads[offset]), at)
+                if offset != last:
+                    last, view = offset, self._view(file, offset, size)
+                _, start, end = _record(view, at)
+                yield view[start + MESSAGE_HEAD.size : end]
 
-    # -- chunks
+    def _view(self, file: BinaryIO, at: int, end: int, check: bool = True) -> View:
+        """Return the records of the piece at an offset: in the file where they lie unpacked, else in memory.
 
-    def _chunk(self, file: BinaryIO, at: int, head: ChunkHead) -> memoryview:
-        """Return an unpacked chunk; only packed chunks are cached."""
+        Chunks are checked the first time, those that lie unpacked only with `check`.
+        """
+        opcode, start, stop = _record(FileView(file, 0, end), at)
+        if opcode != CHUNK:
+            return FileView(file, at, end)
+        head = _chunk_head(file, start, stop)
+        if head.plain and (at in self._checked or not check):
+            return FileView(file, head.at, head.at + head.packed)
         load = partial(self._load, file, at, head)
         return memoryview(load()) if head.plain else self._chunks.get(self.path, at, load)
 
     def _load(self, file: BinaryIO, at: int, head: ChunkHead) -> bytes:
-        """Unpack a chunk; check its checksum the first time."""
         file.seek(head.at)
         chunk = decompress(head.codec, read_exact(file, head.packed), head.size)
         if at not in self._checked and head.checksum and crc32(chunk) != head.checksum:
@@ -141,59 +143,21 @@ class McapFile(IndexedFile):
         self._checked.add(at)
         return chunk
 
-    # -- records
-
     def _in_piece(
         self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
     ) -> Iterator[Record]:
-        opcode, length = _frame(file, piece.at)
-        if opcode != CHUNK:
-            yield from self._walk(file, index, piece.at, piece.end, wanted)
-            return
-        head = _chunk_head(file, length)
-        if head.plain and not piece.topics.isdisjoint(wanted.heads):
-            # Not checked here: the checksum is compared when the first picture is read.
-            yield from self._walk(file, index, head.at, head.at + head.size, wanted, piece.at)
-            return
-        chunk, at = self._chunk(file, piece.at, head), 0
-        while at < len(chunk):
-            opcode, length = FRAME.unpack_from(chunk, at)
-            start, following = at + FRAME.size, at + FRAME.size + length
-            if following > len(chunk):
-                raise ValueError("a record reaches beyond its chunk")
+        # A chunk of which only heads are read is checked when its first picture is read.
+        view = self._view(file, piece.at, piece.end, check=piece.topics.isdisjoint(wanted.heads))
+        for opcode, at, start, end in _records(view, 0, len(view)):
             if opcode == MESSAGE:
-                number, _, log_ns, _ = MESSAGE_HEAD.unpack_from(chunk, start)
+                number, _, log_ns, _ = MESSAGE_HEAD.unpack(view[start : start + MESSAGE_HEAD.size])
                 channel = index.channel(number)
                 if wanted.topic(channel.topic) and wanted.time(log_ns):
-                    data = chunk[start + MESSAGE_HEAD.size : following]
-                    yield Record(channel, log_ns, data, (piece.at, at))
+                    start += MESSAGE_HEAD.size
+                    stop = min(end, start + HEAD) if channel.topic in wanted.heads else end
+                    yield Record(channel, log_ns, view[start:stop], (piece.at, at))
             elif opcode in (SCHEMA, CHANNEL):
-                self._learn(index, opcode, bytes(chunk[start:following]))
-            at = following
-
-    def _walk(
-        self,
-        file: BinaryIO,
-        index: FileIndex,
-        begin: int,
-        end: int,
-        wanted: RecordFilter,
-        chunk: int = LOOSE,
-    ) -> Iterator[Record]:
-        """Yield the wanted messages that lie unpacked in the file; of other messages, read only the head."""
-        origin = 0 if chunk == LOOSE else begin
-        for opcode, at, length in _frames(file, begin, end):
-            if opcode in (SCHEMA, CHANNEL):
-                self._learn(index, opcode, read_exact(file, length))
-            elif opcode == MESSAGE:
-                head = read_exact(file, min(length, MESSAGE_HEAD.size + HEAD))
-                number, _, log_ns, _ = MESSAGE_HEAD.unpack_from(head)
-                channel = index.channel(number)
-                if not (wanted.topic(channel.topic) and wanted.time(log_ns)):
-                    continue
-                if channel.topic not in wanted.heads and length > len(head):
-                    head += read_exact(file, length - len(head))
-                yield Record(channel, log_ns, memoryview(head)[MESSAGE_HEAD.size :], (chunk, at - origin))
+                self._learn(index, opcode, bytes(view[start:end]))
 
     def _learn(self, index: FileIndex, opcode: int, data: bytes) -> None:
         """Add a schema or channel record."""
@@ -229,20 +193,19 @@ class McapFile(IndexedFile):
 
         None where the summary does not state all of them.
         """
-        opcode, length = _frame(file, end)
-        if opcode != FOOTER or length != FOOTER_SIZE - FRAME.size:
+        view = FileView(file, 0, end + FOOTER_SIZE)
+        opcode, at, stop = _record(view, end)
+        if opcode != FOOTER:
             raise ValueError("there is no footer at the end")
-        start, counted = records.Footer.read(_stream(read_exact(file, length))).summary_start, None
-        if start and not len(MAGIC) <= start <= end:
-            raise ValueError("the summary is said to lie outside the file")
-        for opcode, _, length in _frames(file, start, end) if start else ():
+        start, counted = records.Footer.read(_stream(view[at:stop])).summary_start, None
+        for opcode, _, at, stop in _records(view, start, end) if start else ():
             if opcode in (SCHEMA, CHANNEL):
                 try:
-                    self._learn(index, opcode, read_exact(file, length))
+                    self._learn(index, opcode, bytes(view[at:stop]))
                 except ValueError:  # the summary need not repeat schemas; the chunks hold the missing ones
                     return None
             elif opcode == STATISTICS:
-                stated = records.Statistics.read(_stream(read_exact(file, length)))
+                stated = records.Statistics.read(_stream(view[at:stop]))
                 counts: dict[int, int] = stated.channel_message_counts
                 counted = counts if sum(counts.values()) == stated.message_count else None
         return counted
@@ -251,23 +214,23 @@ class McapFile(IndexedFile):
         """Walk once over the file's records; unpack chunks only where no index states what they hold."""
         index, parts = FileIndex(), list[_Part]()
         end = self._data_end(file)
-        for opcode, at, length in _frames(file, len(MAGIC), end):
+        view = FileView(file, 0, end)
+        for opcode, at, start, stop in _records(view, len(MAGIC), end):
             if opcode in (DATA_END, FOOTER):
                 break
-            following = at + FRAME.size + length
             if opcode in (SCHEMA, CHANNEL):
-                self._learn(index, opcode, read_exact(file, length))
-            elif opcode == METADATA and length <= NOTE_BYTES:
-                index.notes |= records.Metadata.read(_stream(read_exact(file, length))).metadata
+                self._learn(index, opcode, view[start:stop])
+            elif opcode == METADATA and stop - start <= NOTE_BYTES:
+                index.notes |= records.Metadata.read(_stream(view[start:stop])).metadata
             elif opcode == CHUNK:
-                head = _chunk_head(file, length)
-                parts.append(_Part(at, following, head.first_ns, head.last_ns, set(), True))
+                head = _chunk_head(file, start, stop)
+                parts.append(_Part(at, stop, head.first_ns, head.last_ns, set(), True))
             elif opcode == MESSAGE_INDEX and parts and parts[-1].chunk:
-                number, size = INDEX_HEAD.unpack(read_exact(file, INDEX_HEAD.size))
+                number, size = INDEX_HEAD.unpack(view[start : start + INDEX_HEAD.size])
                 parts[-1].channels |= {number} if size else set()
             elif opcode == MESSAGE:
-                number, _, log_ns, _ = MESSAGE_HEAD.unpack(read_exact(file, MESSAGE_HEAD.size))
-                _add_loose(parts, at, following, number, log_ns)
+                number, _, log_ns, _ = MESSAGE_HEAD.unpack(view[start : start + MESSAGE_HEAD.size])
+                _add_loose(parts, at, stop, number, log_ns)
         self._summary(file, end, index)
         for part in parts:
             index.pieces.append(self._piece(file, index, part))
@@ -293,22 +256,21 @@ def _stream(data: bytes) -> Any:
     return ReadDataStream(BytesIO(data))
 
 
-def _frame(file: BinaryIO, at: int) -> tuple[int, int]:
-    """Return opcode and length of the record at `at`; leave the file at the record's content."""
-    file.seek(at)
-    opcode, length = FRAME.unpack(read_exact(file, FRAME.size))
-    return opcode, length
+def _record(view: View, at: int) -> tuple[int, int, int]:
+    """Return the opcode of the record at `at`, and where its content begins and ends."""
+    opcode, length = FRAME.unpack(view[at : at + FRAME.size])
+    start = at + FRAME.size
+    if start + length > len(view):
+        raise EOFError(f"it ends {start + length - len(view):,} bytes before a record does")
+    return opcode, start, start + length
 
 
-def _frames(file: BinaryIO, at: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """Yield (opcode, offset, length) of the records from `at` to `end`, with the file at the content."""
+def _records(view: View, at: int, end: int) -> Iterator[tuple[int, int, int, int]]:
+    """Yield (opcode, offset, begin and end of the content) of the records from `at` to `end`."""
     while at < end:
-        opcode, length = _frame(file, at)
-        following = at + FRAME.size + length
-        if following > end:
-            raise EOFError(f"the file ends {following - end:,} bytes before a record does")
-        yield opcode, at, length
-        at = following
+        opcode, start, stop = _record(view, at)
+        yield opcode, at, start, stop
+        at = stop
 
 
 def _add_loose(parts: list[_Part], at: int, end: int, number: int, log_ns: int) -> None:
@@ -321,36 +283,14 @@ def _add_loose(parts: list[_Part], at: int, end: int, number: int, log_ns: int) 
     last.channels.add(number)
 
 
-def _chunk_at(file: BinaryIO, at: int) -> ChunkHead:
-    opcode, length = _frame(file, at)
-    if opcode != CHUNK:
-        raise ValueError(f"there is no chunk at {at:,}")
-    return _chunk_head(file, length)
-
-
-def _chunk_head(file: BinaryIO, length: int) -> ChunkHead:
-    """Return the head of the chunk whose content begins at the file's position."""
-    start = file.tell()
-    data = read_exact(file, min(length, CHUNK_HEAD.size + CODEC_BYTES + SIZE.size))
+def _chunk_head(file: BinaryIO, start: int, end: int) -> ChunkHead:
+    """Return the head of the chunk whose content lies between those offsets."""
+    file.seek(start)
+    data = read_exact(file, min(end - start, CHUNK_HEAD.size + CODEC_BYTES + SIZE.size))
     first_ns, last_ns, size, checksum, named = CHUNK_HEAD.unpack_from(data)
     codec = str(data[CHUNK_HEAD.size : CHUNK_HEAD.size + named], "utf-8")
     (packed,) = SIZE.unpack_from(data, CHUNK_HEAD.size + named)
     at = start + CHUNK_HEAD.size + named + SIZE.size
-    if at + packed > start + length:
+    if at + packed > end:
         raise ValueError("a chunk's records reach beyond it")
     return ChunkHead(first_ns, last_ns, size, checksum, codec, at, packed)
-
-
-def _message(file: BinaryIO, at: int) -> Data:
-    """Return the data of the message at an offset of the file."""
-    _, length = _frame(file, at)
-    return memoryview(read_exact(file, length))[MESSAGE_HEAD.size :]
-
-
-def _message_in(chunk: memoryview, at: int) -> memoryview:
-    """Return the data of the message at a place in a chunk."""
-    _, length = FRAME.unpack_from(chunk, at)
-    end = at + FRAME.size + length
-    if end > len(chunk):
-        raise ValueError("a record reaches beyond its chunk")
-    return chunk[at + FRAME.size + MESSAGE_HEAD.size : end]

@@ -13,7 +13,7 @@ import dataclasses
 import json
 import re
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any
 
@@ -23,16 +23,9 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.bags.container import Channel, Data
 
 Decode = Callable[[Data], Any]
-Step = str | int | slice  # of the path to a field
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 TIME = "builtin_interfaces/msg/Time"
-ROS_BYTES = {"byte": "uint8", "char": "uint8", "octet": "uint8"}
-# By the numbers of FieldDescriptorProto.Type; 14 is an enum.
-PROTOBUF = {
-    1: "float64", 2: "float32", 3: "int64", 4: "uint64", 5: "int32", 6: "uint64", 7: "uint32", 8: "bool",
-    13: "uint32", 14: "int32", 15: "int32", 16: "int64", 17: "int32", 18: "int64",
-}  # fmt: skip
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
 EVENT = re.compile(r"\w+/srv/\w+_Event")
 CALL = re.compile(r"^---\s*$", re.MULTILINE)  # between request and response
@@ -317,59 +310,3 @@ def stamp_ns(message: Any) -> int:
             if isinstance(seconds, int) and isinstance(nanoseconds, int):
                 return seconds * 10**9 + nanoseconds
     return 0
-
-
-# -- dtypes
-
-
-def stated_dtype(channel: Channel, message: Any, steps: Sequence[Step]) -> str | None:
-    """Return the dtype that the definition states for the numbers at a path.
-
-    Args:
-        channel: of the message.
-        message: any decoded message of the channel.
-        steps: of the key.
-
-    Returns:
-        numpy's name of the dtype; for a message of several dtypes, one that holds all; None where none
-        is stated.
-    """
-    names: Iterator[str] = iter(())
-    try:
-        if channel.encoding in ("ros1", "cdr"):
-            from rosbags.interfaces import Nodetype
-
-            store, kind = ros_store(channel)
-            names = _ros_dtypes(store, (Nodetype.NAME, kind), steps)
-        elif channel.encoding == "protobuf":
-            path = [step for step in steps if isinstance(step, str)]
-            names = _protobuf_dtypes(message.DESCRIPTOR, path)
-        found = sorted(set(names))
-        return str(np.result_type(*found)) if found else None
-    except (KeyError, TypeError, AttributeError, RecursionError):  # not a numpy number, or a recursive type
-        return None
-
-
-def _ros_dtypes(store: Any, field: Any, steps: Sequence[Step]) -> Iterator[str]:
-    """Yield the dtypes at a path below one of rosbags's fields, (node type, content)."""
-    from rosbags.interfaces import Nodetype
-
-    node, content = field
-    if node == Nodetype.BASE:
-        yield ROS_BYTES.get(content[0], content[0])
-    elif node == Nodetype.NAME:
-        for name, inner in store.fielddefs[content][1]:
-            if not steps or name == steps[0]:
-                yield from _ros_dtypes(store, inner, steps[1:])
-    else:  # a list
-        yield from _ros_dtypes(store, content[0], steps[1:])
-
-
-def _protobuf_dtypes(kind: Any, path: Sequence[str]) -> Iterator[str]:
-    for field in kind.fields:
-        if path and field.name != path[0]:
-            continue
-        if field.message_type is None:
-            yield PROTOBUF[field.type]
-        else:
-            yield from _protobuf_dtypes(field.message_type, path[1:])

@@ -12,9 +12,8 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from hma_data.sources.bags.container import (
@@ -25,19 +24,20 @@ from hma_data.sources.bags.container import (
     Data,
     FileIndex,
     FilePlace,
+    FileView,
     IndexedFile,
     Piece,
     Record,
     RecordFilter,
+    View,
     damaged,
     decompress,
-    read_exact,
     reading,
     take_last,
 )
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, BAG, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x05, 0x06, 0x07
+MESSAGE, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x05, 0x06, 0x07
 TIME = struct.Struct("<II")
 COUNTS = struct.Struct("<II")  # of a chunk: connection, messages
 Header = dict[str, bytes]
@@ -56,22 +56,33 @@ class Ros1File(IndexedFile):
     def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
         """See Container."""
         with reading(self.path), self.path.open("rb") as file:
-            heads: dict[int, _ChunkHead] = {}
+            last, view = -1, memoryview(b"")
             for offset, at in places:
-                if offset not in heads:
-                    heads = {offset: _chunk_head(file, offset)}
-                head = heads[offset]
-                yield _content(file, head, at) if head.plain else _split(self._chunk(file, head), at)[1]
+                if offset != last:
+                    last, view = offset, self._view(file, offset)
+                _, start, end = _record(view, at)
+                yield view[start:end]
 
-    def _chunk(self, file: BinaryIO, head: "_ChunkHead") -> memoryview:
-        return self._chunks.get(self.path, head.offset, partial(_load_chunk, file, head))
+    def _view(self, file: BinaryIO, offset: int) -> View:
+        """Return the records of a chunk: in the file where they lie unpacked, else in memory."""
+        header, start, end = _record(_whole(file), offset)
+        if _number(header, "op") != CHUNK:
+            raise ValueError(f"there is no chunk at {offset:,}, where the index says one is")
+        codec = header["compression"].decode()
+        if codec == "none":
+            return FileView(file, start, end)
+
+        def unpacked() -> bytes:
+            return decompress(codec, FileView(file, start, end)[0 : end - start], _number(header, "size"))
+
+        return self._chunks.get(self.path, offset, unpacked)
 
     def _make_index(self, file: BinaryIO) -> FileIndex:
         magic = file.read(len(ROS1_MAGIC))
         if magic != ROS1_MAGIC:
             shown = magic.split(b"\n")[0].decode("ascii", "replace")
             raise damaged(self.path, f"begins with {shown!r}, not as a ROS 1 bag" if magic else "is empty")
-        header, _, _ = _record(file, len(ROS1_MAGIC))
+        header, _, _ = _record(_whole(file), len(ROS1_MAGIC))
         if header.get("encryptor"):
             raise ValueError("it is encrypted")
         at = _number(header, "index_pos")
@@ -81,14 +92,12 @@ class Ros1File(IndexedFile):
 
     def _index_of_chunks(self, file: BinaryIO) -> FileIndex:
         """Index a bag whose recorder was killed; every chunk is unpacked for it."""
-        index, at, end = FileIndex(), len(ROS1_MAGIC), file.seek(0, 2)
-        while at < end:
-            header, size, content_at = _record(file, at)
-            if content_at + size > end:
-                raise EOFError(f"the file ends {content_at + size - end:,} bytes before a record does")
+        index, at, view = FileIndex(), len(ROS1_MAGIC), _whole(file)
+        while at < len(view):
+            header, start, end = _record(view, at)
             kind = _number(header, "op")
             if kind == CONNECTION:
-                _learn(index, header, read_exact(file, size))
+                _learn(index, header, view[start:end])
             elif kind == CHUNK:
                 piece = Piece(at, at, FOREVER, -1, frozenset())
                 counts: Counter[Channel] = Counter()
@@ -97,49 +106,39 @@ class Ros1File(IndexedFile):
                     piece = piece._replace(first_ns=first_ns, last_ns=last_ns)
                     counts[record.channel] += 1
                 _add(index, piece, counts)
-            at = content_at + size
+            at = end
         return index
 
     def _in_piece(
         self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
     ) -> Iterator[Record]:
-        head = _chunk_head(file, piece.at)
-        if wanted.heads and head.plain:
-            yield from _walk(file, index, head, wanted)
-            return
-        view, at = self._chunk(file, head), 0
+        view, at = self._view(file, piece.at), 0
         while at < len(view):
             place = (piece.at, at)
-            header, content, at = _split(view, at)
-            channel, log_ns = _take(_header(header), content, index, wanted)
-            if channel:
-                yield Record(channel, log_ns, content, place)
+            header, start, at = _record(view, at)
+            kind = _number(header, "op")
+            if kind == CONNECTION:
+                _learn(index, header, view[start:at])
+            elif kind == MESSAGE:
+                channel, log_ns = index.channel(_number(header, "conn")), _time(header, "time")
+                if wanted.topic(channel.topic) and wanted.time(log_ns):
+                    end = min(at, start + HEAD) if channel.topic in wanted.heads else at
+                    yield Record(channel, log_ns, view[start:end], place)
 
 
-class _ChunkHead(NamedTuple):
-    """The head of the chunk at `offset`; its content lies at `at`, `packed` bytes that unpack to `size`."""
-
-    offset: int
-    codec: str
-    at: int
-    packed: int
-    size: int
-
-    @property
-    def plain(self) -> bool:
-        """Check whether its records are stored uncompressed."""
-        return self.codec == "none"
+def _whole(file: BinaryIO) -> FileView:
+    return FileView(file, 0, file.seek(0, 2))
 
 
-def _record(file: BinaryIO, at: int) -> tuple[Header, int, int]:
-    """Return the header of the record at `at`, and the size and offset of its content.
-
-    The file is left at the content.
-    """
-    file.seek(at)
-    header = _header(read_exact(file, int.from_bytes(read_exact(file, 4), "little")))
-    size = int.from_bytes(read_exact(file, 4), "little")
-    return header, size, file.tell()
+def _record(view: View, at: int) -> tuple[Header, int, int]:
+    """Return the header of the record at `at`, and where its content begins and ends."""
+    begin = at + 4
+    start = begin + int.from_bytes(view[at:begin], "little") + 4
+    header = _header(view[begin : start - 4])
+    end = start + int.from_bytes(view[start - 4 : start], "little")
+    if end > len(view):
+        raise EOFError(f"it ends {end - len(view):,} bytes before a record does")
+    return header, start, end
 
 
 def _header(data: Data) -> Header:
@@ -184,16 +183,14 @@ def _add(index: FileIndex, piece: Piece, counts: Counter[Channel]) -> None:
 
 def _stated_index(file: BinaryIO, at: int, count: int) -> FileIndex:
     """Return the index that lies at the file's end as `count` records."""
-    index, chunks = FileIndex(), list[tuple[Header, bytes]]()
+    index, chunks, view = FileIndex(), list[tuple[Header, bytes]](), _whole(file)
     for _ in range(count):
-        header, size, content_at = _record(file, at)
-        content = read_exact(file, size)
-        at = content_at + size
+        header, start, at = _record(view, at)
         kind = _number(header, "op")
         if kind == CONNECTION:
-            _learn(index, header, content)
+            _learn(index, header, view[start:at])
         elif kind == CHUNK_INFO:
-            chunks.append((header, content))
+            chunks.append((header, view[start:at]))
         else:
             raise ValueError(f"the index holds a record of kind {kind}")
     index.counts.update(dict.fromkeys(index.channels.values(), 0))
@@ -205,71 +202,6 @@ def _stated_index(file: BinaryIO, at: int, count: int) -> FileIndex:
         first_ns, last_ns = _time(header, "start_time"), _time(header, "end_time")
         _add(index, Piece(start, start, first_ns, last_ns, frozenset()), counts)
     return index
-
-
-def _split(view: memoryview, at: int) -> tuple[memoryview, memoryview, int]:
-    """Return header and content of the record at `at` of a chunk, and the offset of the next record."""
-    parts = []
-    for _ in range(2):
-        size = int.from_bytes(view[at : at + 4], "little")
-        at += 4
-        if at + size > len(view):
-            raise ValueError("a record reaches beyond its chunk")
-        parts.append(view[at : at + size])
-        at += size
-    return parts[0], parts[1], at
-
-
-def _walk(file: BinaryIO, index: FileIndex, head: _ChunkHead, wanted: RecordFilter) -> Iterator[Record]:
-    """Yield the messages of a chunk that is not packed; of other messages, read only the header."""
-    at, end = head.at, head.at + head.packed
-    while at < end:
-        place = (head.offset, at - head.at)
-        header, size, content_at = _record(file, at)
-        at = content_at + size
-        if at > end:
-            raise ValueError("a record reaches beyond its chunk")
-        content = read_exact(file, size) if _number(header, "op") == CONNECTION else b""
-        channel, log_ns = _take(header, content, index, wanted)
-        if channel:
-            data = read_exact(file, min(size, HEAD) if channel.topic in wanted.heads else size)
-            yield Record(channel, log_ns, data, place)
-
-
-def _take(
-    header: Header, content: Data, index: FileIndex, wanted: RecordFilter
-) -> tuple[Channel | None, int]:
-    """Return channel and time of a wanted message, else None; learn a connection record."""
-    kind = _number(header, "op")
-    if kind == CONNECTION:
-        _learn(index, header, content)
-    elif kind == MESSAGE:
-        channel = index.channel(_number(header, "conn"))
-        log_ns = _time(header, "time")
-        if wanted.topic(channel.topic) and wanted.time(log_ns):
-            return channel, log_ns
-    return None, 0
-
-
-def _chunk_head(file: BinaryIO, offset: int) -> _ChunkHead:
-    header, packed, at = _record(file, offset)
-    if _number(header, "op") != CHUNK:
-        raise ValueError(f"there is no chunk at {offset:,}, where the index says one is")
-    codec = header["compression"].decode()
-    return _ChunkHead(offset, codec, at, packed, packed if codec == "none" else _number(header, "size"))
-
-
-def _content(file: BinaryIO, head: _ChunkHead, at: int) -> bytes:
-    """Return the data of the message at a place in a chunk that is not packed."""
-    _, size, begin = _record(file, head.at + at)
-    if begin + size > head.at + head.packed:
-        raise ValueError("a record reaches beyond its chunk")
-    return read_exact(file, size)
-
-
-def _load_chunk(file: BinaryIO, head: _ChunkHead) -> bytes:
-    file.seek(head.at)
-    return decompress(head.codec, read_exact(file, head.packed), head.size)
 
 
 # -- sqlite3

@@ -36,7 +36,6 @@ from hma_data.sources.bags.images import (
     video_codec,
 )
 from hma_data.sources.bags.messages import (
-    Step,
     child,
     field_names,
     head_stamp,
@@ -46,6 +45,7 @@ from hma_data.sources.bags.messages import (
 )
 
 STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\]")
+Step = str | int | slice
 SHOWN = 30  # topics or names in an error
 INT64 = np.iinfo(np.int64)
 
