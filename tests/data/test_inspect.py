@@ -14,10 +14,9 @@ from skimage import data
 
 from hma_data.inspection.inspect import inspect_recording
 from hma_data.sources.base import Inspection, open_source
-from hma_data.sources.common import timestamp_checks
-from hma_data.sources.common.image_checks import Look, choose, ycbcr_share
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Look, choose, measure, ycbcr_share
 from hma_data.sources.common.survey import CHECKS
-from hma_data.sources.common.timestamp_checks import measure
 from tests.data.bag_files import make_recording, write_ros1, write_ros2
 from tests.data.rlds_files import TEXT, image, png, tensor, write
 from tests.data.videos import encode as encode_video
@@ -299,21 +298,21 @@ def test_a_clock_counts_what_was_done_to_it() -> None:
 
 def test_lost_frames_are_told_for_cameras_alone() -> None:
     times = np.delete(np.arange(100) / 10, [20, 40, 41, 60])
-    (finding,) = timestamp_checks.findings("cam", measure(times), camera=True)
+    (finding,) = checks.time_findings("cam", measure(times), camera=True)
     assert finding.check == "frames" and finding.numbers["lost"] == 4
-    assert not list(timestamp_checks.findings("arm", measure(times)))
+    assert not list(checks.time_findings("arm", measure(times)))
 
 
 def test_events_have_no_pauses() -> None:
     times = np.cumsum(np.random.default_rng(0).exponential(5.0, 200) ** 2)
-    assert not list(timestamp_checks.findings("/button", measure(times)))
+    assert not list(checks.time_findings("/button", measure(times)))
 
 
 def test_skew_is_the_distance_to_the_nearest_sample() -> None:
     primary = np.arange(10, dtype=np.float64)
     other = np.arange(100, dtype=np.float64) / 10 + 0.02
-    assert timestamp_checks.skew(other, primary) == pytest.approx((20, 20, 20), abs=1e-6)
-    assert timestamp_checks.skew(other + 50, primary) is None
+    assert checks.skew(other, primary) == pytest.approx((20, 20, 20), abs=1e-6)
+    assert checks.skew(other + 50, primary) is None
 
 
 @pytest.mark.parametrize(("length", "pairs"), [(1, 4), (2, 4), (30, 3), (5, 100)])

@@ -21,7 +21,7 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.messages import child, decode, field_names
-from hma_data.sources.common.image_checks import one_channel
+from hma_data.sources.common.checks import one_channel
 from hma_data.sources.common.video_file import is_spoilt
 
 RAW, STILL, VIDEO = "raw", "still", "video"
@@ -214,8 +214,8 @@ class VideoDecoder:
         self._taken = -1  # the last picture returned
         self._ready: dict[int, Any] = {}  # pictures decoded but not returned yet; None for a damaged one
         self._spoilt = False  # whether the last decoded picture, or one it may depend on, is damaged
-        self._lost = -1  # the first message since the last key frame that lacks an earlier picture
-        self._made_without: dict[int, int] = {}  # message -> the first one that lacks an earlier picture
+        self._lost = False  # whether a picture since the last key frame is missing
+        self._incomplete: set[int] = set()  # messages that may depend on a missing picture
 
     def frames(self, indices: Sequence[int]) -> dict[int, Images]:
         """Return the picture (H, W, 3) of each of those indices.
@@ -237,14 +237,9 @@ class VideoDecoder:
             frame = self._ready[index]
             self._ready = {i: frame for i, frame in self._ready.items() if i >= index}
             self._taken = index
-            if index in self._made_without:
-                fault = f"a picture before frame {self._made_without[index]} of the video is missing"
-                raise EpisodeError(self._where, f"{fault}, and frame {index} is made from it")
             if frame is None:
-                raise EpisodeError(
-                    self._where,
-                    f"frame {index} of the video is damaged, or one before it that it is made from",
-                )
+                fault = f"frame {index} of the video is damaged, or depends on one that is damaged or lost"
+                raise EpisodeError(self._where, fault)
             found[index] = frame.to_ndarray(format="rgb24")
         return found
 
@@ -257,19 +252,10 @@ class VideoDecoder:
 
         self._context = av.CodecContext.create(CODECS[self._codec], "r")
         self._context.thread_count = 1
-        self._ready, self._spoilt = {}, False
-        self._lost, self._made_without = -1, {}
+        self._context.options = {"max_pixels": str(MAX_PIXELS)}
+        self._ready, self._spoilt, self._lost, self._incomplete = {}, False, False, set()
         self._next = int(np.flatnonzero(self._keyframes[: index + 1])[-1])
         self._taken = self._next - 1
-
-    def _follow(self, index: int, misses: bool) -> None:
-        """Note whether message `index`, or one it may depend on, lacks an earlier picture."""
-        if self._keyframes[index]:
-            self._lost = -1
-        elif misses and self._lost < 0:
-            self._lost = index
-        if self._lost >= 0:
-            self._made_without[index] = self._lost
 
     def _decode(self, data: bytes | None, wanted: int) -> None:
         """Give the decoder its next message; with None, let it finish."""
@@ -290,14 +276,14 @@ class VideoDecoder:
         if data is None:
             self._context = None
         else:
-            self._follow(self._next, bool(missing))
+            self._lost = not self._keyframes[self._next] and (self._lost or bool(missing))
+            self._incomplete |= {self._next} if self._lost else set()
             self._next += 1
         for frame in frames:
-            if frame.width * frame.height > MAX_PIXELS:
-                raise EpisodeError(self._where, f"the video claims {frame.width}×{frame.height} pixels")
             self._spoilt = is_spoilt(frame, self._spoilt)
             if frame.pts is not None:
-                self._ready[frame.pts] = None if self._spoilt else frame
+                usable = not self._spoilt and frame.pts not in self._incomplete
+                self._ready[frame.pts] = frame if usable else None
 
 
 _LOGGING = threading.Lock()  # PyAV's log settings hold for the whole process

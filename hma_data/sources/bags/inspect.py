@@ -25,11 +25,10 @@ from hma_data.sources.bags.messages import (
     numbers,
 )
 from hma_data.sources.bags.topic_track import Field, TopicTrack, camera_stream, parse_key
-from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
-from hma_data.sources.common import image_checks
-from hma_data.sources.common.findings import Finding, unfollowed
+from hma_data.sources.base import Inspection, KeyInfo, TopicInfo, unfollowed
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Finding, StreamTimes, measure, skew
 from hma_data.sources.common.survey import Survey, sampled
-from hma_data.sources.common.timestamp_checks import StreamTimes, measure, skew
 
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
@@ -260,8 +259,8 @@ class _BagInspection:
         try:
             stream = camera_stream(self.bag, topic.track, "receive")
             keyframes = topic.track.keyframes() if kind == VIDEO else None
-            indices = image_checks.choose(len(stream.timestamps), PAIRS, _starts(keyframes))
-            for run in image_checks.runs(indices):
+            indices = checks.choose(len(stream.timestamps), PAIRS, _starts(keyframes))
+            for run in checks.runs(indices):
                 frames = stream.frames(run)
                 self._survey.pictures(self._name, name, frames, run, stored)
         except EpisodeError as fault:

@@ -52,7 +52,6 @@ CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, unpacked size, chec
 INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
 SIZE = struct.Struct("<Q")
 FOOTER_SIZE = FRAME.size + 20
-NOTE_BYTES = 1 << 20  # most bytes of a metadata record that is read as a note about the episode
 RUN_BYTES = 1 << 20  # most bytes of messages outside of chunks that make one piece
 CODEC_BYTES = 32  # most bytes of a codec's name
 
@@ -220,7 +219,7 @@ class McapFile(IndexedFile):
                 break
             if opcode in (SCHEMA, CHANNEL):
                 self._learn(index, opcode, view[start:stop])
-            elif opcode == METADATA and stop - start <= NOTE_BYTES:
+            elif opcode == METADATA:
                 index.notes |= records.Metadata.read(_stream(view[start:stop])).metadata
             elif opcode == CHUNK:
                 head = _chunk_head(file, start, stop)

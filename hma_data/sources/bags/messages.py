@@ -33,11 +33,6 @@ SEPARATOR = re.compile(r"^={80}\s*$", re.MULTILINE)
 REQUEST_SENT, REQUEST_RECEIVED, RESPONSE_SENT, RESPONSE_RECEIVED = range(4)
 # The event that stands for a call: the first of these that is recorded.
 OF_A_CALL = (REQUEST_RECEIVED, REQUEST_SENT, RESPONSE_SENT, RESPONSE_RECEIVED)
-STANDARD = {  # definitions for bags that hold none
-    "std_srvs/srv/Empty": "---",
-    "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message",
-    "std_srvs/srv/Trigger": "---\nbool success\nstring message",
-}
 EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
 
@@ -194,12 +189,11 @@ def event_definitions(stated: str, kind: str, text: str) -> dict[str, Any]:
         text: the service's definition, or the event's own.
 
     Raises:
-        ValueError: the bag holds no definition, and the service is not a standard one.
+        ValueError: the bag holds no definition.
     """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     package, _, name = stated.removesuffix("_Event").split("/")
-    text = text if text.strip() else STANDARD.get(f"{package}/srv/{name}", "")
     sections = [part for part in SEPARATOR.split(text.replace("\r\n", "\n")) if part.strip()]
     if not sections:
         raise ValueError(f"the bag does not carry the definition of {package}/srv/{name}")

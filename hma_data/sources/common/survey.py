@@ -19,10 +19,8 @@ from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError
 from hma_data.sources.base import KeyInfo
-from hma_data.sources.common import image_checks, timestamp_checks
-from hma_data.sources.common.findings import Finding, Severity
-from hma_data.sources.common.image_checks import Look
-from hma_data.sources.common.timestamp_checks import StreamTimes
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Finding, Look, Severity, StreamTimes
 
 CHECKS = {  # the checks of an inspection, in the order they are printed
     "readable": "episodes that can be read",
@@ -161,7 +159,7 @@ class Survey:
         """Add the times (T,) of one key of an episode, in the order of receipt; return what they show."""
         self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
         held = self._times.setdefault(key, _Times(camera=camera))
-        found = held.met[name] = timestamp_checks.measure(seconds)
+        found = held.met[name] = checks.measure(seconds)
         return found
 
     def skew(self, key: str, found: tuple[float, float, float] | None, period_s: float) -> None:
@@ -193,7 +191,7 @@ class Survey:
         if times is not None and times.met:
             rates = [one.hz for one in times.met.values() if one.hz]
             jitters = [one.jitter_ms for one in times.met.values() if one.jitter_ms is not None]
-            stated = info.hz and any(abs(one / info.hz - 1) <= timestamp_checks.DRIFT for one in rates)
+            stated = info.hz and any(abs(one / info.hz - 1) <= checks.DRIFT for one in rates)
             info = replace(
                 info,
                 hz=info.hz if stated or not rates else float(np.median(rates)),
@@ -208,7 +206,7 @@ class Survey:
         """Return all findings, check by check."""
         found = [
             *self._readable(), *_merged(self._extra), *self._keys(), *self._rows(), *self._stamps(),
-            *self._finite(), *self._constant(keys), *image_checks.findings(self.looks),
+            *self._finite(), *self._constant(keys), *checks.picture_findings(self.looks),
         ]  # fmt: skip
         order = list(CHECKS)
         return tuple(sorted(found, key=lambda one: order.index(one.check) if one.check in order else 99))
@@ -251,7 +249,7 @@ class Survey:
             found = [
                 one
                 for name, times in held.met.items()
-                for one in timestamp_checks.findings(key, times, held.camera, "" if self.alone else name)
+                for one in checks.time_findings(key, times, held.camera, "" if self.alone else name)
             ]
             for check, count in Counter(one.check for one in found).items():
                 first = next(one for one in found if one.check == check)

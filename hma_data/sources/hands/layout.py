@@ -31,8 +31,7 @@ from pathlib import Path, PurePosixPath
 
 from hma_data.errors import EpisodeError, RegistryError, SourceError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import leaves, local_path
-from hma_data.sources.common.findings import nothing_there
+from hma_data.sources.base import leaves, local_path, nothing_there
 from hma_data.sources.hands import VIDEO_SUFFIXES
 
 LABELS = ("detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose")

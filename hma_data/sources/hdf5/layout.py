@@ -15,8 +15,7 @@ import h5py
 
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import leaves, local_path
-from hma_data.sources.common.findings import nothing_there
+from hma_data.sources.base import leaves, local_path, nothing_there
 from hma_data.sources.hdf5.file import OpenFiles, child, explained, member
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
