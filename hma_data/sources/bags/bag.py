@@ -16,7 +16,6 @@ from hma_data.sources.bags.container import (
     MAX_CHUNK,
     Channel,
     ChunkCache,
-    Container,
     Data,
     Record,
     RecordFilter,
@@ -32,6 +31,7 @@ from hma_data.storage.yaml_io import read_yaml
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 MAX_EXPANSION = 200  # most times its packed size that a file may have unpacked, against decompression bombs
+Container = McapFile | Ros1File | SqliteFile
 BagPlace = tuple[int, int, int]  # of a message: the file of the bag, and two numbers for the place in it
 
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import BinaryIO, NamedTuple
 
 from mcap.exceptions import McapError
 
@@ -89,28 +89,6 @@ class RecordFilter:
 ALL = RecordFilter()
 
 
-class Container(Protocol):
-    """One file of a bag. Every method raises EpisodeError when the file is damaged."""
-
-    path: Path
-
-    def counts(self) -> Counter[Channel]:
-        """Count the messages of each channel, from the index if there is one; also of empty channels."""
-        ...
-
-    def records(self, wanted: RecordFilter) -> Iterator[Record]:
-        """Yield the wanted messages, in the file's order."""
-        ...
-
-    def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
-        """Return each topic's last message before a time; topics without one are left out."""
-        ...
-
-    def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
-        """Yield the data of the messages at those places."""
-        ...
-
-
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Raise any error inside as damage of that file."""
@@ -173,7 +151,10 @@ class FileIndex:
 
 
 class IndexedFile:
-    """A bag file that is read piece by piece; its unpacked chunks are kept in `chunks`. See Container."""
+    """A bag file that is read piece by piece; its unpacked chunks are kept in `chunks`.
+
+    Every method of a container raises EpisodeError when the file is damaged.
+    """
 
     def __init__(self, path: Path, chunks: "ChunkCache | None" = None) -> None:
         self.path = path
@@ -181,7 +162,7 @@ class IndexedFile:
         self._indexed: FileIndex | None = None
 
     def records(self, wanted: RecordFilter) -> Iterator[Record]:
-        """See Container; pieces without a wanted message are not read."""
+        """Yield the wanted messages, in the file's order; pieces without one are not read."""
         with reading(self.path), self.path.open("rb") as file:
             index = self._index(file)
             for piece in index.pieces:
@@ -190,7 +171,7 @@ class IndexedFile:
                     yield from self._in_piece(file, index, piece, wanted)
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
-        """See Container; it looks back no further than needed."""
+        """Return each topic's last message before a time; topics without one are left out."""
         found: dict[str, Record] = {}
         with reading(self.path), self.path.open("rb") as file:
             index = self._index(file)
@@ -210,7 +191,29 @@ class IndexedFile:
             self._indexed = self._make_index(file)
         return self._indexed
 
+    def counts(self) -> Counter[Channel]:
+        """Count the messages of each channel, from the index if there is one; also of empty channels."""
+        raise NotImplementedError
+
+    def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
+        """Yield the data of the messages at those places."""
+        with reading(self.path), self.path.open("rb") as file:
+            last = -1
+            for offset, at in places:
+                if offset != last:
+                    last, view = offset, self._view(file, offset)
+                start, end = self._content(view, at)
+                yield view[start:end]
+
     def _make_index(self, file: BinaryIO) -> FileIndex:
+        raise NotImplementedError
+
+    def _view(self, file: BinaryIO, at: int) -> "View":
+        """Return the records of the piece at an offset, read lazily where they lie unpacked in the file."""
+        raise NotImplementedError
+
+    def _content(self, view: "View", at: int) -> tuple[int, int]:
+        """Return where the data of the message at `at` begins and ends."""
         raise NotImplementedError
 
     def _in_piece(

@@ -11,7 +11,7 @@ which also works where the summary leaves the index out.
 
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
@@ -28,9 +28,7 @@ from hma_data.sources.bags.container import (
     HEAD,
     Channel,
     ChunkCache,
-    Data,
     FileIndex,
-    FilePlace,
     FileView,
     IndexedFile,
     Piece,
@@ -86,7 +84,7 @@ class _Part:
 
 
 class McapFile(IndexedFile):
-    """Read one MCAP file; see Container."""
+    """An MCAP file."""
 
     def __init__(self, path: Path, chunks: ChunkCache | None = None) -> None:
         super().__init__(path, chunks)
@@ -94,7 +92,7 @@ class McapFile(IndexedFile):
         self._schemas: dict[int, Any] = {}
 
     def counts(self) -> Counter[Channel]:
-        """See Container."""
+        """See IndexedFile."""
         with reading(self.path), self.path.open("rb") as file:
             index = FileIndex()
             counted = self._summary(file, self._data_end(file), index)
@@ -110,24 +108,16 @@ class McapFile(IndexedFile):
         with reading(self.path), self.path.open("rb") as file:
             return self._index(file).notes
 
-    def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
-        """See Container."""
-        with reading(self.path), self.path.open("rb") as file:
-            size, last, view = file.seek(0, 2), -1, memoryview(b"")
-            for offset, at in places:
-                if offset != last:
-                    last, view = offset, self._view(file, offset, size)
-                _, start, end = _record(view, at)
-                yield view[start + MESSAGE_HEAD.size : end]
+    def _content(self, view: View, at: int) -> tuple[int, int]:
+        _, start, end = _record(view, at)
+        return start + MESSAGE_HEAD.size, end
 
-    def _view(self, file: BinaryIO, at: int, end: int, check: bool = True) -> View:
-        """Return the records of the piece at an offset: in the file where they lie unpacked, else in memory.
-
-        Chunks are checked the first time, those that lie unpacked only with `check`.
-        """
-        opcode, start, stop = _record(FileView(file, 0, end), at)
+    def _view(self, file: BinaryIO, at: int, end: int | None = None, check: bool = True) -> View:
+        """See IndexedFile. A packed chunk is checked the first time, a plain one only with `check`."""
+        whole = FileView(file, 0, file.seek(0, 2))
+        opcode, start, stop = _record(whole, at)
         if opcode != CHUNK:
-            return FileView(file, at, end)
+            return FileView(file, at, end or len(whole))
         head = _chunk_head(file, start, stop)
         if head.plain and (at in self._checked or not check):
             return FileView(file, head.at, head.at + head.packed)
@@ -146,7 +136,7 @@ class McapFile(IndexedFile):
         self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
     ) -> Iterator[Record]:
         # A chunk of which only heads are read is checked when its first picture is read.
-        view = self._view(file, piece.at, piece.end, check=piece.topics.isdisjoint(wanted.heads))
+        view = self._view(file, piece.at, piece.end, piece.topics.isdisjoint(wanted.heads))
         for opcode, at, start, end in _records(view, 0, len(view)):
             if opcode == MESSAGE:
                 number, _, log_ns, _ = MESSAGE_HEAD.unpack(view[start : start + MESSAGE_HEAD.size])

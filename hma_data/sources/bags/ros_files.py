@@ -46,28 +46,21 @@ LATEST = 2**63 - 1  # largest sqlite3 integer
 
 
 class Ros1File(IndexedFile):
-    """Read one ROS 1 bag; see Container."""
+    """A ROS 1 bag."""
 
     def counts(self) -> Counter[Channel]:
-        """See Container."""
+        """See IndexedFile."""
         with reading(self.path), self.path.open("rb") as file:
             return self._index(file).counts.copy()
 
-    def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
-        """See Container."""
-        with reading(self.path), self.path.open("rb") as file:
-            last, view = -1, memoryview(b"")
-            for offset, at in places:
-                if offset != last:
-                    last, view = offset, self._view(file, offset)
-                _, start, end = _record(view, at)
-                yield view[start:end]
+    def _content(self, view: View, at: int) -> tuple[int, int]:
+        _, start, end = _record(view, at)
+        return start, end
 
-    def _view(self, file: BinaryIO, offset: int) -> View:
-        """Return the records of a chunk: in the file where they lie unpacked, else in memory."""
-        header, start, end = _record(_whole(file), offset)
+    def _view(self, file: BinaryIO, at: int) -> View:
+        header, start, end = _record(_whole(file), at)
         if _number(header, "op") != CHUNK:
-            raise ValueError(f"there is no chunk at {offset:,}, where the index says one is")
+            raise ValueError(f"there is no chunk at {at:,}, where the index says one is")
         codec = header["compression"].decode()
         if codec == "none":
             return FileView(file, start, end)
@@ -75,7 +68,7 @@ class Ros1File(IndexedFile):
         def unpacked() -> bytes:
             return decompress(codec, FileView(file, start, end)[0 : end - start], _number(header, "size"))
 
-        return self._chunks.get(self.path, offset, unpacked)
+        return self._chunks.get(self.path, at, unpacked)
 
     def _make_index(self, file: BinaryIO) -> FileIndex:
         magic = file.read(len(ROS1_MAGIC))
@@ -208,13 +201,13 @@ def _stated_index(file: BinaryIO, at: int, count: int) -> FileIndex:
 
 
 class SqliteFile:
-    """Read one .db3 file of rosbag2, with any version of its tables; see Container."""
+    """A .db3 file of rosbag2, with any version of its tables; its methods are those of IndexedFile."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def counts(self) -> Counter[Channel]:
-        """See Container."""
+        """See IndexedFile."""
         with self._opened() as (base, index):
             total: Counter[Channel] = Counter(dict.fromkeys(index.channels.values(), 0))
             for topic_id, count in base.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"):
@@ -222,7 +215,7 @@ class SqliteFile:
         return total
 
     def records(self, wanted: RecordFilter) -> Iterator[Record]:
-        """See Container."""
+        """See IndexedFile."""
         with self._opened() as (base, index):
             conditions, values = ["1"], list[int]()
             if wanted.topics is not None:
@@ -246,7 +239,7 @@ class SqliteFile:
                 yield Record(channel, log_ns, data, (0, row_id))
 
     def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
-        """See Container."""
+        """See IndexedFile."""
         found: dict[str, Record] = {}
         query = (
             "SELECT id, timestamp FROM messages WHERE timestamp < ? AND topic_id = ? "
@@ -259,7 +252,7 @@ class SqliteFile:
         return found
 
     def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
-        """See Container."""
+        """See IndexedFile."""
         with self._opened() as (base, _):
             for _, row_id in places:
                 yield _payload(base, row_id)

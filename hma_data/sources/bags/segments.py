@@ -199,8 +199,8 @@ def _events(
     """
     own = np.maximum.accumulate(times)
     events = []
-    for marker in (start, stop):
-        for i in marker.moments().tolist() if marker else ():
+    for marker in filter(None, (start, stop)):
+        for i in marker.moments().tolist():
             log_ns = int(marker.track.received()[i])
             if clock == "header" and marker.track.stamped:
                 at = int(np.searchsorted(own, marker.track.seconds("header")[i]))
