@@ -225,7 +225,7 @@ def open_source(name: str) -> Source:
         raise plugin.broken(f"{plugin.entry_point.value} has no open()")
     opened = plugin.call("open()", module.open)
     if not isinstance(opened, Source):
-        raise plugin.broken(f"open() gave {type(opened).__name__}, which is no hma_data.sources.base.Source")
+        raise plugin.broken(f"open() gave {type(opened).__name__}, not an hma_data.sources.base.Source")
     return opened
 
 
@@ -428,7 +428,7 @@ def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.f
     values: NDArray[Any] = piece.reshape(len(piece), -1)
     width = values.shape[1]
     if part.slice:
-        fault = f"{part.key} has {width} values, slice {list(part.slice)} wants more"
+        fault = f"{part.key} has {width} values, slice {list(part.slice)} needs {part.slice[1]}"
         if part.slice[1] > width:
             raise EpisodeError(where, fault, "correct slice in the YAML")
         values = values[:, part.slice[0] : part.slice[1]]
@@ -465,7 +465,7 @@ def unfollowed(root: Path, told: Collection[Path] = ()) -> list[Finding]:
             elif not path.exists():
                 gone.append(path)
     found = []
-    for links, remedy in ((outside, "name it itself"), (gone, "copy the file in")):
+    for links, remedy in ((outside, "give the path of that folder"), (gone, "copy the file in")):
         if links:
             target = f"a folder outside {root}, not followed"
             if links is gone:

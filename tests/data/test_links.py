@@ -52,7 +52,7 @@ def test_a_linked_folder_that_holds_all_there_is_is_named_in_the_error(
     name: str, elsewhere: Path, root: Path
 ) -> None:
     (root / "day1").symlink_to(elsewhere)
-    wanted = f"day1 is a link to a folder outside {root}, not followed — name it itself"
+    wanted = f"day1 is a link to a folder outside {root}, not followed — give the path of that folder"
     for look in (detect, open_source(name).episode_ids):
         with pytest.raises(SourceError, match=wanted):
             look(str(root))

@@ -58,7 +58,7 @@ class Bag:
         for item in self._paths:
             if item != root and leaves(item, root if root.is_dir() else root.parent):
                 raise EpisodeError(
-                    item, "is a link to a file outside its folder", "copy the file in, or name it itself"
+                    item, "is a link to a file outside its folder", "copy the file in, or give its own path"
                 )
 
     def files(self) -> list[Container]:
@@ -203,7 +203,9 @@ def _container(path: Path, chunks: ChunkCache) -> Container:
         return SqliteFile(path)
     if not magic:
         raise damaged(path, "is empty")
-    raise damaged(path, f"begins with {magic[:8]!r}, neither as a ROS 1 bag, nor MCAP, nor sqlite3")
+    raise damaged(
+        path, f"begins with {magic[:8]!r}, which is not how a ROS 1 bag, MCAP or sqlite3 file begins"
+    )
 
 
 def _metadata(folder: Path) -> dict[str, Any]:

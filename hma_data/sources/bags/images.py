@@ -129,7 +129,7 @@ def _raw(message: Any, where: str) -> Images:
         )
     pixel, conversion = ENCODINGS[encoding.lower()]
     if min(height, width) < 1 or height * width > MAX_PIXELS:
-        raise EpisodeError(where, f"a picture claims {width}×{height} pixels")
+        raise EpisodeError(where, f"a picture claims {width}×{height} pixels, the most is {MAX_PIXELS:,}")
     planar = encoding.lower() in ("nv12", "nv21")  # rows of colour, half as many, follow those of luma
     rows, row = height * 3 // 2 if planar else height, width * pixel
     step = step or row
@@ -165,7 +165,7 @@ def is_keyframe(data: bytes, codec: str) -> bool | None:
 def _vp9_begins(data: bytes) -> bool:
     """Check whether the first frame is a key frame: VP9 bitstream specification, uncompressed_header."""
     if not data or data[0] >> 6 != 2:
-        raise ValueError("no VP9 frame")
+        raise ValueError("it is not a VP9 frame")
     at = 5 if data[0] >> 4 & 3 == 3 else 4  # bits: marker 2, profile 2, of profile 3 one more
     shows_existing, inter = data[0] >> (7 - at) & 1, data[0] >> (6 - at) & 1
     return not shows_existing and not inter
@@ -272,7 +272,9 @@ class VideoDecoder:
                 frames = self._context.decode(packet)
         except (av.FFmpegError, ValueError) as fault:
             self._context = None
-            raise EpisodeError(self._where, f"frame {wanted} of the video: {fault}") from fault
+            raise EpisodeError(
+                self._where, f"frame {wanted} of the video cannot be decoded: {fault}"
+            ) from fault
         if data is None:
             self._context = None
         else:

@@ -170,11 +170,11 @@ class McapFile(IndexedFile):
         size = file.seek(0, 2)
         file.seek(0)
         if file.read(len(MAGIC)) != MAGIC:
-            raise damaged(self.path, "does not begin as an MCAP file does" if size else "is empty")
+            raise damaged(self.path, "does not begin with MCAP's magic bytes" if size else "is empty")
         end = size - len(MAGIC) - FOOTER_SIZE
         file.seek(size - len(MAGIC))
         if end < len(MAGIC) or file.read(len(MAGIC)) != MAGIC:
-            raise damaged(self.path, "is cut off: it does not end as an MCAP file does")
+            raise damaged(self.path, "is cut off: it does not end with MCAP's magic bytes")
         return end
 
     def _summary(self, file: BinaryIO, end: int, index: FileIndex) -> dict[int, int] | None:

@@ -176,7 +176,7 @@ def event_type(data: Data) -> int:
         ValueError: the message is not an event.
     """
     if len(data) < 5 or data[4] > RESPONSE_RECEIVED:
-        raise ValueError("a message is no event of a service")
+        raise ValueError("a message is not an event of a service")
     return data[4]
 
 
@@ -276,7 +276,7 @@ def numbers(value: Any) -> list[float]:
     if is_message(value):
         return [number for name in field_names(value) for number in _field_numbers(value, name)]
     kinds = {"str": "text", "bytes": "bytes", "NoneType": "null"}
-    raise TypeError(kinds.get(type(value).__name__, "no number"))
+    raise TypeError(kinds.get(type(value).__name__, "something that is not a number"))
 
 
 def _field_numbers(message: Any, name: str) -> list[float]:

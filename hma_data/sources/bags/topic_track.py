@@ -274,7 +274,7 @@ class TopicTrack:
             self.codec = self.codec or video_codec(message)
             return is_keyframe(payload(message), self.codec)
         except (KeyError, TypeError, ValueError) as fault:
-            raise EpisodeError(self.topic, f"a message is no frame of a video: {fault!r}") from fault
+            raise EpisodeError(self.topic, f"a message is not a frame of a video: {fault!r}") from fault
 
     def order(self, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """Return the order of receipt: of all messages, or of those rows (then an index into `rows`)."""

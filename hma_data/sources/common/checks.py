@@ -14,6 +14,7 @@ table looks the same, so it gives only a hint. n pictures, H×W pixels, uint8 RG
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from io import BytesIO
 from typing import Any, Literal
 
 import numpy as np
@@ -39,7 +40,6 @@ PIXELS = 4096  # pixels of a picture whose colours are checked
 DISTINCT = 1_000  # least number of distinct colours for the YCbCr sign
 SURE, CHANCE = 0.98, 0.6  # share of colours that YCbCr gives: least in the right order, most in the other
 COLD = 0.15  # share of cold pixels (saturated, blue > green > red) above which a hint is given
-JPEG_HEAD = 65536  # bytes that are searched for a JPEG's start of frame
 STILL, BLANK = 0.5, 2.0  # limits: share of equal neighbours; standard deviation of all values
 
 
@@ -103,7 +103,7 @@ class StreamTimes:
 
 
 def measure(times: Floats) -> StreamTimes:
-    """Measure the clock of a stream from its times, (T,) seconds."""
+    """Measure the timing of a stream from its times, (T,) seconds."""
     finite = np.isfinite(times)
     times = times[finite]
     steps = np.diff(times)
@@ -163,15 +163,15 @@ def time_findings(key: str, times: StreamTimes, camera: bool = False, episode: s
     if times.infinite:
         yield found("finite", f"{times.infinite} times are not finite", count=times.infinite)
     if times.repeated:
-        yield found("repeated", f"{times.repeated} stamps are the one before again", count=times.repeated)
+        yield found("repeated", f"{times.repeated} stamps equal the stamp before", count=times.repeated)
     if times.back:
-        remedy = "stamp: receive would not" if not episode else ""
+        remedy = "set stamp: receive in the YAML" if not episode else ""
         yield found("back", f"{times.back} stamps go back in time", remedy, count=times.back)
     if times.regular >= STREAM and times.gap_s > max(PAUSE * times.period_s, PAUSE_S):
         said = f"pauses for {times.gap_s:.3g} s after {times.gap_at_s:.3g} s"
         yield found("gaps", said, gap_s=times.gap_s, at_s=times.gap_at_s)
     if camera and times.lost and times.lost > LOST * times.count:
-        said = f"about {times.lost} frames are missing beside {times.count} by its rate of {times.hz:.4g} Hz"
+        said = f"has {times.count} frames; at its rate of {times.hz:.4g} Hz about {times.lost} are missing"
         yield found("frames", said, lost=times.lost, count=times.count)
 
 
@@ -180,9 +180,9 @@ def drift(
 ) -> Iterator[Finding]:
     """Yield a finding where the rates differ by more than DRIFT; `source` says who stated the rate."""
     if measured_hz and stated_hz and abs(measured_hz / stated_hz - 1) > DRIFT:
-        said = f"{key}: ticks at {measured_hz:.4g} Hz, {source} {stated_hz:.4g}"
+        said = f"{key}: runs at {measured_hz:.4g} Hz, {source} {stated_hz:.4g}"
         numbers = {"measured_hz": measured_hz, "stated_hz": stated_hz}
-        yield Finding("rate", "warn", said, "frequency_hz is what the YAML says", key, numbers)
+        yield Finding("rate", "warn", said, "state the true rate as frequency_hz in the YAML", key, numbers)
 
 
 def skew(times: Floats, primary: Floats) -> tuple[float, float, float] | None:
@@ -392,16 +392,14 @@ def stacked(pictures: list[Images]) -> Iterator[tuple[int, Images]]:
 
 
 def one_channel(data: bytes) -> bool:
-    """Check whether a JPEG or PNG is grey, by its header."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
-        return data[25:26] in (b"\0", b"\4")
-    at, head = 2, data[:JPEG_HEAD]
-    while head[:2] == b"\xff\xd8" and at + 10 <= len(head) and head[at] == 0xFF:
-        marker = head[at + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
-            return head[at + 9] == 1
-        at += 2 + (0 if marker == 0xFF else int.from_bytes(head[at + 2 : at + 4], "big"))
-    return False
+    """Check whether a JPEG or PNG is grey, by its header; False for bytes that are no picture."""
+    from PIL import Image
+
+    try:
+        with Image.open(BytesIO(data)) as picture:
+            return picture.mode in ("1", "L", "LA")
+    except (OSError, ValueError, Image.DecompressionBombError):
+        return False
 
 
 def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
@@ -415,18 +413,20 @@ def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
             worst: Severity = "warn" if look.changes else "info"
             yield Finding("size", worst, f"{key}: pictures of several sizes, {said}{part}", key=key)
         if look.blank:
-            said = f"{key}: shows nothing (one colour) in {look.blank} of {look.episodes} episodes looked at"
+            said = f"{key}: shows only one colour in {look.blank} of {look.episodes} episodes looked at"
             # Where every episode is blank, the camera was never plugged in.
             severity: Severity = "info" if look.blank == look.episodes else "warn"
-            yield Finding("blank", severity, said, "is it another camera's key?", key)
+            yield Finding("blank", severity, said, "check the camera's key in the YAML", key)
         share = look.same / max(look.neighbours, 1)
         if share > STILL and look.blank < look.episodes:
-            said = f"{key}: {share:.0%} of neighbouring pictures are the same"
+            said = f"{key}: {share:.0%} of neighbouring pictures are equal"
             remedy = "the camera may be slower than its rate"
             yield Finding("still", "warn", said, remedy, key, {"share": share, "pairs": look.neighbours})
         sureness, reason = look.swapped()
         if sureness in ("sure", "hint"):
-            said = f"{key}: red and blue {'are' if sureness == 'sure' else 'may be'} changed over: {reason}"
-            remedy = "color: bgr in the YAML" if sureness == "sure" else "look at a preview: color: bgr?"
+            said = f"{key}: red and blue {'are' if sureness == 'sure' else 'may be'} swapped: {reason}"
+            remedy = (
+                "set color: bgr in the YAML" if sureness == "sure" else "look at a preview of the pictures"
+            )
             yield Finding("colour", "warn" if sureness == "sure" else "info", said, remedy, key,
                           {"confidence": sureness})  # fmt: skip

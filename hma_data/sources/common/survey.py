@@ -171,7 +171,16 @@ class Survey:
         if found and found[1] > 1e3 * max(period_s, own):
             said = f"{key}: p95 {found[1]:.1f} ms from the first camera's frames, max {found[2]:.1f} ms"
             numbers = dict(zip(("p50_ms", "p95_ms", "max_ms"), found, strict=True))
-            self._extra.append(Finding("skew", "warn", said, "it pauses, or loses messages", key, numbers))
+            self._extra.append(
+                Finding(
+                    "skew",
+                    "warn",
+                    said,
+                    "the stream pauses or loses messages; check the recording",
+                    key,
+                    numbers,
+                )
+            )
 
     # -- results
 
