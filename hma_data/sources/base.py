@@ -225,7 +225,9 @@ def open_source(name: str) -> Source:
         raise plugin.broken(f"{plugin.entry_point.value} has no open()")
     opened = plugin.call("open()", module.open)
     if not isinstance(opened, Source):
-        raise plugin.broken(f"open() gave {type(opened).__name__}, not an hma_data.sources.base.Source")
+        raise plugin.broken(
+            f"open() gave {type(opened).__name__}, which is not an hma_data.sources.base.Source"
+        )
     return opened
 
 

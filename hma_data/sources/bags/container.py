@@ -235,7 +235,7 @@ def take_last(found: dict[str, Record], records: Iterable[Record]) -> None:
 
 
 class ChunkCache:
-    """Keep the last unpacked chunks of one bag: at most CACHED_BYTES of them, and always at least one."""
+    """The last unpacked chunks of one bag: at most CACHED_BYTES of them, and always at least one."""
 
     def __init__(self) -> None:
         self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()

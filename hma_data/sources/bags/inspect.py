@@ -172,7 +172,7 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
 
 
 class _BagInspection:
-    """Read one bag once: keep its keys; hand its numbers, times, skew and some pictures to the survey.
+    """One bag, read once: its keys; its numbers, times, skew and some pictures go to the survey.
 
     Raises:
         EpisodeError: the bag is damaged.

@@ -37,7 +37,7 @@ def open() -> "RosbagSource":
 
 
 class RosbagSource:
-    """Read bags; see sources.base.Source."""
+    """The source of bags; see sources.base.Source."""
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""

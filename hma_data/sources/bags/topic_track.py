@@ -220,7 +220,7 @@ class Column:
 
 
 class TopicTrack:
-    """Record one topic over one pass.
+    """The times and places of one topic's messages, recorded in one pass.
 
     Attributes:
         columns: the components that read this topic; each takes its values as messages are added.

@@ -73,7 +73,7 @@ class _Times:
 
 
 class Survey:
-    """Gather what the sampled episodes show.
+    """The collected results of the sampled episodes.
 
     Args:
         episodes: how many the recording has.

@@ -127,17 +127,11 @@ def _table(
 
 
 class VideoFile:
-    """A video file as an array of frames; it opens on first use, and again after a fork.
+    """A video file as an array of frames; it opens on first use, and again after a fork."""
 
-    Args:
-        path: of the file.
-        threads: of FFmpeg.
-    """
-
-    def __init__(self, path: Path, threads: int = THREADS) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.table = frame_table(path)
-        self._threads = threads
         self._process = 0
         self._container: Any = None
         self._decoder: Iterator[Any] = iter(())
@@ -255,7 +249,7 @@ class VideoFile:
         # A parent's decoder is dropped without closing it: after a fork, both share the file's position.
         self._container, self._process = _open(str(self.path)), os.getpid()
         stream = _video_stream(self._container, str(self.path))
-        stream.codec_context.thread_count = self._threads
+        stream.codec_context.thread_count = THREADS
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         self._decoder, self._next, self._entry = self._container.decode(stream), 0, -1
         self._spoilt = False
