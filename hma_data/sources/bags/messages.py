@@ -26,6 +26,7 @@ Decode = Callable[[Data], Any]
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 TIME = "builtin_interfaces/msg/Time"
+HEADER = "std_msgs/msg/Header"
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
 EVENT = re.compile(r"\w+/srv/\w+_Event")
 CALL = re.compile(r"^---\s*$", re.MULTILINE)  # between request and response
@@ -54,31 +55,28 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
         raise EpisodeError(where, f"a message on {channel.topic} is not a {kind}: {_line(fault)}") from fault
 
 
+@lru_cache(maxsize=256)
 def head_stamp(channel: Channel) -> Callable[[Data], int] | None:
     """Return a function that reads a ROS message's own time, in nanoseconds, from its first HEAD bytes.
 
     None where the time has no fixed place there, or the definition cannot be read; then `decode` is needed.
     """
-    try:
-        return _head_stamp(channel)
-    except Exception:  # `decode` raises it again
-        return None
-
-
-@lru_cache(maxsize=256)
-def _head_stamp(channel: Channel) -> Callable[[Data], int] | None:
     if channel.encoding not in ("ros1", "cdr"):
         return None
-    store, kind = ros_store(channel)
-    fields = [(name, spec[1]) for name, spec in store.fielddefs[kind][1]]
-    at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes that state its encoding
-    if fields and fields[0] == ("header", "std_msgs/msg/Header"):
-        fields = [(name, spec[1]) for name, spec in store.fielddefs["std_msgs/msg/Header"][1]]
-        if fields[0][0] == "seq":
-            fields, at = fields[1:], at + 4
-    elif {name for name, _ in fields[1:]} & {"header", "timestamp"}:
+    try:
+        store, kind = ros_store(channel)
+        fields = [(name, spec[1]) for name, spec in store.fielddefs[kind][1]]
+        headed = bool(fields) and fields[0] == ("header", HEADER)
+        if headed:
+            fields = [(name, spec[1]) for name, spec in store.fielddefs[HEADER][1]]
+    except Exception:  # `decode` raises it again
         return None
-    if not fields or fields[0] not in [(name, TIME) for name in ("stamp", "timestamp")]:
+    at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes that state its encoding
+    if headed and fields[0][0] == "seq":
+        fields, at = fields[1:], at + 4
+    elif not headed and {name for name, _ in fields[1:]} & {"header", "timestamp"}:
+        return None
+    if not fields or fields[0] not in (("stamp", TIME), ("timestamp", TIME)):
         return None
     return partial(_time_at, at, channel.encoding == "cdr")
 
