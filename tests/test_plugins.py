@@ -128,7 +128,7 @@ def test_a_judgement_of_the_registry_changes_when_a_package_is_installed(
         ("import no_such_module", "importing bad_source failed: ModuleNotFoundError"),
         ("1 / 0", "importing bad_source failed: ZeroDivisionError"),
         ("", r"bad_source has no open\(\)"),
-        ("def open():\n    return 5", r"open\(\) gave int, which is no .*Source"),
+        ("def open():\n    return 5", r"open\(\) gave int, which is not .*Source"),
         ("def open():\n    raise OSError('no disk')", r"open\(\) failed: OSError: no disk"),
     ],
 )

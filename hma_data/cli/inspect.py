@@ -107,7 +107,7 @@ def doctor(
     Example: hma doctor ./demo.hdf5 -e my_arm.yaml --fail-on warn
     """
     from hma_data.inspection.inspect import examine
-    from hma_data.sources.common.findings import SEVERITIES
+    from hma_data.sources.common.checks import SEVERITIES
 
     found = examine(target, embodiment, episodes)
     if json:

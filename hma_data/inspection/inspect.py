@@ -19,7 +19,7 @@ from hma_data.episodes.episode import Clip
 from hma_data.errors import HMAError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
-from hma_data.sources.common.findings import SEVERITIES, Finding, Severity
+from hma_data.sources.common.checks import SEVERITIES, Finding, Severity
 from hma_data.sources.common.survey import CHECKS, sampled
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place

@@ -9,7 +9,8 @@ T frames of an episode, A values of a vector.
 """
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatchcase
 from importlib import import_module
@@ -25,8 +26,7 @@ from hma_data.plugins import SOURCE_GROUP, installed
 from hma_data.registry import FORMATS, MORE, known_formats
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.common.findings import Finding
-from hma_data.sources.common.links import nothing_there
+from hma_data.sources.common.checks import Finding
 from hma_data.storage.paths import StrPath, as_text
 
 SAMPLE = 20  # episodes that inspect looks into
@@ -159,7 +159,7 @@ class Inspection:
 
 @runtime_checkable
 class Source(Protocol):
-    """One recording format. `uri` is the path (str or path object) or the URI of a recording."""
+    """A reader of one recording format. `uri` is the path (str or path object) or the URI of a recording."""
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """Return what the recording holds; sample the values and pictures of `episodes` episodes."""
@@ -180,7 +180,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Recognition:
-    """By what a format's recordings are recognised; the format's package states it as `RECOGNITION`.
+    """The signs of a format's recordings; the format's package states them as `RECOGNITION`.
 
     `detect` asks every format by its first attribute, then every format by the next. What is left empty
     recognises nothing.
@@ -225,7 +225,9 @@ def open_source(name: str) -> Source:
         raise plugin.broken(f"{plugin.entry_point.value} has no open()")
     opened = plugin.call("open()", module.open)
     if not isinstance(opened, Source):
-        raise plugin.broken(f"open() gave {type(opened).__name__}, which is no hma_data.sources.base.Source")
+        raise plugin.broken(
+            f"open() gave {type(opened).__name__}, which is not an hma_data.sources.base.Source"
+        )
     return opened
 
 
@@ -268,7 +270,7 @@ def detect(uri: StrPath) -> str:
 
 
 def _of_packages() -> tuple[Recognitions, list[PluginError]]:
-    """How the formats of installed packages are recognised, and the errors of packages that are broken."""
+    """Return how the formats of installed packages are recognised, and the errors of broken packages."""
     found: dict[str, Recognition] = {}
     broken: list[PluginError] = []
     for name, plugin in installed(SOURCE_GROUP).items():
@@ -291,7 +293,7 @@ def _is_away(uri: str) -> bool:
 
 
 def _by_uri(uri: str, known: Recognitions) -> str | None:
-    """The format that a name or URI alone tells."""
+    """Return the format that a name or URI alone shows."""
     suffix = PurePosixPath(uri).suffix if _is_away(uri) else ""
     by_name = (name for name, recognition in known.items() if recognition.uri(uri))
     by_ending = (name for name, recognition in known.items() if suffix in recognition.endings)
@@ -299,7 +301,7 @@ def _by_uri(uri: str, known: Recognitions) -> str | None:
 
 
 def _by_files(path: Path, files: Sequence[Path], known: Recognitions) -> str | None:
-    """The format that the files of a recording on this machine tell."""
+    """Return the format that the files of a recording on this machine show."""
     for name, recognition in known.items():
         if any((path / place).is_file() for place in recognition.layout):
             return name
@@ -349,14 +351,14 @@ def local_path(uri: str) -> Path:
     Raises:
         SourceError: it does not exist, or it is a URI of remote storage.
     """
-    path = Path(uri.removeprefix("file://")).expanduser()
-    if not path.exists() and "://" in uri.removeprefix("file://"):
-        raise SourceError(
-            uri, "is not on this machine", "copy it here: only RLDS and LeRobot are read elsewhere"
-        )
-    if not path.exists():
-        raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
-    return path
+    plain = uri.removeprefix("file://")
+    path = Path(plain).expanduser()
+    if path.exists():
+        return path
+    if "://" in plain:
+        remedy = "copy it here: only RLDS and LeRobot are read elsewhere"
+        raise SourceError(uri, "is not on this machine", remedy)
+    raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
 
 
 def leaves(path: Path, folder: Path) -> bool:
@@ -421,26 +423,64 @@ def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArr
 
 def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.float32]:
     """Return the values (T, dims) float32 of one component; see `compose`."""
-    if piece.dtype == object or piece.dtype.kind not in "fiub":
+    if piece.dtype.kind not in "fiub":
         raise EpisodeError(where, f"{part.key} holds {piece.dtype}, not numbers")
     if piece.ndim < 1 or not len(piece):
         raise EpisodeError(where, f"{part.key} holds no values over time (shape {piece.shape})")
     values: NDArray[Any] = piece.reshape(len(piece), -1)
     width = values.shape[1]
     if part.slice:
+        fault = f"{part.key} has {width} values, slice {list(part.slice)} needs {part.slice[1]}"
         if part.slice[1] > width:
-            raise EpisodeError(
-                where,
-                f"{part.key} has {width} values, slice {list(part.slice)} wants more",
-                "correct slice in the YAML",
-            )
+            raise EpisodeError(where, fault, "correct slice in the YAML")
         values = values[:, part.slice[0] : part.slice[1]]
     elif width != part.dims:
-        raise EpisodeError(
-            where,
-            f"{part.key} has {width} values, the embodiment says {part.dims}",
-            "correct dims or give slice in the YAML",
-        )
+        fault = f"{part.key} has {width} values, the embodiment says {part.dims}"
+        raise EpisodeError(where, fault, "correct dims or give slice in the YAML")
     values = values.astype(np.float64) * np.asarray(part.sign) + np.asarray(part.offset)
     with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite, and align refuses it
         return values.astype(np.float32)
+
+
+# -- links
+
+
+def unfollowed(root: Path, told: Collection[Path] = ()) -> list[Finding]:
+    """Return findings on the links under a folder that lead to a folder outside of it, or to nothing.
+
+    A link to a folder may lead anywhere, even in a circle, so it is not followed. A recording behind a link
+    is read when the user names that recording.
+
+    Args:
+        root: folder of the recordings; a file has no links.
+        told: paths that are reported elsewhere.
+    """
+    outside: list[Path] = []
+    gone: list[Path] = []
+    home = root.resolve()
+    for folder, folders, files in os.walk(root):
+        for path in (Path(folder, name) for name in sorted(folders + files)):
+            if not path.is_symlink() or path in told or path.name.startswith("."):  # editors lock with links
+                continue
+            if path.is_dir() and not path.resolve().is_relative_to(home):
+                outside.append(path)
+            elif not path.exists():
+                gone.append(path)
+    found = []
+    for links, remedy in ((outside, "give the path of that folder"), (gone, "copy the file in")):
+        if links:
+            target = f"a folder outside {root}, not followed"
+            if links is gone:
+                target = f"{gone[0].readlink()}, which is not there"
+            more = f" (and {len(links) - 1:,} more such links)" if len(links) > 1 else ""
+            said = f"{links[0]} is a link to {target}{more}"
+            found.append(Finding("files", "warn", said, remedy, numbers={"links": len(links)}))
+    return found
+
+
+def nothing_there(uri: str, root: Path, fault: str, remedy: str) -> SourceError:
+    """Return the error for a place without recordings; mention a link that was not followed, if any."""
+    links = unfollowed(root)
+    if links:
+        fault, remedy = f"{fault}; {links[0].message}", links[0].remedy
+    return SourceError(uri, fault, remedy)

@@ -8,12 +8,10 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.images import H264Count, VideoDecoder, is_keyframe
+from hma_data.sources.bags.images import VideoDecoder, is_keyframe
 
 GROUP, FRAMES = 9, 27
 QUIET = "log-level=none:keyint=9:min-keyint=9:scenecut=0"
@@ -108,22 +106,3 @@ def test_nothing_is_missed_where_nothing_is_missing(tmp_path: Path, name: str) -
         except EpisodeError as fault:  # a message of hidden frames alone
             assert "missing" not in str(fault) and name.endswith("hidden frames")
     assert shown > FRAMES / 2
-
-
-def test_pictures_are_counted_from_where_the_video_begins(tmp_path: Path) -> None:
-    packets = messages(tmp_path, *STREAMS["x264"])
-    count = H264Count()
-    assert [count.complete(packet) for packet in packets[3:15]] == [True] * 12
-    count = H264Count()
-    assert [count.complete(packet) for packet in packets[:3] + packets[6:9]] == [True] * 3 + [
-        False,
-        True,
-        True,
-    ]
-
-
-@given(st.binary(max_size=200), st.sampled_from([b"", b"\x67", b"\x68", b"\x41", b"\x65"]))
-def test_no_bytes_are_too_odd(data: bytes, kind: bytes) -> None:
-    count = H264Count()
-    for message in (data, b"\x00\x00\x01" + kind + data):
-        assert count.complete(message) in (True, False)

@@ -222,11 +222,12 @@ def test_key_frames_of_every_codec_are_told(
     tmp_path: Path, codec: str, name: str, options: dict[str, str]
 ) -> None:
     from hma_data.sources.bags.bag import Bag
+    from hma_data.sources.bags.container import RecordFilter
     from hma_data.sources.bags.images import is_keyframe, payload
     from hma_data.sources.bags.messages import decode
 
     pictures = write_video(tmp_path / "v.mcap", codec, name, options)
-    records = Bag(tmp_path / "v.mcap").records(frozenset({"/video"}))
+    records = Bag(tmp_path / "v.mcap").records(RecordFilter(frozenset({"/video"})))
     told = [is_keyframe(payload(decode(record.channel, record.data, "")), name) for _, record in records]
     assert [i for i, begins in enumerate(told) if begins][:2] == [0, 10]
     stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]

@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
+from hma_data.sources.bags.container import RecordFilter
 from hma_data.sources.bags.messages import decode, numbers
 from tests.data.bag_files import SOURCE, arm, read
 
@@ -67,7 +68,7 @@ def test_ros2_twins_in_sqlite_and_mcap_hold_the_same_values(real_data: Path) -> 
     assert raw[0] == raw[1] and store
     values = [
         decode(record.channel, record.data, "").float64_values.tolist()
-        for _, record in Bag(folder / "mcap" / "cdr_test").records(frozenset({"/array_topic"}))
+        for _, record in Bag(folder / "mcap" / "cdr_test").records(RecordFilter(frozenset({"/array_topic"})))
     ]
     assert len(values) == 4 and all(len(value) == 3 for value in values)
 

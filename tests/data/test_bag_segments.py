@@ -221,12 +221,13 @@ def test_a_service_that_was_never_called_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["mcap", "db3"])
 def test_events_of_a_real_bag_are_decoded_by_their_services_definition(kind: str, real_data: Path) -> None:
     from hma_data.sources.bags.bag import Bag
+    from hma_data.sources.bags.container import RecordFilter
     from hma_data.sources.bags.messages import decode
 
     path = real_data / "ros2/rosbag2/rosbag2_cpp/test/rosbag2_cpp/bags" / f"topics_and_services.{kind}"
     found = [
         decode(record.channel, record.data, "")
-        for _, record in Bag(path).records(frozenset({"/add_two_ints/_service_event"}))
+        for _, record in Bag(path).records(RecordFilter(frozenset({"/add_two_ints/_service_event"})))
     ]
     assert [message.info.event_type for message in found] == [1, 2] * 3
     assert [(m.request[0].a, m.request[0].b) for m in found[::2]] == [(1, 3), (2, 3), (3, 3)]

@@ -368,4 +368,4 @@ def test_a_rate_that_nothing_states_is_called_measured(folder: Path, monkeypatch
     monkeypatch.delenv("HMA_HAND_MODELS", raising=False)
     make(folder / "a.mp4", "libx264", {}, times=[*range(20), *range(24, 30)])
     (told,) = (one for one in open_source("hands").inspect(str(folder)).findings if one.check == "rate")
-    assert "a.mp4: video: ticks at 10 Hz, measured over its whole length " in told.message
+    assert "a.mp4: video: runs at 10 Hz, measured over its whole length " in told.message

@@ -14,10 +14,9 @@ from skimage import data
 
 from hma_data.inspection.inspect import inspect_recording
 from hma_data.sources.base import Inspection, open_source
-from hma_data.sources.common import timestamp_checks
-from hma_data.sources.common.image_checks import Look, choose, ycbcr_share
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Look, choose, measure, ycbcr_share
 from hma_data.sources.common.survey import CHECKS
-from hma_data.sources.common.timestamp_checks import clock_of
 from tests.data.bag_files import make_recording, write_ros1, write_ros2
 from tests.data.rlds_files import TEXT, image, png, tensor, write
 from tests.data.videos import encode as encode_video
@@ -187,11 +186,9 @@ def test_stamps_of_hdf5_are_checked_against_the_stated_rate(tmp_path: Path) -> N
             demo["timestamps"] = times
 
     said = damaged(tmp_path, stamp)
-    assert (
-        "demo_0: timestamps: 1 stamps are the one before again (and in 2 more episodes)" in said["repeated"]
-    )
+    assert "demo_0: timestamps: 1 stamps equal the stamp before (and in 2 more episodes)" in said["repeated"]
     assert "demo_0: timestamps: 1 stamps go back in time (and in 2 more episodes)" in said["back"]
-    assert "timestamps: ticks at 20 Hz, the recording states 30" in said["rate"][0]
+    assert "timestamps: runs at 20 Hz, the recording states 30" in said["rate"][0]
 
 
 @pytest.mark.parametrize("value", [1e300, -1e39])
@@ -208,7 +205,7 @@ def test_a_rate_measured_in_one_episode_is_not_called_stated(tmp_path: Path) -> 
             demo["timestamps"] = 1.7e9 + np.arange(len(demo["actions"])) / hz
 
     told = damaged(tmp_path, stamp)["rate"]
-    assert told and all("timestamps: ticks at 30 Hz, demo_0 at 20" in one for one in told)
+    assert told and all("timestamps: runs at 30 Hz, demo_0 at 20" in one for one in told)
 
 
 def test_a_bag_tells_skew_and_lost_frames(tmp_path: Path) -> None:
@@ -236,7 +233,7 @@ def test_a_still_picture_key_in_lerobot_is_told(tmp_path: Path) -> None:
         length = {"0": 12, "1": 9, "2": 15}[video.stem[-1]]
         encode_video(video, [7] * length)
     said = found(open_source("lerobot").inspect(str(folder)))
-    assert "100% of neighbouring pictures are the same" in said["still"][0]
+    assert "100% of neighbouring pictures are equal" in said["still"][0]
 
 
 # -- red and blue
@@ -292,28 +289,28 @@ def test_a_clock_counts_what_was_done_to_it() -> None:
     times = np.arange(300) / 30 + draw.normal(scale=0.001, size=300)
     kept = np.delete(times, [50, 120, 121, 122, 200])
     kept[20] = kept[19]
-    clock = clock_of(kept)
+    clock = measure(kept)
     assert (clock.lost, clock.repeated, clock.back) == (5, 1, 0)
     assert clock.hz == pytest.approx(30, rel=0.02)
 
 
 def test_lost_frames_are_told_for_cameras_alone() -> None:
     times = np.delete(np.arange(100) / 10, [20, 40, 41, 60])
-    (finding,) = timestamp_checks.findings("cam", clock_of(times), camera=True)
+    (finding,) = checks.time_findings("cam", measure(times), camera=True)
     assert finding.check == "frames" and finding.numbers["lost"] == 4
-    assert not list(timestamp_checks.findings("arm", clock_of(times)))
+    assert not list(checks.time_findings("arm", measure(times)))
 
 
 def test_events_have_no_pauses() -> None:
     times = np.cumsum(np.random.default_rng(0).exponential(5.0, 200) ** 2)
-    assert not list(timestamp_checks.findings("/button", clock_of(times)))
+    assert not list(checks.time_findings("/button", measure(times)))
 
 
 def test_skew_is_the_distance_to_the_nearest_sample() -> None:
     primary = np.arange(10, dtype=np.float64)
     other = np.arange(100, dtype=np.float64) / 10 + 0.02
-    assert timestamp_checks.skew(other, primary) == pytest.approx((20, 20, 20), abs=1e-6)
-    assert timestamp_checks.skew(other + 50, primary) is None
+    assert checks.skew(other, primary) == pytest.approx((20, 20, 20), abs=1e-6)
+    assert checks.skew(other + 50, primary) is None
 
 
 @pytest.mark.parametrize(("length", "pairs"), [(1, 4), (2, 4), (30, 3), (5, 100)])

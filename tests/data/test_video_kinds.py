@@ -140,7 +140,7 @@ def test_a_lying_container_that_gives_fewer_frames_is_refused(
     table = frame_table(path)
     longer = type(table)(**{**vars(table), "times": np.append(table.times, 99.0)})
     monkeypatch.setattr("hma_data.sources.common.video_file.frame_table", lambda path: longer)
-    with pytest.raises(EpisodeError, match=r"gives \d+ frames, its packets tell of \d+"):
+    with pytest.raises(EpisodeError, match=r"gives \d+ frames, its packets state \d+"):
         VideoFile(path).frames([3])
 
 

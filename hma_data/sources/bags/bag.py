@@ -6,18 +6,19 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.container import (
+    ALL,
     MAX_CHUNK,
     Channel,
     ChunkCache,
-    Container,
     Data,
     Record,
-    Wanted,
+    RecordFilter,
     damaged,
     reading,
     unzstd,
@@ -30,14 +31,8 @@ from hma_data.storage.yaml_io import read_yaml
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 MAX_EXPANSION = 200  # most times its packed size that a file may have unpacked, against decompression bombs
-
-
-class Place(NamedTuple):
-    """The place of a message: the file of the bag, and two numbers that give the place in it."""
-
-    file: int
-    first: int
-    second: int
+Container = McapFile | Ros1File | SqliteFile
+BagPlace = tuple[int, int, int]  # of a message: the file of the bag, and two numbers for the place in it
 
 
 class Bag:
@@ -53,20 +48,18 @@ class Bag:
 
     def __init__(self, path: Path, root: Path | None = None) -> None:
         self.path = path
+        self._metadata = _metadata(path) if path.is_dir() else {}
+        self._paths = _listed(path, self._metadata) if path.is_dir() else [path]
+        self._message_packed = str(self._metadata.get("compression_mode", "")).lower() == "message"
         self._unpacked: tempfile.TemporaryDirectory[str] | None = None
-        self._message_packed = False
-        self._metadata: dict[str, Any] = {}
-        paths = [path]
-        if path.is_dir():
-            self._metadata = _metadata(path)
-            paths = _listed(path, self._metadata)
-            mode = str(self._metadata.get("compression_mode", "")).lower()
-            self._message_packed = mode == "message"
-        for item in paths:
-            _refuse_link(item, root or path)
-        self._paths = paths
         self._files: list[Container] | None = None
         self._counts: Counter[Channel] | None = None
+        root = root or path
+        for item in self._paths:
+            if item != root and leaves(item, root if root.is_dir() else root.parent):
+                raise EpisodeError(
+                    item, "is a link to a file outside its folder", "copy the file in, or give its own path"
+                )
 
     def files(self) -> list[Container]:
         """Return its files in recording order; packed files (.zstd) are unpacked to a temporary folder."""
@@ -86,62 +79,50 @@ class Bag:
     def counts(self) -> Counter[Channel]:
         """Count the messages of each channel, from indexes where there are any."""
         if self._counts is None:
-            self._counts = self._count()
-        return self._counts.copy()
+            packed = any(path.suffix == ".zstd" for path in self._paths)
+            counts = self._stated_counts() if packed else Counter[Channel]()
+            for file in () if packed else self.files():
+                counts.update(file.counts())
+            self._counts = counts
+        return self._counts
 
-    def _count(self) -> Counter[Channel]:
-        if any(path.suffix == ".zstd" for path in self._paths):
-            return self._stated_counts()
-        total: Counter[Channel] = Counter()
-        for file in self.files():
-            for channel, count in file.counts().items():
-                total[channel] += count
-        return total
-
-    def records(self, topics: frozenset[str] | None = None) -> Iterator[tuple[Place, Record]]:
-        """Yield the messages of those topics (of all topics with None), file by file."""
-        return self.wanted(Wanted(topics))
-
-    def wanted(self, wanted: Wanted) -> Iterator[tuple[Place, Record]]:
+    def records(self, wanted: RecordFilter = ALL) -> Iterator[tuple[BagPlace, Record]]:
         """Yield the wanted messages, file by file; a time range costs about its own bytes."""
         if self._message_packed:
             wanted = replace(wanted, heads=frozenset())
         for number, file in enumerate(self.files()):
             for record in file.records(wanted):
-                yield Place(number, *record.place), self._plain_record(record)
+                yield (number, *record.place), self._plain_record(record)
 
-    def before(self, topics: frozenset[str], log_ns: int) -> list[tuple[Place, Record]]:
+    def before(self, topics: frozenset[str], log_ns: int) -> list[tuple[BagPlace, Record]]:
         """Return each topic's last message received before that time, from the last file that has one."""
-        found: dict[str, tuple[Place, Record]] = {}
+        found: dict[str, tuple[BagPlace, Record]] = {}
         for number, file in reversed(list(enumerate(self.files()))):
             missing = topics - found.keys()
             for topic, record in file.before(missing, log_ns).items() if missing else ():
-                found[topic] = (Place(number, *record.place), self._plain_record(record))
-        return sorted(found.values(), key=lambda item: item[0])
+                found[topic] = ((number, *record.place), self._plain_record(record))
+        return sorted(found.values(), key=itemgetter(0))
 
-    def _plain_record(self, record: Record) -> Record:
-        return record._replace(data=self._unpack(record.data)) if self._message_packed else record
-
-    def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
+    def payloads(self, places: Sequence[BagPlace]) -> Iterator[Data]:
         """Yield the data of the messages at those places, in that order."""
         files = self.files()
-        for number, group in groupby(places, key=lambda place: place.file):
-            for data in files[number].payloads([(place.first, place.second) for place in group]):
+        for number, group in groupby(places, key=itemgetter(0)):
+            for data in files[number].payloads([(first, second) for _, first, second in group]):
                 yield self._unpack(data) if self._message_packed else data
 
     def fingerprint(self) -> str:
         """Return a text that changes when a byte of the bag does; see EpisodeRef."""
         return "-".join(file_fingerprint(path) for path in self._paths)
 
-    def state(self) -> tuple[tuple[str, ...], ...]:
-        """Return facts that stay equal only while no file of the bag changes; the key for caching it."""
-        found = []
+    def state(self) -> tuple[tuple[str, int, int], ...]:
+        """Return size and time of change of its files, and of sqlite3's logs; the key for caching it."""
+        logs = (path.with_name(path.name + "-wal") for path in self._paths)
         with reading(self.path):
-            for path in [*self._paths, *(item for item in map(_log, self._paths) if item.is_file())]:
-                stat = path.stat()
-                facts = (stat.st_size, stat.st_mtime_ns, stat.st_ino, file_fingerprint(path))
-                found.append((str(path), *map(str, facts)))
-        return tuple(found)
+            stats = {path: path.stat() for path in [*self._paths, *(log for log in logs if log.is_file())]}
+        return tuple((str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats.items())
+
+    def _plain_record(self, record: Record) -> Record:
+        return record._replace(data=self._unpack(record.data)) if self._message_packed else record
 
     def _unpack(self, data: Data) -> bytes:
         with reading(self.path):
@@ -187,18 +168,18 @@ def find_bags(root: Path) -> dict[str, Path]:
     """
     if root.is_file() or is_bag_folder(root):
         return {root.stem if root.is_file() else root.name: root}
-    found: list[Path] = []
+    found: dict[Path, str] = {}  # bag -> its id
     for folder, folders, names in os.walk(root):
         here = Path(folder)
         if here != root and is_bag_folder(here):
-            found.append(here)
+            found[here] = here.relative_to(root).as_posix()
             folders.clear()
             continue
-        found += [here / name for name in names if _is_bag_file(here / name)]
-    ids = {path: _id(path, root) for path in found}
-    repeated = {item for item, count in Counter(ids.values()).items() if count > 1}
+        bags = (here / name for name in names if _is_bag_file(here / name))
+        found |= {path: path.relative_to(root).with_suffix("").as_posix() for path in bags}
+    counts = Counter(found.values())
     named = {
-        path.relative_to(root).as_posix() if ids[path] in repeated else ids[path]: path for path in found
+        name if counts[name] == 1 else path.relative_to(root).as_posix(): path for path, name in found.items()
     }
     return dict(sorted(named.items()))
 
@@ -208,28 +189,8 @@ def is_bag_folder(path: Path) -> bool:
     return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 4096)
 
 
-def _id(path: Path, root: Path) -> str:
-    relative = path.relative_to(root)
-    return (relative if path.is_dir() else relative.with_suffix("")).as_posix()
-
-
 def _is_bag_file(path: Path) -> bool:
-    if path.suffix in SUFFIXES:
-        return True
-    return first_bytes(path, 8).startswith((b"#ROSBAG", MCAP_MAGIC))
-
-
-def _refuse_link(path: Path, root: Path) -> None:
-    folder = root if root.is_dir() else root.parent
-    if root != path and leaves(path, folder):
-        raise EpisodeError(
-            path, "is a link to a file outside its folder", "copy the file in, or name it itself"
-        )
-
-
-def _log(path: Path) -> Path:
-    """Return the path where sqlite3 keeps changes that are not merged yet."""
-    return path.with_name(path.name + "-wal")
+    return path.suffix in SUFFIXES or first_bytes(path, 8).startswith((b"#ROSBAG", MCAP_MAGIC))
 
 
 def _container(path: Path, chunks: ChunkCache) -> Container:
@@ -242,7 +203,9 @@ def _container(path: Path, chunks: ChunkCache) -> Container:
         return SqliteFile(path)
     if not magic:
         raise damaged(path, "is empty")
-    raise damaged(path, f"begins with {magic[:8]!r}, neither as a ROS 1 bag, nor MCAP, nor sqlite3")
+    raise damaged(
+        path, f"begins with {magic[:8]!r}, which is not how a ROS 1 bag, MCAP or sqlite3 file begins"
+    )
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
@@ -256,11 +219,10 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 def _listed(folder: Path, metadata: dict[str, Any]) -> list[Path]:
     """List the files of metadata.yaml by their last name, because older versions put the folder before it."""
-    where = folder / "metadata.yaml"
-    names = metadata.get("relative_file_paths")
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
+    where, names = folder / "metadata.yaml", metadata.get("relative_file_paths")
+    if not isinstance(names, list) or not names:
         raise EpisodeError(where, "relative_file_paths names no files", "run ros2 bag reindex")
-    paths = [folder / PurePosixPath(name).name for name in names]
+    paths = [folder / PurePosixPath(str(name)).name for name in names]
     missing = [path.name for path in paths if not path.is_file()]
     if missing:
         raise EpisodeError(where, f"names {missing[0]}, which is not in the folder", "run ros2 bag reindex")

@@ -1,19 +1,24 @@
-"""Define what the three kinds of bag file share: the contract, records, chunks, binary fields.
+"""Define what the three kinds of bag file share: the contract, records, the index by time, chunks.
 
 A container is one file. It yields the messages of wanted topics in the file's order. Where it has an index,
 it counts the messages without reading them. It finds a message again by its place, so for pictures only
 places are kept in memory. No container holds an open file between calls.
+
+A piece is a run of a file's records: one chunk, or messages outside of chunks. Its topics and its times of
+receipt are known, so a time range is read without the rest. A file has some thousands of pieces.
 """
 
 import bz2
 import sqlite3
 import struct
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import BinaryIO, NamedTuple
+
+from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
 
@@ -23,11 +28,11 @@ FOREVER = 2**64
 HEAD = 64  # bytes: the stamp of a message is within them
 FAULTS = (
     struct.error, ValueError, LookupError, OverflowError, RecursionError, EOFError, OSError, RuntimeError,
-    MemoryError, sqlite3.Error,
+    MemoryError, sqlite3.Error, McapError,
 )  # fmt: skip
 
 Data = bytes | memoryview
-Place = tuple[int, int]
+FilePlace = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -54,11 +59,11 @@ class Record(NamedTuple):
     channel: Channel
     log_ns: int
     data: Data
-    place: Place
+    place: FilePlace
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RecordFilter:
     """The messages that a container is asked for.
 
     Attributes:
@@ -72,11 +77,6 @@ class Wanted:
     last_ns: int = FOREVER
     heads: frozenset[str] = frozenset()
 
-    @property
-    def bounded(self) -> bool:
-        """Check whether only a part of the recording's time is asked for."""
-        return self.first_ns > 0 or self.last_ns < FOREVER
-
     def topic(self, name: str) -> bool:
         """Check whether messages of that topic are asked for."""
         return self.topics is None or name in self.topics
@@ -86,26 +86,7 @@ class Wanted:
         return self.first_ns <= log_ns <= self.last_ns
 
 
-class Container(Protocol):
-    """One file of a bag. Every method raises EpisodeError when the file is damaged."""
-
-    path: Path
-
-    def counts(self) -> Counter[Channel]:
-        """Count the messages of each channel, from the index if there is one; also of empty channels."""
-        ...
-
-    def records(self, wanted: Wanted) -> Iterator[Record]:
-        """Yield the wanted messages, in the file's order."""
-        ...
-
-    def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
-        """Return each topic's last message before a time; topics without one are left out."""
-        ...
-
-    def payloads(self, places: Sequence[Place]) -> Iterator[Data]:
-        """Yield the data of the messages at those places."""
-        ...
+ALL = RecordFilter()
 
 
 @contextmanager
@@ -125,8 +106,136 @@ def damaged(path: Path, fault: str) -> EpisodeError:
     )
 
 
+class Piece(NamedTuple):
+    """The records from offset `at` to `end`: one chunk, or messages outside of chunks.
+
+    Attributes:
+        first_ns, last_ns: earliest and latest receipt of its messages.
+        topics: of its messages.
+    """
+
+    at: int
+    end: int
+    first_ns: int
+    last_ns: int
+    topics: frozenset[str]
+
+    def holds(self, topics: frozenset[str] | None) -> bool:
+        """Check whether it can hold a message of those topics."""
+        return topics is None or not self.topics.isdisjoint(topics)
+
+
+@dataclass
+class FileIndex:
+    """The channels of a file by number, its pieces in their order, and what else a walk over it shows.
+
+    Attributes:
+        counts: messages of each channel, where the walk counts them.
+        notes: entries of MCAP's metadata records.
+    """
+
+    channels: dict[int, Channel] = field(default_factory=dict)
+    pieces: list[Piece] = field(default_factory=list)
+    counts: Counter[Channel] = field(default_factory=Counter)
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def channel(self, number: int) -> Channel:
+        """Return the channel of that number.
+
+        Raises:
+            ValueError: the file does not declare it.
+        """
+        if number not in self.channels:
+            raise ValueError(f"a message is on channel {number}, which is not declared")
+        return self.channels[number]
+
+
+class IndexedFile:
+    """A bag file that is read piece by piece; its unpacked chunks are kept in `chunks`.
+
+    Every method of a container raises EpisodeError when the file is damaged.
+    """
+
+    def __init__(self, path: Path, chunks: "ChunkCache | None" = None) -> None:
+        self.path = path
+        self._chunks = chunks or ChunkCache()
+        self._indexed: FileIndex | None = None
+
+    def records(self, wanted: RecordFilter) -> Iterator[Record]:
+        """Yield the wanted messages, in the file's order; pieces without one are not read."""
+        with reading(self.path), self.path.open("rb") as file:
+            index = self._index(file)
+            for piece in index.pieces:
+                within = piece.first_ns <= wanted.last_ns and piece.last_ns >= wanted.first_ns
+                if within and piece.holds(wanted.topics):
+                    yield from self._in_piece(file, index, piece, wanted)
+
+    def before(self, topics: frozenset[str], log_ns: int) -> dict[str, Record]:
+        """Return each topic's last message before a time; topics without one are left out."""
+        found: dict[str, Record] = {}
+        with reading(self.path), self.path.open("rb") as file:
+            index = self._index(file)
+            earlier = (piece for piece in index.pieces if piece.first_ns < log_ns and piece.holds(topics))
+            for piece in sorted(earlier, key=lambda piece: piece.last_ns, reverse=True):
+                newest = min(piece.last_ns, log_ns - 1)
+                missing = frozenset(t for t in topics if t not in found or found[t].log_ns < newest)
+                if not missing:
+                    break
+                if piece.holds(missing):
+                    wanted = RecordFilter(missing, last_ns=log_ns - 1)
+                    take_last(found, self._in_piece(file, index, piece, wanted))
+        return found
+
+    def _index(self, file: BinaryIO) -> FileIndex:
+        if self._indexed is None:
+            self._indexed = self._make_index(file)
+        return self._indexed
+
+    def counts(self) -> Counter[Channel]:
+        """Count the messages of each channel, from the index if there is one; also of empty channels."""
+        raise NotImplementedError
+
+    def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
+        """Yield the data of the messages at those places."""
+        with reading(self.path), self.path.open("rb") as file:
+            last = -1
+            for offset, at in places:
+                if offset != last:
+                    last, view = offset, self._view(file, offset)
+                start, end = self._content(view, at)
+                yield view[start:end]
+
+    def _make_index(self, file: BinaryIO) -> FileIndex:
+        raise NotImplementedError
+
+    def _view(self, file: BinaryIO, at: int) -> "View":
+        """Return the records of the piece at an offset, read lazily where they lie unpacked in the file."""
+        raise NotImplementedError
+
+    def _content(self, view: "View", at: int) -> tuple[int, int]:
+        """Return where the data of the message at `at` begins and ends."""
+        raise NotImplementedError
+
+    def _in_piece(
+        self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
+    ) -> Iterator[Record]:
+        raise NotImplementedError
+
+
+def take_last(found: dict[str, Record], records: Iterable[Record]) -> None:
+    """Put the last message of each topic into `found`, with a copy of its bytes."""
+    newest: dict[str, Record] = {}
+    for record in records:
+        topic = record.channel.topic
+        if topic not in newest or newest[topic].log_ns <= record.log_ns:
+            newest[topic] = record
+    for topic, record in newest.items():
+        if topic not in found or found[topic].log_ns <= record.log_ns:
+            found[topic] = record._replace(data=bytes(record.data))
+
+
 class ChunkCache:
-    """Keep the last unpacked chunks of one bag: at most CACHED_BYTES of them, and always at least one."""
+    """The last unpacked chunks of one bag: at most CACHED_BYTES of them, and always at least one."""
 
     def __init__(self) -> None:
         self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()
@@ -188,34 +297,21 @@ def unzstd(data: Data, limit: int) -> bytes:
     return unpacked
 
 
-class Fields:
-    """Read little-endian fields from bytes; raise ValueError where the bytes end too soon."""
+class FileView:
+    """A part of a file whose slices are read when they are taken, like a memoryview of its bytes."""
 
-    def __init__(self, data: Data) -> None:
-        self._data = memoryview(data)
-        self._at = 0
+    def __init__(self, file: BinaryIO, begin: int, end: int) -> None:
+        self._file, self._begin, self._size = file, begin, end - begin
 
-    def take(self, size: int) -> memoryview:
-        """Take the next `size` bytes."""
-        if self._at + size > len(self._data):
-            raise ValueError("a record ends too soon")
-        self._at += size
-        return self._data[self._at - size : self._at]
+    def __len__(self) -> int:
+        return self._size
 
-    def number(self, size: int) -> int:
-        """Read an unsigned number of `size` bytes."""
-        return int.from_bytes(self.take(size), "little")
+    def __getitem__(self, part: slice) -> bytes:
+        self._file.seek(self._begin + part.start)
+        return read_exact(self._file, part.stop - part.start)
 
-    def block(self) -> memoryview:
-        """Take the bytes that follow their 32-bit length."""
-        return self.take(self.number(4))
 
-    def text(self) -> str:
-        """Read UTF-8 text that follows its 32-bit length."""
-        return str(self.block(), "utf-8")
-
-    def __bool__(self) -> bool:
-        return self._at < len(self._data)
+View = memoryview | FileView
 
 
 def read_exact(file: BinaryIO, size: int) -> bytes:

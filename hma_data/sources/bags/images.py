@@ -5,20 +5,22 @@ foxglove, in any encoding of messages; and FFMPEGPacket. T messages; H×W pixels
 """
 
 import base64
-import binascii
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import MAX_PIXELS, Images, decode_image, opencv
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.messages import child, field_names
-from hma_data.sources.common.dtype_hints import one_channel
+from hma_data.sources.bags.bag import Bag
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.messages import child, decode, field_names
+from hma_data.sources.common.checks import one_channel
 from hma_data.sources.common.video_file import is_spoilt
 
 RAW, STILL, VIDEO = "raw", "still", "video"
@@ -31,35 +33,23 @@ KINDS = {
     "ffmpeg_image_transport_msgs/FFMPEGPacket": VIDEO,
 }
 DEPTH = ("compresseddepth", "16uc1", "32fc1", "mono16")
-BYTES = {  # bytes of a pixel
-    "rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4, "8uc4": 4, "mono8": 1, "8uc1": 1,
-    "bayer_rggb8": 1, "bayer_bggr8": 1, "bayer_gbrg8": 1, "bayer_grbg8": 1,
-    "yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2, "nv12": 1, "nv21": 1,
+ENCODINGS = {  # of raw pictures: bytes of a pixel, OpenCV's conversion to RGB
+    "rgb8": (3, ""), "bgr8": (3, "BGR2RGB"), "8uc3": (3, "BGR2RGB"),
+    "rgba8": (4, "RGBA2RGB"), "bgra8": (4, "BGRA2RGB"), "8uc4": (4, "BGRA2RGB"),
+    "mono8": (1, "GRAY2RGB"), "8uc1": (1, "GRAY2RGB"),
+    "bayer_rggb8": (1, "BayerRGGB2RGB"), "bayer_bggr8": (1, "BayerBGGR2RGB"),
+    "bayer_gbrg8": (1, "BayerGBRG2RGB"), "bayer_grbg8": (1, "BayerGRBG2RGB"),
+    "yuv422": (2, "YUV2RGB_UYVY"), "uyvy": (2, "YUV2RGB_UYVY"),
+    "yuv422_yuy2": (2, "YUV2RGB_YUY2"), "yuyv": (2, "YUV2RGB_YUY2"),
+    "nv12": (1, "YUV2RGB_NV12"), "nv21": (1, "YUV2RGB_NV21"),
 }  # fmt: skip
-TO_RGB = {
-    "bgr8": "BGR2RGB", "8uc3": "BGR2RGB", "rgba8": "RGBA2RGB", "bgra8": "BGRA2RGB", "8uc4": "BGRA2RGB",
-    "mono8": "GRAY2RGB", "8uc1": "GRAY2RGB",
-}  # fmt: skip
-
 CODECS = {"h264": "h264", "h265": "hevc", "vp9": "vp9", "av1": "libdav1d"}  # Foxglove's and FFmpeg's names
+ENCODERS = (("264", "h264"), ("265", "h265"), ("hevc", "h265"), ("vp9", "vp9"), ("av1", "av1"))
+BLOCK = 64  # video messages fetched at a time
 NAL_UNIT = re.compile(b"\x00\x00\x01(.)", re.DOTALL)
 AV1_SEQUENCE = 1  # type of the unit that holds a sequence header
-HIGH_PROFILES = {
-    100,
-    110,
-    122,
-    244,
-    44,
-    83,
-    86,
-    118,
-    128,
-    138,
-    139,
-    134,
-    135,
-}  # of H.264, with a chroma format
-ENCODERS = (("264", "h264"), ("265", "h265"), ("hevc", "h265"), ("vp9", "vp9"), ("av1", "av1"))
+# What FFmpeg logs where a reference picture is missing, and the level of that message.
+MISSING = {"h264": ("DEBUG", "Frame num gap"), "h265": ("ERROR", "Could not find ref")}
 
 
 def picture_kind(message_type: str) -> str | None:
@@ -120,63 +110,38 @@ def payload(message: Any) -> bytes:
     """Return the stored bytes of a picture; JSON stores them in base64."""
     data = child(message, "data")
     if isinstance(data, str):
-        try:
-            return base64.b64decode(data, validate=True)
-        except binascii.Error as fault:
-            raise ValueError(f"data is not base64: {fault}") from fault
+        return base64.b64decode(data, validate=True)
     return data.tobytes() if isinstance(data, np.ndarray) else bytes(data)
 
 
 def _raw(message: Any, where: str) -> Images:
     encoding = str(child(message, "encoding"))
     height, width, step = (int(child(message, name)) for name in ("height", "width", "step"))
-    pixel = BYTES.get(encoding.lower())
-    if pixel is None:
+    if encoding.lower() not in ENCODINGS:
         raise EpisodeError(
-            where, f"pictures in {encoding!r} are not 8-bit colour", f"these can be read: {', '.join(BYTES)}"
+            where,
+            f"pictures in {encoding!r} are not 8-bit colour",
+            f"these can be read: {', '.join(ENCODINGS)}",
         )
-    if not 0 < height * width <= MAX_PIXELS or min(height, width) < 1:
-        raise EpisodeError(where, f"a picture claims {width}×{height} pixels")
-    step = step or width * pixel
+    pixel, conversion = ENCODINGS[encoding.lower()]
+    if min(height, width) < 1 or height * width > MAX_PIXELS:
+        raise EpisodeError(where, f"a picture claims {width}×{height} pixels, the most is {MAX_PIXELS:,}")
+    planar = encoding.lower() in ("nv12", "nv21")  # rows of colour, half as many, follow those of luma
+    rows, row = height * 3 // 2 if planar else height, width * pixel
+    step = step or row
     data = child(message, "data")
     flat = data if isinstance(data, np.ndarray) else np.frombuffer(payload(message), np.uint8)
-    if step < width * pixel or len(flat) < step * (height - 1) + width * pixel:
+    odd = planar and (height % 2 or width % 2)
+    if odd or step < row or len(flat) < step * (rows - 1) + row:
         raise EpisodeError(
             where, f"a picture of {width}×{height} in {encoding} has {len(flat):,} bytes, rows of {step}"
         )
-    if len(flat) < step * height:  # the last row may end with its last pixel
-        flat = np.concatenate([flat, np.zeros(step * height - len(flat), np.uint8)])
-    if encoding.lower() in ("nv12", "nv21"):
-        return _semi_planar(flat, height, width, step, encoding.lower(), where)
-    rows = flat[: step * height].reshape(height, step)[:, : width * pixel]
-    return _to_rgb(np.ascontiguousarray(rows).reshape(height, width, pixel), encoding.lower())
-
-
-def _semi_planar(
-    flat: NDArray[np.uint8], height: int, width: int, step: int, encoding: str, where: str
-) -> Images:
-    """Convert NV12 or NV21: rows of luma, then half as many rows with both colour channels interleaved."""
-    rows = height * 3 // 2
-    if height % 2 or width % 2 or len(flat) < step * (rows - 1) + width:
-        raise EpisodeError(where, f"a picture of {width}×{height} in {encoding} has {len(flat):,} bytes")
-    flat = np.concatenate([flat, np.zeros(max(0, step * rows - len(flat)), np.uint8)])
-    planes = np.ascontiguousarray(flat[: step * rows].reshape(rows, step)[:, :width])
+    if len(flat) < step * rows:  # the last row may end with its last pixel
+        flat = np.concatenate([flat, np.zeros(step * rows - len(flat), np.uint8)])
+    pixels = np.ascontiguousarray(flat[: step * rows].reshape(rows, step)[:, :row])
+    pixels = pixels.reshape(rows, width, pixel)
     cv2 = opencv()
-    return cv2.cvtColor(planes, cv2.COLOR_YUV2RGB_NV12 if encoding == "nv12" else cv2.COLOR_YUV2RGB_NV21)
-
-
-def _to_rgb(pixels: NDArray[np.uint8], encoding: str) -> Images:
-    cv2 = opencv()
-    if encoding.startswith("bayer_"):
-        pattern = encoding.removeprefix("bayer_").removesuffix("8").upper()
-        return cv2.cvtColor(np.ascontiguousarray(pixels[..., 0]), getattr(cv2, f"COLOR_Bayer{pattern}2RGB"))
-    if encoding in ("yuv422", "uyvy"):
-        return cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_YUV2RGB_UYVY)
-    if encoding in ("yuv422_yuy2", "yuyv"):
-        return cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_YUV2RGB_YUY2)
-    if encoding in TO_RGB:
-        return cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{TO_RGB[encoding]}"))
-    return pixels
+    return cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")) if conversion else pixels
 
 
 # -- video
@@ -184,18 +149,19 @@ def _to_rgb(pixels: NDArray[np.uint8], encoding: str) -> Images:
 
 def is_keyframe(data: bytes, codec: str) -> bool | None:
     """Check whether decoding can begin at a message; None for a codec that is not parsed."""
-    kinds = {unit[1][0] for unit in NAL_UNIT.finditer(data)}
     if codec == "h264":
-        return any(kind & 0x1F == 5 for kind in kinds)
+        return any(unit[1][0] & 0x1F == 5 for unit in NAL_UNIT.finditer(data))
     if codec == "h265":
-        return any(16 <= (kind >> 1) & 0x3F <= 21 for kind in kinds)
-    return {"vp9": _vp9_begins, "av1": _av1_begins}.get(codec, lambda data: None)(data)
+        return any(16 <= (unit[1][0] >> 1) & 0x3F <= 21 for unit in NAL_UNIT.finditer(data))
+    if codec == "vp9":
+        return _vp9_begins(data)
+    return _av1_begins(data) if codec == "av1" else None
 
 
 def _vp9_begins(data: bytes) -> bool:
     """Check whether the first frame is a key frame: VP9 bitstream specification, uncompressed_header."""
     if not data or data[0] >> 6 != 2:
-        raise ValueError("no VP9 frame")
+        raise ValueError("it is not a VP9 frame")
     at = 5 if data[0] >> 4 & 3 == 3 else 4  # bits: marker 2, profile 2, of profile 3 one more
     shows_existing, inter = data[0] >> (7 - at) & 1, data[0] >> (6 - at) & 1
     return not shows_existing and not inter
@@ -206,21 +172,22 @@ def _av1_begins(data: bytes) -> bool:
     at = 0
     while at < len(data):
         kind, extended, sized = data[at] >> 3 & 15, data[at] & 4, data[at] & 2
-        at += 2 if extended else 1
-        size, shift = (0, 0) if sized else (len(data), 0)
-        while sized and at < len(data):
-            size |= (data[at] & 0x7F) << shift
-            at, shift = at + 1, shift + 7
-            if not data[at - 1] & 0x80:
-                break
         if kind == AV1_SEQUENCE:
             return True
+        if not sized:
+            return False
+        at += 2 if extended else 1
+        size = shift = 0
+        more = True
+        while more and at < len(data):
+            size |= (data[at] & 0x7F) << shift
+            more, at, shift = bool(data[at] & 0x80), at + 1, shift + 7
         at += size
     return False
 
 
 class VideoDecoder:
-    """Decode a video; continue from the last frame when asked in order, else begin at a key frame.
+    """A decoder of video; it goes on from the last frame when asked in order, else begins at a key frame.
 
     Args:
         codec: h264, h265, vp9 or av1.
@@ -243,9 +210,8 @@ class VideoDecoder:
         self._taken = -1  # the last picture returned
         self._ready: dict[int, Any] = {}  # pictures decoded but not returned yet; None for a damaged one
         self._spoilt = False  # whether the last decoded picture, or one it may depend on, is damaged
-        self._count = H264Count()
-        self._lost = -1  # the first message since the last key frame that lacks an earlier picture
-        self._made_without: dict[int, int] = {}  # message -> the first one that lacks an earlier picture
+        self._lost = False  # whether a picture since the last key frame is missing
+        self._incomplete: set[int] = set()  # messages that may depend on a missing picture
 
     def frames(self, indices: Sequence[int]) -> dict[int, Images]:
         """Return the picture (H, W, 3) of each of those indices.
@@ -267,14 +233,9 @@ class VideoDecoder:
             frame = self._ready[index]
             self._ready = {i: frame for i, frame in self._ready.items() if i >= index}
             self._taken = index
-            if index in self._made_without:
-                fault = f"a picture before frame {self._made_without[index]} of the video is missing"
-                raise EpisodeError(self._where, f"{fault}, and frame {index} is made from it")
             if frame is None:
-                raise EpisodeError(
-                    self._where,
-                    f"frame {index} of the video is damaged, or one before it that it is made from",
-                )
+                fault = f"frame {index} of the video is damaged, or depends on one that is damaged or lost"
+                raise EpisodeError(self._where, fault)
             found[index] = frame.to_ndarray(format="rgb24")
         return found
 
@@ -287,19 +248,10 @@ class VideoDecoder:
 
         self._context = av.CodecContext.create(CODECS[self._codec], "r")
         self._context.thread_count = 1
-        self._ready, self._spoilt = {}, False
-        self._count, self._lost, self._made_without = H264Count(), -1, {}
+        self._context.options = {"max_pixels": str(MAX_PIXELS)}
+        self._ready, self._spoilt, self._lost, self._incomplete = {}, False, False, set()
         self._next = int(np.flatnonzero(self._keyframes[: index + 1])[-1])
         self._taken = self._next - 1
-
-    def _follow(self, index: int, misses: bool) -> None:
-        """Note whether message `index`, or one it may depend on, lacks an earlier picture."""
-        if self._keyframes[index]:
-            self._lost = -1
-        elif misses and self._lost < 0:
-            self._lost = index
-        if self._lost >= 0:
-            self._made_without[index] = self._lost
 
     def _decode(self, data: bytes | None, wanted: int) -> None:
         """Give the decoder its next message; with None, let it finish."""
@@ -316,19 +268,20 @@ class VideoDecoder:
                 frames = self._context.decode(packet)
         except (av.FFmpegError, ValueError) as fault:
             self._context = None
-            raise EpisodeError(self._where, f"frame {wanted} of the video: {fault}") from fault
+            raise EpisodeError(
+                self._where, f"frame {wanted} of the video cannot be decoded: {fault}"
+            ) from fault
         if data is None:
             self._context = None
         else:
-            lost = not self._count.complete(data) if self._codec == "h264" else bool(missing)
-            self._follow(self._next, lost)
+            self._lost = not self._keyframes[self._next] and (self._lost or bool(missing))
+            self._incomplete |= {self._next} if self._lost else set()
             self._next += 1
         for frame in frames:
-            if frame.width * frame.height > MAX_PIXELS:
-                raise EpisodeError(self._where, f"the video claims {frame.width}×{frame.height} pixels")
             self._spoilt = is_spoilt(frame, self._spoilt)
             if frame.pts is not None:
-                self._ready[frame.pts] = None if self._spoilt else frame
+                usable = not self._spoilt and frame.pts not in self._incomplete
+                self._ready[frame.pts] = frame if usable else None
 
 
 _LOGGING = threading.Lock()  # PyAV's log settings hold for the whole process
@@ -336,107 +289,120 @@ _LOGGING = threading.Lock()  # PyAV's log settings hold for the whole process
 
 @contextmanager
 def _missing_references(codec: str) -> Iterator[list[str]]:
-    """Gather FFmpeg's log messages on missing reference pictures; it writes them for H.265 only.
+    """Gather FFmpeg's log messages on missing reference pictures, of H.264 and H.265.
 
-    A decoder goes on without a lost picture, and marks no frame as damaged. So a loss is found in other ways:
-    in H.264 by the numbers of the pictures (H264Count), in H.265 by the log. In AV1, dav1d returns no picture
+    FFmpeg goes on without a lost picture, and marks no frame as damaged. In AV1, dav1d returns no picture
     that depends on a lost one.
     """
     import av.logging as log
 
     missing: list[str] = []
-    if codec != "h265":
+    if codec not in MISSING:
         yield missing
         return
+    wanted_level, text = MISSING[codec]
     with _LOGGING, log.Capture() as said:
         level, skip = log.get_level(), log.get_skip_repeated()
-        log.set_level(log.ERROR)
+        log.set_level(getattr(log, wanted_level))
         log.set_skip_repeated(False)
         try:
             yield missing
         finally:
             log.set_level(level)
             log.set_skip_repeated(skip)
-            missing += [text for _, _, text in said if "Could not find ref" in text]
+            missing += [message for _, _, message in said if text in message]
 
 
-class H264Count:
-    """Check the numbers of H.264's reference pictures: each has the number after the last, or the same.
+# -- streams
 
-    The number is frame_num in ITU-T H.264, 7.3.2.1, 7.3.3 and 7.4.3. FFmpeg does not report missing ones.
+
+class Messages:
+    """The messages of one topic, read again by index.
+
+    Args:
+        places: (T, 4) as TopicTrack keeps them, in order of receipt.
+        channels: the channels that the last number of a place points into.
     """
 
-    def __init__(self) -> None:
-        self._bits: dict[int, int] = {}  # sequence parameter set -> bits of frame_num, where it is checked
-        self._of: dict[int, int] = {}  # picture parameter set -> sequence parameter set
-        self._last: int | None = None  # frame_num of the reference picture before
+    def __init__(self, bag: Bag, channels: list[Channel], places: NDArray[np.int64], where: str) -> None:
+        self.where = where
+        self._bag, self._channels, self._places = bag, channels, places
 
-    def complete(self, data: bytes) -> bool:
-        """Check whether all pictures that a message depends on came before; True where it is unknown."""
-        starts = [found.end() - 1 for found in NAL_UNIT.finditer(data)]
-        whole = True
-        for start, end in zip(starts, [*starts[1:], len(data) + 3]):
-            with suppress(ValueError):  # the decoder reports what is wrong with the unit
-                whole &= self._unit(data[start : end - 3])
-        return whole
-
-    def _unit(self, unit: bytes) -> bool:
-        kind, reference, bits = unit[0] & 31, bool(unit[0] >> 5 & 3), _Bits(unit[1:97])
-        if kind == 7:
-            self._sequence(bits)
-        elif kind == 8:
-            number = bits.ue()
-            self._of[number] = bits.ue()
-        if kind not in (1, 2, 5) or bits.ue():  # not the first slice of a picture
-            return True
-        bits.ue()  # its type
-        size = self._bits.get(self._of.get(bits.ue(), 0))
-        if size is None:
-            return True
-        number, before = bits.u(size), self._last
-        if reference or kind == 5:
-            self._last = number
-        return kind == 5 or before is None or number in (before, (before + 1) % (1 << size))
-
-    def _sequence(self, bits: "_Bits") -> None:
-        """Learn a sequence parameter set; forms that are rare in live video are not checked."""
-        profile = bits.u(8)
-        bits.u(16)
-        number = bits.ue()
-        self._bits.pop(number, None)
-        if profile in HIGH_PROFILES:
-            if bits.ue() == 3 and bits.u(1):  # colour planes are coded separately
-                return
-            bits.ue(), bits.ue(), bits.u(1)  # depths, transform bypass
-            if bits.u(1):  # scaling lists
-                return
-        size, order = bits.ue() + 4, bits.ue()
-        if order == 1:
-            return
-        if order == 0:
-            bits.ue()
-        bits.ue()  # reference frames
-        if not bits.u(1):  # gaps in frame_num are not allowed
-            self._bits[number] = size
+    def read(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[object]:
+        """Yield the decoded messages of those indices, in that order."""
+        rows = self._places[np.asarray(indices, np.int64)].tolist()
+        places = [(file, first, second) for file, first, second, _ in rows]
+        for row, data in zip(rows, self._bag.payloads(places), strict=True):
+            yield decode(self._channels[row[3]], data, self.where)
 
 
-class _Bits:
-    """Read the syntax elements of a unit; raise ValueError where it ends before."""
+class StillStream:
+    """A camera of raw or still pictures; see episode.Stream."""
 
-    def __init__(self, unit: bytes) -> None:
-        plain = unit.replace(b"\x00\x00\x03", b"\x00\x00")  # drop the emulation prevention bytes
-        self._text = "".join(f"{byte:08b}" for byte in plain)
-        self._at = 0
+    def __init__(self, timestamps: Floats, messages: Messages, kind: str) -> None:
+        self.timestamps = timestamps
+        self._messages, self._kind = messages, kind
 
-    def u(self, bits: int) -> int:
-        """Read an unsigned number of `bits` bits."""
-        self._at += bits
-        if self._at > len(self._text):
-            raise ValueError("the unit ends in its header")
-        return int(self._text[self._at - bits : self._at] or "0", 2)
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """See episode.Stream."""
+        distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
+        stacked = _stack(self.each(distinct), len(distinct))
+        return stacked if np.array_equal(inverse, np.arange(len(stacked))) else stacked[inverse]
 
-    def ue(self) -> int:
-        """Read an unsigned Exp-Golomb number."""
-        zeros = self._text.index("1", self._at) - self._at
-        self._at += zeros
-        return self.u(zeros + 1) - 1
+    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[Images]:
+        """See episode.OneByOne."""
+        where = self._messages.where
+        return _of_one_size((picture(m, self._kind, where) for m in self._messages.read(indices)), where)
+
+
+class VideoStream:
+    """A camera of video; see episode.Stream.
+
+    Args:
+        timestamps: (T,) of the pictures shown, which are the last T messages.
+        keyframes: (M,) of all messages; the messages before those shown serve only for decoding.
+    """
+
+    def __init__(
+        self, timestamps: Floats, messages: Messages, keyframes: NDArray[np.bool_], codec: str
+    ) -> None:
+        self.timestamps = timestamps
+        self._messages, self._count = messages, len(keyframes)
+        self._lead = len(keyframes) - len(timestamps)
+        self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where)
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+        """See episode.Stream."""
+        wanted = [int(i) + self._lead for i in indices]
+        found = self._decoder.frames(wanted)
+        distinct = list(found)
+        stacked = _stack(_of_one_size(iter(found.values()), self._messages.where), len(found))
+        return stacked[[distinct.index(i) for i in wanted]]
+
+    def _from(self, start: int) -> Iterator[bytes]:
+        for block in range(start, self._count, BLOCK):
+            for message in self._messages.read(range(block, min(block + BLOCK, self._count))):
+                yield payload(message)
+
+
+def _of_one_size(pictures: Iterator[Images], where: str) -> Iterator[Images]:
+    """Yield the pictures; raise EpisodeError at the first whose size differs."""
+    first: tuple[int, ...] = ()
+    for item in pictures:
+        first = first or item.shape
+        if item.shape != first:
+            shapes = sorted({first, item.shape})
+            raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
+        yield item
+
+
+def _stack(pictures: Iterator[Images], count: int) -> Images:
+    """Stack pictures to (count, H, W, 3), one at a time, so that only one picture is in memory twice."""
+    first = next(pictures, None)
+    if first is None:
+        return np.zeros((0, 1, 1, 3), np.uint8)
+    stacked = np.empty((count, *first.shape), np.uint8)
+    stacked[0] = first
+    for i, item in enumerate(pictures, start=1):
+        stacked[i] = item
+    return stacked

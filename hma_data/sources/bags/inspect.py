@@ -15,17 +15,20 @@ import numpy as np
 from hma_data.episodes.episode import Floats
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
-from hma_data.sources.bags.container import Channel
-from hma_data.sources.bags.fields import Field, parse_key, stated_dtype
 from hma_data.sources.bags.images import VIDEO, codec, is_grey, picture_kind
-from hma_data.sources.bags.messages import child, decode, field_names, is_list, is_message, numbers
-from hma_data.sources.bags.topic_track import TopicTrack, camera_stream
-from hma_data.sources.base import Inspection, KeyInfo, TopicInfo
-from hma_data.sources.common import image_checks
-from hma_data.sources.common.findings import Finding
-from hma_data.sources.common.links import unfollowed
+from hma_data.sources.bags.messages import (
+    child,
+    decode,
+    field_names,
+    is_list,
+    is_message,
+    numbers,
+)
+from hma_data.sources.bags.topic_track import Field, TopicTrack, camera_stream, parse_key
+from hma_data.sources.base import Inspection, KeyInfo, TopicInfo, unfollowed
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Finding, StreamTimes, measure, skew
 from hma_data.sources.common.survey import Survey, sampled
-from hma_data.sources.common.timestamp_checks import Clock, clock_of, skew
 
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
@@ -34,6 +37,7 @@ MAX_FIELDS = 64  # most numeric keys of a topic whose values are checked
 MAX_HELD = 1 << 16  # most numbers of a key in memory
 MAX_WIDTH = 4096  # most values of an action or state; wider fields are maps or point clouds
 LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # not streams
+PAIRS = 4  # runs of neighbouring pictures looked at, for a camera
 APART_S = 1.0  # header stamps further than this from receive times are reported
 
 
@@ -86,8 +90,8 @@ class _Topic:
             self.sample, self.named = message, count
         if first and not picture_kind(self.track.channels[0].type):
             topic = self.track.topic
-            keys = [key for key in _values(topic, message) if key.kind == "vector"][:MAX_FIELDS]
-            narrow = [key.key for key in keys if key.shape[0] <= MAX_WIDTH]
+            vectors = [key for key in _values(topic, message) if key.kind == "vector"][:MAX_FIELDS]
+            narrow = [key.key for key in vectors if key.shape[0] <= MAX_WIDTH]
             self.values = [_Values(parse_key(key, (topic,), where)) for key in narrow]
         for value in self.values:
             value.add(message, where)
@@ -111,61 +115,55 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
     Raises:
         SourceError: none of them can be read.
     """
-    survey = Survey(len(bags), alone=len(bags) == 1, by_field=True)
+    survey, budget = Survey(len(bags), alone=len(bags) == 1, by_field=True), _Budget()
     for link in unfollowed(root, set(bags.values())):
         survey.note(link)
-    counted: dict[str, Counter[Channel]] = {}
     opened: dict[str, Bag] = {}
+    lengths: list[Counter[str]] = []  # of each bag: messages by topic
     for name, path in bags.items():
         try:
-            opened[name] = Bag(path, root)
-            counted[name] = opened[name].counts()
+            bag = Bag(path, root)
+            counts: Counter[str] = Counter()
+            for channel, count in bag.counts().items():
+                counts[channel.topic] += count
         except EpisodeError as fault:
             survey.fault(name, fault)
-    full = [name for name in counted if counted[name].total()]
-    for name in set(counted) - set(full):
-        survey.note(Finding("readable", "info", f"{opened[name].path}: holds no messages"))
-    telling: _Telling | None = None
-    budget = _Budget()
-    for name in [full[i] for i in sampled(len(full), episodes)] if full else []:
+            continue
+        lengths.append(counts)
+        if counts.total():
+            opened[name] = bag
+        else:
+            survey.note(Finding("readable", "info", f"{path}: holds no messages"))
+    first: _BagInspection | None = None
+    names = list(opened)
+    for name in [names[i] for i in sampled(len(names), episodes)] if names else []:
         try:
-            looked = _Telling(name, opened[name], counted[name], survey, budget)
+            looked = _BagInspection(name, opened[name], survey, budget)
         except EpisodeError as fault:
             survey.fault(name, fault)
             continue
         survey.episode(name)
-        telling = telling or looked
+        first = first or looked
         if budget.spent:
             break
-    if telling is None:
+    if first is None:
         faults = [str(one) for one in survey.findings(()) if one.severity != "info"]
         raise SourceError(uri, f"nothing to inspect: {faults[0] if faults else 'no bag holds a message'}")
-    return _inspection(uri, telling, counted, survey, len(bags), budget)
-
-
-def _inspection(
-    uri: str,
-    telling: "_Telling",
-    counted: dict[str, Counter[Channel]],
-    survey: Survey,
-    episodes: int,
-    budget: _Budget,
-) -> Inspection:
-    keys = tuple(survey.key(key) for key in telling.keys)
-    cameras = [key for key in keys if key.kind == "camera"]
-    lengths = tuple(_length(counts, cameras) for counts in counted.values()) if cameras else ()
-    facts = {"keys and rates of": str(telling.bag.path)}
+    keys = tuple(survey.key(key) for key in first.keys)
+    camera = next((key for key in keys if key.kind == "camera"), None)
+    frames = [counts[camera.key] for counts in lengths] if camera else []
+    facts = {"keys and rates of": str(first.bag.path)}
     if budget.spent:
         facts["measured up to"] = f"{MAX_MESSAGES:,} messages or {MAX_BYTES >> 20:,} MiB; counts are whole"
     return Inspection(
         format="rosbag",
         uri=uri,
-        episodes=episodes,
+        episodes=len(bags),
         keys=keys,
-        frames=sum(lengths) if cameras and len(counted) == episodes else None,
-        lengths=lengths[:MAX_LENGTHS],
-        hz=cameras[0].hz if cameras else None,
-        robot=telling.bag.notes().get("robot") or None,
+        frames=sum(frames) if camera and len(lengths) == len(bags) else None,
+        lengths=tuple(frames[:MAX_LENGTHS]),
+        hz=camera.hz if camera else None,
+        robot=first.bag.notes().get("robot") or None,
         facts=facts,
         looked_at=len(survey.looked),
         findings=survey.findings(keys),
@@ -173,29 +171,24 @@ def _inspection(
     )
 
 
-def _length(counts: Counter[Channel], cameras: list[KeyInfo]) -> int:
-    return sum(count for channel, count in counts.items() if channel.topic == cameras[0].key)
-
-
-class _Telling:
-    """Read one bag once: keep its keys; hand its numbers, times, skew and some pictures to the survey.
+class _BagInspection:
+    """One bag, read once: its keys; its numbers, times, skew and some pictures go to the survey.
 
     Raises:
         EpisodeError: the bag is damaged.
     """
 
-    def __init__(
-        self, name: str, bag: Bag, counts: Counter[Channel], survey: Survey, budget: _Budget
-    ) -> None:
+    def __init__(self, name: str, bag: Bag, survey: Survey, budget: _Budget) -> None:
         self.bag, self._name, self._survey = bag, name, survey
         self._frozen: list[str] = []
+        counts = bag.counts()
         self._topics = {topic: _Topic(TopicTrack(topic)) for topic in sorted({at.topic for at in counts})}
         for channel, count in counts.items():
             self._topics[channel.topic].count += count
         self._measure(budget)
         self.keys = [key for topic in self._topics.values() for key in self._keys(topic)]
         if self._frozen:
-            said = f"{', '.join(self._frozen[:8])}: header stamps never move; receive times are used"
+            said = f"{', '.join(self._frozen[:8])}: header stamps never change; receive times are used"
             survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
         self._skew()
 
@@ -219,37 +212,46 @@ class _Telling:
                 topic.track.add(record.channel, record.log_ns, place, None)
 
     def _keys(self, topic: _Topic) -> list[KeyInfo]:
-        if not len(topic.track):
-            return [KeyInfo(topic.track.topic, "other", (), "", count=0)]
+        track, name = topic.track, topic.track.topic
+        if not len(track):
+            return [KeyInfo(name, "other", (), "", count=0)]
         if topic.fault:
-            self._survey.note(Finding("readable", "warn", topic.fault, key=topic.track.topic))
-        stated = topic.track.channels[0]
+            self._survey.note(Finding("readable", "warn", topic.fault, key=name))
+        stated = track.channels[0]
         kind = picture_kind(stated.type)
-        times = topic.track.seconds("header")[topic.track.order()]
-        clock = clock_of(times) if topic.track.topic in LOGS else self._times(topic, times, bool(kind))
+        times = track.seconds("header")[track.order()]
+        measured = measure(times) if name in LOGS else self._times(track, times, bool(kind))
         found: list[KeyInfo] = []
         if not topic.fault:
-            found = [self._camera(topic, kind)] if kind else _recorded(topic)
-        found = found or [KeyInfo(topic.track.topic, "other", (), stated.type or stated.encoding)]
+            found = [self._camera(topic, kind)] if kind else _values(name, topic.sample)
+        found = found or [KeyInfo(name, "other", (), stated.type or stated.encoding)]
         for value in topic.values:
             value.hand_on(self._survey, self._name)
-        about = _about(topic, times, stated.type or stated.encoding)
-        return [
-            replace(key, hz=clock.hz, count=topic.count, jitter_ms=clock.jitter_ms, topic=about)
-            for key in found
-        ]
+        steps, delay_ms = np.diff(times), None
+        if track.stamped and not topic.fault:
+            delay_ms = float(np.median(track.seconds("receive") - track.seconds("header")) * 1e3)
+        about = TopicInfo(
+            name,
+            stated.type or stated.encoding,
+            gap_ms=float(steps.max() * 1e3) if len(steps) else None,
+            delay_ms=delay_ms,
+            goes_back=bool(len(steps) and steps.min() < 0),
+        )
+        hz, jitter_ms = measured.hz, measured.jitter_ms
+        return [replace(key, hz=hz, count=topic.count, jitter_ms=jitter_ms, topic=about) for key in found]
 
-    def _times(self, topic: _Topic, times: Floats, camera: bool) -> Clock:
+    def _times(self, track: TopicTrack, times: Floats, camera: bool) -> StreamTimes:
         """Hand the times to the survey; check what only messages with two times can show."""
-        track, name = topic.track, topic.track.topic
         self._survey.made.add("stamps")
-        self._frozen += [name] if track.frozen else []
+        self._frozen += [track.topic] if track.frozen else []
         if track.stamped:
             apart = float(np.median(np.abs(track.seconds("header") - track.seconds("receive"))))
             if apart > APART_S:
-                said = f"{name}: header stamps are {apart:.3g} s from receive times"
-                self._survey.note(Finding("stamps", "warn", said, key=name, numbers={"seconds": apart}))
-        return self._survey.times(self._name, name, times, camera)
+                said = f"{track.topic}: header stamps are {apart:.3g} s from receive times"
+                self._survey.note(
+                    Finding("stamps", "warn", said, key=track.topic, numbers={"seconds": apart})
+                )
+        return self._survey.times(self._name, track.topic, times, camera)
 
     def _camera(self, topic: _Topic, kind: str) -> KeyInfo:
         name = topic.track.topic
@@ -257,8 +259,8 @@ class _Telling:
         try:
             stream = camera_stream(self.bag, topic.track, "receive")
             keyframes = topic.track.keyframes() if kind == VIDEO else None
-            indices = image_checks.choose(len(stream.timestamps), _PAIRS, _starts(keyframes))
-            for run in image_checks.runs(indices):
+            indices = checks.choose(len(stream.timestamps), PAIRS, _starts(keyframes))
+            for run in checks.runs(indices):
                 frames = stream.frames(run)
                 self._survey.pictures(self._name, name, frames, run, stored)
         except EpisodeError as fault:
@@ -269,7 +271,9 @@ class _Telling:
 
     def _skew(self) -> None:
         """Measure the skew of each camera and vector stream from the frames of the first camera."""
-        topics = {key.topic.name: key.kind for key in self.keys if key.topic and key.kind in _STREAMS}
+        topics = {
+            key.topic.name: key.kind for key in self.keys if key.topic and key.kind in ("camera", "vector")
+        }
         cameras = [name for name, kind in topics.items() if kind == "camera"]
         if not cameras:
             return
@@ -281,9 +285,6 @@ class _Telling:
                 self._survey.skew(name, found, period_s)
 
 
-_STREAMS, _PAIRS = ("camera", "vector"), 4
-
-
 def _starts(keyframes: Any) -> Any:
     """Return for each frame the keyframe before it, counted from the first; None where it is unknown."""
     if keyframes is None or not keyframes.any():
@@ -293,34 +294,6 @@ def _starts(keyframes: Any) -> Any:
 
 
 # -- keys
-
-
-def _about(topic: _Topic, times: Floats, kind: str) -> TopicInfo:
-    track, steps = topic.track, np.diff(times)
-    delay_ms = None
-    if track.stamped and not topic.fault:
-        delay_ms = float(np.median(track.seconds("receive") - track.seconds("header")) * 1e3)
-    return TopicInfo(
-        track.topic,
-        kind,
-        gap_ms=float(steps.max() * 1e3) if len(steps) else None,
-        delay_ms=delay_ms,
-        goes_back=bool(len(steps) and steps.min() < 0),
-    )
-
-
-def _recorded(topic: _Topic) -> list[KeyInfo]:
-    """Return the keys of a topic without pictures, with the dtypes that their definition states."""
-    name, channel = topic.track.topic, topic.track.channels[0]
-    found = _values(name, topic.sample)
-    if channel.encoding == "json":
-        return found
-    steps = [parse_key(key.key, (name,), name).steps for key in found]
-    stated = [stated_dtype(channel, topic.sample, path) for path in steps]
-    return [
-        replace(key, dtype=dtype) if dtype and key.kind == "vector" else key
-        for key, dtype in zip(found, stated, strict=True)
-    ]
 
 
 def _values(key: str, value: Any) -> list[KeyInfo]:

@@ -20,23 +20,20 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.container import FAULTS, Channel, Data
+from hma_data.sources.bags.container import Channel, Data
 
 Decode = Callable[[Data], Any]
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 TIME = "builtin_interfaces/msg/Time"
+HEADER = "std_msgs/msg/Header"
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
-EVENT = re.compile(r"^(?P<package>\w+)/srv/(?P<name>\w+)_Event$")
+EVENT = re.compile(r"\w+/srv/\w+_Event")
+CALL = re.compile(r"^---\s*$", re.MULTILINE)  # between request and response
 SEPARATOR = re.compile(r"^={80}\s*$", re.MULTILINE)
 REQUEST_SENT, REQUEST_RECEIVED, RESPONSE_SENT, RESPONSE_RECEIVED = range(4)
 # The event that stands for a call: the first of these that is recorded.
 OF_A_CALL = (REQUEST_RECEIVED, REQUEST_SENT, RESPONSE_SENT, RESPONSE_RECEIVED)
-STANDARD = {  # definitions for bags that hold none
-    "std_srvs/srv/Empty": "---",
-    "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message",
-    "std_srvs/srv/Trigger": "---\nbool success\nstring message",
-}
 EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
 
@@ -46,42 +43,40 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
     Raises:
         EpisodeError: its encoding or type is unknown, or the bytes do not fit it.
     """
+    # The libraries below raise almost any error for damaged definitions and bytes.
     try:
         read = _decoder(channel)
-    except (*FAULTS, TypeError, AssertionError, SyntaxError, AttributeError) as fault:
+    except Exception as fault:
         raise EpisodeError(where, f"{channel.topic}: {_line(fault)}") from fault
     try:
         return read(data)
-    except (*FAULTS, TypeError) as fault:
+    except Exception as fault:
         kind = channel.type or channel.encoding
         raise EpisodeError(where, f"a message on {channel.topic} is not a {kind}: {_line(fault)}") from fault
 
 
+@lru_cache(maxsize=256)
 def head_stamp(channel: Channel) -> Callable[[Data], int] | None:
     """Return a function that reads a ROS message's own time, in nanoseconds, from its first HEAD bytes.
 
-    None where the time has no fixed place there; then `decode` is needed.
+    None where the time has no fixed place there, or the definition cannot be read; then `decode` is needed.
     """
-    try:
-        return _head_stamp(channel)
-    except (*FAULTS, TypeError, AssertionError, SyntaxError, AttributeError):
-        return None  # `decode` raises it again
-
-
-@lru_cache(maxsize=256)
-def _head_stamp(channel: Channel) -> Callable[[Data], int] | None:
     if channel.encoding not in ("ros1", "cdr"):
         return None
-    store, kind = ros_store(channel)
-    fields = [(name, spec[1]) for name, spec in store.fielddefs[kind][1]]
-    at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes that state its encoding
-    if fields and fields[0] == ("header", "std_msgs/msg/Header"):
-        fields = [(name, spec[1]) for name, spec in store.fielddefs["std_msgs/msg/Header"][1]]
-        if fields[0][0] == "seq":
-            fields, at = fields[1:], at + 4
-    elif {name for name, _ in fields[1:]} & {"header", "timestamp"}:
+    try:
+        store, kind = ros_store(channel)
+        fields = [(name, spec[1]) for name, spec in store.fielddefs[kind][1]]
+        headed = bool(fields) and fields[0] == ("header", HEADER)
+        if headed:
+            fields = [(name, spec[1]) for name, spec in store.fielddefs[HEADER][1]]
+    except Exception:  # `decode` raises it again
         return None
-    if not fields or fields[0] not in [(name, TIME) for name in ("stamp", "timestamp")]:
+    at = 0 if channel.encoding == "ros1" else 4  # CDR begins with four bytes that state its encoding
+    if headed and fields[0][0] == "seq":
+        fields, at = fields[1:], at + 4
+    elif not headed and {name for name, _ in fields[1:]} & {"header", "timestamp"}:
+        return None
+    if not fields or fields[0] not in (("stamp", TIME), ("timestamp", TIME)):
         return None
     return partial(_time_at, at, channel.encoding == "cdr")
 
@@ -100,7 +95,9 @@ def _line(fault: BaseException) -> str:
 @lru_cache(maxsize=256)
 def _decoder(channel: Channel) -> Decode:
     if channel.encoding in ("ros1", "cdr"):
-        return _ros_decoder(channel)
+        store, kind = ros_store(channel)
+        read = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
+        return partial(read, typename=kind)
     if channel.encoding == "json":
         return lambda data: json.loads(bytes(data))
     if channel.encoding == "protobuf":
@@ -110,31 +107,31 @@ def _decoder(channel: Channel) -> Decode:
     )
 
 
-# -- ROS
+def _protobuf_decoder(channel: Channel) -> Decode:
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # type: ignore[import-untyped]
+
+    files, pool = descriptor_pb2.FileDescriptorSet(), descriptor_pool.DescriptorPool()
+    files.ParseFromString(channel.schema)
+    for item in files.file:
+        pool.Add(item)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(channel.type))
+    return lambda data: kind.FromString(bytes(data))
 
 
-def _ros_decoder(channel: Channel) -> Decode:
-    from rosbags.serde import SerdeError
-
-    store, kind = ros_store(channel)
-    read = store.deserialize_ros1 if channel.encoding == "ros1" else store.deserialize_cdr
-    return _telling(partial(read, typename=kind), SerdeError)
+# -- ROS definitions
 
 
 @lru_cache(maxsize=256)
 def ros_store(channel: Channel) -> tuple[Any, str]:
     """Return a type store that knows the channel's type, and the type's name in it."""
-    from rosbags.typesys import Stores, TypesysError, get_typestore
+    from rosbags.typesys import Stores, get_typestore
     from rosbags.typesys.msg import normalize_msgtype
 
     kind = normalize_msgtype(channel.type)
     stores = [get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.LATEST)]
     if is_service_event(channel) or channel.schema.strip():
         stores = [get_typestore(Stores.EMPTY)]
-        try:
-            stores[0].register(_definitions(channel, kind))
-        except TypesysError as fault:
-            raise ValueError(f"the definition of {channel.type} cannot be read: {_line(fault)}") from fault
+        stores[0].register(_definitions(channel, kind))
     for store in stores:
         if kind in store.types:
             return store, kind
@@ -142,18 +139,6 @@ def ros_store(channel: Channel) -> tuple[Any, str]:
         f"the bag does not carry the definition of {channel.type}, and it is not one of ROS 2's own types: "
         "record with ROS 2 Iron or later, or convert the bag to MCAP with its definitions"
     )
-
-
-def _telling(read: Decode, error: type[Exception]) -> Decode:
-    """Wrap `read`, so that a library's own error is raised as ValueError."""
-
-    def told(data: Data) -> Any:
-        try:
-            return read(data)
-        except error as fault:
-            raise ValueError(str(fault)) from fault
-
-    return told
 
 
 def _definitions(channel: Channel, kind: str) -> Any:
@@ -174,31 +159,12 @@ def _definitions(channel: Channel, kind: str) -> Any:
     return types
 
 
-# -- protobuf
-
-
-def _protobuf_decoder(channel: Channel) -> Decode:
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # type: ignore[import-untyped]
-    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
-
-    files = descriptor_pb2.FileDescriptorSet()
-    try:
-        files.ParseFromString(channel.schema)
-    except DecodeError as fault:
-        raise ValueError(f"the definition of {channel.type} is damaged") from fault
-    pool = descriptor_pool.DescriptorPool()
-    for item in files.file:
-        pool.Add(item)
-    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(channel.type))
-    return _telling(lambda data: kind.FromString(bytes(data)), DecodeError)
-
-
 # -- services
 
 
 def is_service_event(channel: Channel) -> bool:
     """Check whether a channel's messages are events of a service."""
-    return channel.encoding == "cdr" and EVENT.match(channel.type) is not None
+    return channel.encoding == "cdr" and EVENT.fullmatch(channel.type) is not None
 
 
 def event_type(data: Data) -> int:
@@ -208,7 +174,7 @@ def event_type(data: Data) -> int:
         ValueError: the message is not an event.
     """
     if len(data) < 5 or data[4] > RESPONSE_RECEIVED:
-        raise ValueError("a message is no event of a service")
+        raise ValueError("a message is not an event of a service")
     return data[4]
 
 
@@ -221,32 +187,27 @@ def event_definitions(stated: str, kind: str, text: str) -> dict[str, Any]:
         text: the service's definition, or the event's own.
 
     Raises:
-        ValueError: the bag holds no definition, and the service is not a standard one.
+        ValueError: the bag holds no definition.
     """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    match = EVENT.match(stated)
-    assert match
-    service = f"{match['package']}/srv/{match['name']}"
-    text = text if text.strip() else STANDARD.get(service, "")
+    package, _, name = stated.removesuffix("_Event").split("/")
     sections = [part for part in SEPARATOR.split(text.replace("\r\n", "\n")) if part.strip()]
     if not sections:
-        raise ValueError(f"the bag does not carry the definition of {service}")
-    if not re.search(r"^---\s*$", sections[0], re.MULTILINE):
+        raise ValueError(f"the bag does not carry the definition of {package}/srv/{name}")
+    body, *rest = sections
+    if not CALL.search(body):
         return dict(get_types_from_msg(text, kind))
-    body = re.sub(r"^\s*SRV:.*\n", "", sections[0])
-    request, response = re.split(r"^---\s*$", body, flags=re.MULTILINE)[:2]
-    rest = "".join(f"\n{'=' * 80}\n{part.strip()}\n" for part in sections[1:])
     known = get_typestore(Stores.LATEST).fielddefs
     types: dict[str, Any] = {EVENT_INFO: known[EVENT_INFO], TIME: known[TIME]}
-    for part, members in (("Request", request), ("Response", response)):
-        name = f"{match['package']}/msg/{match['name']}_{part}"
-        types |= get_types_from_msg(_members(members) + rest, name)
-    held = f"{match['package']}/{match['name']}"
-    event = f"""service_msgs/ServiceEventInfo info
-{held}_Request[<=1] request
-{held}_Response[<=1] response
-"""
+    members = CALL.split(re.sub(r"^\s*SRV:.*\n", "", body))[:2]
+    others = "".join(f"\n{'=' * 80}\n{part.strip()}\n" for part in rest)
+    for part, fields in zip(("Request", "Response"), members, strict=True):
+        types |= get_types_from_msg(_members(fields) + others, f"{package}/msg/{name}_{part}")
+    event = (
+        "service_msgs/ServiceEventInfo info\n"
+        f"{package}/{name}_Request[<=1] request\n{package}/{name}_Response[<=1] response\n"
+    )
     return types | get_types_from_msg(event, kind)
 
 
@@ -312,9 +273,8 @@ def numbers(value: Any) -> list[float]:
         return [number for item in value for number in numbers(item)]
     if is_message(value):
         return [number for name in field_names(value) for number in _field_numbers(value, name)]
-    raise TypeError(
-        {"str": "text", "bytes": "bytes", "NoneType": "null"}.get(type(value).__name__, "no number")
-    )
+    kinds = {"str": "text", "bytes": "bytes", "NoneType": "null"}
+    raise TypeError(kinds.get(type(value).__name__, "something that is not a number"))
 
 
 def _field_numbers(message: Any, name: str) -> list[float]:
@@ -322,7 +282,7 @@ def _field_numbers(message: Any, name: str) -> list[float]:
         return numbers(child(message, name))
     except TypeError as fault:
         text = str(fault)
-        raise TypeError(f"{text} in {name}" if " in " not in text else f"{text} of {name}") from fault
+        raise TypeError(f"{text} of {name}" if " in " in text else f"{text} in {name}") from fault
 
 
 def stamp_ns(message: Any) -> int:
@@ -334,18 +294,11 @@ def stamp_ns(message: Any) -> int:
                 value = child(value, name)
         except KeyError:
             continue
-        time = _time_ns(value)
-        if time is not None:
-            return time
+        for names in TIME_FIELDS:
+            try:
+                seconds, nanoseconds = (child(value, name) for name in names)
+            except KeyError:
+                continue
+            if isinstance(seconds, int) and isinstance(nanoseconds, int):
+                return seconds * 10**9 + nanoseconds
     return 0
-
-
-def _time_ns(value: Any) -> int | None:
-    for seconds, nanoseconds in TIME_FIELDS:
-        try:
-            whole, part = child(value, seconds), child(value, nanoseconds)
-        except KeyError:
-            continue
-        if isinstance(whole, int) and isinstance(part, int):
-            return whole * 10**9 + part
-    return None

@@ -9,31 +9,26 @@ An episode inside a bag is read together with the earlier messages that are stil
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode, Floats, Signal, Stream
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.registry.components import Camera, Component, Segments
+from hma_data.registry.components import Camera, Component
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.bags.bag import Bag, Place, find_bags
-from hma_data.sources.bags.container import Channel, Record, Wanted, damaged
-from hma_data.sources.bags.fields import Column, Field, missing_topic, parse_key
+from hma_data.sources.bags.bag import Bag, BagPlace, find_bags
+from hma_data.sources.bags.container import Channel, Record, RecordFilter, damaged
 from hma_data.sources.bags.images import picture_kind
 from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
-from hma_data.sources.bags.segments import Segment, Table, heads, parted
-from hma_data.sources.bags.topic_track import TopicTrack, camera_stream
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values, local_path
-from hma_data.sources.common.links import nothing_there
+from hma_data.sources.bags.segments import Rows, Table, heads, parted
+from hma_data.sources.bags.topic_track import Column, TopicTrack, camera_stream, missing_topic, parse_key
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, component_values, local_path, nothing_there
 from hma_data.storage.paths import StrPath, as_text
 
-PART = re.compile(r"[0-9]{4,9}")
-Rows = NDArray[np.int64]
+PART = re.compile(r"(?P<bag>.+)/(?P<number>[0-9]{4,9})")
 
 
 def open() -> "RosbagSource":
@@ -42,7 +37,7 @@ def open() -> "RosbagSource":
 
 
 class RosbagSource:
-    """Read bags; see sources.base.Source."""
+    """The source of bags; see sources.base.Source."""
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
@@ -56,13 +51,7 @@ class RosbagSource:
         """
         uri = as_text(uri)
         root = local_path(uri)
-        found: list[EpisodeRef] = []
-        for name, path in _bags(uri).items():
-            if embodiment and embodiment.source.segments:
-                found += _part_refs(name, path, root, embodiment, embodiment.source.segments)
-            else:
-                found.append(_ref(name, path, root, embodiment))
-        return found
+        return [ref for name, path in _bags(uri).items() for ref in _refs(name, path, root, embodiment)]
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """See Source: return the ids of whole bags, even where an embodiment divides them."""
@@ -81,11 +70,12 @@ class RosbagSource:
             path = bags[episode_id]
             bag = parted(path, root, embodiment, segments)[0] if segments else Bag(path, root)
             return _EpisodeReading(bag, episode_id, embodiment).episode()
-        name, number = _part_of(episode_id)
-        if not segments or name not in bags:
+        match = PART.fullmatch(episode_id)
+        if not segments or not match or match["bag"] not in bags:
             raise SourceError(uri, f"has no bag {episode_id!r}", f"it has {', '.join(list(bags)[:10])}")
+        name, number = match["bag"], int(match["number"])
         bag, table = parted(bags[name], root, embodiment, segments)
-        if not 0 <= number < len(table.segments):
+        if number >= len(table.segments):
             held = f"{name} holds {_part_id(name, 0)} to {_part_id(name, len(table.segments) - 1)}"
             raise SourceError(uri, f"has no episode {episode_id!r}", held)
         return _EpisodeReading(bag, episode_id, embodiment, table, number).episode()
@@ -102,36 +92,22 @@ def _bags(uri: str) -> dict[str, Path]:
     return bags
 
 
-def _ref(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> EpisodeRef:
-    frames, fingerprint = 0, ""
-    try:
-        bag = Bag(path, root)
-        fingerprint = bag.fingerprint()
-        frames = _frames(bag.counts(), embodiment)
-    except (EpisodeError, OSError):
-        pass  # `read` raises it again
-    return EpisodeRef(name, frames, fingerprint=fingerprint)
-
-
 def _part_id(name: str, number: int) -> str:
     return f"{name}/{number:04d}"
 
 
-def _part_of(episode_id: str) -> tuple[str, int]:
-    """Return the bag's name of an episode id and the episode's number; -1 where it has none."""
-    name, _, digits = episode_id.rpartition("/")
-    return name, int(digits) if PART.fullmatch(digits) else -1
-
-
-def _part_refs(
-    name: str, path: Path, root: Path, embodiment: Embodiment, segments: Segments
-) -> list[EpisodeRef]:
-    """List the episodes of one bag; where they cannot be found, one without frames, and `read` raises why."""
+def _refs(name: str, path: Path, root: Path, embodiment: Embodiment | None) -> list[EpisodeRef]:
+    """List the episodes of one bag; one without frames where it cannot be read, and `read` raises why."""
+    fingerprint = ""
     try:
-        bag, table = parted(path, root, embodiment, segments)
+        bag = Bag(path, root)
         fingerprint = bag.fingerprint()
+        segments = embodiment.source.segments if embodiment else None
+        if not embodiment or not segments:
+            return [EpisodeRef(name, _frames(bag.counts(), embodiment), fingerprint=fingerprint)]
+        table = parted(path, root, embodiment, segments)[1]
     except (EpisodeError, OSError):
-        return [replace(_ref(name, path, root, embodiment), frames=0)]
+        return [EpisodeRef(name, 0, fingerprint=fingerprint)]
     return [
         EpisodeRef(_part_id(name, i), len(segment), None, fingerprint, group=name, left_out=table.left_out)
         for i, segment in enumerate(table.segments)
@@ -162,10 +138,9 @@ class _EpisodeReading:
     ) -> None:
         self._bag, self._id, self._embodiment = bag, episode_id, embodiment
         self._table, self._number = table, number
-        self._segment: Segment | None = table.segments[number] if table else None
+        self._segment = table.segments[number] if table else None
         self._where = str(bag.path) if table is None else f"{bag.path}, episode {number}"
         self._counts: Counter[str] = Counter()
-        self._heads = heads(list(bag.counts()))
         for channel, count in bag.counts().items():
             self._counts[channel.topic] += count
         self._tracks: dict[str, TopicTrack] = {}
@@ -184,24 +159,26 @@ class _EpisodeReading:
             self._track(camera.key)
         actions = self._columns(embodiment.action.components)
         states = self._columns(embodiment.state.components if embodiment.state else ())
-        self._scan(self._instruction_field())
+        self._scan()
         notes = self._bag.notes()
         primary = self._stream(embodiment.primary_camera)
+        shown = primary.timestamps
         streams: dict[str, Stream] = {}
         for camera in embodiment.cameras:
             same = camera is embodiment.primary_camera
-            streams[camera.name] = primary if same else self._stream(camera, primary.timestamps)
+            streams[camera.name] = primary if same else self._stream(camera, shown)
+        clocks = {topic: "header" if track.stamped else "receive" for topic, track in self._tracks.items()}
         parted = self._table is not None and len(self._table.segments) > 1
         return Episode(
             id=self._id,
             streams=streams,
-            actions=tuple(self._signal(column, primary.timestamps) for column in actions),
-            states=tuple(self._signal(column, primary.timestamps) for column in states),
+            actions=tuple(self._signal(column, shown) for column in actions),
+            states=tuple(self._signal(column, shown) for column in states),
             rate_stamped=False,
             instruction=self._instruction() or notes.get("instruction", ""),
             success=None if parted else {"true": True, "false": False}.get(notes.get("success", "").lower()),
             source=str(self._bag.path),
-            metadata={"clocks": self._clocks(), "notes": notes} | self._about(),
+            metadata={"clocks": clocks, "notes": notes} | self._about(),
         )
 
     # -- the pass
@@ -212,62 +189,29 @@ class _EpisodeReading:
     def _columns(self, components: tuple[Component, ...]) -> list[Column]:
         columns = []
         for component in components:
-            field = parse_key(component.key, self._counts, self._where)
-            column = Column(component, field, self._where)
-            self._track(field.topic).columns.append(column)
+            column = Column(component, parse_key(component.key, self._counts, self._where), self._where)
+            self._track(column.field.topic).columns.append(column)
             columns.append(column)
         return columns
 
-    def _instruction_field(self) -> Field | None:
+    def _scan(self) -> None:
         key = self._embodiment.source.instruction
-        return parse_key(key, self._counts, self._where) if key else None
-
-    def _scan(self, instruction: Field | None) -> None:
+        instruction = parse_key(key, self._counts, self._where) if key else None
         read = {topic for topic, track in self._tracks.items() if track.columns}
         read |= {instruction.topic} if instruction else set()
-        for place, record in self._records(frozenset(self._tracks) | read, self._heads - read):
+        short = (heads(list(self._bag.counts())) & self._tracks.keys()) - read
+        for place, record in self._records(frozenset(self._tracks) | read, short):
             topic = record.channel.topic
-            if topic in self._tracks and topic in self._heads - read:
+            if topic in short:
                 self._tracks[topic].add_head(record.channel, record.log_ns, place, record.data)
                 continue
             message = decode(record.channel, record.data, self._where)
             if instruction and topic == instruction.topic:
-                self._hear(record.log_ns, str(instruction.value(message, self._where)))
+                text = str(instruction.value(message, self._where))
+                if self._segment is None or (text and record.log_ns <= self._segment.last_ns):
+                    self._said.append((record.log_ns, text))
             if topic in self._tracks:
                 self._tracks[topic].add(record.channel, record.log_ns, place, message)
-        self._check()
-
-    def _records(self, topics: frozenset[str], short: frozenset[str]) -> Iterator[tuple[Place, Record]]:
-        segment, table = self._segment, self._table
-        if segment is None or table is None:
-            return self._bag.wanted(Wanted(topics, heads=short))
-        first_ns, last_ns = segment.first_ns - table.reach_ns, segment.last_ns + table.reach_ns
-        first_ns = max(first_ns, 0)
-        videos = topics & table.keyframes.keys()
-        plain = topics - videos
-        held = plain - {self._embodiment.primary_camera.key}
-        within = Wanted(plain, first_ns, last_ns, short)
-        parts = [iter(self._bag.before(held, first_ns)), self._bag.wanted(within)]
-        for topic in sorted(videos):
-            keyframes = table.keyframes[topic]
-            at = int(np.searchsorted(keyframes, first_ns, side="right")) - 1
-            begin = int(keyframes[at]) if at >= 0 else 0
-            parts.append(self._bag.wanted(Wanted(frozenset({topic}), begin, last_ns)))
-        return chain.from_iterable(parts)
-
-    def _hear(self, log_ns: int, text: str) -> None:
-        if self._segment is None:
-            self._said = self._said or [(log_ns, text)]
-        elif text and log_ns <= self._segment.last_ns:
-            self._said.append((log_ns, text))
-
-    def _instruction(self) -> str:
-        """Return the first instruction; in an episode inside a bag, the one nearest to its beginning."""
-        begins = self._segment.first_ns if self._segment else 0
-        nearest = min(self._said, key=lambda said: abs(said[0] - begins), default=(0, ""))
-        return nearest[1]
-
-    def _check(self) -> None:
         for topic, track in self._tracks.items():
             if not len(track):
                 raise EpisodeError(self._where, f"{topic} has no messages")
@@ -275,24 +219,47 @@ class _EpisodeReading:
                 fault = f"its index counts {self._counts[topic]} messages of {topic}, it holds {len(track)}"
                 raise damaged(self._bag.path, fault)
 
+    def _records(self, topics: frozenset[str], short: frozenset[str]) -> Iterator[tuple[BagPlace, Record]]:
+        """Yield the messages of the bag; of an episode in it, those of its time and those still in force."""
+        segment, table = self._segment, self._table
+        if segment is None or table is None:
+            return self._bag.records(RecordFilter(topics, heads=short))
+        first_ns, last_ns = max(segment.first_ns - table.reach_ns, 0), segment.last_ns + table.reach_ns
+        plain = topics - table.keyframes.keys()
+        held = plain - {self._embodiment.primary_camera.key}
+        within = RecordFilter(plain, first_ns, last_ns, short)
+        parts = [iter(self._bag.before(held, first_ns)), self._bag.records(within)]
+        for topic in sorted(topics & table.keyframes.keys()):
+            keyframes = table.keyframes[topic]
+            at = int(np.searchsorted(keyframes, first_ns, side="right")) - 1
+            begin = int(keyframes[at]) if at >= 0 else 0
+            parts.append(self._bag.records(RecordFilter(frozenset({topic}), begin, last_ns)))
+        return chain.from_iterable(parts)
+
     # -- results
+
+    def _instruction(self) -> str:
+        """Return the first instruction; in an episode inside a bag, the one nearest to its beginning."""
+        if not self._said:
+            return ""
+        if self._segment is None:
+            return self._said[0][1]
+        begins = self._segment.first_ns
+        return min(self._said, key=lambda said: abs(said[0] - begins))[1]
 
     def _stream(self, camera: Camera, shown: Floats | None = None) -> Stream:
         """Return a camera; for an episode in a bag, its own pictures, or those around the times `shown`."""
         track, clock = self._tracks[camera.key], camera.stamp or self._embodiment.sync.stamp
         if self._segment is None or self._table is None:
             return camera_stream(self._bag, track, clock)
+        order = track.order()
+        received = track.received()[order]
         if shown is not None:
-            order = track.order()
-            begin, stop = self._around(track.received()[order], track.seconds(clock)[order], shown)
-            return camera_stream(self._bag, track, clock, (begin, stop))
-        begin = int(np.searchsorted(track.received()[track.order()], self._segment.first_ns))
-        begin += self._segment.skip
-        stop = begin + len(self._segment)
-        if stop > len(track):
-            fault = f"the episode had {len(self._segment)} pictures, now {len(track) - begin}"
-            raise damaged(self._bag.path, fault)
-        return camera_stream(self._bag, track, self._table.clock, (begin, stop))
+            return camera_stream(
+                self._bag, track, clock, self._around(received, track.seconds(clock)[order], shown)
+            )
+        begin = int(np.searchsorted(received, self._segment.first_ns)) + self._segment.skip
+        return camera_stream(self._bag, track, self._table.clock, (begin, begin + len(self._segment)))
 
     def _signal(self, column: Column, shown: Floats) -> Signal:
         track, rows = self._tracks[column.field.topic], column.rows()
@@ -322,10 +289,6 @@ class _EpisodeReading:
         begin = low + max(0, int(np.searchsorted(times[low:high], shown[0], side="right")) - 1)
         stop = low + int(np.searchsorted(times[low:high], shown[-1], side="left")) + 1
         return begin, min(max(stop, begin + 1), high)
-
-    def _clocks(self) -> dict[str, str]:
-        """Return topic -> header or receive: the clock of its times where the YAML forces none."""
-        return {topic: "header" if track.stamped else "receive" for topic, track in self._tracks.items()}
 
     def _about(self) -> dict[str, dict[str, int]]:
         if self._segment is None or self._table is None:

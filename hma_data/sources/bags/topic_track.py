@@ -1,40 +1,226 @@
-"""Record the times and places of a topic's messages in one pass over a bag, a few bytes a message.
+"""Read a topic of a bag in one pass: the numbers at its keys, and the times and places of its messages.
 
-A camera's pictures are read again by these places on demand. T messages of a topic, H×W pixels; times are
-float64 seconds; the clock of a topic is `header` or `receive`.
+A camera's key is its topic. A number's key is the topic and a path into its messages:
+`/joint_states.position`, `/joint_states.position[0:7]`, `/markers.poses[2].position.x`, `/cmd_vel`,
+`/cmd_vel.linear` (a message of numbers gives them in the order of its fields).
+
+Of a message only its times and its place are kept, a few bytes; a camera's pictures are read again by these
+places on demand. T messages of a topic, A values of a component; times are float64 seconds; the clock of a
+topic is `header` or `receive`.
 """
 
+import re
 import struct
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats, Stream
-from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError
-from hma_data.sources.bags.bag import Bag, Place
+from hma_data.registry.components import Component
+from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.container import Channel, Data
-from hma_data.sources.bags.fields import Column
 from hma_data.sources.bags.images import (
     VIDEO,
-    VideoDecoder,
+    Messages,
+    StillStream,
+    VideoStream,
     is_keyframe,
     payload,
-    picture,
     picture_kind,
     video_codec,
 )
-from hma_data.sources.bags.messages import decode, head_stamp, stamp_ns
+from hma_data.sources.bags.messages import (
+    child,
+    field_names,
+    head_stamp,
+    is_list,
+    numbers,
+    stamp_ns,
+)
 
+STEP = re.compile(r"\.(?P<name>[A-Za-z_]\w*)|\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\]")
+Step = str | int | slice
+SHOWN = 30  # topics or names in an error
 INT64 = np.iinfo(np.int64)
-BLOCK = 64  # video messages fetched at a time
+
+
+@dataclass(frozen=True)
+class Field:
+    """A key, parsed into its topic and the steps of its path."""
+
+    key: str
+    topic: str
+    steps: tuple[Step, ...]
+
+    def value(self, message: Any, where: str) -> Any:
+        """Return the value at the key in a message.
+
+        Raises:
+            EpisodeError: there is none; the error names the fields that are there.
+        """
+        for step in self.steps:
+            if isinstance(step, str):
+                try:
+                    message = child(message, step)
+                except KeyError as fault:
+                    known = ", ".join(field_names(message)) or "none, it is not a message"
+                    raise EpisodeError(
+                        where, f"{self.key}: there is no field {step!r}", f"the fields there: {known}"
+                    ) from fault
+                continue
+            if not is_list(message):
+                raise EpisodeError(where, f"{self.key}: what is before [ is not a list")
+            if (step + 1 if isinstance(step, int) else step.stop or 0) > len(message):
+                fault_of = f"{self.key}: the list has {len(message)} values in one of the messages"
+                raise EpisodeError(where, fault_of)
+            message = message[step]
+        return message
+
+    def owner(self, message: Any, where: str) -> Any:
+        """Return the message that holds the last field."""
+        return Field(self.key, self.topic, self.steps[:-1]).value(message, where)
+
+
+def parse_key(key: str, topics: Iterable[str], where: str) -> Field:
+    """Parse a key; its topic is the longest topic of the bag with which the key begins.
+
+    Raises:
+        EpisodeError: no topic fits, or the rest of the key is not a path.
+    """
+    topics = list(topics)
+    fitting = [t for t in topics if key == t or (key.startswith(t) and key[len(t)] in ".[")]
+    if not fitting:
+        raise missing_topic(key, topics, where)
+    topic = max(fitting, key=len)
+    return Field(key, topic, _steps(key, len(topic), where))
+
+
+def _steps(key: str, at: int, where: str) -> tuple[Step, ...]:
+    steps: list[Step] = []
+    while at < len(key):
+        match = STEP.match(key, at)
+        if not match or (not match["name"] and not match["colon"] and not match["start"]):
+            raise EpisodeError(
+                where, f"{key}: {key[at:]!r} is not a path", "write .field, [index] or [from:to]"
+            )
+        if match["name"]:
+            steps.append(match["name"])
+        elif match["colon"]:
+            bounds = [int(bound) if bound else None for bound in (match["start"], match["stop"])]
+            steps.append(slice(*bounds))
+        else:
+            steps.append(int(match["start"]))
+        at = match.end()
+    return tuple(steps)
+
+
+def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
+    """Return the error of a key whose topic the bag does not have."""
+    known = sorted(" ".join(topic.split()) for topic in topics)
+    near = get_close_matches(re.split(r"[.\[]", key)[0], known, n=2, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    more = f" and {len(known) - SHOWN} more" if len(known) > SHOWN else ""
+    listed = f"its topics: {', '.join(known[:SHOWN])}{more}" if known else "it has no topics"
+    return EpisodeError(where, f"the bag has no topic for {key}", hint + listed)
+
+
+class Column:
+    """The values of one component, gathered message by message.
+
+    Where the message that holds the field also has a list `name` (JointState), the component's `names` select
+    and order the values, unless the key or the YAML slices. Messages of another publisher, with none of those
+    names, are left out.
+    """
+
+    def __init__(self, component: Component, field: Field, where: str) -> None:
+        self.component, self.field = component, field
+        self._where = where
+        self._values, self._rows = array("d"), array("q")
+        self._width: int | None = None
+        self._picks: dict[tuple[str, ...], list[int] | None] = {}
+        whole = not component.slice and field.steps and isinstance(field.steps[-1], str)
+        self._selects = bool(component.names and whole)
+
+    def add(self, message: Any, row: int) -> None:
+        """Add the values of message `row`."""
+        value = self.field.value(message, self._where)
+        try:
+            values = numbers(value)
+        except TypeError as fault:
+            known = ", ".join(field_names(value))
+            raise EpisodeError(
+                self._where,
+                f"{self.field.key} holds {fault}, not numbers alone",
+                f"name a field of it: {known}" if known else "",
+            ) from fault
+        if self._selects:
+            picks = self._pick(message, len(values))
+            if picks is None:
+                return
+            values = [values[i] for i in picks]
+        if not values:
+            raise EpisodeError(self._where, f"{self.field.key} is empty in message {row}")
+        self._width = self._width or len(values)
+        if len(values) != self._width:
+            said = f"{self.field.key} has {self._width} values, then {len(values)} in message {row}"
+            raise EpisodeError(self._where, said)
+        self._values.extend(values)
+        self._rows.append(row)
+
+    def rows(self) -> NDArray[np.int64]:
+        """Return the indices of the messages that gave values.
+
+        Raises:
+            EpisodeError: none did.
+        """
+        if not self._rows:
+            seen = sorted({name for names in self._picks for name in names})[:SHOWN]
+            names = ", ".join(self.component.names or ())
+            raise EpisodeError(
+                self._where, f"{self.field.key}: no message names {names}", f"names there: {', '.join(seen)}"
+            )
+        return np.frombuffer(self._rows, np.int64)
+
+    def values(self) -> Floats:
+        """Return the values (T, A) as recorded."""
+        return np.frombuffer(self._values, np.float64).reshape(len(self._rows), -1)
+
+    def _pick(self, message: Any, width: int) -> list[int] | None:
+        """Return the indices of the wanted names; None where the message has none of them."""
+        owner = self.field.owner(message, self._where)
+        stated = child(owner, "name") if "name" in field_names(owner) else ()
+        if not is_list(stated) or not len(stated):
+            return list(range(width))
+        names = tuple(stated)
+        if names not in self._picks:
+            self._picks[names] = self._indices(names)
+        picks = self._picks[names]
+        if picks is not None and len(names) != width:
+            raise EpisodeError(self._where, f"{self.field.key} has {width} values for {len(names)} names")
+        return picks
+
+    def _indices(self, names: tuple[str, ...]) -> list[int] | None:
+        wanted = self.component.names or ()
+        absent = [name for name in wanted if name not in names]
+        if len(absent) == len(wanted):
+            return None
+        if absent:
+            raise EpisodeError(
+                self._where,
+                f"{self.field.key}: a message lacks {', '.join(absent)}",
+                f"it names {', '.join(names)}",
+            )
+        return [names.index(name) for name in wanted]
 
 
 class TopicTrack:
-    """Record one topic over one pass.
+    """The times and places of one topic's messages, recorded in one pass.
 
     Attributes:
         columns: the components that read this topic; each takes its values as messages are added.
@@ -53,7 +239,7 @@ class TopicTrack:
     def __len__(self) -> int:
         return len(self._log_ns)
 
-    def add_head(self, channel: Channel, log_ns: int, place: Place, data: Data) -> None:
+    def add_head(self, channel: Channel, log_ns: int, place: BagPlace, data: Data) -> None:
         """Add the next message, of which only the time in its first bytes is needed.
 
         Raises:
@@ -68,7 +254,7 @@ class TopicTrack:
             ) from fault
         self._take(channel, log_ns, place, own_ns)
 
-    def add(self, channel: Channel, log_ns: int, place: Place, message: Any) -> None:
+    def add(self, channel: Channel, log_ns: int, place: BagPlace, message: Any) -> None:
         """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt."""
         for column in self.columns:
             column.add(message, len(self))
@@ -76,7 +262,7 @@ class TopicTrack:
             self._keyframes.append(self._is_keyframe(message))
         self._take(channel, log_ns, place, stamp_ns(message))
 
-    def _take(self, channel: Channel, log_ns: int, place: Place, own_ns: int) -> None:
+    def _take(self, channel: Channel, log_ns: int, place: BagPlace, own_ns: int) -> None:
         if channel not in self.channels:
             self.channels.append(channel)
         self._log_ns.append(min(log_ns, INT64.max))
@@ -88,7 +274,7 @@ class TopicTrack:
             self.codec = self.codec or video_codec(message)
             return is_keyframe(payload(message), self.codec)
         except (KeyError, TypeError, ValueError) as fault:
-            raise EpisodeError(self.topic, f"a message is no frame of a video: {fault!r}") from fault
+            raise EpisodeError(self.topic, f"a message is not a frame of a video: {fault!r}") from fault
 
     def order(self, rows: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """Return the order of receipt: of all messages, or of those rows (then an index into `rows`)."""
@@ -182,95 +368,3 @@ def _decodable(
         raise EpisodeError(where, f"the {track.codec} video has no key frame")
     earlier = np.flatnonzero(keyframes[: begin + 1])
     return int(earlier[-1] if len(earlier) else np.argmax(keyframes)), keyframes
-
-
-class Messages:
-    """Read the messages of one topic again by index.
-
-    Args:
-        places: (T, 4) as TopicTrack keeps them, in order of receipt.
-        channels: the channels that the last number of a place points into.
-    """
-
-    def __init__(self, bag: Bag, channels: list[Channel], places: NDArray[np.int64], where: str) -> None:
-        self.where = where
-        self._bag, self._channels, self._places = bag, channels, places
-
-    def read(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[object]:
-        """Yield the decoded messages of those indices, in that order."""
-        rows = self._places[np.asarray(indices, np.int64)].tolist()
-        places = [Place(file, first, second) for file, first, second, _ in rows]
-        for row, data in zip(rows, self._bag.payloads(places), strict=True):
-            yield decode(self._channels[row[3]], data, self.where)
-
-
-class StillStream:
-    """Serve a camera of raw or still pictures; see episode.Stream."""
-
-    def __init__(self, timestamps: Floats, messages: Messages, kind: str) -> None:
-        self.timestamps = timestamps
-        self._messages, self._kind = messages, kind
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """See episode.Stream."""
-        distinct, inverse = np.unique(np.asarray(indices, np.int64), return_inverse=True)
-        stacked = _stack(self.each(distinct), len(distinct))
-        return stacked if np.array_equal(inverse, np.arange(len(stacked))) else stacked[inverse]
-
-    def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[Images]:
-        """See episode.OneByOne."""
-        where = self._messages.where
-        return _of_one_size((picture(m, self._kind, where) for m in self._messages.read(indices)), where)
-
-
-class VideoStream:
-    """Serve a camera of video; see episode.Stream.
-
-    Args:
-        timestamps: (T,) of the pictures shown, which are the last T messages.
-        keyframes: (M,) of all messages; the messages before those shown serve only for decoding.
-    """
-
-    def __init__(
-        self, timestamps: Floats, messages: Messages, keyframes: NDArray[np.bool_], codec: str
-    ) -> None:
-        self.timestamps = timestamps
-        self._messages, self._count = messages, len(keyframes)
-        self._lead = len(keyframes) - len(timestamps)
-        self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where)
-
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
-        """See episode.Stream."""
-        wanted = [int(i) + self._lead for i in indices]
-        found = self._decoder.frames(wanted)
-        distinct = list(found)
-        stacked = _stack(_of_one_size(iter(found.values()), self._messages.where), len(found))
-        return stacked[[distinct.index(i) for i in wanted]]
-
-    def _from(self, start: int) -> Iterator[bytes]:
-        for block in range(start, self._count, BLOCK):
-            for message in self._messages.read(range(block, min(block + BLOCK, self._count))):
-                yield payload(message)
-
-
-def _of_one_size(pictures: Iterator[Images], where: str) -> Iterator[Images]:
-    """Yield the pictures; raise EpisodeError at the first whose size differs."""
-    first: tuple[int, ...] = ()
-    for item in pictures:
-        first = first or item.shape
-        if item.shape != first:
-            shapes = sorted({first, item.shape})
-            raise EpisodeError(where, f"pictures change size within the episode: {shapes}")
-        yield item
-
-
-def _stack(pictures: Iterator[Images], count: int) -> Images:
-    """Stack pictures to (count, H, W, 3), one at a time, so that only one picture is in memory twice."""
-    first = next(pictures, None)
-    if first is None:
-        return np.zeros((0, 1, 1, 3), np.uint8)
-    stacked = np.empty((count, *first.shape), np.uint8)
-    stacked[0] = first
-    for i, item in enumerate(pictures, start=1):
-        stacked[i] = item
-    return stacked

@@ -19,10 +19,8 @@ from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError
 from hma_data.sources.base import KeyInfo
-from hma_data.sources.common import image_checks, timestamp_checks
-from hma_data.sources.common.findings import Finding, Severity
-from hma_data.sources.common.image_checks import Look
-from hma_data.sources.common.timestamp_checks import Clock
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Finding, Look, Severity, StreamTimes
 
 CHECKS = {  # the checks of an inspection, in the order they are printed
     "readable": "episodes that can be read",
@@ -67,15 +65,15 @@ class _Numbers:
 
 @dataclass
 class _Times:
-    """The clock of one key over the episodes."""
+    """The times of one key over the episodes."""
 
-    met: dict[str, Clock] = field(default_factory=dict)
+    met: dict[str, StreamTimes] = field(default_factory=dict)
     camera: bool = False
     skew: tuple[float, float, float] | None = None
 
 
 class Survey:
-    """Gather what the sampled episodes show.
+    """The collected results of the sampled episodes.
 
     Args:
         episodes: how many the recording has.
@@ -127,27 +125,26 @@ class Survey:
             return
         self.made |= {"finite", "constant"}
         flat: NDArray[Any] = values.reshape(len(values), -1)
+        blank = np.full(flat.shape[1], np.nan)
+        held = self._numbers.setdefault(key, _Numbers(blank, blank.copy()))
+        if len(held.low) != flat.shape[1]:
+            return  # another width than before: the source reports it
         infinite = 0
         if flat.dtype.kind == "f":
             finite = np.isfinite(flat)
             infinite = int(finite.size - np.count_nonzero(finite))
-        held = self._numbers.get(key)
-        if held is None or held.low.shape[0] != flat.shape[1]:
-            if held is not None:
-                return  # another width than before: the source reports it
-            blank = np.full(flat.shape[1], np.nan)
-            held = self._numbers[key] = _Numbers(blank, blank.copy())
-        if infinite and not held.infinite:
-            held.first = f"{name}: {key} is not finite at step {begin + int(np.argwhere(~finite)[0, 0])}"
         if infinite:
+            if not held.infinite:
+                step = begin + int(np.argwhere(~finite)[0, 0])
+                held.first = f"{name}: {key} is not finite at step {step}"
+            held.episodes += held.last != name
+            held.last = name
             flat = np.where(finite, flat, np.nan)
         held.low = np.fmin(held.low, np.fmin.reduce(flat, axis=0))
         held.high = np.fmax(held.high, np.fmax.reduce(flat, axis=0))
         held.rows += len(flat)
         held.values += flat.size
         held.infinite += infinite
-        held.episodes += bool(infinite) and held.last != name
-        held.last = name if infinite else held.last
 
     def pictures(
         self, name: str, key: str, frames: Images, indices: NDArray[np.int64], codec: str | None
@@ -158,23 +155,32 @@ class Survey:
         look.add(frames, indices, again=self._shown.get(key) == name)
         self._shown[key] = name
 
-    def times(self, name: str, key: str, seconds: Floats, camera: bool = False) -> Clock:
-        """Add the times (T,) of one key of an episode, in the order of receipt; return their clock."""
+    def times(self, name: str, key: str, seconds: Floats, camera: bool = False) -> StreamTimes:
+        """Add the times (T,) of one key of an episode, in the order of receipt; return what they show."""
         self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
         held = self._times.setdefault(key, _Times(camera=camera))
-        held.met[name] = timestamp_checks.clock_of(seconds)
-        return held.met[name]
+        found = held.met[name] = checks.measure(seconds)
+        return found
 
     def skew(self, key: str, found: tuple[float, float, float] | None, period_s: float) -> None:
         """Note how far a stream is from the primary stream's frames; `period_s` is their median interval."""
         self.made.add("skew")
         held = self._times[key]
         held.skew = found
-        own = max((clock.period_s for clock in held.met.values()), default=0.0)
+        own = max((times.period_s for times in held.met.values()), default=0.0)
         if found and found[1] > 1e3 * max(period_s, own):
             said = f"{key}: p95 {found[1]:.1f} ms from the first camera's frames, max {found[2]:.1f} ms"
             numbers = dict(zip(("p50_ms", "p95_ms", "max_ms"), found, strict=True))
-            self._extra.append(Finding("skew", "warn", said, "it pauses, or loses messages", key, numbers))
+            self._extra.append(
+                Finding(
+                    "skew",
+                    "warn",
+                    said,
+                    "the stream pauses or loses messages; check the recording",
+                    key,
+                    numbers,
+                )
+            )
 
     # -- results
 
@@ -183,23 +189,21 @@ class Survey:
         held, look = self._numbers.get(info.key), self.looks.get(info.key)
         times = self._times.get(info.topic.name if info.topic else info.key)
         if held is not None:
-            still = self._still(held)
-            low, high = held.low[np.isfinite(held.low)], held.high[np.isfinite(held.high)]
+            still, ends = _still(held), _finite(held)
             info = replace(
                 info,
                 constant=bool(still) and len(still) == len(held.low) and not held.infinite,
                 still=tuple(still),
-                low=float(low.min()) if len(low) else None,
-                high=float(high.max()) if len(high) else None,
+                low=float(ends.min()) if len(ends) else None,
+                high=float(ends.max()) if len(ends) else None,
             )
         if times is not None and times.met:
-            rates = [clock.hz for clock in times.met.values() if clock.hz]
-            jitters = [clock.jitter_ms for clock in times.met.values() if clock.jitter_ms is not None]
-            measured = float(np.median(rates)) if rates else None
-            stated = info.hz and any(abs(one / info.hz - 1) <= timestamp_checks.DRIFT for one in rates)
+            rates = [one.hz for one in times.met.values() if one.hz]
+            jitters = [one.jitter_ms for one in times.met.values() if one.jitter_ms is not None]
+            stated = info.hz and any(abs(one / info.hz - 1) <= checks.DRIFT for one in rates)
             info = replace(
                 info,
-                hz=info.hz if stated or not measured else measured,
+                hz=info.hz if stated or not rates else float(np.median(rates)),
                 jitter_ms=float(np.median(jitters)) if jitters else info.jitter_ms,
                 skew_ms=times.skew,
             )
@@ -210,8 +214,8 @@ class Survey:
     def findings(self, keys: Sequence[KeyInfo]) -> tuple[Finding, ...]:
         """Return all findings, check by check."""
         found = [
-            *self._readable(), *_merged(self._extra), *self._keys(), *self._rows(), *self._clocks(),
-            *self._finite(), *self._constant(keys), *image_checks.findings(self.looks),
+            *self._readable(), *_merged(self._extra), *self._keys(), *self._rows(), *self._stamps(),
+            *self._finite(), *self._constant(keys), *checks.picture_findings(self.looks),
         ]  # fmt: skip
         order = list(CHECKS)
         return tuple(sorted(found, key=lambda one: order.index(one.check) if one.check in order else 99))
@@ -249,43 +253,38 @@ class Survey:
             said = f"{len(self._odd) - SHOWN} more episodes have keys of different length"
             yield Finding("rows", "warn", said, numbers={"episodes": len(self._odd)})
 
-    def _clocks(self) -> Iterator[Finding]:
+    def _stamps(self) -> Iterator[Finding]:
         for key, held in self._times.items():
-            worst: dict[str, Finding] = {}
-            counts: Counter[str] = Counter()
-            for name, clock in held.met.items():
-                for one in timestamp_checks.findings(key, clock, held.camera, "" if self.alone else name):
-                    worst.setdefault(one.check, one)
-                    counts[one.check] += 1
-            for check, one in worst.items():
-                more = f" (and in {counts[check] - 1} more episodes)" if counts[check] > 1 else ""
-                yield replace(one, message=one.message + more)
+            found = [
+                one
+                for name, times in held.met.items()
+                for one in checks.time_findings(key, times, held.camera, "" if self.alone else name)
+            ]
+            for check, count in Counter(one.check for one in found).items():
+                first = next(one for one in found if one.check == check)
+                more = f" (and in {count - 1} more episodes)" if count > 1 else ""
+                yield replace(first, message=first.message + more)
 
     def _finite(self) -> Iterator[Finding]:
         for key, held in self._numbers.items():
             if held.infinite:
                 said = f"{held.first} ({held.infinite:,} of {held.values:,} values looked at"
                 said += f", in {held.episodes} episodes)" if held.episodes > 1 else ")"
-                yield Finding("finite", "warn", said, key=key,
-                              numbers={"count": held.infinite, "values": held.values})  # fmt: skip
-            ends = np.array([*held.low, *held.high])
-            ends = ends[np.isfinite(ends)]
-            furthest = float(ends[np.argmax(np.abs(ends))]) if len(ends) else 0.0
+                numbers = {"count": held.infinite, "values": held.values}
+                yield Finding("finite", "warn", said, key=key, numbers=numbers)
+            furthest = float(max(_finite(held), key=abs, default=0.0))
             if abs(furthest) > FLOAT32_MAX:
                 said = f"{key} reaches {furthest:.3g}, float32 holds up to {FLOAT32_MAX:.3g}"
-                numbers = {"value": furthest}
-                yield Finding(
-                    "finite", "warn", said, "as an action or state its episode is refused", key, numbers
-                )
+                remedy = "an episode that uses it as action or state is refused"
+                yield Finding("finite", "warn", said, remedy, key, {"value": furthest})
 
     def _constant(self, keys: Sequence[KeyInfo]) -> Iterator[Finding]:
         names = {info.key: info.names for info in keys}
         whole: list[str] = []
         for key, held in self._numbers.items():
-            still = self._still(held)
-            if not still or held.rows < 2:
+            still, command = _still(held), bool(_COMMANDS.search(key.lower()))
+            if not still:
                 continue
-            command = bool(_COMMANDS.search(key.lower()))
             if len(still) == len(held.low) and not command:
                 whole.append(key)
                 continue
@@ -297,13 +296,19 @@ class Survey:
             numbers = {"dims": still, "rows": held.rows}
             yield Finding("constant", severity, f"{key} never changes{said}", key=key, numbers=numbers)
         if whole:
-            yield Finding(
-                "constant", "info", f"never change at all: {listed(whole)}", numbers={"keys": whole}
-            )
+            said = f"never change at all: {listed(whole)}"
+            yield Finding("constant", "info", said, numbers={"keys": whole})
 
-    @staticmethod
-    def _still(held: _Numbers) -> list[int]:
-        return [int(i) for i in np.flatnonzero(held.low == held.high)] if held.rows > 1 else []
+
+def _still(held: _Numbers) -> list[int]:
+    """Return the indices of the values that never change."""
+    return [int(i) for i in np.flatnonzero(held.low == held.high)] if held.rows > 1 else []
+
+
+def _finite(held: _Numbers) -> NDArray[Any]:
+    """Return the smallest and largest finite number of each value."""
+    ends = np.array([*held.low, *held.high])
+    return ends[np.isfinite(ends)]
 
 
 def _merged(found: list[Finding]) -> Iterator[Finding]:

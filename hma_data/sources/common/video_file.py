@@ -109,7 +109,7 @@ def _table(
     if not len(stamps) or not keyframes:
         raise EpisodeError(path, "has no frames")
     if (np.diff(stamps) == 0).any():
-        raise EpisodeError(path, f"shows two frames at {stamps[np.diff(stamps, append=-1) == 0][0]} ticks")
+        raise EpisodeError(path, f"has two frames at {stamps[np.diff(stamps, append=-1) == 0][0]} ticks")
     starts = np.array(sorted(keyframes), np.int64)  # (K, 2): shown at, seek to
     order = np.maximum(np.searchsorted(starts[:, 0], stamps, side="right") - 1, 0)
     rate = stream.average_rate
@@ -127,17 +127,11 @@ def _table(
 
 
 class VideoFile:
-    """A video file as an array of frames; it opens on first use, and again after a fork.
+    """A video file as an array of frames; it opens on first use, and again after a fork."""
 
-    Args:
-        path: of the file.
-        threads: of FFmpeg.
-    """
-
-    def __init__(self, path: Path, threads: int = THREADS) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.table = frame_table(path)
-        self._threads = threads
         self._process = 0
         self._container: Any = None
         self._decoder: Iterator[Any] = iter(())
@@ -196,7 +190,7 @@ class VideoFile:
             self._count()
             frame = self._frame(index)
         if self._spoilt:
-            raise EpisodeError(self.path, f"frame {index} is damaged, or one before it that it is made from")
+            raise EpisodeError(self.path, f"frame {index} is damaged, or depends on a damaged one")
         return self._to_rgb(frame)
 
     def _count(self) -> None:
@@ -208,7 +202,7 @@ class VideoFile:
         self._reopen()
         given = sum(1 for _ in self._decoder)
         if given != len(self):
-            raise EpisodeError(self.path, f"gives {given} frames, its packets tell of {len(self)}")
+            raise EpisodeError(self.path, f"gives {given} frames, its packets state {len(self)}")
         self._counts, self._seeks = True, False
         self._reopen()
 
@@ -255,7 +249,7 @@ class VideoFile:
         # A parent's decoder is dropped without closing it: after a fork, both share the file's position.
         self._container, self._process = _open(str(self.path)), os.getpid()
         stream = _video_stream(self._container, str(self.path))
-        stream.codec_context.thread_count = self._threads
+        stream.codec_context.thread_count = THREADS
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         self._decoder, self._next, self._entry = self._container.decode(stream), 0, -1
         self._spoilt = False
@@ -264,13 +258,13 @@ class VideoFile:
     def _index_of(self, frame: Any) -> int:
         """Return the frame's index; -1 for a frame that comes before the first shown."""
         if frame.pts is None:
-            raise EpisodeError(self.path, f"frame {self._next} comes without a time")
+            raise EpisodeError(self.path, f"frame {self._next} has no time")
         index = int(np.searchsorted(self.table.stamps, frame.pts))
         if index < len(self) and self.table.stamps[index] == frame.pts:
             return index
         if index == 0:
             return -1
-        raise EpisodeError(self.path, f"gives a frame at {frame.pts} ticks that its packets do not name")
+        raise EpisodeError(self.path, f"gives a frame at {frame.pts} ticks, which no packet states")
 
     def _to_rgb(self, frame: Any) -> Images:
         picture: Images = self._reformatter.reformat(frame, format="rgb24").to_ndarray()
@@ -310,9 +304,9 @@ def _video_stream(container: Any, path: str) -> Any:
     if stream is None:
         raise EpisodeError(path, "has no video in it")
     if stream.codec_context is None or not stream.width:
-        raise EpisodeError(path, "holds video of a kind that is not known", "the file may be damaged")
+        raise EpisodeError(path, "holds video of an unknown codec", "the file may be damaged")
     if stream.width * stream.height > MAX_PIXELS:
-        raise EpisodeError(path, f"claims {stream.width}×{stream.height} pixels")
+        raise EpisodeError(path, f"claims {stream.width}×{stream.height} pixels, more than {MAX_PIXELS:,}")
     return stream
 
 

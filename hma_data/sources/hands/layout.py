@@ -33,8 +33,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 
 from hma_data.errors import RegistryError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import local_path
-from hma_data.sources.common.links import nothing_there
+from hma_data.sources.base import local_path, nothing_there
 from hma_data.sources.common.video_file import opened
 from hma_data.sources.hands import VIDEO_SUFFIXES
 

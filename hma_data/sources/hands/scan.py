@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError, OutputError
-from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint, local_path
-from hma_data.sources.common import image_checks, timestamp_checks
-from hma_data.sources.common.findings import Finding
-from hma_data.sources.common.links import unfollowed
+from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint, local_path, unfollowed
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands, load_models
@@ -142,7 +141,7 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
             survey.fault(name, fault)
     chosen = [list(headers)[i] for i in sampled(len(headers), episodes)] if headers else []
     for name in chosen:
-        _look(name, videos[name], headers[name], survey, max(1, image_checks.PAIRS // len(chosen)))
+        _look(name, videos[name], headers[name], survey, max(1, checks.PAIRS // len(chosen)))
     facts = {"keys": "each point also with /next (value at the next labelled frame) and /delta"}
     kinds = Counter((each.height, each.width, round(each.hz, 2), each.codec) for each in headers.values())
     if len(kinds) > 1:
@@ -185,13 +184,13 @@ def _look(name: str, video: Video, header: Header, survey: Survey, pairs: int) -
         survey.episode(name)
         clock = survey.times(name, "video", file.timestamps, camera=True)
         source = "measured over its whole length"  # few containers state a rate
-        for found in timestamp_checks.drift(f"{name}: video", clock.hz, header.hz or None, source):
+        for found in checks.drift(f"{name}: video", clock.hz, header.hz or None, source):
             survey.note(found)
         if header.frames and abs(len(file) - header.frames) > 1:
             said = f"{name}: holds {len(file):,} frames, its header states {header.frames:,}"
             numbers = {"frames": len(file), "stated": header.frames}
             survey.note(Finding("frames", "warn", said, key="video", numbers=numbers))
-        for run in image_checks.runs(image_checks.choose(len(file), pairs, file.table.keys)):
+        for run in checks.runs(checks.choose(len(file), pairs, file.table.keys)):
             survey.pictures(name, "video", file.frames(run), run, header.codec)
         file.close()
     except EpisodeError as fault:

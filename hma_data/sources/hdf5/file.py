@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.sources.base import local_path
-from hma_data.sources.common.links import nothing_there
+from hma_data.sources.base import local_path, nothing_there
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
 WHOLE_FILE = "/"

@@ -11,11 +11,9 @@ import numpy as np
 
 from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, HMAError
-from hma_data.sources.base import Inspection, KeyInfo, local_path
-from hma_data.sources.common import image_checks, timestamp_checks
-from hma_data.sources.common.dtype_hints import is_times, one_channel, seconds_a_unit, seconds_of
-from hma_data.sources.common.findings import Finding
-from hma_data.sources.common.links import unfollowed
+from hma_data.sources.base import Inspection, KeyInfo, local_path, unfollowed
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit, seconds_of
 from hma_data.sources.common.survey import MAX_VALUES, Survey, listed, sampled
 from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
@@ -64,7 +62,7 @@ def inspect(uri: str, finder: EpisodeFinder, files: OpenFiles, episodes: int) ->
         survey.note(link)
     lengths: dict[str, int] = {}
     held: Counter[str] = Counter()
-    pairs = max(1, image_checks.PAIRS // len(chosen))
+    pairs = max(1, checks.PAIRS // len(chosen))
     for name in [*order[:LENGTHS], *(name for name in order[LENGTHS:] if name in chosen)]:
         place = found[name]
         try:
@@ -151,12 +149,12 @@ def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, fir
         survey.made.add("rate")
         measured = first.facts["rate"].startswith(_MEASURED)
         source = f"{first.name} at" if measured else "the recording states"
-        for found in timestamp_checks.drift(f"{name}: {key}", clock.hz, first.rate, source):
+        for found in checks.drift(f"{name}: {key}", clock.hz, first.rate, source):
             survey.note(found)
 
 
 def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Survey, pairs: int) -> None:
-    for run in image_checks.runs(image_checks.choose(item.shape[0], pairs)):
+    for run in checks.runs(checks.choose(item.shape[0], pairs)):
         found = rows(item, run)
         if info.codec == "raw":
             survey.pictures(name, key, as_rgb(found), run, info.codec)
@@ -164,7 +162,7 @@ def _pictures(name: str, key: str, item: h5py.Dataset, info: KeyInfo, survey: Su
         pictures = [
             decode_image(encoded(row), f"{name} {key}, frame {i}") for row, i in zip(found, run, strict=True)
         ]
-        for start, frames in image_checks.stacked(pictures):
+        for start, frames in checks.stacked(pictures):
             survey.pictures(name, key, frames, run[start : start + len(frames)], info.codec)
 
 
@@ -267,7 +265,11 @@ def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | N
         codec = "jpeg" if start[:2] == b"\xff\xd8" else "png" if start[:4] == b"\x89PNG" else None
         if codec:
             shape = decode_image(encoded(first), where).shape
-            return "camera", (*shape[:2], 1) if one_channel(bytes(encoded(first))) else shape, codec
+            return (
+                "camera",
+                (*shape[:2], 1) if checks.one_channel(bytes(encoded(first))) else shape,
+                codec,
+            )
     if item.dtype.kind in "OS":
         return "text", shape[1:], None
     if item.dtype.kind in "fiub" and 1 <= len(shape) <= 3:

@@ -8,8 +8,8 @@ import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.sources.base import Inspection, KeyInfo
-from hma_data.sources.common import image_checks, timestamp_checks
-from hma_data.sources.common.findings import Finding
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.metadata import Feature, Metadata, episode_name
@@ -73,7 +73,7 @@ class _Looking:
             whole &= self._present(f"videos of {key}", key)
         order = [index for index in self._indices if index in whole]
         chosen = [order[i] for i in sampled(len(order), self._episodes)] if order else []
-        pairs = max(1, image_checks.PAIRS // max(len(chosen), 1))
+        pairs = max(1, checks.PAIRS // max(len(chosen), 1))
         limit = max(1, CAMERA_BUDGET // max(len(self._videos), 1))
         shown = set(chosen[:: max(1, -(-len(chosen) // limit))])
         for index in chosen:
@@ -130,13 +130,13 @@ class _Looking:
         if key == "timestamp":
             clock = self._survey.times(name, key, values.reshape(len(values), -1)[:, 0].astype(np.float64))
             self._survey.made.add("rate")
-            for found in timestamp_checks.drift(f"{name}: {key}", clock.hz, self._meta.fps):
+            for found in checks.drift(f"{name}: {key}", clock.hz, self._meta.fps):
                 self._survey.note(found)
 
     def _stills(self, name: str, key: str, rows: Rows, pairs: int) -> None:
         stream = StillPictures(rows, key, np.zeros(len(rows)), self._meta.folder)
         codec = stream.codec()
-        for run in image_checks.runs(image_checks.choose(len(rows), pairs)):
+        for run in checks.runs(checks.choose(len(rows), pairs)):
             self._survey.pictures(name, key, stream.frames(run), run, codec)
 
     def _video(self, key: str, index: int, pairs: int) -> None:
@@ -152,10 +152,8 @@ class _Looking:
                 numbers = {"frames": last - first, "rows": rows}
                 self._survey.note(Finding("frames", "warn", said, key=key, numbers=numbers))
             if last > first:
-                indices = first + image_checks.choose(
-                    last - first, pairs, file.table.keys[first:last] - first
-                )
-                for run in image_checks.runs(indices):
+                indices = first + checks.choose(last - first, pairs, file.table.keys[first:last] - first)
+                for run in checks.runs(indices):
                     self._survey.pictures(name, key, file.frames(run), run, file.table.codec)
             file.close()
         except HMAError as fault:

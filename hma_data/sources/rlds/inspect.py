@@ -4,9 +4,8 @@ import math
 
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import EpisodeRef, Inspection, KeyInfo
-from hma_data.sources.common import image_checks
-from hma_data.sources.common.dtype_hints import is_times, seconds_of
-from hma_data.sources.common.findings import Finding
+from hma_data.sources.common import checks
+from hma_data.sources.common.checks import Finding, is_times, seconds_of
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.rlds.features import Steps
 from hma_data.sources.rlds.folder import Folder, open_folder
@@ -56,7 +55,7 @@ def _survey(
     lengths: dict[int, int] = {}
     first: Steps | None = None
     budget = INSPECTED_BYTES
-    pairs = max(1, image_checks.PAIRS // max(len(chosen), 1))
+    pairs = max(1, checks.PAIRS // max(len(chosen), 1))
     for i in [*chosen, *others]:
         if budget < 0 and i not in wanted:
             break
@@ -93,8 +92,8 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
 
 def _pictures(steps: Steps, key: str, survey: Survey, pairs: int) -> None:
     decode, codec = steps.decoder(key), _codec(steps, key)
-    for run in image_checks.runs(image_checks.choose(steps.count, pairs)):
-        for start, frames in image_checks.stacked([decode(int(i)) for i in run]):
+    for run in checks.runs(checks.choose(steps.count, pairs)):
+        for start, frames in checks.stacked([decode(int(i)) for i in run]):
             survey.pictures(steps.name, key, frames, run[start : start + len(frames)], codec)
 
 
