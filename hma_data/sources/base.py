@@ -85,7 +85,7 @@ class KeyInfo:
         key: as an embodiment's YAML would name it.
         kind: camera, vector, text or other.
         shape: of one sample; pictures are (H, W, 3), or (H, W, 1) where they are recorded in grey.
-        dtype: as recorded.
+        dtype: of the values as they are decoded.
         hz: measured or stated rate; None when unknown.
         names: of the values, where the recording has them.
         codec: of pictures: jpeg, png, raw, av1, h264.
