@@ -58,9 +58,9 @@ from hma_model.training.recipe import find_recipe, load_recipe, make_recipe
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
 from tests.data.bag_files import make_recording, write_ros1
 from tests.data.hands_files import rows, write_table
-from tests.data.test_rlds import toy as write_rlds
-from tests.data.test_tokenizer_train import write_recipe
+from tests.data.sources.rlds.test_rlds import toy as write_rlds
 from tests.data.tokenizer_files import write_magvit2
+from tests.data.tokenizers.test_tokenizer_train import write_recipe
 from tests.data.videos import encode, make_v3
 from tests.model import robots
 from tests.model.runs import TINY

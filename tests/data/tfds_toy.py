@@ -8,7 +8,7 @@ import numpy as np
 import tensorflow as tf
 import tensorflow_datasets as tfds
 
-from tests.data.test_rlds_tfds import EPISODES, NUMBERS
+from tests.data.sources.rlds.test_rlds_tfds import EPISODES, NUMBERS
 
 F = tfds.features
 

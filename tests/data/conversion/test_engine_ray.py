@@ -1,0 +1,257 @@
+"""The Ray engine on a cluster of two nodes: the same bytes, whether nodes and actors are lost or not."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from hma_data.conversion.engines.base import Limits, Retry
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.errors import HMAError, MissingDependencyError, TokenizerError
+from tests.data.conversion.test_engines import PLAIN, MakeWork, Unit
+
+on_a_cluster = pytest.mark.slow
+LIMITS = Limits(quiet_s=5, kills=4)
+SETTINGS = Settings(val_fraction=0.2, shard_frames=60)
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two nodes; the second may be killed, and comes back."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    os.environ["PYTHONPATH"] = f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    made.add_node(num_cpus=2)
+    ray.init(address=made.address, log_to_driver=False, logging_level="error")
+    yield made
+    ray.shutdown()
+    made.shutdown()
+
+
+def do(units: list[Unit], notes: Path, workers: int = 2):
+    from hma_data.conversion.engines.ray import run
+
+    events: list = []
+    results = dict(run(units, MakeWork(notes), workers, lambda n, event: events.append((n, event)), LIMITS))
+    return results, events
+
+
+@on_a_cluster
+def test_every_unit_is_done_once_and_its_events_arrive(cluster, tmp_path: Path) -> None:
+    results, events = do(PLAIN, tmp_path)
+    assert results == {unit.name: ["a", "b"] for unit in PLAIN}
+    assert sorted(events) == sorted((i, f"u{i} {step}") for i in range(5) for step in "ab")
+
+
+@on_a_cluster
+def test_a_process_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
+    results, events = do([Unit("bad", ("a", "b", "c"), "b", "SIGKILL", times=1), *PLAIN], tmp_path)
+    assert results["bad"] == ["a", "b", "c"]
+    assert [event.reason for _, event in events if isinstance(event, Retry)] == ["ended by SIGKILL at b"]
+
+
+@on_a_cluster
+def test_an_actor_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
+    def lose() -> None:
+        until = time.monotonic() + 60
+        while not list(tmp_path.glob("long-*")) and time.monotonic() < until:
+            time.sleep(0.05)
+        for pid in actors_of(os.getpid()):
+            if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::Worker"):
+                os.kill(pid, signal.SIGKILL)
+
+    thread = threading.Thread(target=lose, daemon=True)
+    thread.start()
+    results, events = do([Unit("long", ("a",), "a", "nap"), PLAIN[0]], tmp_path)
+    thread.join(60)
+    assert results == {"long": ["a"], "u0": ["a", "b"]}
+    reasons = [event.reason for _, event in events if isinstance(event, Retry)]
+    assert any(reason.startswith("was lost: ") for reason in reasons)
+
+
+@on_a_cluster
+def test_workers_that_cannot_be_made_are_one_error(
+    cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hma_data.conversion.engines import ray as engine
+
+    monkeypatch.setattr(engine, "LOST_STARTS", 1)
+    with pytest.raises(HMAError, match=r"the Ray cluster: .*on every node"):
+        list(engine.run(PLAIN, Unreadable(), 1, lambda number, event: None, LIMITS))
+
+
+class Unreadable:
+    """Stands for work whose module a node does not have."""
+
+    def __reduce__(self):
+        return _not_there, ()
+
+
+def _not_there() -> None:
+    raise ModuleNotFoundError("No module named 'hma_data'")
+
+
+@on_a_cluster
+@pytest.mark.parametrize("kind", ["SIGSEGV", "hang"])
+def test_a_step_that_ends_or_stops_its_actor_is_refused(kind: str, cluster, tmp_path: Path) -> None:
+    results, _ = do([Unit("bad", ("a", "b", "c"), "b", kind), PLAIN[0]], tmp_path)
+    assert results == {"bad": ["a", "c"], "u0": ["a", "b"]}
+
+
+@on_a_cluster
+def test_an_error_that_is_not_the_datas_ends_the_run_as_it_is(cluster, tmp_path: Path) -> None:
+    with pytest.raises(TokenizerError, match="weights: are wrong"):
+        do([Unit("bad", ("a",), "a", "error"), *PLAIN], tmp_path)
+
+
+@on_a_cluster
+def test_a_node_that_is_lost_takes_no_unit_along(cluster, tmp_path: Path) -> None:
+    extra = cluster.add_node(num_cpus=2)
+    units = [Unit(f"long{i}", ("a",), "a", "nap", times=1) for i in range(6)]
+
+    def lose() -> None:
+        while len(list(tmp_path.glob("long*"))) < 3:
+            time.sleep(0.1)
+        cluster.remove_node(extra, allow_graceful=False)
+
+    thread = threading.Thread(target=lose)
+    thread.start()
+    results, _ = do(units, tmp_path, workers=4)
+    thread.join()
+    assert results == {unit.name: ["a"] for unit in units}
+
+
+@pytest.fixture
+def whole(toy_arm, toy_recording, tmp_path: Path) -> dict[str, bytes]:
+    """What the local engine makes."""
+    convert(toy_arm, str(toy_recording), "raw", tmp_path / "whole", settings=SETTINGS)
+    return contents(tmp_path / "whole")
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+@on_a_cluster
+def test_the_bytes_are_those_of_the_local_engine(
+    cluster, toy_arm, toy_recording, tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    convert(toy_arm, str(toy_recording), "raw", tmp_path / "out", settings=SETTINGS, workers=2, engine="ray")
+    assert contents(tmp_path / "out") == whole
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+import ray
+import hma_data.conversion.job as conversion
+from hma_data.registry.embodiment import Embodiment
+from hma_data.conversion.engines.base import Limits
+from tests.conftest import ARM_YAML
+from tests.data.conversion.test_engine_ray import SETTINGS
+from tests.data.conversion.test_ray_actor import Slow
+
+make_work = conversion.MakeWork
+conversion.MakeWork = lambda *args: Slow(make_work(*args))
+ray.init(address=sys.argv[1], log_to_driver=False, logging_level="error")
+conversion.convert(
+    Embodiment.from_yaml(ARM_YAML), sys.argv[2], "raw", Path(sys.argv[3]), settings=SETTINGS, workers=3,
+    engine="ray", limits=Limits(quiet_s=60, kills=50),
+)
+"""
+
+
+@on_a_cluster
+def test_a_storm_of_kills_ends_with_the_same_bytes(
+    cluster, toy_recording, tmp_path: Path, whole: dict[str, bytes], request
+) -> None:
+    """Of actors, of the processes that work for them, and twice of the driver, which is run again."""
+    draws = random.Random(0)
+    script, out, killed = tmp_path / "driver.py", tmp_path / "out", 0
+    script.write_text(DRIVER)
+    for kills, shards in ((2, 1), (2, 3), (2, 1_000)):  # the driver is killed once there are so many shards
+        driver = subprocess.Popen(
+            [sys.executable, str(script), cluster.address, str(toy_recording), str(out)],
+            cwd=ROOT,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        request.addfinalizer(driver.kill)
+        until = time.monotonic() + 200
+        while driver.poll() is None and len(list(out.rglob("*.parquet"))) < shards:
+            assert time.monotonic() < until
+            time.sleep(draws.uniform(0.1, 0.6))
+            victims = actors_of(os.getpid())
+            if kills and victims and draws.random() < 0.5:
+                with suppress(ProcessLookupError):
+                    os.kill(draws.choice(victims), signal.SIGKILL)
+                    kills, killed = kills - 1, killed + 1
+        if shards < 1_000:
+            driver.kill()
+        _, errors = driver.communicate(timeout=100)
+    assert driver.returncode == 0, errors
+    assert killed
+    assert contents(out) == whole
+
+
+def actors_of(pid: int) -> list[int]:
+    """Actors that work, and their processes, on nodes that `pid` started."""
+    parents, names = {}, {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            names[int(entry.name)] = (entry / "cmdline").read_bytes()
+    ours, found = {pid}, []
+    for _ in range(6):  # generations
+        ours |= {child for child, parent in parents.items() if parent in ours}
+    for child in ours & names.keys():
+        name = names[child]
+        if name.startswith(b"ray::Worker") or names.get(parents[child], b"").startswith(b"ray::Worker"):
+            found.append(child)
+    return sorted(found)
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("", "Ray on this machine: cannot be started: timed out"),
+        ("10.0.0.9:6379", "the Ray cluster at 10.0.0.9:6379: cannot be joined: timed out"),
+    ],
+)
+def test_a_cluster_that_does_not_answer_is_one_error(
+    address: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from hma_data.conversion.engines import ray as engine
+
+    class NoRay:
+        is_initialized = staticmethod(lambda: False)
+        shutdown = staticmethod(lambda: None)
+
+        @staticmethod
+        def init(**settings: object) -> None:
+            raise Exception("timed out\nof many lines")
+
+    monkeypatch.setattr(engine, "_ray", NoRay)
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(HMAError) as caught:
+        do(PLAIN, tmp_path)
+    assert str(caught.value).startswith(said)
+
+
+def test_without_ray_the_error_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'hma-toolkit\[ray\]'"):
+        do(PLAIN, tmp_path)

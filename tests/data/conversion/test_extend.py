@@ -1,0 +1,239 @@
+"""Files that have grown: their known episodes are recognised, new ones are added, changed ones refused."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import pyarrow.parquet as pq
+import pytest
+
+from hma_data.conversion.extend import Content, content_of
+from hma_data.conversion.job import Summary, convert
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.rewrite import restat
+from hma_data.errors import OutputError
+from hma_data.inspection.inspect import examine
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import EPISODES, Manifest
+from hma_data.shards.verify import verify
+from hma_data.sources.base import open_source
+from tests.conftest import BlockTokenizer, write_toy
+from tests.data.sources.lerobot.test_lerobot import embodiment as lerobot_robot
+from tests.data.sources.rlds.test_rlds import embodiment as rlds_robot
+from tests.data.sources.rlds.test_rlds import toy
+from tests.data.videos import make_v3
+
+SMALL = Settings(val_fraction=0.2, shard_frames=60)
+Change = Callable[[h5py.File], None]
+
+
+def run(robot: Embodiment, recording: Path, out: Path, settings: Settings = SMALL, extend=False) -> Summary:
+    return convert(robot, str(recording), BlockTokenizer(), out, settings=settings, extend=extend)
+
+
+def shards(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.glob("*/shard-*")}
+
+
+def grow(path: Path, lengths: list[int], begun: int) -> None:
+    """More demos at the end of an HDF5 file, as a recorder adds them."""
+    beside = path.with_name("more.hdf5")
+    write_toy(beside, [1] * begun + lengths)
+    with h5py.File(beside) as source, h5py.File(path, "a") as file:
+        for i in range(begun, begun + len(lengths)):
+            source.copy(f"data/demo_{i}", file["data"])
+    beside.unlink()
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "toy.hdf5"
+    write_toy(path, [20, 21, 22])
+    return path
+
+
+def check_extended(
+    robot: Embodiment, recording: Path, out: Path, before: dict[str, bytes], count: int
+) -> None:
+    summary = run(robot, recording, out, extend=True)
+    assert summary.made_shards and verify(out) == []
+    assert shards(out).items() > before.items(), "the old shards stay as they are"
+    assert sum(split["episodes"] for split in summary.manifest.splits.values()) == count
+    assert run(robot, recording, out).made_shards == 0
+
+
+def test_demos_added_to_a_file_extend_the_set_again_and_again(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(toy_arm, recording, out)
+    for begun, lengths in ((3, [23, 24]), (5, [25])):
+        before = shards(out)
+        grow(recording, lengths, begun)
+        with pytest.raises(OutputError, match="--extend adds"):
+            run(toy_arm, recording, out)
+        check_extended(toy_arm, recording, out, before, begun + len(lengths))
+
+
+def test_strided_rows_of_two_cameras_are_recognised(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    settings = Settings(frames="strided", cameras=tuple(c.name for c in toy_arm.cameras), shard_frames=60)
+    run(toy_arm, recording, tmp_path / "out", settings)
+    grow(recording, [23], 3)
+    summary = run(toy_arm, recording, tmp_path / "out", settings, extend=True)
+    assert summary.made_shards == 1 and verify(tmp_path / "out") == []
+
+
+def set_value(key: str, index: int) -> Change:
+    def change(file: h5py.File) -> None:
+        data = file[f"data/demo_1/{key}"]
+        data[index] = data[index] + 1
+
+    return change
+
+
+def name_task(file: h5py.File) -> None:
+    file["data/demo_1"].attrs["language_instruction"] = "another task"
+
+
+CHANGES = {
+    "an action": set_value("actions", 7),
+    "its first picture": set_value("obs/image", 0),
+    "its last picture": set_value("obs/image", 20),
+    "its instruction": name_task,
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_known_episode_that_changed_is_refused_by_its_name(
+    what: str, toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(toy_arm, recording, out)
+    before = shards(out)
+    grow(recording, [23], 3)
+    with h5py.File(recording, "a") as file:
+        CHANGES[what](file)
+    with pytest.raises(OutputError, match="1 of its episodes were recorded anew, first 'demo_1'"):
+        run(toy_arm, recording, out, extend=True)
+    assert shards(out) == before
+
+
+def test_a_known_episode_that_cannot_be_read_any_more_is_refused_by_its_name(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    run(toy_arm, recording, tmp_path / "out")
+    grow(recording, [23], 3)
+    with h5py.File(recording, "a") as file:
+        del file["data/demo_2/obs"]
+    with pytest.raises(OutputError, match="1 of its episodes were recorded anew, first 'demo_2'"):
+        run(toy_arm, recording, tmp_path / "out", extend=True)
+
+
+def test_a_set_written_before_contents_were_noted_is_as_it_was(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    with monkeypatch.context() as before:
+        before.setattr(Content, "text", lambda self: "")
+        run(toy_arm, recording, out)
+    episodes = (out / EPISODES).read_bytes()
+    assert "content" not in pq.read_schema(out / EPISODES).names and verify(out) == []
+    (out / EPISODES).unlink()
+    restat(out)
+    assert (out / EPISODES).read_bytes() == episodes
+    assert run(toy_arm, recording, out).made_shards == 0
+    grow(recording, [23], 3)
+    with pytest.raises(
+        OutputError, match="3 of its episodes cannot be compared with changed files, first 'demo_0'"
+    ):
+        run(toy_arm, recording, out, extend=True)
+
+
+# -- what is kept must be there
+
+
+@pytest.mark.parametrize("name", ["episodes.parquet", "quarantine.jsonl", "embodiment.yaml"])
+@pytest.mark.parametrize("damage", ["gone", "blank", "other"])
+def test_what_follows_from_the_shards_is_written_anew_or_told_before_it_is_extended(
+    name: str, damage: str, toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(toy_arm, recording, out)
+    before, shards_before = (out / name).read_bytes(), shards(out)
+    (out / name).unlink()
+    if damage != "gone":
+        (out / name).write_bytes(b"\n" if damage == "blank" else b'{"id": 3}\n' + before)
+    with pytest.raises(OutputError, match=rf"{name}: is missing, or changed .* hma shards restat {out} "):
+        run(toy_arm, recording, out, extend=True)
+    assert run(toy_arm, recording, out).made_shards == 0
+    assert (out / name).read_bytes() == before and shards(out) == shards_before and verify(out) == []
+
+
+def test_a_shard_that_is_missing_is_told_before_the_set_is_extended(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(toy_arm, recording, out)
+    whole = shards(out)
+    first = out / sorted(whole)[0]
+    first.write_bytes(b"PAR1")
+    with pytest.raises(OutputError, match=r"is missing, or has other than the [\d,]+ bytes"):
+        run(toy_arm, recording, out, extend=True)
+    first.unlink()
+    with pytest.raises(OutputError, match="shard-00000.parquet: is missing, or has other"):
+        run(toy_arm, recording, out, extend=True)
+    assert run(toy_arm, recording, out).made_shards == 1 and shards(out) == whole
+    grow(recording, [23], 3)
+    run(toy_arm, recording, out, extend=True)
+    first.unlink()
+    for extend in (False, True):
+        with pytest.raises(OutputError, match="is missing, or has other than .* put back a copy of it"):
+            run(toy_arm, recording, out, extend=extend)
+
+
+def test_doctor_tells_a_set_that_is_not_finished_from_a_recording(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    run(toy_arm, recording, tmp_path / "out")
+    (tmp_path / "out" / "manifest.json").unlink()
+    (found,) = examine(str(tmp_path / "out"))
+    assert found.check == "integrity" and "its conversion has not finished" in found.message
+
+
+def test_what_a_worker_notes_is_what_is_found_later(
+    toy_arm: Embodiment, recording: Path, tmp_path: Path
+) -> None:
+    run(toy_arm, recording, tmp_path / "out")
+    facts = Manifest.load(tmp_path / "out").plan
+    rows = pq.read_table(tmp_path / "out" / EPISODES).to_pylist()
+    source = open_source("hdf5")
+    found = {row["id"]: content_of(source, str(recording), row["id"], toy_arm, facts) for row in rows}
+    assert found == {row["id"]: row["content"] for row in rows} and len(set(found.values())) == 3
+
+
+@pytest.mark.parametrize(("make", "robot"), [(make_v3, lerobot_robot), (toy, rlds_robot)])
+def test_episodes_added_to_a_lerobot_datasets_videos_or_a_split_of_rlds(
+    make: Callable[..., Path], robot: Callable[[], Embodiment], tmp_path: Path
+) -> None:
+    folder, out = tmp_path / "set", tmp_path / "out"
+    make(folder, (12, 9, 15))
+    run(robot(), folder, out)
+    before = shards(out)
+    shutil.rmtree(folder)
+    make(folder, (12, 9, 15, 11))
+    check_extended(robot(), folder, out, before, 4)
+
+
+def test_records_in_another_order_are_refused(tmp_path: Path) -> None:
+    folder, out = tmp_path / "set", tmp_path / "out"
+    toy(folder, (4, 3, 5))
+    run(rlds_robot(), folder, out)
+    shutil.rmtree(folder)
+    toy(folder, (6, 4, 3, 5))
+    with pytest.raises(OutputError, match="recorded anew, first 'train/000000'"):
+        run(rlds_robot(), folder, out, extend=True)
+    assert json.loads((out / "manifest.json").read_text())["totals"]["episodes"] == 3

@@ -1,0 +1,450 @@
+"""Batch jobs: shares of an array, extension, kills, storage that fails; the same bytes in the end."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from hma_data.conversion import worker as shard_work
+from hma_data.conversion.engines.base import Limits
+from hma_data.conversion.job import convert, convert_share
+from hma_data.conversion.output import LOCK, Share, locked
+from hma_data.conversion.plan import Settings
+from hma_data.conversion.recipe import load_jobs
+from hma_data.errors import HMAError, OutputError, RecipeError
+from hma_data.registry.embodiment import Embodiment, find
+from hma_data.shards.manifest import Manifest
+from hma_data.shards.verify import verify
+from hma_data.sources.hdf5.source import Hdf5Source
+from tests.conftest import BlockTokenizer, write_toy
+
+SMALL = Settings(val_fraction=0.2, shard_frames=60)
+ROOT = Path(__file__).parents[3]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
+
+
+def run(arm: Embodiment, recording: Path, out: Path, settings: Settings = SMALL, **options):
+    return convert(arm, str(recording), BlockTokenizer(), out, settings=settings, **options)
+
+
+@pytest.fixture
+def whole(toy_arm: Embodiment, toy_recording: Path, tmp_path: Path) -> dict[str, bytes]:
+    """What an undisturbed run makes."""
+    run(toy_arm, toy_recording, tmp_path / "whole")
+    return contents(tmp_path / "whole")
+
+
+# -- shares
+
+
+@pytest.mark.parametrize("count", [1, 3, 20])
+def test_shares_in_any_order_make_what_one_job_makes(
+    count: int, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    order = list(range(count))
+    random.Random(count).shuffle(order)
+    for index in order:
+        done = convert_share(
+            toy_arm,
+            str(toy_recording),
+            BlockTokenizer(),
+            tmp_path / "out",
+            Share(index, count),
+            settings=SMALL,
+        )
+        assert (done.missing == 0) == (index == order[-1])
+    assert contents(tmp_path / "out") == whole
+
+
+def test_shares_run_side_by_side_and_one_of_them_finishes(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    threads = [
+        threading.Thread(
+            target=convert_share,
+            args=(toy_arm, str(toy_recording), BlockTokenizer(), tmp_path / "out", Share(i, 3)),
+            kwargs={"settings": SMALL},
+        )
+        for i in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert contents(tmp_path / "out") == whole
+
+
+def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with locked(out, Share(0, 2)):
+        with (
+            pytest.raises(OutputError, match="another job is writing share 0-of-2"),
+            locked(out, Share(0, 2)),
+        ):
+            pass
+        with locked(out, Share(1, 2)):
+            pass
+        with pytest.raises(OutputError, match="another job is writing it"):
+            run(toy_arm, toy_recording, out)
+    assert not out.exists()
+
+
+def test_a_lock_left_by_a_killed_job_is_no_lock(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / LOCK).touch()
+    run(toy_arm, toy_recording, out)
+    assert contents(out) == whole
+
+
+# -- extension
+
+
+def test_added_episodes_become_new_shards_and_the_old_stay(toy_arm: Embodiment, tmp_path: Path) -> None:
+    recording, out = tmp_path / "recorded", tmp_path / "out"
+    recording.mkdir()
+    write_toy(recording / "monday.hdf5", range(20, 26))
+    run(toy_arm, recording, out)
+    before = contents(out)
+    write_toy(recording / "tuesday.hdf5", range(20, 26))
+    with pytest.raises(OutputError, match="--extend adds the episodes that are new"):
+        run(toy_arm, recording, out)
+    assert contents(out) == before
+    summary = run(toy_arm, recording, out, extend=True)
+    after = contents(out)
+    assert verify(out) == []
+    assert {name: data for name, data in after.items() if name in before and "shard-" in name} == {
+        name: data for name, data in before.items() if "shard-" in name
+    }
+    splits = summary.manifest.splits
+    assert splits["train"]["episodes"] + splits["val"]["episodes"] == 12
+    assert run(toy_arm, recording, out).made_shards == 0, "what was extended is continued as it is"
+    assert run(toy_arm, recording, out, extend=True).made_shards == 0
+    assert contents(out) == after
+
+
+def test_an_extension_stopped_anywhere_ends_with_the_same_bytes(toy_arm: Embodiment, tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+        write_toy(folder / "a.hdf5", [20, 21, 22])
+    write_toy(second / "b.hdf5", [40, 41, 42])
+    results = []
+    for stop_at in (None, 0, 2):
+        out = tmp_path / f"out-{stop_at}"
+        run(toy_arm, first, out)
+        if stop_at is not None:
+
+            class Stopping(BlockTokenizer):
+                left = stop_at
+
+                def encode(self, frames):
+                    self.left -= 1
+                    if self.left < 0:
+                        raise KeyboardInterrupt
+                    return super().encode(frames)
+
+            with pytest.raises(KeyboardInterrupt):
+                convert(toy_arm, str(second), Stopping(), out, settings=SMALL, extend=True)
+            assert Manifest.load(out).splits["train"]["episodes"] <= 3
+        run(toy_arm, second, out, extend=True)
+        assert verify(out) == []
+        shards = {name: data for name, data in contents(out).items() if "shard-" in name}
+        results.append(shards)
+    assert results[0] == results[1] == results[2]
+
+
+def test_an_episode_recorded_anew_cannot_extend(toy_arm: Embodiment, tmp_path: Path) -> None:
+    recording, out = tmp_path / "toy.hdf5", tmp_path / "out"
+    write_toy(recording, [20, 21, 22])
+    run(toy_arm, recording, out)
+    write_toy(recording, [20, 25, 22, 23])
+    before = contents(out)
+    with pytest.raises(OutputError, match="of its episodes were recorded anew"):
+        run(toy_arm, recording, out, extend=True)
+    with pytest.raises(OutputError, match="cannot be extended; different: embodiment"):
+        run(toy_arm.model_copy(update={"id": "other"}), recording, out, extend=True)
+    assert contents(out) == before
+
+
+# -- faults
+
+
+def test_a_read_error_that_goes_away_costs_nothing(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
+) -> None:
+    monkeypatch.setattr(shard_work, "WAITS_S", (0.0, 0.0, 0.0))
+    failures = {"demo_3": [OSError(5, "Input/output error")] * 2, "demo_7": [TimeoutError("slow")] * 3}
+    read = Hdf5Source.read
+
+    def failing(self, uri, episode_id, embodiment):
+        if failures.get(episode_id):
+            raise failures[episode_id].pop()
+        return read(self, uri, episode_id, embodiment)
+
+    monkeypatch.setattr(Hdf5Source, "read", failing)
+    run(toy_arm, toy_recording, tmp_path / "out")
+    assert contents(tmp_path / "out") == whole
+    assert not any(failures.values())
+
+
+def test_storage_that_stays_away_ends_the_job_and_quarantines_nobody(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
+) -> None:
+    monkeypatch.setattr(shard_work, "WAITS_S", (0.0,))
+    read, away = Hdf5Source.read, True
+
+    def failing(self, uri, episode_id, embodiment):
+        if away and episode_id == "demo_7":
+            raise ConnectionResetError("by peer")
+        return read(self, uri, episode_id, embodiment)
+
+    monkeypatch.setattr(Hdf5Source, "read", failing)
+    with pytest.raises(OutputError, match=r"storage does not answer: by peer .* run the same command again"):
+        run(toy_arm, toy_recording, tmp_path / "out")
+    away = False
+    run(toy_arm, toy_recording, tmp_path / "out")
+    assert contents(tmp_path / "out") == whole
+
+
+def test_a_full_disk_is_one_error_and_what_was_made_is_kept(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
+) -> None:
+    add, calls = shard_work.ShardWriter.add, 0
+
+    def full(self, episode):
+        nonlocal calls
+        calls += 1
+        if calls == 9:
+            raise OSError(28, "No space left on device")
+        add(self, episode)
+
+    monkeypatch.setattr(shard_work.ShardWriter, "add", full)
+    with pytest.raises(OutputError, match=r"No space left on device .* free space"):
+        run(toy_arm, toy_recording, tmp_path / "out")
+    assert list((tmp_path / "out").rglob("shard-*"))
+    assert not list((tmp_path / "out").rglob("*.part"))
+    run(toy_arm, toy_recording, tmp_path / "out")
+    assert contents(tmp_path / "out") == whole
+
+
+COMMAND = """
+import os, signal, sys, time
+from pathlib import Path
+from hma_data.conversion import worker as shard_work
+from hma_data.conversion.job import convert
+from hma_data.registry.embodiment import Embodiment
+from hma_data.conversion.engines.base import Limits
+from hma_data.conversion.plan import Settings
+from hma_data.sources.hdf5.source import Hdf5Source
+from hma_data.tokenizers import base
+from tests.conftest import ARM_YAML, BlockTokenizer
+
+TROUBLE = Path(sys.argv[3])
+read = Hdf5Source.read
+def troubled(self, uri, episode_id, embodiment):
+    time.sleep(0.02)
+    said = TROUBLE / episode_id
+    if said.exists():
+        kind = said.read_text()
+        if kind == "hang":
+            time.sleep(600)
+        os.kill(os.getpid(), getattr(signal, kind))
+    return read(self, uri, episode_id, embodiment)
+Hdf5Source.read = troubled
+shard_work.get_tokenizer = lambda *a, **k: BlockTokenizer()
+import hma_data.conversion.job
+hma_data.conversion.job.get_tokenizer = shard_work.get_tokenizer
+if __name__ == "__main__":
+    summary = convert(
+        Embodiment.from_yaml(ARM_YAML), sys.argv[1], "block", Path(sys.argv[2]), workers=2,
+        settings=Settings(val_fraction=0.2, shard_frames=60), max_quarantine=1,
+        limits=Limits(quiet_s=float(sys.argv[4]), kills=50),
+    )
+    print("made", summary.made_shards, flush=True)
+"""
+
+
+def job(script: Path, recording: Path, out: Path, trouble: Path, quiet_s: float = 120) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, str(script), str(recording), str(out), str(trouble), str(quiet_s)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    path = tmp_path / "job.py"
+    path.write_text(COMMAND)
+    (tmp_path / "trouble").mkdir()
+    return path
+
+
+def workers_of(pid: int) -> list[int]:
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        names = {child: Path(f"/proc/{child}/cmdline").read_bytes() for child in children}
+    except OSError:
+        return []
+    return [int(child) for child, name in names.items() if b"spawn_main" in name]
+
+
+def shards_in(out: Path) -> int:
+    return len(list(out.rglob("*.parquet")))
+
+
+def test_a_killed_job_is_continued_to_the_same_bytes(
+    script: Path, toy_arm: Embodiment, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    (tmp_path / "trouble" / "demo_11").write_text("hang")  # so that it cannot end before it is killed
+    process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble")
+    while process.poll() is None and not shards_in(tmp_path / "out"):
+        time.sleep(0.01)
+    process.kill()
+    _, errors = process.communicate()
+    assert process.returncode == -signal.SIGKILL, errors
+    assert run(toy_arm, toy_recording, tmp_path / "out").kept_shards >= 1
+    assert contents(tmp_path / "out") == whole
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_storm_of_kills_ends_with_the_same_bytes(
+    seed: int, script: Path, toy_recording: Path, tmp_path: Path, whole: dict[str, bytes]
+) -> None:
+    """Each run loses two workers, then is killed, each at a drawn number of shards; the last one ends."""
+    draws, out = random.Random(seed), tmp_path / "out"
+    for last in (False, False, True):
+        process = job(script, toy_recording, out, tmp_path / "trouble")
+        for victim in ("worker", "worker", "job"):
+            wanted = shards_in(out) + draws.choice([0, 1])
+            while process.poll() is None and (shards_in(out) < wanted or not workers_of(process.pid)):
+                time.sleep(0.01)
+            alive = workers_of(process.pid)
+            if victim == "worker" and alive:
+                with suppress(ProcessLookupError):
+                    os.kill(draws.choice(alive), signal.SIGKILL)
+            elif victim == "job" and not last:
+                process.kill()
+        _, errors = process.communicate(timeout=200)
+        assert process.returncode in (0, -signal.SIGKILL), errors
+    assert process.returncode == 0, errors
+    assert contents(out) == whole
+
+
+@pytest.mark.slow  # test_engines has both, quickly, without a conversion around them
+@pytest.mark.parametrize("kind", ["SIGSEGV", "hang"])
+def test_an_episode_that_crashes_or_hangs_its_reader_is_refused_and_the_rest_kept(
+    kind: str, script: Path, toy_recording: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "trouble" / "demo_5").write_text(kind)
+    process = job(script, toy_recording, tmp_path / "out", tmp_path / "trouble", 30)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    lines = [json.loads(line) for line in (tmp_path / "out" / "quarantine.jsonl").read_text().splitlines()]
+    assert [line["id"] for line in lines] == ["demo_5"]
+    said = "made no progress for 30 s" if kind == "hang" else "ended the process by SIGSEGV"
+    assert said in lines[0]["message"]
+    assert verify(tmp_path / "out") == []
+    splits = Manifest.load(tmp_path / "out").splits
+    assert splits["train"]["episodes"] + splits["val"]["episodes"] == 11
+
+
+def test_an_episode_that_breaks_off_in_the_middle_leaves_nothing_of_itself(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
+) -> None:
+    with h5py.File(toy_recording, "a") as file:
+        pictures = file["data/demo_4/obs/image"][()]
+        del file["data/demo_4/obs/image"]
+        kind = h5py.vlen_dtype(np.uint8)
+        encoded = file.create_dataset("data/demo_4/obs/image", (len(pictures),), dtype=kind)
+        import cv2
+
+        for i, picture in enumerate(pictures):
+            encoded[i] = cv2.imencode(".png", picture)[1].ravel() if i < 20 else np.zeros(9, np.uint8)
+    shard_work_batch = shard_work.BATCH
+    try:
+        shard_work.BATCH = 4
+        summary = run(toy_arm, toy_recording, tmp_path / "out")
+    finally:
+        shard_work.BATCH = shard_work_batch
+    assert summary.manifest.quarantined == 1
+    assert verify(tmp_path / "out") == []
+    rest = tmp_path / "rest.hdf5"
+    with h5py.File(toy_recording) as file, h5py.File(rest, "w") as other:
+        for name in file["data"]:
+            if name != "demo_4":
+                file.copy(f"data/{name}", other.require_group("data"))
+    assert summary.manifest.splits["train"]["episodes"] + summary.manifest.splits["val"]["episodes"] == 11
+
+
+# -- recipes
+
+
+def test_a_recipe_holds_several_conversions_with_common_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "two.yaml"
+    path.write_text(
+        "defaults: {tokenizer: fsq-8, workers: 2}\n"
+        "jobs:\n  - {embodiment: a, out: x}\n  - {embodiment: b, out: y, workers: 0, limit: 3}\n"
+    )
+    first, second = load_jobs(path)
+    assert (first.tokenizer, first.workers, first.limit) == ("fsq-8", 2, None)
+    assert (second.tokenizer, second.workers, second.settings.limit) == ("fsq-8", 0, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "jobs: [{embodiment: a, out: x, tokeniser: b}]",
+            "unknown key 'tokeniser', did you mean 'tokenizer'",
+        ),
+        ("jobs: [{embodiment: a}]", r"jobs\[0\]: lacks out"),
+        ("jobs: [{embodiment: a, out: x, limit: none}]", "limit is 'none'"),
+        ("jobs: [{embodiment: a, out: x}, {embodiment: b, out: ./x}]", "two jobs write"),
+        ("job: []", "lacks jobs"),
+        ("jobs: [a]", "jobs.0 is 'a'"),
+        ("{jobs: [{embodiment: a, out: x}], default: {}}", "unknown key 'default'"),
+    ],
+)
+def test_a_wrong_recipe_is_one_clear_error(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(RecipeError, match=said):
+        load_jobs(path)
+
+
+def test_the_shipped_recipes_are_valid() -> None:
+    for path in sorted((ROOT / "recipes" / "convert").glob("*.yaml")):
+        for job in load_jobs(path):
+            find(job.embodiment)
+
+
+def test_limits_are_kept_apart_from_errors_of_the_job(
+    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(HMAError, match="tokenizer"):
+        convert(toy_arm, str(toy_recording), "no-such", tmp_path / "o", workers=1, limits=Limits(quiet_s=1))

@@ -1,0 +1,211 @@
+"""The stream of batches: the same with any workers, in any DataLoader, over stops and ranks."""
+
+import copy
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from hma_data.bench.loader import make_set
+from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset, as_batch
+from hma_data.shards import writer
+from tests.data.fresh import run_fresh
+from tests.data.loading.test_pools import SMALL
+
+FRAMES, SIZE = 6, 8
+WORKERS = "forkserver"  # forking this process, which has threads, may stop the child for ever
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two embodiments, one of them small."""
+    folder = tmp_path_factory.mktemp("workers")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(writer, "ROW_GROUP", 300)
+        return [
+            make_set(folder / str(i), i, SMALL | {"frames": frames, "shard_frames": frames})
+            for i, frames in enumerate((3_000, 600))
+        ]
+
+
+def dataset(sets: Sequence[str | Path], **others: Any) -> MixtureDataset:
+    return MixtureDataset(sets, **({"batch_size": SIZE, "frames": FRAMES, "seed": 4, "pool": 2} | others))
+
+
+def seen(batches: Iterator[Batch], count: int) -> list[list[tuple[str, int, int]]]:
+    """Which windows each batch holds."""
+    return [windows_of(batch) for batch in islice(batches, count)]
+
+
+def windows_of(batch: Batch) -> list[tuple[str, int, int]]:
+    assert batch.episode is not None and batch.frame is not None
+    return list(zip(batch.embodiment, batch.episode.tolist(), batch.frame.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("workers", "context"), [(1, WORKERS), pytest.param(2, "spawn", marks=pytest.mark.slow), (3, WORKERS)]
+)
+def test_any_number_of_workers_gives_the_same_batches(sets: list[Path], workers: int, context: str) -> None:
+    data = dataset(sets)
+    assert seen(data.batches(workers, context), 14) == seen(iter(dataset(sets)), 14)
+    assert data.state_dict()["step"] == 14
+
+
+FORKING = """
+import sys
+from tests.data.loading.test_loader_workers import dataset, seen
+
+sets = sys.argv[1:]
+data = dataset(sets)
+assert seen(data.batches(3, "fork"), 14) == seen(iter(dataset(sets)), 14)
+"""
+
+
+def test_forked_workers_give_the_same_batches(sets: list[Path]) -> None:
+    run_fresh(FORKING, *sets)
+
+
+def test_a_run_stopped_with_some_workers_goes_on_with_others(sets: list[Path]) -> None:
+    whole = seen(iter(dataset(sets)), 30)
+    state, found = dataset(sets).state_dict(), []
+    for workers, count in ((2, 7), (0, 5), (3, 9), (1, 9)):
+        data = dataset(sets)
+        data.load_state_dict(copy.deepcopy(state))
+        found += seen(data.batches(workers, WORKERS), count)
+        state = data.state_dict()
+    assert found == whole
+
+
+def test_a_state_is_small_and_plain(sets: list[Path]) -> None:
+    import json
+
+    data = dataset(sets)
+    list(islice(data, 9))
+    text = json.dumps(data.state_dict())
+    assert len(text) < 2_000
+    other = dataset(sets)
+    other.load_state_dict(json.loads(text))
+    assert seen(iter(other), 3) == seen(iter(data), 3)
+
+
+def test_the_state_of_one_rank_serves_another(sets: list[Path]) -> None:
+    whole = seen(iter(dataset(sets, rank=1, world=2)), 12)
+    first = dataset(sets, rank=0, world=2)
+    list(islice(first, 7))
+    second = dataset(sets, rank=1, world=2)
+    second.load_state_dict(first.state_dict())
+    assert seen(iter(second), 5) == whole[7:]
+
+
+def test_a_dataloader_gives_the_same_batches_after_some_were_taken_here(sets: list[Path]) -> None:
+    whole = seen(iter(dataset(sets)), 12)
+    data = dataset(sets)
+    list(islice(data, 3))
+    loader = DataLoader(data, batch_size=None, num_workers=2, multiprocessing_context=WORKERS)
+    assert seen(iter(loader), 9) == whole[3:]
+
+
+def test_workers_that_persist_go_on_with_new_windows(sets: list[Path]) -> None:
+    loader = DataLoader(
+        dataset(sets),
+        batch_size=None,
+        num_workers=2,
+        persistent_workers=True,
+        multiprocessing_context=WORKERS,
+    )
+    first = seen(iter(loader), 4)
+    again = seen(iter(loader), 4)
+    assert first == seen(iter(dataset(sets)), 4)
+    assert not {tuple(b) for b in first} & {tuple(b) for b in again}
+
+
+def test_a_dataloader_shuffles_windows_by_number(sets: list[Path]) -> None:
+    windows = WindowDataset(sets[1], "train", FRAMES)
+    order = torch.Generator().manual_seed(0)
+    loader = DataLoader(
+        windows,
+        batch_size=7,
+        shuffle=True,
+        generator=order,
+        num_workers=1,
+        multiprocessing_context=WORKERS,
+        collate_fn=as_batch,
+    )
+    found = [window for batch in loader for window in windows_of(batch)]
+    assert len(found) == len(set(found)) == len(windows)
+    assert sorted(found) == sorted(windows_of(windows.batch(range(len(windows)))))
+
+
+@pytest.mark.parametrize("world", [2, 3])
+def test_ranks_and_lanes_never_share_a_window(sets: list[Path], world: int) -> None:
+    """As long as no lane begins its second epoch; the set's shares differ by a few windows."""
+    runs = [dataset(sets[:1], rank=rank, world=world, lanes=2) for rank in range(world)]
+    share = int(0.8 * runs[0].mixture.counts[0]) // world // SIZE
+    taken = [[w for batch in seen(iter(data), share) for w in batch] for data in runs]
+    assert all(len(set(windows)) == len(windows) == share * SIZE for windows in taken)
+    assert len(set().union(*taken)) == world * share * SIZE
+
+
+@pytest.mark.parametrize("draw", ["per_sample", "per_batch"])
+def test_what_was_taken_follows_the_mixture_and_is_counted(sets: list[Path], draw: Any) -> None:
+    data = dataset(sets, draw=draw, temperature=1.0, batch_size=16)
+    names = [name for batch in seen(iter(data), 300) for name, _, _ in batch]
+    rows = {str(row["embodiment"]): row for row in data.realised()}
+    for name, row in rows.items():
+        assert row["samples"] == names.count(name)
+        assert row["realised"] == pytest.approx(row["intended"], abs=0.02 if draw == "per_sample" else 0.08)
+        assert row["passes"] == row["samples"] / row["windows"]
+
+
+def test_no_batch_holds_two_windows_that_share_a_frame(sets: list[Path]) -> None:
+    data = dataset(sets[:1], batch_size=12, pool=8, lanes=1)
+    span = FRAMES * 2
+    met = 0
+    for batch in islice(data, 200):
+        places = np.array([1_000 * episode + frame for _, episode, frame in windows_of(batch)])
+        met += int((np.diff(np.sort(places)) < span).sum())
+    assert met <= 200 // 40  # where one pool ends and the next begins
+
+
+def test_a_set_in_a_store_gives_the_same_batches_as_the_folder(sets: list[Path]) -> None:
+    import fsspec
+
+    store = fsspec.filesystem("memory")
+    uris = []
+    for folder in sets:
+        store.put(str(folder), f"/loader-{folder.name}", recursive=True)
+        uris.append(f"memory://loader-{folder.name}")
+    try:
+        assert seen(iter(dataset(uris)), 20) == seen(iter(dataset(sets)), 20)
+        windows = WindowDataset(uris[1], "train", FRAMES)
+        assert windows_of(windows.batch([5, 3])) == windows_of(
+            WindowDataset(sets[1], "train", FRAMES).batch([5, 3])
+        )
+    finally:
+        for uri in uris:
+            store.rm(uri, recursive=True)
+
+
+def stateful(sets: list[Path], workers: int) -> Any:
+    from torchdata.stateful_dataloader import StatefulDataLoader
+
+    context = WORKERS if workers else None
+    return StatefulDataLoader(
+        dataset(sets), batch_size=None, num_workers=workers, multiprocessing_context=context
+    )
+
+
+@pytest.mark.parametrize("workers", [0, 1, 3])
+@pytest.mark.parametrize("stop", [1, 4, 9])
+def test_torchdatas_loader_saves_and_goes_on(sets: list[Path], workers: int, stop: int) -> None:
+    whole = seen(iter(dataset(sets)), 16)
+    first = stateful(sets, workers)
+    begun = seen(iter(first), stop)
+    second = stateful(sets, workers)
+    second.load_state_dict(first.state_dict())
+    assert begun + seen(iter(second), 16 - stop) == whole

@@ -1,0 +1,221 @@
+"""Foxglove's messages in every encoding, big-endian ones, and bags of a recorder that was killed."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from hma_data.errors import EpisodeError
+from hma_data.inspection.inspect import examine, inspect_recording
+from hma_data.sources.base import open_source
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers.training.frames import recording_frames
+from tests.data import bag_parts
+from tests.data.bag_files import CAMERA, SOURCE, arm, as_cdr, make_recording, read, ros_message, write_mcap
+from tests.data.sources.bags.test_bag_pictures import LOW_DELAY, VIDEO_YAML
+
+PICTURES = np.random.default_rng(3).integers(0, 256, (6, 10, 14, 3), np.uint8)
+FIELDS = {
+    "CompressedImage": "string frame_id\nuint8[] data\nstring format\n",
+    "RawImage": "string frame_id\nuint32 width\nuint32 height\nstring encoding\nuint32 step\nuint8[] data\n",
+    "CompressedVideo": "string frame_id\nuint8[] data\nstring format\n",
+}
+NUMBERS = "float64 value\n"
+
+
+def png(picture: np.ndarray) -> np.ndarray:
+    return cv2.imencode(".png", picture[..., ::-1])[1].reshape(-1)
+
+
+def packets(pictures: np.ndarray) -> list[bytes]:
+    """The pictures as H.264, a packet each."""
+    import av
+
+    encoder = av.CodecContext.create("libx264", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = pictures.shape[2], pictures.shape[1], "yuv420p"
+    encoder.options = LOW_DELAY
+    found = []
+    for i, picture in enumerate(pictures):
+        frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p")
+        frame.pts = i
+        found += encoder.encode(frame)
+    return [bytes(packet) for packet in found + encoder.encode(None)]
+
+
+def values(name: str, pictures: np.ndarray) -> list[dict[str, Any]]:
+    """The fields of each message but its time."""
+    if name == "RawImage":
+        height, width = pictures.shape[1:3]
+        about = {"width": width, "height": height, "encoding": "rgb8", "step": width * 3}
+        return [about | {"data": picture.reshape(-1)} for picture in pictures]
+    if name == "CompressedImage":
+        return [{"data": png(picture), "format": "png"} for picture in pictures]
+    return [{"data": np.frombuffer(data, np.uint8), "format": "h264"} for data in packets(pictures)]
+
+
+def ros_encoder(name: str, encoding: str) -> tuple[str, str, bytes, Callable[[int, dict[str, Any]], bytes]]:
+    """Type, schema encoding, schema and encoder of foxglove_msgs in ROS 1 or 2."""
+    one = encoding == "ros1"
+    store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
+    text = ("time timestamp\n" if one else "builtin_interfaces/Time timestamp\n") + FIELDS[name]
+    kind = f"foxglove_msgs/msg/{name}"
+    store.register(get_types_from_msg(text, kind))
+    write = store.serialize_ros1 if one else store.serialize_cdr
+
+    def encode(i: int, fields: dict[str, Any]) -> bytes:
+        stamp = store.types["builtin_interfaces/msg/Time"](sec=1 + i, nanosec=500)
+        return bytes(write(store.types[kind](timestamp=stamp, frame_id="cam", **fields), kind))
+
+    schema = text if one else store.generate_msgdef(kind, ros_version=2)[0]
+    return (
+        kind.replace("/msg/", "/") if one else kind,
+        f"ros{encoding[-1] if one else 2}msg",
+        schema.encode(),
+        encode,
+    )
+
+
+def protobuf_encoder(name: str) -> tuple[str, str, bytes, Callable[[int, dict[str, Any]], bytes]]:
+    """The same of foxglove's protobuf schemas."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+
+    files = descriptor_pb2.FileDescriptorSet()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(files.file.add())
+    own = files.file.add(name=f"foxglove/{name}.proto", package="foxglove", syntax="proto3")
+    own.dependency.append("google/protobuf/timestamp.proto")
+    kind = own.message_type.add(name=name)
+    stamp = ".google.protobuf.Timestamp"
+    kind.field.add(name="timestamp", number=1, type=11, label=1, type_name=stamp)
+    numbers = {"string": 9, "uint32": 7, "uint8[]": 12}
+    for i, line in enumerate(FIELDS[name].splitlines()):
+        field_type, field = line.split()
+        kind.field.add(name=field, number=i + 2, type=numbers[field_type], label=1)
+    pool = descriptor_pool.DescriptorPool()
+    for file in files.file:
+        pool.Add(file)
+    made = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
+
+    def encode(i: int, fields: dict[str, Any]) -> bytes:
+        message = made(**(fields | {"data": fields["data"].tobytes(), "frame_id": "cam"}))
+        message.timestamp.FromNanoseconds((1 + i) * 10**9 + 500)
+        return bytes(message.SerializeToString())
+
+    return f"foxglove.{name}", "protobuf", files.SerializeToString(), encode
+
+
+def write(path: Path, name: str, encoding: str, pictures: np.ndarray) -> Path:
+    """An MCAP file of those pictures as /video, a second apart, and of numbers as /n."""
+    made = protobuf_encoder(name) if encoding == "protobuf" else ros_encoder(name, encoding)
+    kind, schema_encoding, schema, encode = made
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=4096)
+        writer.start()
+        camera = writer.register_channel(
+            "/video", encoding, writer.register_schema(kind, schema_encoding, schema)
+        )
+        number = writer.register_channel("/n", "json", 0)
+        for i, fields in enumerate(values(name, pictures)):
+            writer.add_message(camera, (i + 1) * 10**9 + 900, encode(i, fields), i)
+            writer.add_message(number, (i + 1) * 10**9, b'{"value": 1}', i)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf"])
+@pytest.mark.parametrize("name", ["CompressedImage", "RawImage"])
+def test_foxglove_pictures_in_every_encoding(tmp_path: Path, name: str, encoding: str) -> None:
+    episode = read(write(tmp_path / "run.mcap", name, encoding, PICTURES), arm(VIDEO_YAML))
+    stream = episode.streams["cam"]
+    np.testing.assert_array_equal(stream.frames(range(6)), PICTURES)
+    np.testing.assert_allclose(stream.timestamps, np.arange(1, 7) + 500e-9, atol=1e-9)
+    assert episode.metadata["clocks"]["/video"] == "header"
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf"])
+def test_foxglove_video_in_every_encoding(tmp_path: Path, encoding: str) -> None:
+    y, x = np.mgrid[:64, :96]
+    pictures = np.stack([np.stack([x * 2, y * 3, np.full_like(x, 8 * i)], -1) for i in range(24)])
+    path = write(tmp_path / "run.mcap", "CompressedVideo", encoding, pictures.astype(np.uint8))
+    stream = read(path, arm(VIDEO_YAML)).streams["cam"]
+    for indices in ([0, 5], [23], [11, 4]):
+        assert np.abs(stream.frames(indices).astype(int) - pictures[indices]).mean() < 4, indices
+
+
+def test_big_endian_messages_are_read(tmp_path: Path) -> None:
+    recording = make_recording(4)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    how = as_cdr()
+    for topic, encoded in how.items():
+
+        def encode(item: Any, kind: str = encoded.type) -> bytes:
+            return bytes(store.serialize_cdr(ros_message(store, item), kind, little_endian=False))
+
+        how[topic] = encoded._replace(encode=encode)
+    episode = read(write_mcap(tmp_path / "run.mcap", recording, how), arm())
+    stream = episode.streams["front"]
+    np.testing.assert_array_equal(stream.frames(range(4)), recording.pictures)
+    np.testing.assert_allclose(stream.timestamps, recording.picture_ns / 1e9, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(episode.actions[0].values, recording.commands.astype(np.float32))
+
+
+def test_an_image_that_says_it_is_big_endian_has_the_same_bytes(tmp_path: Path) -> None:
+    recording, store = make_recording(3), get_typestore(Stores.ROS2_HUMBLE)
+    how = as_cdr()
+
+    def encode(item: Any) -> bytes:
+        message = ros_message(store, item)
+        message.is_bigendian = 1
+        return bytes(store.serialize_cdr(message, how_kind))
+
+    how_kind = how[CAMERA].type
+    how[CAMERA] = how[CAMERA]._replace(encode=encode)
+    stream = read(write_mcap(tmp_path / "run.mcap", recording, how), arm()).streams["front"]
+    np.testing.assert_array_equal(stream.frames(range(3)), recording.pictures)
+
+
+@pytest.mark.parametrize("left", [0.2, 0.5, 0.9])
+def test_a_bag_that_a_killed_recorder_left_is_refused_with_what_mends_it(tmp_path: Path, left: float) -> None:
+    """Its last chunk is cut off; of such a recording no episode is taken for whole."""
+    path = bag_parts.ros1_without_index(tmp_path, bag_parts.make_run(40, pause_after=(20,)))
+    data = path.read_bytes()
+    path.unlink()
+    active = tmp_path / "run.bag.active"
+    active.write_bytes(data[: int(len(data) * left) - 7])
+    robot = bag_parts.parted("{gap_s: 1}")
+    refs = open_source("rosbag").index(str(tmp_path), robot)
+    assert [(ref.id, ref.frames) for ref in refs] == [("run.bag", 0)]
+    with pytest.raises(EpisodeError, match=r"run\.bag\.active.*cut off.*rosbag reindex"):
+        SOURCE.read(str(tmp_path), "run.bag", robot)
+
+
+def test_inspect_doctor_and_eval_look_at_the_embodiments_episodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag_parts.mcap(tmp_path, bag_parts.make_run(60, pause_after=(20, 40)))
+    robot = bag_parts.parted("{gap_s: 1}")
+    where = tmp_path / "robot.yaml"
+    where.write_text(robot.to_yaml())
+    facts = inspect_recording(str(path), str(where))["embodiment"]
+    assert facts["first episode"].startswith("run/0000: 20 frames")
+    asked: list[str] = []
+    plain = type(SOURCE).read
+
+    def spy(self: Any, uri: str, name: str, embodiment: Any) -> Any:
+        asked.append(name)
+        return plain(self, uri, name, embodiment)
+
+    monkeypatch.setattr(type(SOURCE), "read", spy)
+    examine(str(path), str(where))
+    list(recording_frames(robot, str(path), _spec(), frames=2))
+    assert asked == ["run/0000", "run/0001", "run/0002"] * 2
+
+
+def _spec() -> TokenizerSpec:
+    from hma_data.tokenizers import get_tokenizer
+
+    return get_tokenizer("raw").spec

@@ -1,0 +1,287 @@
+"""Pictures of bags: raw encodings, compressed, video."""
+
+import json
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from hma_data.errors import EpisodeError
+from hma_data.sources.bags.images import VideoDecoder, picture
+from tests.data.bag_files import SOURCE, arm, read
+from tests.data.sources.common.test_video_kinds import make
+
+
+def image(encoding: str, data: np.ndarray, width: int, height: int, step: int) -> dict[str, Any]:
+    flat = np.frombuffer(data.tobytes(), np.uint8)
+    return {"encoding": encoding, "width": width, "height": height, "step": step, "data": flat}
+
+
+def smooth(height: int = 16, width: int = 24) -> np.ndarray:
+    y, x = np.mgrid[:height, :width]
+    return np.stack([x * 8, y * 12, 255 - x * 5 - y * 4], -1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+def test_raw_encodings_become_rgb(padding: int) -> None:
+    rgb = smooth()
+    height, width = rgb.shape[:2]
+    alpha = np.full((height, width, 1), 7, np.uint8)
+    for encoding, pixels in {
+        "rgb8": rgb,
+        "bgr8": rgb[..., ::-1],
+        "rgba8": np.concatenate([rgb, alpha], -1),
+        "bgra8": np.concatenate([rgb[..., ::-1], alpha], -1),
+    }.items():
+        rows = pixels.reshape(height, -1)
+        rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=99)
+        found = picture(image(encoding, rows, width, height, rows.shape[1]), "raw", "")
+        np.testing.assert_array_equal(found, rgb, err_msg=encoding)
+    grey = picture(image("mono8", rgb[..., 0], width, height, width), "raw", "")
+    np.testing.assert_array_equal(grey, np.repeat(rgb[..., :1], 3, -1))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "corners"), [("rggb", "RGGB"), ("bggr", "BGGR"), ("gbrg", "GBRG"), ("grbg", "GRBG")]
+)
+def test_bayer_patterns_keep_the_colours_in_place(encoding: str, corners: str) -> None:
+    rgb = smooth()
+    mosaic = np.zeros(rgb.shape[:2], np.uint8)
+    for i, colour in enumerate(corners):
+        mosaic[i // 2 :: 2, i % 2 :: 2] = rgb[i // 2 :: 2, i % 2 :: 2, "RGB".index(colour)]
+    found = picture(image(f"bayer_{encoding}8", mosaic, 24, 16, 24), "raw", "")
+    assert np.abs(found[2:-2, 2:-2].astype(int) - rgb[2:-2, 2:-2]).max() <= 6
+
+
+@pytest.mark.parametrize(("encoding", "luma"), [("yuv422", 1), ("yuv422_yuy2", 0)])
+def test_yuv_is_the_inverse_of_the_standard_conversion(encoding: str, luma: int) -> None:
+    """Rec. 601, studio range: grey of luma 126 is 128; a red sample is red."""
+    packed = np.zeros((2, 4, 2), np.uint8)
+    packed[..., luma], packed[..., 1 - luma] = 126, 128
+    grey = picture(image(encoding, packed, 4, 2, 8), "raw", "")
+    np.testing.assert_allclose(grey, 128, atol=1)
+    packed[..., luma], packed[:, ::2, 1 - luma], packed[:, 1::2, 1 - luma] = 81, 90, 240
+    np.testing.assert_allclose(
+        picture(image(encoding, packed, 4, 2, 8), "raw", "")[0, 0], [254, 0, 0], atol=2
+    )
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "mono16", "rgb16", ""])
+def test_what_is_no_8_bit_colour_is_refused(encoding: str) -> None:
+    with pytest.raises(EpisodeError, match=r"not 8-bit colour.*rgb8"):
+        picture(image(encoding, np.zeros(32, np.uint8), 4, 4, 8), "raw", "depth")
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"data": np.zeros(5, np.uint8)},
+        {"width": 10**6, "height": 10**6},
+        {"step": 3},
+        {"height": 0},
+        {"width": -4},
+        {"width": None},
+    ],
+)
+def test_a_raw_picture_that_does_not_fit_is_refused(broken: dict[str, Any]) -> None:
+    message = image("rgb8", np.zeros(48, np.uint8), 4, 4, 12) | broken
+    with pytest.raises(EpisodeError):
+        picture(message, "raw", "camera")
+
+
+def test_compressed_depth_is_refused_and_jpeg_is_decoded() -> None:
+    jpeg = cv2.imencode(".jpg", smooth())[1]
+    found = picture({"format": "rgb8; jpeg compressed bgr8", "data": jpeg.reshape(-1)}, "still", "")
+    np.testing.assert_array_equal(found, cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1])
+    with pytest.raises(EpisodeError, match="depth"):
+        picture({"format": "16UC1; compressedDepth png", "data": jpeg.reshape(-1)}, "still", "")
+    for data in (b"no picture", "n@t base64", 5):
+        with pytest.raises(EpisodeError):
+            picture({"format": "jpeg", "data": data}, "still", "")
+
+
+def write_video(path: Path, codec: str, name: str, options: dict[str, str], drop: int = 0) -> np.ndarray:
+    """An MCAP of CompressedVideo, one frame a message; the pictures that went in."""
+    import base64
+
+    import av
+    from mcap.writer import Writer
+
+    y, x = np.mgrid[:64, :96]
+    pictures = np.stack([np.stack([x * 2, y * 3, np.full_like(x, 8 * i)], -1) for i in range(30)]).astype(
+        np.uint8
+    )
+    encoder = av.CodecContext.create(codec, "w")
+    encoder.width, encoder.height, encoder.pix_fmt = 96, 64, "yuv420p"
+    encoder.time_base = Fraction(1, 30)
+    encoder.options = options
+    packets = []
+    for i, pixels in enumerate(pictures):
+        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p")
+        frame.pts = i
+        packets += encoder.encode(frame)
+    packets += encoder.encode(None)
+    assert len(packets) == 30
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=4096)
+        writer.start()
+        schema = writer.register_schema("foxglove.CompressedVideo", "jsonschema", b"{}")
+        channel = writer.register_channel("/video", "json", schema)
+        number = writer.register_channel("/n", "json", 0)
+        for i, packet in list(enumerate(packets))[drop:]:
+            text = {
+                "timestamp": {"sec": 1 + i, "nsec": 0},
+                "format": name,
+                "data": base64.b64encode(bytes(packet)).decode(),
+            }
+            writer.add_message(channel, i + 1, json.dumps(text).encode(), i)
+            writer.add_message(number, i + 1, b'{"value": 1}', i)
+        writer.finish()
+    return pictures
+
+
+VIDEO_YAML = """
+id: video
+kind: real
+frequency_hz: 30
+action: {space: mixed, components: [{key: /n.value, dims: 1}]}
+cameras: [{name: cam, key: /video}]
+source: {format: rosbag}
+"""
+LOW_DELAY = {"preset": "ultrafast", "tune": "zerolatency", "g": "10", "crf": "10"}
+
+
+@pytest.mark.parametrize(("codec", "name"), [("libx264", "h264"), ("libx265", "h265")])
+def test_video_gives_the_asked_frames_in_any_order(tmp_path: Path, codec: str, name: str) -> None:
+    options = LOW_DELAY | ({"x265-params": "log-level=none:keyint=10:bframes=0"} if name == "h265" else {})
+    pictures = write_video(tmp_path / "v.mcap", codec, name, options)
+    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
+    for indices in ([0, 1, 2], [3, 7, 7], [25, 29], [12], [5, 4], [11, 28]):
+        found = stream.frames(indices).astype(int)
+        assert np.abs(found - pictures[indices]).mean() < 4, indices
+
+
+def test_video_begins_at_its_first_key_frame(tmp_path: Path) -> None:
+    pictures = write_video(tmp_path / "v.mcap", "libx264", "h264", LOW_DELAY, drop=4)
+    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
+    assert stream.timestamps[0] == 11
+    assert np.abs(stream.frames([0]).astype(int) - pictures[10]).mean() < 4
+
+
+def test_unknown_video_is_refused(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.mcap", "libx264", "mjpeg2000", LOW_DELAY)
+    with pytest.raises(EpisodeError, match=r"'mjpeg2000' cannot be read.*h264"):
+        read(tmp_path / "v.mcap", arm(VIDEO_YAML))
+
+
+@pytest.mark.parametrize("padding", [0, 4])
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+def test_semi_planar_yuv_is_converted_plane_by_plane(encoding: str, padding: int) -> None:
+    """Rec. 601, studio range: luma 81 with U 90 and V 240 is red."""
+    luma, colours = np.full((4, 6), 81, np.uint8), np.zeros((2, 6), np.uint8)
+    first, second = (90, 240) if encoding == "nv12" else (240, 90)
+    colours[:, ::2], colours[:, 1::2] = first, second
+    rows = np.pad(np.concatenate([luma, colours]), ((0, 0), (0, padding)))
+    found = picture(image(encoding, rows, 6, 4, 6 + padding), "raw", "")
+    np.testing.assert_allclose(found, np.broadcast_to([254, 0, 0], (4, 6, 3)), atol=2)
+    with pytest.raises(EpisodeError, match="has 20 bytes"):
+        picture(image(encoding, np.zeros(20, np.uint8), 4, 4, 4), "raw", "")
+
+
+def test_opencvs_names_of_encodings_are_blue_first() -> None:
+    rgb = smooth()
+    found = picture(image("8UC3", np.ascontiguousarray(rgb[..., ::-1]), 24, 16, 72), "raw", "")
+    np.testing.assert_array_equal(found, rgb)
+    four = np.concatenate([rgb[..., ::-1], np.full((16, 24, 1), 9, np.uint8)], -1)
+    np.testing.assert_array_equal(picture(image("8UC4", four, 24, 16, 96), "raw", ""), rgb)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    ["jpeg", "rgb8; jpeg compressed bgr8", "bgr8; jpeg compressed ", "png", "bgr8; png compressed bgr8", ""],
+)
+def test_compressed_pictures_are_told_by_their_bytes(stated: str) -> None:
+    encoded = cv2.imencode(".png" if "png" in stated else ".jpg", smooth()[..., ::-1])[1]
+    found = picture({"format": stated, "data": encoded.reshape(-1)}, "still", "")
+    assert np.abs(found.astype(int) - smooth()).mean() < 6
+
+
+VP9 = {"g": "10", "lag-in-frames": "0", "deadline": "realtime", "cpu-used": "8", "auto-alt-ref": "0"}
+AV1 = {"g": "10", "preset": "12", "svtav1-params": "pred-struct=1:lookahead=0"}
+
+
+@pytest.mark.parametrize(
+    ("codec", "name", "options"),
+    [("libx264", "h264", LOW_DELAY), ("libvpx-vp9", "vp9", VP9), ("libsvtav1", "av1", AV1)],
+)
+def test_key_frames_of_every_codec_are_told(
+    tmp_path: Path, codec: str, name: str, options: dict[str, str]
+) -> None:
+    from hma_data.sources.bags.bag import Bag
+    from hma_data.sources.bags.container import RecordFilter
+    from hma_data.sources.bags.images import is_keyframe, payload
+    from hma_data.sources.bags.messages import decode
+
+    pictures = write_video(tmp_path / "v.mcap", codec, name, options)
+    records = Bag(tmp_path / "v.mcap").records(RecordFilter(frozenset({"/video"})))
+    told = [is_keyframe(payload(decode(record.channel, record.data, "")), name) for _, record in records]
+    assert [i for i, begins in enumerate(told) if begins][:2] == [0, 10]
+    stream = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"]
+    for indices in ([3], [25, 12], [29]):
+        assert np.abs(stream.frames(indices).astype(int) - pictures[indices]).mean() < 12
+
+
+@pytest.mark.parametrize(
+    ("codec", "name", "options"), [("libx264", "h264", LOW_DELAY), ("libvpx-vp9", "vp9", VP9)]
+)
+def test_an_episode_that_begins_between_key_frames_is_decoded_from_the_one_before(
+    tmp_path: Path, codec: str, name: str, options: dict[str, str]
+) -> None:
+    write_video(tmp_path / "v.mcap", codec, name, options)
+    whole = read(tmp_path / "v.mcap", arm(VIDEO_YAML)).streams["cam"].frames(range(30))
+    parted = arm(VIDEO_YAML, **{"format: rosbag": "format: rosbag, segments: {gap_s: 0.5}"})
+    refs = SOURCE.index(str(tmp_path / "v.mcap"), parted)
+    assert [ref.frames for ref in refs] == [1] * 30  # a picture a second
+    for i in (0, 7, 10, 23):
+        found = SOURCE.read(str(tmp_path / "v.mcap"), refs[i].id, parted).streams["cam"]
+        assert found.timestamps.tolist() == [1 + i]
+        np.testing.assert_array_equal(found.frames([0])[0], whole[i])
+
+
+def test_frames_made_from_a_damaged_message_are_refused_up_to_the_next_keyframe(tmp_path: Path) -> None:
+    made, group, hit = make(tmp_path / "v.h264", "libx264", {"crf": "4", "bf": "0"}, gop=13), 13, 6
+    with av.open(str(made)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    keyframes = np.arange(len(packets)) % group == 0
+    spoilt = bytearray(packets[hit])
+    spoilt[12:] = np.random.default_rng(0).integers(0, 256, len(spoilt) - 12, np.uint8).tobytes()
+    damaged = [*packets[:hit], bytes(spoilt), *packets[hit + 1 :]]
+
+    def decoder(messages: list[bytes]) -> VideoDecoder:
+        return VideoDecoder("h264", keyframes, lambda start: iter(messages[start:]), "v.mcap /video")
+
+    whole = decoder(packets).frames(range(len(packets)))
+    going_on = decoder(damaged)
+    for i in range(len(packets)):
+        for asked in (going_on, decoder(damaged)):
+            if hit <= i < group:
+                with pytest.raises(EpisodeError, match=f"frame {i} of the video is damaged"):
+                    asked.frames([i])
+            else:
+                np.testing.assert_array_equal(asked.frames([i])[i], whole[i])
+
+
+@pytest.mark.parametrize(
+    ("stated", "codec"),
+    [("libx264", "h264"), ("h264_nvenc", "h264"), ("hevc_vaapi", "h265"), ("h264;yuv420p;bgr8;bgr8", "h264"),
+     ("libsvtav1", "av1"), ("mpeg4", "mpeg4")],
+)  # fmt: skip
+def test_the_codec_of_an_ffmpeg_packet_is_that_of_its_encoder(stated: str, codec: str) -> None:
+    from hma_data.sources.bags.images import picture_kind, video_codec
+
+    assert picture_kind("ffmpeg_image_transport_msgs/msg/FFMPEGPacket") == "video"
+    assert video_codec({"encoding": stated, "data": b""}) == codec

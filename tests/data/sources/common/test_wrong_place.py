@@ -1,0 +1,140 @@
+"""A recording that is not what the YAML or the command says: the error tells what it is, and what to do."""
+
+from pathlib import Path
+
+import h5py
+import pytest
+from typer.testing import CliRunner
+
+from hma_data.conversion.job import convert
+from hma_data.errors import HMAError, OutputError, SourceError, StorageError, UsageError
+from hma_data.inspection.inspect import examine, inspect_recording
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.base import detect, of_another_format, open_source
+from hma_model.cli import app
+from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.data.bag_files import make_recording, write_ros2
+from tests.data.sources.rlds.test_rlds import embodiment as rlds_robot
+from tests.data.sources.rlds.test_rlds import toy
+from tests.data.videos import make_v3
+
+
+def converted(robot: Embodiment, source: str, out: Path) -> str:
+    with pytest.raises(HMAError) as refused:
+        convert(robot, source, BlockTokenizer(), out)
+    assert not out.exists() or not list(out.iterdir())
+    return str(refused.value)
+
+
+def test_another_format_than_the_yaml_says_is_named(toy_arm: Embodiment, tmp_path: Path) -> None:
+    toy(tmp_path / "rlds")
+    write_toy(tmp_path / "toy.hdf5", [3])
+    make_v3(tmp_path / "lerobot", (3,))
+    said = "it looks like {}, source.format in the YAML says {}"
+    for robot, name, other in (
+        (toy_arm, "rlds", "rlds"),
+        (toy_arm, "lerobot", "lerobot"),
+        (rlds_robot(), "toy.hdf5", "hdf5"),
+    ):
+        expected = said.format(other, robot.source.format)
+        assert converted(robot, str(tmp_path / name), tmp_path / "out").endswith(expected)
+    (tmp_path / "arm.yaml").write_text(ARM_YAML)
+    (found,) = examine(str(tmp_path / "lerobot"), str(tmp_path / "arm.yaml"))
+    assert found.check == "readable" and said.format("lerobot", "hdf5") in found.message
+    with pytest.raises(SourceError, match=said.format("lerobot", "hdf5")):
+        inspect_recording(str(tmp_path / "lerobot"), str(tmp_path / "arm.yaml"))
+
+
+@pytest.mark.parametrize("uri", ["no/such", "hf://datasets/team/set", "s3://bucket/toy"])
+def test_of_a_place_that_is_not_here_no_format_is_guessed(uri: str) -> None:
+    fault = SourceError(uri, "does not exist", "check it")
+    assert of_another_format(uri, "hdf5", fault) is fault
+
+
+@pytest.mark.parametrize(("uri", "name"), [("s3://bucket/a.hdf5", "hdf5"), ("https://host/b.mcap", "rosbag")])
+def test_what_is_read_from_files_alone_says_so_of_a_store(uri: str, name: str) -> None:
+    assert detect(uri) == name
+    with pytest.raises(SourceError, match=f"^{uri}: is not on this machine — copy it here"):
+        open_source(name).index(uri)
+
+
+def test_an_empty_path_is_told_and_the_yamls_is_not_taken_for_it(toy_arm: Embodiment, tmp_path: Path) -> None:
+    robot = toy_arm.model_copy(update={"source": toy_arm.source.model_copy(update={"uri": "elsewhere"})})
+    with pytest.raises(UsageError, match="--source: is empty"):
+        convert(robot, "", BlockTokenizer(), tmp_path / "out")
+    with pytest.raises(SourceError, match="the recording's path is empty"):
+        detect("")
+
+
+def test_the_same_fault_of_many_episodes_is_told_once(tmp_path: Path) -> None:
+    folder = make_v3(tmp_path / "set", (3, 4, 5))
+    data = next((folder / "data").rglob("*.parquet"))
+    data.write_bytes(b"")
+    found = [one for one in open_source("lerobot").inspect(str(folder)).findings if one.check == "readable"]
+    assert len(found) == 1 and found[0].message.endswith("(and 2 more episodes)")
+    assert str(data) in found[0].message
+
+
+def test_doctor_names_an_episode_it_could_not_use_and_the_keys_there_are(tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [60, 60])
+    (tmp_path / "arm.yaml").write_text(ARM_YAML.replace("key: obs/image", "key: obs/nothing"))
+    (first, *_) = examine(str(tmp_path / "toy.hdf5"), str(tmp_path / "arm.yaml"))
+    assert first.message.startswith("2 of 2 episodes looked at, such as demo_0: has no 'obs/nothing'")
+    toy(tmp_path / "rlds")
+    changed = rlds_robot(cameras=[{"name": "primary", "key": "observation/none"}])
+    (tmp_path / "rlds.yaml").write_text(changed.to_yaml())
+    (first, *_) = examine(str(tmp_path / "rlds"), str(tmp_path / "rlds.yaml"))
+    assert first.check == "usable" and "observation/image" in first.remedy
+
+
+def test_a_bag_folder_without_its_files_is_known_as_one(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "run", make_recording(), "SQLITE3")
+    assert detect(str(folder / "metadata.yaml")) == "rosbag"
+    with pytest.raises(SourceError, match=f"only describes a bag — give the bag's folder, {folder}$"):
+        inspect_recording(str(folder / "metadata.yaml"))
+    next(folder.glob("*.db3")).unlink()
+    with pytest.raises(SourceError, match="metadata.yaml: names run.db3, which is not in the folder"):
+        inspect_recording(str(folder))
+
+
+def test_a_reason_of_one_episode_alone_names_it(toy_arm: Embodiment, tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [5, 6, 7, 8])
+    with h5py.File(tmp_path / "toy.hdf5", "a") as file:
+        del file["data/demo_1/obs"]
+        for i in (2, 3):
+            del file[f"data/demo_{i}/actions"]
+    summary = convert(toy_arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "out")
+    (one, count), (many, counts) = sorted(summary.reasons.items(), key=lambda item: item[1])
+    assert (count, counts) == (1, 2)
+    assert "data/demo_1: has no 'obs/image'" in one and "data/<episode>: has no 'actions'" in many
+
+
+@pytest.mark.parametrize("out", ["s3://", "s3:", "hf://", "gs:///"])
+def test_a_store_without_a_bucket_is_no_folder_of_this_machine(
+    out: str, toy_arm: Embodiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_toy(tmp_path / "toy.hdf5", [5])
+    with pytest.raises(StorageError, match="names no bucket"):
+        convert(toy_arm, "toy.hdf5", BlockTokenizer(), Path(out))
+    assert [item.name for item in tmp_path.iterdir()] == ["toy.hdf5"]
+
+
+def test_an_out_that_cannot_be_named_is_one_clear_error(toy_arm: Embodiment, tmp_path: Path) -> None:
+    write_toy(tmp_path / "toy.hdf5", [5])
+    with pytest.raises(OutputError, match="cannot be written: File name too long — choose another --out"):
+        convert(toy_arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / ("n" * 300))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--frequency-hz", "0"], "--frequency-hz: is 0.0: input should be greater than 0"),
+        (["--frequency-hz", "nan"], "--frequency-hz: is nan"),
+        (["--frequency-hz", "inf"], "--frequency-hz: is inf"),
+        (["--extend", "--overwrite"], "give one of them"),
+    ],
+)
+def test_options_that_cannot_be_meant_are_wrong_usage(options: list[str], said: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["convert", "-e", "x", "--out", str(tmp_path / "out"), *options])
+    assert isinstance(result.exception, UsageError) and said in str(result.exception)

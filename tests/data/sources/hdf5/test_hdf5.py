@@ -1,0 +1,516 @@
+"""HDF5 recordings against h5py itself, in the layouts that are met, whole and damaged."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hma_data.episodes.align import to_clip
+from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.base import detect, open_source
+from hma_data.sources.hdf5 import file as hdf5_file
+from hma_data.sources.hdf5.file import OPEN_FILES, rows
+from tests.data.fresh import run_fresh
+from tests.data.hdf5_files import H, T, W, embodiment, fill
+from tests.data.hub_cache import as_snapshot
+
+
+@pytest.fixture
+def demos(tmp_path: Path) -> Path:
+    """Twelve demos, two of them in the mask `valid`."""
+    path = tmp_path / "demos.hdf5"
+    with h5py.File(path, "w") as file:
+        for i in range(12):
+            fill(file.create_group(f"data/demo_{i}"), T + i, i)
+        names = [f"demo_{i}".encode() for i in range(12)]
+        file["mask/train"], file["mask/valid"] = names[:10], names[10:]
+        file["mask/few"] = names[:2]
+        arguments = {"env_name": "Lift", "env_kwargs": {"control_freq": 20, "robots": ["Panda"]}}
+        file["data"].attrs["env_args"] = json.dumps(arguments)
+    return path
+
+
+# -- layouts
+
+
+def test_values_and_pictures_equal_h5py(demos: Path) -> None:
+    episode = open_source("hdf5").read(str(demos), "demo_7", embodiment())
+    with h5py.File(demos) as file:
+        np.testing.assert_array_equal(
+            episode.actions[0].values, file["data/demo_7/actions"][()].astype(np.float32)
+        )
+        stored = file["data/demo_7/obs/agentview_image"][()]
+    stream = episode.streams["front"]
+    np.testing.assert_array_equal(stream.frames(range(len(stored))), stored)
+    np.testing.assert_array_equal(stream.frames([9, 2, 2, 15]), stored[[9, 2, 2, 15]])
+    np.testing.assert_allclose(stream.timestamps, np.arange(16) / 20)
+
+
+def test_demos_are_in_natural_order(demos: Path) -> None:
+    assert open_source("hdf5").episode_ids(str(demos)) == [f"demo_{i}" for i in range(12)]
+
+
+def test_masks_are_the_splits(demos: Path) -> None:
+    refs = open_source("hdf5").index(str(demos), embodiment())
+    assert [ref.split for ref in refs] == ["train"] * 10 + ["val"] * 2
+    assert [ref.frames for ref in refs] == [T + i for i in range(12)]
+
+
+def test_without_both_masks_there_is_no_split(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        del file["mask/valid"]
+    assert {ref.split for ref in open_source("hdf5").index(str(demos))} == {None}
+
+
+def test_a_named_mask_chooses_the_episodes(demos: Path) -> None:
+    refs = open_source("hdf5").index(str(demos), embodiment(source__split="few"))
+    assert [(ref.id, ref.split) for ref in refs] == [("demo_0", None), ("demo_1", None)]
+    with pytest.raises(SourceError, match=r"no mask 'rest'.*few, train, valid"):
+        open_source("hdf5").index(str(demos), embodiment(source__split="rest"))
+
+
+def test_a_folder_names_episodes_by_file(demos: Path, tmp_path: Path) -> None:
+    (tmp_path / "b").mkdir()
+    with h5py.File(tmp_path / "b" / "run 2.h5", "w") as file:
+        fill(file.create_group("data/demo_0"))
+    source = open_source("hdf5")
+    ids = [ref.id for ref in source.index(str(tmp_path))]
+    assert ids[0] == "b/run_2/demo_0"
+    assert ids[1:] == [f"demos/demo_{i}" for i in range(12)]
+    for episode_id in ids:
+        assert source.read(str(tmp_path), episode_id, embodiment()).id == episode_id
+
+
+def test_libero_says_what_was_asked(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        said = {"problem_name": "x", "language_instruction": '"pick up the bowl"'}
+        file["data"].attrs["problem_info"] = json.dumps(said)
+        file["data/demo_1"].attrs["language_instruction"] = "pick up the cup"
+    source = open_source("hdf5")
+    assert source.read(str(demos), "demo_0", embodiment()).instruction == "pick up the bowl"
+    assert source.read(str(demos), "demo_1", embodiment()).instruction == "pick up the cup"
+
+
+def test_the_instruction_is_where_the_yaml_says(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        file["data/demo_0/goal"] = "stack"
+    arm = embodiment(source__instruction="goal")
+    assert open_source("hdf5").read(str(demos), "demo_0", arm).instruction == "stack"
+    with pytest.raises(EpisodeError, match="has no 'goal'"):
+        open_source("hdf5").read(str(demos), "demo_1", arm)
+
+
+def test_success_is_the_last_reward_then_the_last_done(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        file["data/demo_1/rewards"][-1] = 1
+        del file["data/demo_2/rewards"]
+        del file["data/demo_3/rewards"], file["data/demo_3/dones"]
+    read = open_source("hdf5").read
+    found = [read(str(demos), f"demo_{i}", embodiment()).success for i in range(4)]
+    assert found == [False, True, True, None]
+
+
+@pytest.fixture(params=["raw", "padded", "vlen"])
+def aloha(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """Two ACT episodes, one a file; pictures raw, as padded rows of JPEG, or as JPEGs of their own length."""
+    for i in range(2):
+        with h5py.File(tmp_path / f"episode_{i}.hdf5", "w") as file:
+            file["action"] = np.full((T, 14), i, np.float32)
+            file["observations/qpos"] = np.full((T, 14), -i, np.float64)
+            frames = np.repeat(np.arange(T, dtype=np.uint8) * 20, H * W * 3).reshape(T, H, W, 3)
+            jpegs = [cv2.imencode(".jpg", frame)[1].reshape(-1) for frame in frames]
+            key = "observations/images/top"
+            if request.param == "raw":
+                file[key] = frames
+            elif request.param == "padded":
+                longest = max(map(len, jpegs)) + 30
+                file[key] = np.stack([np.pad(jpeg, (0, longest - len(jpeg))) for jpeg in jpegs])
+            else:
+                stored = file.create_dataset(key, (T,), h5py.vlen_dtype(np.uint8))
+                for row, jpeg in enumerate(jpegs):
+                    stored[row] = jpeg
+    return tmp_path
+
+
+def aloha_arm(**changes: Any) -> Embodiment:
+    return embodiment(
+        frequency_hz=50,
+        action={"space": "joint_position", "components": [{"key": "/action", "dims": 14}]},
+        state={"components": [{"key": "/observations/qpos", "dims": 14}]},
+        cameras=[{"name": "top", "key": "/observations/images/top"}],
+        **changes,
+    )
+
+
+def test_aloha_is_one_file_an_episode(aloha: Path) -> None:
+    source = open_source("hdf5")
+    assert source.episode_ids(str(aloha)) == ["episode_0", "episode_1"]
+    clip = to_clip(source.read(str(aloha), "episode_1", aloha_arm()), aloha_arm())
+    assert clip.actions.shape == (T, 14) and clip.actions[0, 0] == 1
+    assert clip.states is not None and clip.states[0, 0] == -1
+    shown = clip.episode.streams["top"].frames([0, 3, 8])
+    assert np.abs(shown.astype(int).mean(axis=(1, 2, 3)) - [0, 60, 160]).max() < 3
+
+
+def test_one_aloha_file_is_a_recording(aloha: Path) -> None:
+    uri = str(aloha / "episode_1.hdf5")
+    assert open_source("hdf5").episode_ids(uri) == ["episode_1"]
+    assert open_source("hdf5").read(uri, "episode_1", aloha_arm()).actions[0].values[0, 0] == 1
+
+
+def test_a_layout_names_groups_and_times(tmp_path: Path) -> None:
+    path = tmp_path / "lab.h5"
+    with h5py.File(path, "w") as file:
+        for day in ("mon", "tue"):
+            for run in (10, 9):
+                fill(file.create_group(f"{day}/runs/{run}"), seed=run)
+                file[f"{day}/runs/{run}/clock"] = np.arange(T) * 0.3 + 100
+    layout = {"episodes": "*/runs/*", "timestamps": "clock"}
+    arm = embodiment(source__layout=layout, frequency_hz=None)
+    source = open_source("hdf5")
+    ids = [ref.id for ref in source.index(str(path), arm)]
+    assert ids == ["mon/runs/9", "mon/runs/10", "tue/runs/9", "tue/runs/10"]
+    np.testing.assert_allclose(
+        source.read(str(path), ids[1], arm).streams["front"].timestamps, 100 + np.arange(T) * 0.3
+    )
+
+
+def test_without_rate_and_times_reading_says_what_to_set(demos: Path) -> None:
+    with pytest.raises(SourceError, match=r"layout\.timestamps"):
+        open_source("hdf5").read(str(demos), "demo_0", embodiment(frequency_hz=None))
+
+
+def test_an_unknown_rate_can_still_be_looked_at(demos: Path) -> None:
+    episode = open_source("hdf5").read(str(demos), "demo_0", embodiment(frequency_hz="unknown"))
+    assert len(episode.streams["front"].timestamps) == T
+
+
+def test_a_layout_key_of_another_format_is_refused(demos: Path) -> None:
+    with pytest.raises(SourceError, match=r"source\.layout\.episode is not known.*episodes, timestamps"):
+        open_source("hdf5").index(str(demos), embodiment(source__layout={"episode": "data/*"}))
+
+
+@pytest.mark.parametrize("shape", [(T, H, W), (T, H, W, 1), (T, H, W, 4), (T, 3, H, W)])
+def test_pictures_of_other_shapes_become_rgb(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    stored = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        fill(file.create_group("data/demo_0"))
+        del file["data/demo_0/obs/agentview_image"]
+        file["data/demo_0/obs/agentview_image"] = stored
+    arm = embodiment()
+    shown = open_source("hdf5").read(str(tmp_path), "a/demo_0", arm).streams["front"].frames([4])[0]
+    last = stored[4].transpose(1, 2, 0) if shape[1] == 3 else stored[4].reshape(H, W, -1)
+    expected = np.repeat(last, 3, axis=2) if last.shape[2] == 1 else last[..., :3]
+    np.testing.assert_array_equal(shown, expected)
+
+
+# -- reading
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    indices=st.lists(st.integers(0, 49), max_size=12),
+    chunk=st.sampled_from([None, 1, 7, 50]),
+)
+def test_rows_are_those_asked_for(indices: list[int], chunk: int | None) -> None:
+    values = np.arange(100).reshape(50, 2)
+    with h5py.File("rows", "w", driver="core", backing_store=False) as file:
+        stored = file.create_dataset("x", data=values, chunks=chunk and (chunk, 2))
+        np.testing.assert_array_equal(rows(stored, indices), values[indices])
+
+
+def test_only_the_chunks_of_the_frames_asked_for_are_read(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        stored = file["data/demo_9/obs/agentview_image"]
+        stored.id.write_direct_chunk((12, 0, 0, 0), b"not gzip")
+    frames = open_source("hdf5").read(str(demos), "demo_9", embodiment()).streams["front"].frames
+    frames([0, 5, 11])
+    with pytest.raises(EpisodeError, match=r"demo_9: cannot be read as HDF5"):
+        frames([13])
+
+
+FORKING = """
+import os, sys
+import numpy as np
+from hma_data.sources.base import open_source
+from tests.data.sources.hdf5.test_hdf5 import embodiment
+
+stream = open_source("hdf5").read(sys.argv[1], "demo_3", embodiment()).streams["front"]
+first = stream.frames([1])
+child = os.fork()
+if child == 0:
+    os._exit(0 if np.array_equal(stream.frames([1]), first) else 1)
+assert np.array_equal(stream.frames([1]), first)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+"""
+
+
+def test_a_forked_child_reads_what_its_parent_opened(demos: Path) -> None:
+    run_fresh(FORKING, demos)
+
+
+@pytest.mark.parametrize("locking", [None, False])
+def test_a_file_held_open_by_another_with_or_without_locks_is_read(demos: Path, locking: bool | None) -> None:
+    with h5py.File(demos, locking=locking) as other:
+        assert len(open_source("hdf5").index(str(demos))) == len(other["data"])
+
+
+def test_a_file_that_changed_is_read_anew(demos: Path) -> None:
+    source = open_source("hdf5")
+    assert len(source.index(str(demos))) == 12
+    with h5py.File(demos.with_name("new.hdf5"), "w") as file:
+        fill(file.create_group("data/demo_0"))
+    demos.with_name("new.hdf5").replace(demos)
+    assert len(source.index(str(demos))) == 1
+
+
+def test_the_fingerprint_follows_the_bytes(demos: Path) -> None:
+    before = open_source("hdf5").index(str(demos))
+    os.utime(demos, (1, 1))
+    assert open_source("hdf5").index(str(demos)) == before
+    assert len({ref.fingerprint for ref in before}) == 12
+    with h5py.File(demos, "a") as file:
+        file["more"] = np.arange(1000)
+    assert open_source("hdf5").index(str(demos))[0].fingerprint != before[0].fingerprint
+
+
+# -- what is refused
+
+
+def refused(path: Path, episode_id: str = "demo_0", **changes: Any) -> str:
+    """The one line of the EpisodeError."""
+    with pytest.raises(EpisodeError) as found:
+        to_clip(open_source("hdf5").read(str(path), episode_id, embodiment(**changes)), embodiment(**changes))
+    assert "\n" not in str(found.value)
+    return str(found.value)
+
+
+def test_a_missing_key_names_the_nearest(demos: Path) -> None:
+    line = refused(demos, cameras=[{"name": "front", "key": "obs/agentview_rgb"}])
+    assert "has no 'obs/agentview_rgb'" in line and "did you mean obs/agentview_image" in line
+    assert f"{demos}:data/demo_0" in line
+
+
+def test_a_wrong_width_is_told_with_both_numbers(demos: Path) -> None:
+    wide = {"space": "mixed", "components": [{"key": "actions", "dims": 7}]}
+    assert "actions has 3 values, the embodiment says 7" in refused(demos, action=wide)
+
+
+def test_streams_of_different_length_are_refused(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        file["data/demo_0/short"] = np.zeros((T - 1, 2))
+    both = [{"key": "actions", "dims": 3}, {"key": "short", "dims": 2}]
+    line = refused(demos, action={"space": "mixed", "components": both})
+    assert "differ in length: actions 9, short 8" in line
+    assert "differ in length" in refused(demos, state={"components": [{"key": "short", "dims": 2}]})
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (np.zeros((0, 3)), "is empty"),
+        (3.0, "is a single value"),
+        (np.full((T, 3), np.nan), "not finite"),
+        (np.array([b"a"] * T), "not numbers"),
+    ],
+)
+def test_actions_that_are_none_are_refused(demos: Path, value: Any, said: str) -> None:
+    with h5py.File(demos, "a") as file:
+        del file["data/demo_0/actions"]
+        file["data/demo_0/actions"] = value
+    assert said in refused(demos)
+
+
+def test_depth_is_not_a_colour_camera(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        file["data/demo_0/obs/depth"] = np.zeros((T, H, W, 1), np.float32)
+    line = refused(demos, cameras=[{"name": "front", "key": "obs/depth"}])
+    assert "float32, not colour pictures" in line
+
+
+def test_a_group_is_not_a_dataset(demos: Path) -> None:
+    line = refused(demos, cameras=[{"name": "front", "key": "obs"}])
+    assert "'obs' is a group" in line and "obs/agentview_image" in line
+
+
+def test_values_kept_in_other_files_are_refused(demos: Path, tmp_path: Path) -> None:
+    secret = tmp_path / "secret.h5"
+    with h5py.File(secret, "w") as file:
+        file["actions"] = np.zeros((T, 3))
+    with h5py.File(demos, "a") as file:
+        for i in range(3):
+            del file[f"data/demo_{i}/actions"]
+        file["data/demo_0/actions"] = h5py.ExternalLink(str(secret), "actions")
+        file["data/demo_1"].create_dataset("actions", (T, 3), "f8", external=[(str(secret), 0, T * 24)])
+        layout = h5py.VirtualLayout((T, 3), "f8")
+        layout[:] = h5py.VirtualSource(str(secret), "actions", (T, 3))
+        file["data/demo_2"].create_virtual_dataset("actions", layout)
+    assert "keeps its values in other files" in refused(demos)
+    assert "keeps its values in other files" in refused(demos, "demo_1")
+    assert "keeps its values in other files" in refused(demos, "demo_2")
+
+
+def test_a_chunk_too_large_to_inflate_is_refused(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        file["data/demo_0"].create_dataset(
+            "bomb", (T, 1 << 28), "f8", chunks=(1, 1 << 28), compression="gzip"
+        )
+    bomb = {"space": "mixed", "components": [{"key": "bomb", "dims": 1, "slice": [0, 1]}]}
+    assert "too large to read" in refused(demos, action=bomb)
+
+
+def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(demos: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "plain"
+    folder.mkdir()
+    shutil.copy(demos, folder)
+    snapshot = as_snapshot(folder, tmp_path / "cache")
+    source = open_source("hdf5")
+    assert source.episode_ids(str(snapshot)) == source.episode_ids(str(folder))
+
+
+def test_indexing_opens_each_of_many_files_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for i in range(2 * OPEN_FILES):
+        with h5py.File(tmp_path / f"episode_{i}.h5", "w") as file:
+            fill(file)
+    opened: list[Path] = []
+    plain = hdf5_file._open
+
+    def counted(path: Path) -> h5py.File:
+        opened.append(path)
+        return plain(path)
+
+    monkeypatch.setattr(hdf5_file, "_open", counted)
+    assert len(open_source("hdf5").index(str(tmp_path))) == len(opened) == 2 * OPEN_FILES
+
+
+def test_two_files_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    for name in ("a.h5", "a.hdf5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            fill(file.create_group("data/demo_0"))
+    with pytest.raises(SourceError, match=r"differs from a\.h5 in its suffix"):
+        open_source("hdf5").index(str(tmp_path))
+
+
+def test_a_file_without_demos_has_no_episodes(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "none.hdf5", "w") as file:
+        file.create_group("data")
+    with pytest.raises(SourceError, match="holds no episodes"):
+        open_source("hdf5").index(str(tmp_path / "none.hdf5"))
+
+
+def test_an_unknown_episode_is_a_source_error(demos: Path) -> None:
+    with pytest.raises(SourceError, match="no episode 'demo_99'"):
+        open_source("hdf5").read(str(demos), "demo_99", embodiment())
+
+
+def test_a_damaged_file_among_others_is_one_refused_episode(demos: Path) -> None:
+    (demos.parent / "broken.hdf5").write_bytes(demos.read_bytes()[:5000])
+    source = open_source("hdf5")
+    refs = source.index(str(demos.parent), embodiment())
+    assert len(refs) == 13 and refs[0].id == "broken" and refs[0].frames == 0
+    with pytest.raises(EpisodeError, match=r"broken\.hdf5: cannot be read as HDF5"):
+        source.read(str(demos.parent), "broken", embodiment())
+    assert source.read(str(demos.parent), "demos/demo_0", embodiment()).id == "demos/demo_0"
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_cut_or_flipped_file_gives_only_our_errors(demos: Path, data: st.DataObject) -> None:
+    whole = bytearray(demos.read_bytes())
+    at = data.draw(st.integers(0, len(whole) - 1))
+    if data.draw(st.booleans()):
+        whole = whole[:at]
+    else:
+        whole[at] ^= data.draw(st.integers(1, 255))
+    path = demos.with_name("bad.hdf5")
+    path.write_bytes(whole)
+    source = open_source("hdf5")
+    try:
+        source.inspect(str(path))
+        for ref in source.index(str(path), embodiment())[:3]:
+            source.read(str(path), ref.id, embodiment()).streams["front"].frames([0, 5])
+    except HMAError as fault:
+        assert "bad.hdf5" in str(fault)
+
+
+# -- inspect
+
+
+def test_inspect_lists_keys_rate_and_lengths(demos: Path) -> None:
+    found = open_source("hdf5").inspect(str(demos))
+    keys = {info.key: info for info in found.keys}
+    assert detect(str(demos)) == "hdf5" and found.episodes == 12
+    assert found.frames == sum(found.lengths) == sum(T + i for i in range(12))
+    assert found.hz == 20 and found.robot == "Panda"
+    camera = keys["obs/agentview_image"]
+    assert (camera.kind, camera.shape, camera.codec, camera.hz) == ("camera", (H, W, 3), "raw", 20)
+    assert (keys["actions"].kind, keys["actions"].shape) == ("vector", (3,))
+    assert found.problems == ()
+    assert json.loads(json.dumps(found.to_json()))["episodes"] == 12
+
+
+def test_inspect_sees_encoded_pictures(aloha: Path) -> None:
+    info = next(key for key in open_source("hdf5").inspect(str(aloha)).keys if key.kind == "camera")
+    assert info.shape == (H, W, 3) and info.codec in ("jpeg", "raw")
+
+
+def test_inspect_tells_what_looks_wrong(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        for demo in file["data"].values():
+            demo["actions"][:, 1] = 5
+        file["data/demo_0/rewards"][3] = np.nan
+        del file["data/demo_1/actions"]
+        file["data/demo_2/rewards"].parent["extra"] = 1
+        del file["data/demo_3/rewards"]
+        file["data/demo_3/rewards"] = np.zeros(2)
+    said = " | ".join(open_source("hdf5").inspect(str(demos)).problems)
+    assert "actions never changes in dims 1" in said
+    assert "demo_0: rewards is not finite at step 3" in said
+    assert "demo_1: has no actions" in said
+    assert "demo_3: of 12 frames, rewards has 2" in said
+
+
+# -- real recordings
+
+
+@pytest.mark.real
+def test_the_rendered_lift_equals_h5py(real_data: Path) -> None:
+    from hma_data.registry.embodiment import find
+
+    path, arm = real_data / "hdf5" / "lift_rendered.hdf5", find("robosuite_lift")
+    source = open_source("hdf5")
+    refs = source.index(str(path), arm)
+    assert [(ref.id, ref.frames, ref.split) for ref in refs] == [
+        ("demo_0", 137, "train"),
+        ("demo_1", 137, "train"),
+        ("demo_2", 138, "val"),
+    ]
+    episode = source.read(str(path), "demo_2", arm)
+    clip = to_clip(episode, arm)
+    with h5py.File(path) as file:
+        stored = file["data/demo_2"]
+        np.testing.assert_array_equal(clip.actions, stored["actions"][()].astype(np.float32))
+        wanted = [3, 50, 137]
+        for camera in arm.cameras:
+            np.testing.assert_array_equal(
+                episode.streams[camera.name].frames(wanted), stored[camera.key][wanted]
+            )
+    assert episode.success is True
+    assert source.read(str(path), "demo_0", arm).success is False
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("task", "length"), [("lift", 412), ("door", 261)])
+def test_raw_robosuite_is_listed(real_data: Path, task: str, length: int) -> None:
+    found = open_source("hdf5").inspect(str(real_data / "hdf5" / f"robosuite_{task}"))
+    assert found.episodes == 1 and found.lengths == (length,) and found.robot == "Panda"
+    assert {info.key for info in found.keys} == {"states", "actions", "joint_torques"}

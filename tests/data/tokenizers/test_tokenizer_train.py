@@ -1,0 +1,215 @@
+"""The training of the embedded tokenizers: recipes, crops, optimizers, stopping and going on."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from hma_data.errors import RecipeError, TokenizerError
+from hma_data.storage.paths import shipped
+from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.checkpoints import read_weights
+from hma_data.tokenizers.fsq import FORMAT, WEIGHTS, FsqConfig
+from hma_data.tokenizers.training.eval import psnr_db
+from hma_data.tokenizers.training.frames import draw_batch, load_pools
+from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
+from hma_data.tokenizers.training.train import Muon, orthogonal, train
+from tests.data.tokenizer_files import draw_scene, drawn_corpus
+
+RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
+SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
+
+
+def scenes(count: int, size: int) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return np.stack([draw_scene(rng, size) for _ in range(count)])
+
+
+def write_recipe(folder: Path, **training: object) -> Path:
+    import yaml
+
+    values = {
+        "job": "tokenizer",
+        "name": "small",
+        "seed": 1,
+        "corpus": str(folder),
+        "network": SMALL.model_dump(),
+        "training": {
+            "steps": 6,
+            "batch": 4,
+            "crop": 32,
+            "learning_rate": 0.02,
+            "adam_learning_rate": 0.001,
+            "warmup_steps": 2,
+            **training,
+        },
+        "loss": {"l2": 10.0, "l1": 0.3, "gradient": 0.3, "ssim": 0.05},
+        "sources": [drawn_corpus(folder, 4)],
+    }
+    path = folder / "recipe.yaml"
+    path.write_text(yaml.safe_dump(json.loads(json.dumps(values))))
+    return path
+
+
+def test_training_makes_weights_that_tokenize(tmp_path):
+    out = tmp_path / "w.safetensors"
+    lines: list[str] = []
+    facts = train(write_recipe(tmp_path), out, report=lines.append, report_every=3)
+    assert facts["steps"] == 6 and len(lines) == 3
+    tokenizer = get_tokenizer("fsq-8", weights=str(out))
+    assert psnr_db(scenes(4, 128), tokenizer.decode(tokenizer.encode(scenes(4, 128)))).mean() > 14
+
+
+def test_training_learns(tmp_path):
+    out = tmp_path / "w.safetensors"
+    lines: list[str] = []
+    train(write_recipe(tmp_path, steps=60), out, report=lines.append, report_every=30)
+    first, last = (float(line.split("PSNR ")[1].split(" ")[0]) for line in lines[1:])
+    assert last > first
+
+
+def test_training_again_gives_the_same_weights(tmp_path):
+    recipe = write_recipe(tmp_path)
+    facts = [train(recipe, tmp_path / name, report=lambda _: None) for name in ("a", "b")]
+    one, two = load_file(tmp_path / "a"), load_file(tmp_path / "b")
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    assert {**facts[0], "seconds": 0} == {**facts[1], "seconds": 0}
+
+
+def test_crops_drawn_ahead_train_the_same_weights(tmp_path):
+    recipe = write_recipe(tmp_path)
+    for workers in (0, 1, 3):
+        train(recipe, tmp_path / str(workers), workers=workers, report=lambda _: None)
+    alone, one, many = (load_file(tmp_path / name) for name in ("0", "1", "3"))
+    assert all(torch.equal(alone[name], one[name]) and torch.equal(alone[name], many[name]) for name in alone)
+
+
+def test_a_device_that_is_not_there_is_refused_before_anything_is_read(tmp_path):
+    with pytest.raises(TokenizerError, match="abacus"):
+        train(tmp_path / "gone.yaml", tmp_path / "w", device="abacus")
+
+
+def test_a_stopped_training_goes_on_as_if_it_had_not_been(tmp_path):
+    recipe = write_recipe(tmp_path, fall=[[4, 1], [6, 0]])
+    train(recipe, tmp_path / "whole", report=lambda _: None)
+
+    class Stopped(Exception):
+        pass
+
+    def stop(line: str) -> None:
+        if line.startswith("step 4"):
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        train(recipe, tmp_path / "parts", report=stop, report_every=1)
+    train(recipe, tmp_path / "parts", report=lambda _: None)
+    whole, parts = load_file(tmp_path / "whole"), load_file(tmp_path / "parts")
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_a_stopped_training_may_be_given_another_end_but_no_other_past(tmp_path):
+    class Stopped(Exception):
+        pass
+
+    def stop(line: str) -> None:
+        if line.startswith("step 4"):
+            raise Stopped
+
+    recipe, out = write_recipe(tmp_path, fall=[[2, 1], [6, 0]]), tmp_path / "w"
+    with pytest.raises(Stopped):
+        train(recipe, out, report=stop, report_every=1)
+    with pytest.raises(RecipeError, match="other settings"):
+        train(recipe, out, {"training.fall": [[3, 1], [6, 0]]}, report=lambda _: None)
+    sooner = {"training.steps": 5, "training.fall": [[2, 1], [4, 0.5], [5, 0]]}
+    assert train(recipe, out, sooner, report=lambda _: None)["steps"] == 5
+
+
+def test_a_state_of_another_training_is_refused(tmp_path):
+    (tmp_path / "w.state").write_bytes(b"junk")
+    with pytest.raises(RecipeError, match=r"w\.state"):
+        train(write_recipe(tmp_path), tmp_path / "w", report=lambda _: None)
+
+
+def test_crops_depend_on_seed_and_step_alone(tmp_path):
+    source = DrawnSource(**drawn_corpus(tmp_path, 3))
+    pools, digest = load_pools([source], tmp_path)
+    again, same = load_pools([source], tmp_path)
+    assert digest == same
+    crops = draw_batch(pools, 48, 6, 7, 3)
+    assert np.array_equal(crops, draw_batch(again, 48, 6, 7, 3))
+    assert not np.array_equal(crops, draw_batch(pools, 48, 6, 7, 4))
+    assert crops.min() >= -1 and crops.max() <= 1
+
+
+def test_the_shipped_recipe_is_valid_and_makes_the_shipped_network():
+    config, _, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
+    assert load_recipe(RECIPE).network == config
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ({"training.steps": 0}, "training.steps"),
+        ({"training.stepz": 5}, "training.stepz"),
+        ({"loss.l2": float("nan")}, "loss.l2"),
+        ({"network.hidden": 0}, "network"),
+        ({"seed.x": 1}, "seed.x"),
+        ({"training.fall": [[5, 0.5], [4000, 0]]}, "training"),
+        ({"training.fall": [[5, 1], [7, 0]]}, "training"),
+        ({"sources": []}, "sources"),
+    ],
+)
+def test_recipe_faults_name_the_key(overrides, named):
+    with pytest.raises(RecipeError, match=named):
+        load_recipe(RECIPE, overrides)
+
+
+def test_a_corpus_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(RecipeError, match="scikit-image"):
+        train(RECIPE, tmp_path / "w", {"corpus": str(tmp_path)})
+
+
+def test_pictures_that_were_not_drawn_are_named_with_what_draws_them(tmp_path):
+    drawn_corpus(tmp_path, 3)
+    with pytest.raises(RecipeError, match=r"holds 3 pictures, the recipe says 4 — recipes/tokenizer/draw.py"):
+        load_pools([DrawnSource(kind="drawn", pictures=4)], tmp_path)
+
+
+def test_the_script_draws_what_the_recipe_lists(tmp_path):
+    script = Path(__file__).parents[3] / "recipes/tokenizer/draw.py"
+    command = [sys.executable, str(script), str(tmp_path), "--pusht", "2", "--drawn", "3"]
+    subprocess.run(command, check=True)
+    pools, _ = load_pools(
+        [DrawnSource(kind="pusht", pictures=2), DrawnSource(kind="drawn", pictures=3)], tmp_path
+    )
+    assert [(pool.name, len(pool.pictures)) for pool in pools] == [("pusht", 2), ("drawn", 3)]
+
+
+@pytest.mark.parametrize("shape", [(6, 40), (40, 6)])
+def test_orthogonal_brings_singular_values_near_one(shape):
+    matrix = torch.randn(*shape, generator=torch.Generator().manual_seed(0))
+    values = torch.linalg.svdvals(orthogonal(matrix))
+    assert values.min() > 0.6 and values.max() < 1.3
+
+
+def test_weight_decay_bounds_the_norm_of_a_matrix_that_is_always_pushed_one_way():
+    push = torch.eye(4)
+    norms = {}
+    for decay in (0.0, 0.5):
+        weight = torch.nn.Parameter(torch.zeros(4, 4))
+        optimizer = Muon([weight], lr=0.1, decay=decay)
+        for _ in range(200):
+            weight.grad = -push
+            optimizer.step()
+        norms[decay] = float(torch.linalg.matrix_norm(weight.detach(), 2))
+    assert norms[0.0] > 10 and norms[0.5] < 1.3 / 0.5
+
+
+def test_training_leaves_denormal_numbers_as_they_were(tmp_path):
+    train(write_recipe(tmp_path), tmp_path / "w", report=lambda _: None)
+    assert float(torch.tensor(1e-40) * 1.0) > 0
