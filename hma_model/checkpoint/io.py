@@ -1,7 +1,6 @@
 """Save a model with all its embodiments; load a trunk with some of them.
 
-A checkpoint is one folder, in the same layout as on the hub. `hma_model.checkpoint.folder` describes and
-checks it.
+`hma_model.checkpoint.folder` describes the layout.
 """
 
 import shutil
@@ -17,6 +16,7 @@ from hma_model.checkpoint import weights
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
+    FORMAT_VERSION,
     HEAD,
     LIBRARY,
     PARTS,
@@ -27,18 +27,13 @@ from hma_model.checkpoint.folder import (
     TRAINING,
     TRUNK,
     YAML,
-    ActionStats,
     Checkpoint,
     action_stats,
     check_id,
     digest,
     inside,
-    parse_config,
     require_tokenizer,
-    resolve,
-    training_checkpoints,
 )  # fmt: skip
-from hma_model.checkpoint.migrate import FORMAT_VERSION
 from hma_model.checkpoint.model_card import render
 from hma_model.checkpoint.weights import write_tensors
 from hma_model.config import ActionSpace, HMAConfig
@@ -46,13 +41,6 @@ from hma_model.config import ActionSpace, HMAConfig
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import TokenizerSpec
     from hma_model.network.model import HMA
-
-__all__ = [
-    "CARD", "CONFIG", "HEAD", "LIBRARY", "PARTS", "README", "SAMPLE", "STATS", "STEM", "TRAINING",
-    "TRUNK", "YAML", "ActionStats", "Checkpoint", "action_stats", "add_embodiment", "check_id",
-    "config_json", "digest", "inside", "load", "parse_config", "read_embodiment", "remove",
-    "require_tokenizer", "resolve", "save", "training_checkpoints", "update_card", "write_readme",
-]  # fmt: skip
 
 
 def save(
@@ -86,7 +74,7 @@ def save(
     """
     from safetensors import SafetensorError
 
-    folder = Path(folder)
+    folder = as_path(folder)
     _check_parts(model, folder, embodiment_yaml, stats)
     config = model.config.replace(tokenizer=dict(tokenizer))
     try:
@@ -237,26 +225,24 @@ def _write_embodiment(model: "HMA", home: Path, trunk: str, tokenizer: str, give
     metadata = {"format": "pt", "format_version": str(FORMAT_VERSION), "embodiment": home.name, **links}
     write_tensors(home / STEM, model.stem_state(home.name), metadata)
     write_tensors(home / HEAD, model.head_state(home.name), metadata)
-    card = {**_facts(Embodiment.load(home / YAML)), "data": {}, "metrics": {}, **given, **links}
-    card["files"] = {part: file_sha256(home / part) for part in PARTS[:-1]}
-    (home / CARD).write_bytes(to_json(card))
-
-
-def _facts(embodiment: Embodiment) -> dict[str, Any]:
-    unstated = embodiment.frequency_hz == "unknown" and not embodiment.sync.rate_hz
-    return {
+    robot = Embodiment.load(home / YAML)
+    unstated = robot.frequency_hz == "unknown" and not robot.sync.rate_hz
+    facts = {
         "format_version": FORMAT_VERSION,
-        "id": embodiment.id,
-        "description": embodiment.description,
-        "robot": embodiment.robot,
-        "kind": embodiment.kind,
-        "action_space": embodiment.action.space,
-        "action_dim": embodiment.action_dim,
-        "stride": embodiment.stride,
-        "chunk_dim": embodiment.chunk_dim,
-        "effective_hz": None if unstated else embodiment.effective_hz,
-        "license": embodiment.license,
+        "id": robot.id,
+        "description": robot.description,
+        "robot": robot.robot,
+        "kind": robot.kind,
+        "action_space": robot.action.space,
+        "action_dim": robot.action_dim,
+        "stride": robot.stride,
+        "chunk_dim": robot.chunk_dim,
+        "effective_hz": None if unstated else robot.effective_hz,
+        "license": robot.license,
     }
+    files = {part: file_sha256(home / part) for part in PARTS[:-1]}
+    card = {**facts, "data": {}, "metrics": {}, **given, **links, "files": files}
+    (home / CARD).write_bytes(to_json(card))
 
 
 def _check_parts(

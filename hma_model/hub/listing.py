@@ -9,8 +9,16 @@ from typing import Any
 from hma_data.errors import HMAError, HubError, PluginError, TokenizerError
 from hma_data.storage.files import json_object
 from hma_data.storage.paths import StrPath
-from hma_model.checkpoint import migrate
-from hma_model.checkpoint.io import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
+from hma_model.checkpoint.folder import (
+    CARD,
+    CONFIG,
+    LIBRARY,
+    PARTS,
+    TRUNK,
+    converted,
+    digest,
+    parse_config,
+)  # fmt: skip
 from hma_model.hub.publish import Store, embodiment_ids, open_store, total_bytes
 
 RELEASED_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
@@ -80,20 +88,24 @@ def _ours(
     facts = _facts(where, LIBRARY, size, _tokenizer_problems(values.get("tokenizer")))
     try:
         parse_config(values, f"{where}/{CONFIG}")
-        values = migrate.config(values, where) | {"format_version": values["format_version"]}
+        values = converted("config", values, values["format_version"], where)
     except HMAError as fault:
         facts["problems"].append(f"{fault.fault}: {fault.remedy}")
     facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
     if TRUNK not in files:
         facts["problems"].append(f"{lacks} {TRUNK}")
     store.warm([f"{root}embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
+    tokenizer = values.get("tokenizer")
     for name in embodiment_ids(files):
         parts = {f"embodiments/{name}/{part}": part for part in PARTS}
         size, path = total_bytes(store, files, parts), f"embodiments/{name}/{CARD}"
         try:
             card = json_object(store.read(root + path), f"{where}/{path}", HubError)
             problems = [f"{lacks} {part}" for path, part in parts.items() if path not in files]
-            problems += _card_problems(card, values)
+            if card.get("trunk_sha256") != values.get("trunk_sha256"):
+                problems.append("belongs to another trunk")
+            if isinstance(tokenizer, dict) and card.get("tokenizer") != digest(tokenizer):
+                problems.append("was trained on another tokenizer")
         except HMAError as fault:
             card, problems = {}, [fault.fault]
         facts["embodiments"].append(_row(name, card, size, problems))
@@ -134,16 +146,6 @@ def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[st
         "bytes": size,
         "problems": problems,
     }
-
-
-def _card_problems(card: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    problems = []
-    if card.get("trunk_sha256") != config.get("trunk_sha256"):
-        problems.append("belongs to another trunk")
-    tokenizer = config.get("tokenizer")
-    if isinstance(tokenizer, dict) and card.get("tokenizer") != digest(tokenizer):
-        problems.append("was trained on another tokenizer")
-    return problems
 
 
 def _tokenizer_problems(tokenizer: Any) -> list[str]:

@@ -19,7 +19,6 @@ from hma_data.registry.embodiment import ID_PATTERN, find
 from hma_data.storage.files import cache_folder, file_sha256, json_object
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint import migrate
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
@@ -30,7 +29,10 @@ from hma_model.checkpoint.folder import (
     YAML,
     Checkpoint,
     check_id,
+    converted,
     inside,
+    parse_config,
+    resolve,
 )  # fmt: skip
 from hma_model.checkpoint.model_card import render
 from hma_model.hub.folder import FolderStore
@@ -218,7 +220,7 @@ def from_pretrained(
     """Load a model as `HMA.from_pretrained` does; the source may also be a training run's folder."""
     address, revision = addressed(as_address(source), revision)
     if not is_repository(address) and "://" not in str(address):
-        address = checkpoints.resolve(Path(address).expanduser())
+        address = resolve(Path(address).expanduser())
     folder, ids = _pull(address, embodiments, None, revision)
     return checkpoints.load(folder, ids, str(device))
 
@@ -291,7 +293,7 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
             raise HubError(store.name, "holds a shard set", "push to a place of its own")
         present[CONFIG] = inside(source.folder, CONFIG)
     if TRUNK not in files:
-        present[TRUNK] = source.trunk()
+        present[TRUNK] = inside(source.folder, TRUNK)
     for name in ids:
         sample = source.folder / "embodiments" / name / SAMPLE
         parts = (SAMPLE, *PARTS) if sample.is_file() else PARTS
@@ -323,8 +325,8 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
         raise HubError(store.name, f"has no {CONFIG}", "it is no checkpoint of hma-toolkit; check the name")
     values = json_object(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
     try:
-        checkpoints.parse_config(values, f"{store.name}: {CONFIG}")
-        return migrate.config(values, store.name) | {"format_version": values["format_version"]}
+        parse_config(values, f"{store.name}: {CONFIG}")
+        return converted("config", values, values["format_version"], store.name)
     except CheckpointError as fault:
         raise HubError(fault.where, fault.fault, fault.remedy) from fault
 

@@ -10,7 +10,7 @@ from hma_data.errors import CheckpointError, UsageError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint.io import SAMPLE, Checkpoint
+from hma_model.checkpoint.folder import SAMPLE, Checkpoint, require_tokenizer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -69,7 +69,7 @@ def sample(checkpoint: StrPath, shards: "ShardSet", tokenizer: "Tokenizer | None
     from hma_model.evaluation.evaluate import rollout
 
     model = checkpoints.load(checkpoint, [shards.embodiment.id])
-    checkpoints.require_tokenizer(model.config, shards.spec, shards.folder)
+    require_tokenizer(model.config, shards.spec, shards.folder)
     batch = _window(shards, model.config.frames)
     tokenizer = tokenizer or tokenizer_of(shards)
     true = rollout(model, tokenizer, batch)
