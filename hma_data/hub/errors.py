@@ -99,15 +99,8 @@ def failed_by_xet(fault: BaseException) -> bool:
     of_library = any(isinstance(item, ConnectionError | TimeoutError | RuntimeError) for item in chain)
     if constants.HF_HUB_DISABLE_XET or not of_library or any(isinstance(c, httpx.HTTPError) for c in chain):
         return False
-    upload_by_lfs()
-    return True
-
-
-def upload_by_lfs() -> None:
-    """Make this process upload by plain LFS, which every hub takes, instead of the client's Xet protocol."""
-    from huggingface_hub import constants
-
     constants.HF_HUB_DISABLE_XET = True
+    return True
 
 
 def raised() -> tuple[type[BaseException], ...]:

@@ -16,13 +16,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
 from hma_data.errors import HubError
-from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, upload_by_lfs, waiting
+from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, waiting
 from hma_data.storage.files import PART
 
 ATTEMPTS = 8  # attempts to commit; half as many for any other call
@@ -142,14 +141,10 @@ class Repository:
         Args:
             sha256: SHA-256 of the content, if it is known.
         """
-        entry = self.stated(name)
+        entry = self._entries.get(name)
         if entry and entry.sha256 and sha256:
             return entry.sha256 == sha256
         return entry is not None and entry.states(content)
-
-    def stated(self, name: str) -> Entry | None:
-        """Return the entry of a file in the listing of `files`; None if there is none."""
-        return self._entries.get(name)
 
     def _info(self) -> Any:
         """Return the client's facts; None if the hub is out of reach, `_ABSENT` if the repository is new."""
@@ -182,15 +177,15 @@ class Repository:
         entries = self._api.list_repo_tree(
             self.repo, repo_type=self.kind, revision=self._commit, recursive=True
         )
-        files = [item for item in entries if isinstance(item, RepoFile) and item.path]
         return {
             item.path: Entry(
                 item.path,
                 int(item.size or 0),
-                item.lfs.sha256 if item.lfs else None,
+                item.lfs and item.lfs.sha256,
                 "" if item.lfs else str(item.blob_id),
             )
-            for item in files
+            for item in entries
+            if isinstance(item, RepoFile) and item.path
         }
 
     def _of_cache(self) -> dict[str, Entry]:
@@ -198,15 +193,14 @@ class Repository:
         from huggingface_hub import snapshot_download
 
         with explained(self.name):
-            self._cached = folder = Path(
-                snapshot_download(
-                    self.repo,
-                    repo_type=self.kind,
-                    revision=self._revision,
-                    local_files_only=True,
-                    allow_patterns=[],
-                )
+            found = snapshot_download(
+                self.repo,
+                repo_type=self.kind,
+                revision=self._revision,
+                local_files_only=True,
+                allow_patterns=[],
             )
+        self._cached = folder = Path(found)
         names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
         return {name: Entry(name, (folder / name).stat().st_size, None, "") for name in names}
 
@@ -401,7 +395,7 @@ class Repository:
         if not constants.HF_HUB_DISABLE_XET:
             answer = self._request("GET", f"{self.kind}s/{self.repo}/xet-write-token/{self._branch}")
             if not answer.is_success or b"accessToken" not in answer.content:
-                upload_by_lfs()
+                constants.HF_HUB_DISABLE_XET = True
 
     def _upload_modes(self, names: Iterable[str]) -> list[dict[str, Any]]:
         """Return how the hub would take files; it answers only those who may write."""
@@ -437,17 +431,16 @@ class Repository:
             hf_raise_for_status(answer)
         return answer.json()
 
-    def _ask[T](self, call: Callable[[], T], where: str = "") -> T:
+    def _ask[T](self, call: Callable[[], T], where: str = "", attempt: int = 0) -> T:
         """Return the result of a client's call; repeat it if the hub is busy or the connection was cut."""
-        for attempt in count():
-            try:
-                with explained(where or self.name):
-                    return call()
-            except HubError as fault:
-                if status(fault) in _CONFLICTS:
-                    raise
-                self._pause(fault, attempt)
-        raise AssertionError("the loop returns or raises")
+        try:
+            with explained(where or self.name):
+                return call()
+        except HubError as fault:
+            if status(fault) in _CONFLICTS:
+                raise
+            self._pause(fault, attempt)
+        return self._ask(call, where, attempt + 1)
 
 
 def _snapshot(path: Path, name: str) -> Path:

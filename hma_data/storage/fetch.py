@@ -53,17 +53,12 @@ def retried[T](action: Callable[[], T], where: object, waits_s: Sequence[float])
     Args:
         where: for the log.
         waits_s: seconds before the second and further tries.
-
-    Raises:
-        Exception: what the last try raised.
     """
     for wait_s in waits_s:
         try:
             return action()
-        except HMAError:
-            raise
         except Exception as fault:  # file systems raise exceptions of any kind
-            if not may_pass(fault):
+            if isinstance(fault, HMAError) or not may_pass(fault):
                 raise
             log.info("%s: %s; trying again", where, said(fault))
             time.sleep(wait_s)
@@ -150,24 +145,21 @@ def file_system(uri: str) -> tuple[Any, str]:
         ValueError: no file system is known by that scheme.
     """
     scheme = uri.split("://", 1)[0]
+    options: dict[str, Any] = {}
     try:
-        files, path = fsspec.core.url_to_fs(uri, **_client_options(scheme))
+        if scheme in ("s3", "s3a"):
+            ours = {"connect_timeout": CONNECT_S, "retries": {"total_max_attempts": 1}}
+            options["config_kwargs"] = ours | fsspec.config.conf.get("s3", {}).get("config_kwargs", {})
+        elif scheme in NO_LISTING:
+            import aiohttp
+
+            options["client_kwargs"] = {"timeout": aiohttp.ClientTimeout(total=300, sock_connect=CONNECT_S)}
+        files, path = fsspec.core.url_to_fs(uri, **options)
     except ImportError as fault:
         package = PACKAGES.get(scheme)
         remedy = f"pip install {package}" if package else said(fault)
         raise MissingDependencyError(uri, f"needs the package of {scheme}://", remedy) from fault
     return files, path
-
-
-def _client_options(scheme: str) -> dict[str, Any]:
-    if scheme in ("s3", "s3a"):
-        ours = {"connect_timeout": CONNECT_S, "retries": {"total_max_attempts": 1}}
-        return {"config_kwargs": ours | fsspec.config.conf.get("s3", {}).get("config_kwargs", {})}
-    if scheme in NO_LISTING:
-        import aiohttp
-
-        return {"client_kwargs": {"timeout": aiohttp.ClientTimeout(total=300, sock_connect=CONNECT_S)}}
-    return {}
 
 
 def protocol(files: Any) -> str:
@@ -246,12 +238,11 @@ def fetch_whole(files: Any, path: str, limit: int) -> bytes | None:
         SourceError: it cannot be read, or is a local file longer than `limit` bytes.
     """
 
-    def whole() -> bytes | None:
+    def whole() -> Any:
         try:
-            data: bytes = files.cat_file(path)
+            return files.cat_file(path)
         except ABSENT:
             return None
-        return data
 
     if is_local(files):
         size = attempt(files, path, lambda: files.size(path) if files.isfile(path) else 0)

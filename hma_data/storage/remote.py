@@ -161,8 +161,8 @@ class RemotePath(PosixPath):
         except FileNotFoundError:
             return {}
         begin = f"{self.key}/"
-        sizes = {name: int(found[name]["size"] or 0) for name in sorted(found)}
-        return {name.removeprefix(begin): size for name, size in sizes.items() if name.startswith(begin)}
+        below = (name for name in sorted(found) if name.startswith(begin))
+        return {name.removeprefix(begin): int(found[name]["size"] or 0) for name in below}
 
     def _kind(self) -> str:
         try:
@@ -199,10 +199,9 @@ class RemotePath(PosixPath):
             names = attempt(self, "listed", ask)
         except FileNotFoundError:
             return
-        for name in sorted(names):
-            last = name.rstrip("/").rsplit("/", 1)[-1]
-            if name.rstrip("/") != self.key:
-                yield self / last
+        for name in sorted(item.rstrip("/") for item in names):
+            if name != self.key:
+                yield self / name.rsplit("/", 1)[-1]
 
     def glob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
         """Yield the files below whose path matches the pattern, part by part; folders are not listed."""
@@ -273,11 +272,10 @@ class RemotePath(PosixPath):
         if self.scheme not in WHOLE_PUTS:
             attempt(self, "made", lambda: self.files.makedirs(self.key, exist_ok=True))
 
-    def delete_tree(self, keep: Callable[[str], bool] = lambda name: False) -> None:
-        """Delete every file below, except where `keep` returns True for its name below this folder."""
+    def delete_tree(self) -> None:
+        """Delete every file below."""
         for name in self.listing():
-            if not keep(name):
-                (self / name).unlink(missing_ok=True)
+            (self / name).unlink(missing_ok=True)
 
 
 # -- writing
@@ -346,8 +344,8 @@ class RangeFile(io.RawIOBase):
     """
 
     def __init__(self, path: RemotePath, size: int | None = None) -> None:
-        self._path, self._at, self._last = path, 0, -1
-        self._files, self._key = path.files, path.key
+        self._path, self._files, self._key = path, path.files, path.key
+        self._at, self._last = 0, -1
         self._size = int(path.info()["size"]) if size is None else size
         self._begin, self._kept = 0, b""
 
@@ -359,10 +357,6 @@ class RangeFile(io.RawIOBase):
 
     def tell(self) -> int:
         return self._at
-
-    def size(self) -> int:
-        """Return the bytes of the whole file."""
-        return self._size
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
@@ -411,5 +405,4 @@ def parquet_file(path: Path, **options: Any) -> Any:
     """Open a local or remote pyarrow ParquetFile; a remote row group is read in few requests."""
     import pyarrow.parquet as pq
 
-    remote = is_remote(path)
-    return pq.ParquetFile(parquet_input(path), pre_buffer=remote, **options)
+    return pq.ParquetFile(parquet_input(path), pre_buffer=is_remote(path), **options)

@@ -5,12 +5,9 @@
     frame = rollout.step(chunk)              # the frame that the chunk leads to
 
 A frame costs one pass for each step of unmasking. The first pass also adds the frame before it, now finished,
-to the cache. `cache=False` computes the whole history in every pass, with the same result.
-
-Attention over time is causal, so the cached keys and values of a past frame never change. A frame at time t
-lies in slot t mod R of the cache. With rotary positions the length of a rollout has no limit. There is then
-one slot more than the window has frames, for the pass that computes a finished frame and the next one
-together.
+to the cache. Attention over time is causal, so the cached keys and values of a past frame never change. A
+frame at time t lies in slot t mod R. With rotary positions there is one slot more than the window has frames,
+for the pass that computes a finished frame and the next one together.
 
 B batch, P frames of a prompt, h,w token grid, S = h*w, K = stride * action dim, c channels, H,W latent grid,
 N tokens of a frame with its action tokens, L layers, R slots, n frames of a pass.
@@ -23,10 +20,9 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
-from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame
+from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, masked_after
 from hma_model.network.conditioning import ActionConditioning, Groups, condition, no_chunks
 from hma_model.network.embed import unpatchify
-from hma_model.network.masking import masked_after
 from hma_model.network.model import HMA
 from hma_model.network.trunk import (
     Conditioning,
@@ -37,7 +33,7 @@ from hma_model.network.trunk import (
     window_times,
 )
 
-_NEVER = -(1 << 40)
+_NEVER = -(1 << 40)  # the time of an empty slot
 
 
 class Cache:
@@ -61,17 +57,6 @@ class Cache:
             for _ in range(config.layers)
         ]
         self.times = torch.full((self.slots,), _NEVER, device=like.device)
-
-    def clear(self) -> None:
-        """Forget every frame."""
-        self.times.fill_(_NEVER)
-
-    def hold_still(self) -> None:
-        """Mark the addresses of keys and values as static, so that a compiler may write them in place."""
-        for layer in self.layers:
-            for kept in (layer.time, layer.action):
-                if kept is not None:
-                    torch._dynamo.mark_static_address(kept)
 
     def time_positions(self, start: int, frames: int) -> TimePositions:
         """Return the times of a pass over n consecutive frames, and record their times in their slots."""
@@ -206,8 +191,11 @@ class Rollout:
                 like = like.to(torch.get_autocast_dtype(like.device.type))
             tokens = self.config.tokens_per_frame + appended
             self.cache = Cache(self.config, self.batch, tokens, like)
-            if self.compiled is not None:
-                self.cache.hold_still()
+            if self.compiled is not None:  # static addresses: the compiled code writes them in place
+                for layer in self.cache.layers:
+                    for kept in (layer.time, layer.action):
+                        if kept is not None:
+                            torch._dynamo.mark_static_address(kept)
         return self.cache
 
     # -- state --------------------------------------------------------------------------------------------
@@ -270,7 +258,7 @@ class Rollout:
             self._keep(self.config.frames - 1, ahead=1)
             self.fresh = self.time = self.frames.shape[1]
             if self.cache is not None:
-                self.cache.clear()
+                self.cache.times.fill_(_NEVER)
 
     def _keep(self, frames: int, ahead: int = 0) -> None:
         """Drop all but the last frames, and all chunks but theirs and the `ahead` chunks after them."""

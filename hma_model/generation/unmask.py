@@ -6,14 +6,14 @@ how many; they are chosen at random or by confidence. Kept tokens do not change 
 B batch, S tokens of a frame, k tokens unmasked in a pass, D width, C values of a patch.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from hma_model.network.embed import from_digits
-from hma_model.network.head import LatentReadout, TokenReadout
-from hma_model.network.masking import uniform
+from hma_model.network.head import LatentReadout, TokenReadout, uniform
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,13 @@ class Decoding:
     order: str = "random"
     sample_steps: int | None = None
     generator: torch.Generator | None = None
+
+
+def masked_after(step: int, steps: int, tokens: int) -> int:
+    """Return how many tokens of a frame stay masked after step `step` of `steps` (cosine schedule)."""
+    if step + 1 >= steps:
+        return 0
+    return min(math.ceil(math.cos((step + 1) / steps * math.pi / 2) * tokens), tokens - 1)
 
 
 class TokenFrame:

@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
-from hma_model.network.embed import LatentEmbedding, TokenEmbedding
-from hma_model.network.stem import Modulation
+from hma_model.network.embed import LatentEmbedding, Modulation, TokenEmbedding
 
 
 @dataclass
