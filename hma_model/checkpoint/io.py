@@ -161,17 +161,6 @@ def read_embodiment(
     return space, *weights.embodiment(checkpoint, embodiment, space)
 
 
-def update_card(folder: StrPath, embodiment: str, **facts: Any) -> dict[str, Any]:
-    """Update an embodiment's card (`metrics` is merged, other facts are replaced), and README.md."""
-    checkpoint = Checkpoint.open(folder)
-    card = dict(checkpoint.card(embodiment))
-    metrics = {**card.get("metrics", {}), **facts.pop("metrics", {})}
-    card.update(facts, metrics=metrics)
-    write_atomic(checkpoint.path(embodiment, CARD), to_json(card))
-    write_readme(checkpoint.folder)
-    return card
-
-
 def write_readme(folder: StrPath) -> None:
     """Write README.md from the cards in a checkpoint's folder."""
     folder = as_path(folder)

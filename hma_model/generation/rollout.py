@@ -319,13 +319,12 @@ def generate(
     """Continue a prompt by `frames` frames; `HMA.generate` explains the arguments."""
     known = prompt.shape[1]
     rollout = Rollout(model, embodiment, prompt.shape[0], **decoding)  # type: ignore[arg-type]
-    if actions is not None and actions.shape[1] < known + frames - 1:
-        fault = f"there are {actions.shape[1]} chunks for {known} + {frames} frames"
-        raise HMAError("actions", fault, f"give {known + frames}")
+    chunks: Sequence[Tensor | None] = [None] * (known + frames)
+    if actions is not None:
+        if actions.shape[1] < known + frames - 1:
+            fault = f"there are {actions.shape[1]} chunks for {known} + {frames} frames"
+            raise HMAError("actions", fault, f"give {known + frames}")
+        chunks = [*actions.unbind(1), None]
     rollout.prompt(prompt, actions)
-    made = []
-    for index in range(known - 1, known - 1 + frames):
-        chunk = None if actions is None else actions[:, index]
-        last = actions is None or index + 1 >= actions.shape[1]
-        made.append(rollout.step(chunk, None if last else actions[:, index + 1]))  # type: ignore[index]
+    made = [rollout.step(chunks[i], chunks[i + 1]) for i in range(known - 1, known - 1 + frames)]
     return torch.stack(made, dim=1)

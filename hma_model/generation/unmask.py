@@ -1,7 +1,7 @@
 """Unmask a frame's tokens or patches in a few passes (arXiv 2202.04200).
 
-Each pass predicts the tokens that are still masked, and keeps some of them. The cosine schedule determines
-how many; they are chosen at random or by confidence. Kept tokens do not change any more.
+Each pass predicts the tokens that are still masked, and keeps some of them for good. The cosine schedule
+determines how many; they are chosen at random or by confidence.
 
 B batch, S tokens of a frame, k tokens unmasked in a pass, D width, C values of a patch.
 """
@@ -70,10 +70,13 @@ class TokenFrame:
         """Return token ids (B, k) and the sums (B, k) of the log probabilities of their digits."""
         digits, confidence = [], torch.zeros(features.shape[:2], device=features.device)
         for scores in readout(features).split(list(readout.factored), dim=-1):
-            digit = _draw(scores, self.decoding)
-            digits.append(digit)
+            drawn = scores
+            if self.decoding.temperature > 0:  # the largest of these sums is a sample from the softmax
+                noise = uniform(scores.shape, self.decoding.generator, scores.device).clamp(min=1e-20)
+                drawn = scores / self.decoding.temperature - (-noise.log()).log()
+            digits.append(drawn.argmax(-1))
             if self.decoding.order == "confidence":
-                confidence += scores.log_softmax(-1).gather(-1, digit.unsqueeze(-1)).squeeze(-1)
+                confidence += scores.log_softmax(-1).gather(-1, digits[-1].unsqueeze(-1)).squeeze(-1)
         return from_digits(torch.stack(digits, dim=-1), readout.factored), confidence
 
 
@@ -93,10 +96,9 @@ class PatchFrame:
     def unmask(self, readout: LatentReadout, features: Tensor, position: Tensor, count: int) -> None:
         """Draw `count` more patches from the frame's features (B, S, D) at its time (1,)."""
         chosen = _top(self.rank, self.masked, count)
-        conditions = _gather(readout(features.unsqueeze(1), position).squeeze(1), chosen)
+        conditions = _gather(readout(features.unsqueeze(1), position).squeeze(1), chosen).flatten(0, 1)
         way = self.decoding
-        rows = conditions.flatten(0, 1)
-        patches = readout.diffusion.sample(rows, way.sample_steps, way.temperature, way.generator)
+        patches = readout.diffusion.sample(conditions, way.sample_steps, way.temperature, way.generator)
         patches = patches.view(*chosen.shape, -1)
         self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
         self.masked = self.masked.scatter(1, chosen, False)
@@ -110,12 +112,3 @@ def _top(score: Tensor, masked: Tensor, count: int) -> Tensor:
 def _gather(features: Tensor, chosen: Tensor) -> Tensor:
     """Return the features (B, k, D) of the tokens (B, k) from (B, S, D)."""
     return features.gather(1, chosen.unsqueeze(-1).expand(-1, -1, features.shape[-1]))
-
-
-def _draw(scores: Tensor, decoding: Decoding) -> Tensor:
-    """Choose the value (B, k) of a digit from its scores (B, k, V)."""
-    if decoding.temperature > 0:
-        noise = uniform(scores.shape, decoding.generator, scores.device).clamp(min=1e-20)
-        # The largest of these sums is a sample from the softmax.
-        scores = scores / decoding.temperature - (-noise.log()).log()
-    return scores.argmax(-1)

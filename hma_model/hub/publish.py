@@ -8,7 +8,7 @@ yet.
 
 import hashlib
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,10 +101,8 @@ def push(
     _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
 
-    def changes() -> dict[str, Content]:
-        return _changes(source, ids, store)
-
-    return store.publish(changes, f"Add {', '.join(ids)}" if ids else "Add the trunk")
+    message = f"Add {', '.join(ids)}" if ids else "Add the trunk"
+    return store.publish(lambda: _changes(source, ids, store), message)
 
 
 def pull(
@@ -174,41 +172,10 @@ def _pull(
 
 
 def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
-    """Return a row for each published embodiment: ids, action, rate, figures, licence, bytes."""
-    from hma_model.hub.listing import listed
+    """Return a row for each published embodiment; see `hma_model.hub.listing.survey`."""
+    from hma_model.hub.listing import survey
 
-    return listed(describe(source, revision))
-
-
-def describe(source: StrPath, revision: str | None = None) -> dict[str, Any]:
-    """Return the published facts: the trunk's hash and bytes, tokenizer, model; each id's `card` and `bytes`.
-
-    Bytes are None if the hub is out of reach and the client's cache does not have the files.
-    """
-    store = open_store(source, revision)
-    files = store.files()
-    values = _config(store, files)
-    store.warm([f"embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
-    return {
-        "source": store.name,
-        **{key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
-        "trunk_bytes": total_bytes(store, files, [TRUNK]),
-        "embodiments": {
-            name: {
-                "card": _card(store, name),
-                "bytes": total_bytes(store, files, [f"embodiments/{name}/{part}" for part in PARTS]),
-            }
-            for name in embodiment_ids(files)
-        },
-    }
-
-
-def total_bytes(store: Store, files: Mapping[str, int], names: Iterable[str]) -> int | None:
-    """Return the bytes of files; None if the hub is out of reach and the cache lacks one of them."""
-    sizes = [files.get(name) for name in names]
-    if store.from_cache and None in sizes:
-        return None
-    return sum(size or 0 for size in sizes)
+    return [row for found in survey(source, revision) for row in found["embodiments"]]
 
 
 def from_pretrained(
@@ -287,7 +254,16 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     files = store.files()
     present: dict[str, Content] = {}
     if CONFIG in files:
-        _require_trunk(source, _config(store, files), store.name)
+        there = _config(store, files)
+        if there.get("trunk_sha256") != source.trunk_sha256:
+            theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
+            fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
+            remedy = "push to a hub of its own, or finetune on the trunk that is there"
+            raise HubError(store.name, fault, remedy)
+        if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
+            raise HubError(
+                store.name, "has the same trunk with another tokenizer", "push to a hub of its own"
+            )
     else:
         if MANIFEST in files:
             raise HubError(store.name, "holds a shard set", "push to a place of its own")
@@ -309,16 +285,6 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     return present
 
 
-def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:
-    if there.get("trunk_sha256") != source.trunk_sha256:
-        theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
-        fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
-        remedy = "push to a hub of its own, or finetune on the trunk that is there"
-        raise HubError(where, fault, remedy)
-    if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
-        raise HubError(where, "has the same trunk with another tokenizer", "push to a hub of its own")
-
-
 def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
     """Return the values of config.json, checked."""
     if CONFIG not in files:
@@ -337,15 +303,11 @@ def embodiment_ids(files: Iterable[str]) -> list[str]:
     return sorted(name for name in found if ID_PATTERN.fullmatch(name) and ".." not in name)
 
 
-def _card(store: Store, name: str) -> dict[str, Any]:
-    path = f"embodiments/{name}/{CARD}"
-    return json_object(store.read(path), f"{store.name}: {path}", HubError)
-
-
 def _readable_card(store: Store, name: str) -> dict[str, Any]:
     """Return the card of an embodiment that is not pushed now; an empty card if it cannot be read."""
+    path = f"embodiments/{name}/{CARD}"
     try:
-        return _card(store, name)
+        return json_object(store.read(path), f"{store.name}: {path}", HubError)
     except HubError:
         return {}
 

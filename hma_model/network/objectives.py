@@ -7,7 +7,7 @@ B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = strid
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -19,17 +19,8 @@ from hma_model.network.embed import from_digits, to_digits
 from hma_model.network.head import device_of, uniform
 
 if TYPE_CHECKING:
+    from hma_data.loading.rows import Batch
     from hma_model.network.model import HMA
-
-
-class Windows(Protocol):
-    """The batch of a loader; see `hma_data.loader.Batch`."""
-
-    embodiment: list[str]
-    actions: Tensor
-    action_mask: Tensor
-    tokens: Tensor | None
-    latents: Tensor | None
 
 
 @dataclass
@@ -68,7 +59,7 @@ class VideoMask:
     corruption: Tensor
 
 
-def compute(model: "HMA", batch: Windows, objective: str | None, generator: torch.Generator | None) -> Output:
+def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torch.Generator | None) -> Output:
     """Compute the losses of one batch; `HMA.forward` explains the arguments."""
     config = model.config
     name = objective or draw_objective(config, generator)
@@ -165,7 +156,7 @@ def _video_loss(
 def _action_loss(
     model: "HMA",
     features: Tensor,
-    batch: Windows,
+    batch: "Batch",
     dropped: Tensor,
     readout: Readout,
     groups: Groups,

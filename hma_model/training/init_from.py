@@ -151,6 +151,7 @@ def _require_source(source: str, out: Path) -> None:
     The checkpoint is the same if its trunk is, so it may have moved, and it may be gone.
     """
     from hma_model.hub import publish as hub
+    from hma_model.hub.listing import survey
 
     before = read_json(out / RECIPE).get("start") if (out / RECIPE).is_file() else None
     if before in (None, source):
@@ -158,7 +159,7 @@ def _require_source(source: str, out: Path) -> None:
     address, revision = hub.addressed(source)
     path = Path(address).expanduser()
     if hub.is_repository(address) or "://" in address:
-        trunk = hub.describe(address, revision)["trunk_sha256"]
+        trunk = survey(address, revision)[0]["trunk_sha256"]
     else:
         trunk = Checkpoint.open(resolve(path)).trunk_sha256 if path.exists() else None
     if trunk not in (None, Checkpoint.open(out / START).trunk_sha256):

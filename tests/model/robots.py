@@ -1,5 +1,6 @@
 """Small embodiments, models and checkpoints for the tests of this folder."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -64,3 +65,10 @@ def save(folder: Path, names: dict[str, int], seed: int = 0, **given: Any) -> HM
         **given,
     )
     return model
+
+
+def edit_card(folder: Path, name: str, **facts: Any) -> None:
+    """Change facts of an embodiment's card.json, as a person does, and write README.md anew."""
+    path = folder / "embodiments" / name / "card.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | facts))
+    checkpoint.write_readme(folder)
