@@ -42,7 +42,7 @@ class Entry:
     Attributes:
         size: bytes.
         sha256: SHA-256 of a file that the hub keeps by LFS; None for any other file.
-        blob_id: git's name of its content, if `sha256` is None; empty if the hub does not state it.
+        blob_id: git's name of its content, or of its LFS pointer; empty if the hub does not state it.
     """
 
     size: int
@@ -165,21 +165,18 @@ class Repository:
         from huggingface_hub import RepoFile
 
         entries = self._api.list_repo_tree(**self._place, revision=self._commit, recursive=True)
-        files = [item for item in entries if isinstance(item, RepoFile) and item.path]
         return {
-            item.path: Entry(item.size or 0, item.lfs.sha256, "")
-            if item.lfs
-            else Entry(item.size or 0, None, str(item.blob_id))
-            for item in files
+            item.path: Entry(item.size or 0, item.lfs.sha256 if item.lfs else None, str(item.blob_id))
+            for item in entries
+            if isinstance(item, RepoFile) and item.path
         }
 
     def _of_cache(self) -> dict[str, Entry]:
         from huggingface_hub import snapshot_download
 
         with explained(self.name):
-            found = snapshot_download(
-                **self._place, revision=self._revision, local_files_only=True, allow_patterns=[]
-            )
+            only = {"local_files_only": True, "allow_patterns": []}
+            found = snapshot_download(**self._place, **only, revision=self._revision)
         self._cached = folder = Path(found)
         names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
         return {name: Entry((folder / name).stat().st_size, None, "") for name in names}
@@ -199,8 +196,8 @@ class Repository:
         if small := [name for name in there if self._entries[name].size <= MAX_JSON_BYTES]:
             self.pull(small)
 
-    def pull(self, names: list[str], out: Path | None = None) -> Path:
-        """Download files that the client's cache lacks, and return their folder there; `out` has no effect."""
+    def pull(self, names: list[str]) -> Path:
+        """Return the folder of files in the client's cache; download those that it lacks."""
         if self._cached is not None:
             if missing := [name for name in names if name not in self._entries]:
                 fault = f"is out of reach, and {missing[0]} is not in the cache"
@@ -241,17 +238,16 @@ class Repository:
             path.touch()
             return path
         for anew in (False, True):
-            path = Path(
-                hf_hub_download(
-                    **self._place,
-                    filename=name,
-                    revision=self._commit,
-                    local_dir=folder,
-                    force_download=anew,
-                    library_name="hma-toolkit",
-                    tqdm_class=None if entry.size >= LARGE else _no_bar(),
-                )
+            found = hf_hub_download(
+                **self._place,
+                filename=name,
+                revision=self._commit,
+                local_dir=folder,
+                force_download=anew,
+                library_name="hma-toolkit",
+                tqdm_class=None if entry.size >= LARGE else _no_bar(),
             )
+            path = Path(found)
             if entry.states(path):
                 return path
         remedy = f"pull again; if it stays so, delete {path}, or do not use this repository"
@@ -291,7 +287,6 @@ class Repository:
 
         Args:
             changes: returns contents by name, None to delete; it calls `files`.
-            message: message of the commit.
 
         Raises:
             HubError: the hub refuses the commit, or others keep committing.

@@ -1,8 +1,7 @@
 """Use folders and files of object stores like paths: `s3://bucket/set`, `gs://`, `hf://`, `memory://`.
 
 `place` makes a path of what a user wrote. A `RemotePath` can be joined, listed, read by ranges and deleted;
-`put_file` and `put_bytes` upload whole files. Stores raise many kinds of exceptions. A fault that may pass by
-itself is tried again; any other becomes FileNotFoundError, or a StorageError that names the URI.
+`put_file` and `put_bytes` upload whole files.
 """
 
 import errno
@@ -17,7 +16,7 @@ from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
 from hma_data.errors import HMAError, StorageAwayError, StorageError
-from hma_data.storage.fetch import ABSENT, address_hint, file_system, may_pass, retried, said
+from hma_data.storage.fetch import ABSENT, file_system, retried, said
 from hma_data.storage.paths import StrPath, as_text
 
 WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
@@ -65,29 +64,21 @@ def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
 
     Raises:
         FileNotFoundError: there is no such file.
-        StorageAwayError: it failed in such a way at every try.
-        StorageError: it fails for good.
+        StorageError: it fails for good; StorageAwayError: as `retried` does.
     """
     try:
-        return retried(action, where, WAITS_S)
+        return retried(action, where, doing, WAITS_S)
     except HMAError:
         raise
     except ABSENT as fault:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(where)) from fault
     except Exception as fault:  # stores raise exceptions of any kind
-        text = f"cannot be {doing}: {said(fault)}"
-        if may_pass(fault):
-            remedy = address_hint(fault) + "everything finished is kept: run the same command again"
-            raise StorageAwayError(where, text, remedy) from fault
-        raise StorageError(where, text, _remedy(fault)) from fault
-
-
-def _remedy(fault: BaseException) -> str:
-    if "credential" in said(fault).lower():
-        return "give credentials, in the way its driver reads them (environment or configuration file)"
-    if isinstance(fault, PermissionError) or "401" in said(fault) or "403" in said(fault):
-        return "check the credentials, and what they allow"
-    return "check the URI and your access to it"
+        remedy = "check the URI and your access to it"
+        if "credential" in said(fault).lower():
+            remedy = "give credentials, in the way its driver reads them (environment or configuration file)"
+        elif isinstance(fault, PermissionError) or "401" in said(fault) or "403" in said(fault):
+            remedy = "check the credentials, and what they allow"
+        raise StorageError(where, f"cannot be {doing}: {said(fault)}", remedy) from fault
 
 
 class RemotePath(PosixPath):

@@ -21,7 +21,7 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, masked_after
-from hma_model.network.conditioning import ActionConditioning, Groups, condition, no_chunks
+from hma_model.network.conditioning import ActionConditioning, Groups, condition, unknown
 from hma_model.network.embed import unpatchify
 from hma_model.network.model import HMA
 from hma_model.network.trunk import (
@@ -152,7 +152,11 @@ class Rollout:
                 own = features[:, :tokens]
                 frame.unmask(self.model.readout, own, position, count)  # type: ignore[arg-type]
                 left -= count
-        self._append(frame.values)
+        self.frames = torch.cat([self.frames, frame.values.unsqueeze(1)], dim=1)
+        self.time += 1
+        self.fresh = 1 if self.caching else self.frames.shape[1]
+        if self.caching and self.config.time_position == "rotary":
+            self._keep(1)
         return self._show(frame.values)
 
     # -- one pass -----------------------------------------------------------------------------------------
@@ -209,7 +213,7 @@ class Rollout:
 
     def _condition_on(self, actions: Tensor | None, frames: int) -> ActionConditioning:
         """Return the chunk at each known frame; with `current` alignment `step` adds the last chunk."""
-        given = no_chunks(self.batch, frames, self.width, self.model.device)
+        given = unknown(self.model, self.sorted, frames)
         if actions is None or frames == 1:
             return given
         if actions.shape[1] < frames - 1 or actions.shape[2] < self.width:
@@ -228,7 +232,7 @@ class Rollout:
             raise HMAError("step", "some steps have actions and some have none", "give them always or never")
         self.passive = self.passive and chunk is None
         self.begun = True
-        new = self._condition_on(None, 1)
+        new = unknown(self.model, self.sorted, 1)
         if chunk is not None:
             values = self._chunk(chunk)
             if self.config.action_alignment == "current":
@@ -244,13 +248,6 @@ class Rollout:
             fault = f"a chunk has the shape {tuple(chunk.shape)}"
             raise HMAError("step", fault, f"give ({self.batch}, {self.width})")
         return self.groups.sort(chunk.to(self.model.device))[:, : self.width].float()
-
-    def _append(self, values: Tensor) -> None:
-        self.frames = torch.cat([self.frames, values.unsqueeze(1)], dim=1)
-        self.time += 1
-        self.fresh = 1 if self.caching else self.frames.shape[1]
-        if self.caching and self.config.time_position == "rotary":
-            self._keep(1)
 
     def _slide(self) -> None:
         """Recompute the window when it moves with learned positions, which change for each of its frames."""

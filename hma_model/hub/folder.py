@@ -1,10 +1,9 @@
 """Publish to and pull from a folder, on this machine or at any fsspec URI.
 
-A push first writes its files under temporary names. Then it renames them one by one: config and trunk first,
-then the parts of each embodiment with its card last. An embodiment without a card counts as absent, and a
-card holds the digests of its parts. The same push again completes one that was killed. Pushes to a folder of
-this machine wait for one another. In a store nothing is locked: the first config.json stays, and the digests
-reveal a mixture of two pushes of one embodiment.
+A push writes its files under temporary names and renames them one by one: config and trunk first, then the
+parts of each embodiment with its card last. An embodiment without a card counts as absent. The same push
+again completes one that was killed. Pushes to a folder of this machine wait for one another. In a store
+nothing is locked: the first config.json stays, and the digests in the cards reveal a mixture of two pushes.
 """
 
 import fcntl
@@ -87,14 +86,12 @@ class FolderStore:
 
     # -- pulling
 
-    def download(self, names: list[str], out: Path) -> None:
-        """Fetch files as `pull` does."""
-        self.pull(names, out)
+    def pull(self, names: list[str]) -> Path:
+        """Return the hub's folder."""
+        return self._root
 
-    def pull(self, names: list[str], out: Path | None) -> Path:
-        """Copy the files that `out` lacks or that differ there; without `out`, return the hub's folder."""
-        if out is None:
-            return self._root
+    def download(self, names: list[str], out: Path) -> None:
+        """Copy the files that `out` lacks or that differ there."""
         for name in names:
             target, ours = out / name, self._root / name
             with _explained(target, "pulled"):
@@ -108,7 +105,6 @@ class FolderStore:
                         raise HubError(out, fault, "pull to another folder")
                 with atomic_path(target) as part:
                     _copy(ours, part)
-        return out
 
     # -- pushing
 

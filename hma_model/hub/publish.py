@@ -2,8 +2,7 @@
 
 A hub is a folder, any fsspec URI, or a repository of the Hugging Face Hub; all hold the layout of
 `hma_model.checkpoint`. `org/name` and `hf://org/name` are repositories; `./org/name` or any other path is a
-folder. A push writes the files of its embodiments and README.md. It writes the trunk only if there is none
-yet.
+folder.
 """
 
 import hashlib
@@ -18,6 +17,7 @@ from hma_data.hub.repository import Repository
 from hma_data.registry.embodiment import ID_PATTERN, find
 from hma_data.storage.files import cache_folder, file_sha256, json_object
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
+from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import (
     CARD,
@@ -98,7 +98,13 @@ def push(
     """
     source = Checkpoint.open(checkpoint)
     ids = sorted(set(source.embodiments if embodiments is None else embodiments))
-    _require_publishable(source, ids)
+    source.trunk()
+    for name in ids:
+        _require_yaml(source, name)
+        checkpoints.read_embodiment(source, name)
+        if source.card(name).get("id", name) != name:
+            fault = f"is the card of {str(source.card(name)['id'])[:60]!r}"
+            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
     store = open_store(target, write=True, private=private)
 
     message = f"Add {', '.join(ids)}" if ids else "Add the trunk"
@@ -134,7 +140,6 @@ def _pull(
     source: str | Path, embodiments: Iterable[str] | None, out: Path | None, revision: str | None
 ) -> tuple[Path, list[str]]:
     """Return the checkpoint's folder and the requested ids; the folder may hold older ones too."""
-    source, revision = addressed(source, revision)
     store = open_store(source, revision)
     files = store.files()
     values = _config(store, files)
@@ -154,21 +159,21 @@ def _pull(
         raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
     names = [f"embodiments/{name}/{part}" for name in wanted for part in (SAMPLE, *PARTS)]
     names = [CONFIG, TRUNK, *(name for name in names if name in files or not name.endswith(SAMPLE))]
-    place = out
-    if place is None and "://" in str(source) and not is_repository(source):
+    place = folder = store.pull(names)
+    if isinstance(folder, RemotePath):
         key = f"{store.name} {values.get('trunk_sha256')}".encode()
         place = cache_folder() / "hub" / hashlib.sha256(key).hexdigest()[:24]
-    folder = store.pull(names, place)
-    if place and folder != place:
-        folder = FolderStore(folder).pull(names, place)
-    pulled = Checkpoint.open(folder)
+    place = out or place
+    if place != folder:
+        FolderStore(folder).download(names, place)
+    pulled = Checkpoint.open(place)
     pulled.trunk()
     for name in wanted:
         pulled.check(name)
         _require_yaml(pulled, name)
     if out:
-        checkpoints.write_readme(folder)
-    return folder, wanted
+        checkpoints.write_readme(out)
+    return place, wanted
 
 
 def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
@@ -207,32 +212,18 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             stats[name] = known.stats(name)
             cards[name] = {key: known.card(name).get(key, {}) for key in ("data", "metrics", "training")}
         else:
-            yaml[name] = _registered(name)
+            try:
+                yaml[name] = find(name).to_yaml()
+            except HMAError as fault:
+                text = "has no YAML where the model was loaded from, nor in the registry"
+                remedy = "save with hma_model.checkpoint.save and push the folder"
+                raise HubError(f"embodiment {name}", text, remedy) from fault
             action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
             stats[name] = {"action": action}
     with tempfile.TemporaryDirectory() as folder:
         made, tokenizer = Path(folder) / "model", model.config.tokenizer
         checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards, tokenizer=tokenizer)
         return push(made, target, embodiments)
-
-
-# -- checks before a push
-
-
-def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
-    """Raise unless others can load the embodiments.
-
-    Raises:
-        CheckpointError: parts do not belong together, are damaged, or hold values that no model can use.
-        RegistryError: an embodiment's YAML is not valid.
-    """
-    source.trunk()
-    for name in embodiments:
-        _require_yaml(source, name)
-        checkpoints.read_embodiment(source, name)
-        if source.card(name).get("id", name) != name:
-            fault = f"is the card of {str(source.card(name)['id'])[:60]!r}"
-            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
 
 
 def _require_yaml(source: Checkpoint, name: str) -> None:
@@ -245,25 +236,13 @@ def _require_yaml(source: Checkpoint, name: str) -> None:
         raise CheckpointError(path, f"is not the file that {CARD} names", remedy)
 
 
-# -- the changes of a push
-
-
 def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
     from hma_data.shards.manifest import MANIFEST  # imports pyarrow
 
     files = store.files()
     present: dict[str, Content] = {}
     if CONFIG in files:
-        there = _config(store, files)
-        if there.get("trunk_sha256") != source.trunk_sha256:
-            theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
-            fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
-            remedy = "push to a hub of its own, or finetune on the trunk that is there"
-            raise HubError(store.name, fault, remedy)
-        if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
-            raise HubError(
-                store.name, "has the same trunk with another tokenizer", "push to a hub of its own"
-            )
+        _require_trunk(source, _config(store, files), store.name)
     else:
         if MANIFEST in files:
             raise HubError(store.name, "holds a shard set", "push to a place of its own")
@@ -283,6 +262,16 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
     config = checkpoints.config_json(source.config, source.trunk_sha256)
     present[README] = render(config, cards, repo=store.repo, samples=samples)
     return present
+
+
+def _require_trunk(source: Checkpoint, there: dict[str, Any], where: str) -> None:
+    if there.get("trunk_sha256") != source.trunk_sha256:
+        theirs, ours = str(there.get("trunk_sha256"))[:16], source.trunk_sha256[:16]
+        fault = f"has another trunk: {theirs}, this checkpoint's is {ours}"
+        remedy = "push to a hub of its own, or finetune on the trunk that is there"
+        raise HubError(where, fault, remedy)
+    if there.get("tokenizer") != source.config.to_json()["tokenizer"]:
+        raise HubError(where, "has the same trunk with another tokenizer", "push to a hub of its own")
 
 
 def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
@@ -310,12 +299,3 @@ def _readable_card(store: Store, name: str) -> dict[str, Any]:
         return json_object(store.read(path), f"{store.name}: {path}", HubError)
     except HubError:
         return {}
-
-
-def _registered(name: str) -> str:
-    try:
-        return find(name).to_yaml()
-    except HMAError as fault:
-        text = "has no YAML where the model was loaded from, nor in the registry"
-        remedy = "save with hma_model.checkpoint.save and push the folder"
-        raise HubError(f"embodiment {name}", text, remedy) from fault
