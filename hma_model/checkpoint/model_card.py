@@ -44,8 +44,11 @@ def render(
         f"### {name}\n\n![A rollout of {name} beside the truth](embodiments/{name}/sample.png)"
         for name in sorted(set(cards) & set(samples))
     ]
+    front: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
+    front |= licence(card.get("license") for card in cards.values())
+    front["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
     parts = [
-        _front_matter(cards),
+        f"---\n{write_yaml(front)}---",
         f"# {line((repo or 'HMA world model').rsplit('/', 1)[-1])}",
         _about(config),
         "## Embodiments\n\n" + _table(cards),
@@ -55,13 +58,6 @@ def render(
         "parts that do not belong together are refused on loading.",
     ]
     return ("\n\n".join(parts) + "\n").encode()
-
-
-def _front_matter(cards: Mapping[str, Mapping[str, Any]]) -> str:
-    values: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
-    values |= licence(card.get("license") for card in cards.values())
-    values["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
-    return f"---\n{write_yaml(values)}---"
 
 
 def _about(config: Mapping[str, Any]) -> str:

@@ -216,7 +216,7 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
                 yaml[name] = find(name).to_yaml()
             except HMAError as fault:
                 text = "has no YAML where the model was loaded from, nor in the registry"
-                remedy = "save with hma_model.checkpoint.save and push the folder"
+                remedy = "save with hma_model.checkpoint.io.save and push the folder"
                 raise HubError(f"embodiment {name}", text, remedy) from fault
             action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
             stats[name] = {"action": action}
