@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from hma_data.errors import HubError
+from hma_data.errors import HMAError, HubError
 from hma_data.storage.fetch import causes
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
@@ -20,9 +20,9 @@ def explained(where: str) -> Iterator[None]:
     """Raise what the client raises in the `with` block as a HubError."""
     try:
         yield
-    except HubError:
+    except HMAError:
         raise
-    except raised() as fault:
+    except Exception as fault:  # the client and its libraries raise exceptions of any kind
         raise explain(where, without_token(fault)) from fault
 
 
@@ -101,15 +101,6 @@ def failed_by_xet(fault: BaseException) -> bool:
         return False
     constants.HF_HUB_DISABLE_XET = True
     return True
-
-
-def raised() -> tuple[type[BaseException], ...]:
-    """Return the types of error that the client raises."""
-    import httpx
-    from huggingface_hub import errors
-
-    others = (OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError)
-    return (*others, httpx.HTTPError, errors.EntryNotFoundError)
 
 
 def _response(fault: BaseException) -> Any:

@@ -32,14 +32,12 @@ from hma_model.checkpoint.folder import (
     check_id,
     digest,
     inside,
-    require_tokenizer,
 )  # fmt: skip
 from hma_model.checkpoint.model_card import render
 from hma_model.checkpoint.weights import write_tensors
 from hma_model.config import ActionSpace, HMAConfig
 
 if TYPE_CHECKING:
-    from hma_data.tokenizers.base import TokenizerSpec
     from hma_model.network.model import HMA
 
 
@@ -50,7 +48,6 @@ def save(
     embodiment_yaml: Mapping[str, str],
     stats: Mapping[str, dict[str, Any]],
     cards: Mapping[str, dict[str, Any]],
-    tokenizer: Mapping[str, Any],
     training: Callable[[Path], None] | None = None,
     base: Checkpoint | None = None,
     samples: Mapping[str, bytes] | None = None,
@@ -63,7 +60,6 @@ def save(
         embodiment_yaml: id -> registry YAML.
         stats: id -> {"action": {"mean", "std", ...}, ...}.
         cards: id -> the known facts of its data and metrics; an id without a card gets an empty one.
-        tokenizer: the spec, plain values.
         training: writes what only a resumed run needs into the folder `training/`, which it is given.
         base: a checkpoint with the same trunk. Its trunk, its configuration and the files of its other
             embodiments are taken over unchanged.
@@ -76,7 +72,6 @@ def save(
 
     folder = as_path(folder)
     _check_parts(model, folder, embodiment_yaml, stats)
-    config = model.config.replace(tokenizer=dict(tokenizer))
     try:
         with new_folder(folder) as new:
             if base:
@@ -84,7 +79,7 @@ def save(
             else:
                 write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"})
                 trunk = file_sha256(new / TRUNK)
-                (new / CONFIG).write_bytes(to_json(config_json(config, trunk)))
+                (new / CONFIG).write_bytes(to_json(config_json(model.config, trunk)))
             for name in sorted(embodiment_yaml):
                 home = new / "embodiments" / name
                 home.mkdir(parents=True)
@@ -92,7 +87,7 @@ def save(
                 (home / STATS).write_bytes(to_json(stats[name]))
                 if samples and name in samples:
                     (home / SAMPLE).write_bytes(samples[name])
-                _write_embodiment(model, home, trunk, digest(tokenizer), cards.get(name, {}))
+                _write_embodiment(model, home, trunk, cards.get(name, {}))
             if training:
                 (new / TRAINING).mkdir()
                 training(new / TRAINING)
@@ -103,19 +98,13 @@ def save(
     return Checkpoint.open(folder)
 
 
-def load(
-    folder: StrPath,
-    embodiments: Iterable[str] | None = None,
-    device: str = "cpu",
-    tokenizer: "TokenizerSpec | None" = None,
-) -> "HMA":
+def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str = "cpu") -> "HMA":
     """Return the model of a checkpoint with the chosen embodiments; read nothing else.
 
     Args:
         folder: str or path of a checkpoint, or of a training run.
         embodiments: ids; None for all of the checkpoint.
         device: where the model goes.
-        tokenizer: the expected tokenizer; a model that was trained on another one is refused.
 
     Raises:
         CheckpointError: the checkpoint is missing or damaged, or its parts do not belong together.
@@ -123,8 +112,6 @@ def load(
     from hma_model.network.model import HMA
 
     checkpoint = Checkpoint.open(folder)
-    if tokenizer is not None:
-        require_tokenizer(checkpoint.config, tokenizer, checkpoint.folder)
     trunk = weights.trunk(checkpoint)
     model = HMA(checkpoint.config)
     model.load_trunk(trunk)
@@ -209,8 +196,9 @@ def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
     return base.trunk_sha256
 
 
-def _write_embodiment(model: "HMA", home: Path, trunk: str, tokenizer: str, given: dict[str, Any]) -> None:
-    links = {"trunk_sha256": trunk, "tokenizer": tokenizer, "stats_sha256": file_sha256(home / STATS)}
+def _write_embodiment(model: "HMA", home: Path, trunk: str, given: dict[str, Any]) -> None:
+    tokenizer, stats = digest(model.config.tokenizer), file_sha256(home / STATS)
+    links = {"trunk_sha256": trunk, "tokenizer": tokenizer, "stats_sha256": stats}
     metadata = {"format": "pt", "format_version": str(FORMAT_VERSION), "embodiment": home.name, **links}
     write_tensors(home / STEM, model.stem_state(home.name), metadata)
     write_tensors(home / HEAD, model.head_state(home.name), metadata)

@@ -221,8 +221,8 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
             stats[name] = {"action": action}
     with tempfile.TemporaryDirectory() as folder:
-        made, tokenizer = Path(folder) / "model", model.config.tokenizer
-        checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards, tokenizer=tokenizer)
+        made = Path(folder) / "model"
+        checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards)
         return push(made, target, embodiments)
 
 

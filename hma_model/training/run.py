@@ -359,7 +359,6 @@ class Run:
                 embodiment_yaml={name: s.embodiment.to_yaml() for name, s in self.sets.items()},
                 stats=self.stats,
                 cards={name: self._card(name, s) for name, s in self.sets.items()},
-                tokenizer=model.config.tokenizer,
                 training=lambda folder: write_state(folder, state, moments, weights),
                 base=self.start.checkpoint if self.start and self.start.frozen else None,
                 samples=newest_sheets(self.out, self.sets),

@@ -61,7 +61,6 @@ def save(folder: Path, names: dict[str, int], seed: int = 0, **given: Any) -> HM
         embodiment_yaml={name: yaml(name, dims) for name, dims in names.items()},
         stats={name: stats(dims) for name, dims in names.items()},
         cards={name: {"data": {"windows": 12}, "metrics": {"val_loss": 1.5}} for name in names},
-        tokenizer=SPEC.to_json(),
         **given,
     )
     return model

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.io import Checkpoint
+from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.checkpoint.weights import read_metadata
 from tests.model.robots import CONFIG, SPEC, edit_card, make_model, save, yaml
 from tests.model.robots import stats as stats_of
@@ -139,7 +139,7 @@ def test_a_checkpoint_of_another_library_is_refused(folder):
 def test_a_tokenizer_other_than_the_models_is_refused_with_the_difference(folder):
     other = {**SPEC.to_json(), "image_size": 32}
     with pytest.raises(CheckpointError, match="image_size is 16 there and 32 here"):
-        checkpoint.load(folder, tokenizer=type(SPEC).from_json(other))
+        require_tokenizer(Checkpoint.open(folder).config, type(SPEC).from_json(other), folder)
 
 
 def test_truncated_weights_are_refused(folder):
@@ -196,7 +196,6 @@ def test_a_model_with_an_embodiment_without_yaml_is_not_saved(tmp_path):
             embodiment_yaml=robots,
             stats=numbers,
             cards={},
-            tokenizer=SPEC.to_json(),
         )
 
 
