@@ -175,7 +175,7 @@ class Repository:
         from huggingface_hub import snapshot_download
 
         with explained(self.name):
-            only = {"local_files_only": True, "allow_patterns": []}
+            only: dict[str, Any] = {"local_files_only": True, "allow_patterns": []}
             found = snapshot_download(**self._place, **only, revision=self._revision)
         self._cached = folder = Path(found)
         names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
