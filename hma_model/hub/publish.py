@@ -98,13 +98,7 @@ def push(
     """
     source = Checkpoint.open(checkpoint)
     ids = sorted(set(source.embodiments if embodiments is None else embodiments))
-    source.trunk()
-    for name in ids:
-        _require_yaml(source, name)
-        checkpoints.read_embodiment(source, name)
-        if source.card(name).get("id", name) != name:
-            fault = f"is the card of {str(source.card(name)['id'])[:60]!r}"
-            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
+    _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
 
     message = f"Add {', '.join(ids)}" if ids else "Add the trunk"
@@ -224,6 +218,17 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
         made = Path(folder) / "model"
         checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards)
         return push(made, target, embodiments)
+
+
+def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
+    """Raise unless others can load the embodiments."""
+    source.trunk()
+    for name in embodiments:
+        _require_yaml(source, name)
+        checkpoints.read_embodiment(source, name)
+        if source.card(name).get("id", name) != name:
+            fault = f"is the card of {str(source.card(name)['id'])[:60]!r}"
+            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
 
 
 def _require_yaml(source: Checkpoint, name: str) -> None:
