@@ -161,7 +161,7 @@ def published(made: Made, given: Given, out: Path) -> Any:
     hub.push(checkpoint_, target)
     hub.push_model(robots.make_model({"so100": 6}), given(out / "other"))
     hub.pull(target, out=given(out / "pulled"))
-    found = hub.describe(target), hub.list_embodiments(target), hub_list.survey(target)
+    found = hub.list_embodiments(target), hub_list.survey(target)
     return content(out), str(found).replace(str(out), ""), hub.is_repository(target)
 
 
@@ -180,9 +180,8 @@ def kept(made: Made, given: Given, out: Path) -> Any:
     """A checkpoint that is written, changed, opened and removed."""
     folder = out / "kept"
     robots.save(given(folder), {"arm": 2})  # type: ignore[arg-type]
-    card = checkpoint.update_card(given(folder), "arm", metrics={"psnr": 20.0})
     checkpoint.write_readme(given(folder))
-    found = content(folder), card, Checkpoint.open(given(folder)).embodiments, resolve(given(folder)).name
+    found = content(folder), Checkpoint.open(given(folder)).embodiments, resolve(given(folder)).name
     checkpoint.remove(given(folder))
     return found, folder.exists()
 
@@ -425,7 +424,7 @@ INNER = {  # take what a public function has made of a path already
     "hma_data.sources.hands.scan": {"scan_cached", "inspect_videos"},
     "hma_data.tokenizers.training.frames": {"read_pictures", "load_pools"},
     "hma_data.tokenizers.training.train": {"Run"},
-    "hma_model.checkpoint.folder": {"inside"},
+    "hma_model.checkpoint.folder": {"inside", "read_metadata"},
     "hma_model.hub.publish": {"embodiment_ids"},
     "hma_model.training.recipe": {"differences"},
     "hma_model.training.logging": {"EventFile", "Remote", "RunLog", "open_trackers"},

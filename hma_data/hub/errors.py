@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from hma_data.errors import HubError
+from hma_data.errors import HMAError, HubError
 from hma_data.storage.fetch import causes
 
 TRANSIENT = (408, 429, 500, 502, 503, 504)
@@ -20,9 +20,9 @@ def explained(where: str) -> Iterator[None]:
     """Raise what the client raises in the `with` block as a HubError."""
     try:
         yield
-    except HubError:
+    except HMAError:
         raise
-    except raised() as fault:
+    except Exception as fault:  # the client and its libraries raise exceptions of any kind
         raise explain(where, without_token(fault)) from fault
 
 
@@ -99,24 +99,8 @@ def failed_by_xet(fault: BaseException) -> bool:
     of_library = any(isinstance(item, ConnectionError | TimeoutError | RuntimeError) for item in chain)
     if constants.HF_HUB_DISABLE_XET or not of_library or any(isinstance(c, httpx.HTTPError) for c in chain):
         return False
-    upload_by_lfs()
-    return True
-
-
-def upload_by_lfs() -> None:
-    """Make this process upload by plain LFS, which every hub takes, instead of the client's Xet protocol."""
-    from huggingface_hub import constants
-
     constants.HF_HUB_DISABLE_XET = True
-
-
-def raised() -> tuple[type[BaseException], ...]:
-    """Return the types of error that the client raises."""
-    import httpx
-    from huggingface_hub import errors
-
-    others = (OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError)
-    return (*others, httpx.HTTPError, errors.EntryNotFoundError)
+    return True
 
 
 def _response(fault: BaseException) -> Any:

@@ -1,8 +1,7 @@
 """List, pull and push a repository of the Hugging Face Hub at one commit.
 
-A push is one commit on top of the commit it was prepared for. If somebody else has committed in between, the
-push is prepared again. Pulled files are in the cache of the hub's client, which works offline. The client
-compares no digests, so this module does: a file that differs from the listing is downloaded once more.
+A push is one commit on top of the commit it was prepared for; if somebody else has committed in between, it
+is prepared again. The hub's client compares no digests of what it downloads, so this module does.
 """
 
 import hashlib
@@ -12,24 +11,22 @@ import random
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
 from hma_data.errors import HubError
-from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, upload_by_lfs, waiting
-from hma_data.storage.files import PART
+from hma_data.hub.errors import LOG_IN, explained, failed_by_xet, shown, status, waiting
+from hma_data.storage.files import MAX_JSON_BYTES, PART
 
 ATTEMPTS = 8  # attempts to commit; half as many for any other call
 LISTING_S, SILENCE_S = 30.0, 300.0  # seconds; the hub needs minutes for a commit of many files
 AT_ONCE = 4  # downloads at a time
 LARGE = 1_000_000  # bytes of a file; from here on a bar shows the progress
-MOST_READ = 16_000_000  # largest size in bytes of a file that `read` takes
 CARD = "README.md"
 _ABSENT = object()
 _CONFLICTS = (409, 412)
@@ -43,13 +40,11 @@ class Entry:
     """A file of a repository, as a listing states it.
 
     Attributes:
-        name: path in the repository.
         size: bytes.
         sha256: SHA-256 of a file that the hub keeps by LFS; None for any other file.
-        blob_id: git's name of its content, if `sha256` is None; empty if the hub does not state it.
+        blob_id: git's name of its content, or of its LFS pointer; empty if the hub does not state it.
     """
 
-    name: str
     size: int
     sha256: str | None
     blob_id: str
@@ -102,6 +97,7 @@ class Repository:
 
         prefix = "datasets/" if kind == "dataset" else ""
         self.name, self.repo, self.kind, self._revision = name or f"hf://{prefix}{repo}", repo, kind, revision
+        self._place: dict[str, Any] = {"repo_id": repo, "repo_type": kind}
         self._api = HfApi(library_name="hma-toolkit")
         self.address = f"{self._api.endpoint}/{prefix}{repo}"
         self._write, self._private, self._absent = write, private, False
@@ -120,9 +116,9 @@ class Repository:
     # -- what is there
 
     def files(self) -> dict[str, int]:
-        """Return sizes by name at the newest commit; if the hub is out of reach, those of the cache.
+        """Return sizes by name at the newest commit, or of the cache if the hub is out of reach.
 
-        For a repository that is to be written and does not exist yet, return an empty mapping.
+        A repository that is to be written and does not exist yet has no files.
         """
         info = self._info()
         self._absent = info is _ABSENT
@@ -137,19 +133,11 @@ class Repository:
         return {name: entry.size for name, entry in self._entries.items()}
 
     def has(self, name: str, content: Path | bytes, sha256: str | None = None) -> bool:
-        """Check whether the commit that `files` listed has this content under this name.
-
-        Args:
-            sha256: SHA-256 of the content, if it is known.
-        """
-        entry = self.stated(name)
+        """Check whether the commit that `files` listed has this content (of this SHA-256) under this name."""
+        entry = self._entries.get(name)
         if entry and entry.sha256 and sha256:
             return entry.sha256 == sha256
         return entry is not None and entry.states(content)
-
-    def stated(self, name: str) -> Entry | None:
-        """Return the entry of a file in the listing of `files`; None if there is none."""
-        return self._entries.get(name)
 
     def _info(self) -> Any:
         """Return the client's facts; None if the hub is out of reach, `_ABSENT` if the repository is new."""
@@ -158,9 +146,7 @@ class Repository:
 
         def ask() -> Any:
             try:
-                return self._api.repo_info(
-                    self.repo, repo_type=self.kind, revision=self._revision, timeout=LISTING_S
-                )
+                return self._api.repo_info(**self._place, revision=self._revision, timeout=LISTING_S)
             except (errors.OfflineModeIsEnabled, httpx.ConnectError, httpx.TimeoutException):
                 if self._write:
                     raise
@@ -176,58 +162,54 @@ class Repository:
         return self._ask(ask)
 
     def _listing(self) -> dict[str, Entry]:
-        """Return the files of the commit by name."""
         from huggingface_hub import RepoFile
 
-        entries = self._api.list_repo_tree(
-            self.repo, repo_type=self.kind, revision=self._commit, recursive=True
-        )
-        files = [item for item in entries if isinstance(item, RepoFile) and item.path]
+        entries = self._api.list_repo_tree(**self._place, revision=self._commit, recursive=True)
         return {
-            item.path: Entry(
-                item.path,
-                int(item.size or 0),
-                item.lfs.sha256 if item.lfs else None,
-                "" if item.lfs else str(item.blob_id),
-            )
-            for item in files
+            item.path: Entry(item.size or 0, item.lfs.sha256 if item.lfs else None, str(item.blob_id))
+            for item in entries
+            if isinstance(item, RepoFile) and item.path
         }
 
     def _of_cache(self) -> dict[str, Entry]:
-        """Return the files of the revision in the client's cache."""
         from huggingface_hub import snapshot_download
 
         with explained(self.name):
-            self._cached = folder = Path(
-                snapshot_download(
-                    self.repo,
-                    repo_type=self.kind,
-                    revision=self._revision,
-                    local_files_only=True,
-                    allow_patterns=[],
-                )
-            )
+            only: dict[str, Any] = {"local_files_only": True, "allow_patterns": []}
+            found = snapshot_download(**self._place, **only, revision=self._revision)
+        self._cached = folder = Path(found)
         names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-        return {name: Entry(name, (folder / name).stat().st_size, None, "") for name in names}
+        return {name: Entry((folder / name).stat().st_size, None, "") for name in names}
 
     # -- pulling
 
     def read(self, name: str) -> bytes:
         """Return the content of a file of at most 16 MB at the commit that `files` listed."""
-        if self._entries[name].size > MOST_READ:
-            fault = f"is larger than {MOST_READ:,} bytes"
+        if self._entries[name].size > MAX_JSON_BYTES:
+            fault = f"is larger than {MAX_JSON_BYTES:,} bytes"
             raise HubError(f"{self.name}/{name}", fault, "this is not a file of ours")
-        return self._brought([name])[0].read_bytes()
+        return (self.pull([name]) / name).read_bytes()
 
     def warm(self, names: Iterable[str]) -> None:
         """Download small files to the cache together, for later calls of `read`."""
-        if not self.from_cache:
-            sizes = {name: self._entries[name].size for name in names if name in self._entries}
-            self._brought([name for name in sizes if sizes[name] <= MOST_READ])
+        there = [name for name in names if name in self._entries]
+        if small := [name for name in there if self._entries[name].size <= MAX_JSON_BYTES]:
+            self.pull(small)
 
-    def pull(self, names: list[str], out: Path | None = None) -> Path:
-        """Download files to the client's cache and return their folder there; `out` has no effect."""
-        return _snapshot(self._brought(names)[0], names[0])
+    def pull(self, names: list[str]) -> Path:
+        """Return the folder of files in the client's cache; download those that it lacks."""
+        if self._cached is not None:
+            if missing := [name for name in names if name not in self._entries]:
+                fault = f"is out of reach, and {missing[0]} is not in the cache"
+                raise HubError(self.name, fault, "go online and pull again")
+            return self._cached
+        folder = self._each(self._fetch, names)[0].parents[len(PurePosixPath(names[0]).parts) - 1]
+        named, commit = self._revision or "main", str(self._commit)
+        ref = folder.parent.parent / "refs" / named
+        if not _COMMIT.fullmatch(named) and not (ref.is_file() and ref.read_text() == commit):
+            ref.parent.mkdir(parents=True, exist_ok=True)
+            ref.write_text(commit)  # as the client does, which finds the revision by it offline
+        return folder
 
     def download(self, names: list[str], out: Path) -> None:
         """Download files to a folder, not to the client's cache; each gets its name when it is complete."""
@@ -245,18 +227,6 @@ class Repository:
         finally:
             shutil.rmtree(staging, ignore_errors=True)
 
-    def _brought(self, names: Sequence[str]) -> list[Path]:
-        """Return paths of files in the cache; download those that are missing or damaged."""
-        if (folder := self._cached) is not None:
-            if missing := [name for name in names if name not in self._entries]:
-                fault = f"is out of reach, and {missing[0]} is not in the cache"
-                raise HubError(self.name, fault, "go online and pull again")
-            return [folder / name for name in names]
-        paths = self._each(self._fetch, names)
-        if paths:
-            self._remember(_snapshot(paths[0], names[0]))
-        return paths
-
     def _fetch(self, name: str, folder: Path | None = None) -> Path:
         """Download a file to a folder or to the client's cache, unless it is there; return its path."""
         from huggingface_hub import hf_hub_download
@@ -268,30 +238,20 @@ class Repository:
             path.touch()
             return path
         for anew in (False, True):
-            path = Path(
-                hf_hub_download(
-                    self.repo,
-                    name,
-                    repo_type=self.kind,
-                    revision=self._commit,
-                    local_dir=folder,
-                    force_download=anew,
-                    library_name="hma-toolkit",
-                    tqdm_class=None if entry.size >= LARGE else _no_bar(),
-                )
+            found = hf_hub_download(
+                **self._place,
+                filename=name,
+                revision=self._commit,
+                local_dir=folder,
+                force_download=anew,
+                library_name="hma-toolkit",
+                tqdm_class=None if entry.size >= LARGE else _no_bar(),
             )
+            path = Path(found)
             if entry.states(path):
                 return path
         remedy = f"pull again; if it stays so, delete {path}, or do not use this repository"
         raise HubError(f"{self.name}/{name}", "came with other content than the hub stated", remedy)
-
-    def _remember(self, snapshot: Path) -> None:
-        """Record in the cache which commit the revision is, so that it can be found by this name offline."""
-        named, commit = self._revision or "main", str(self._commit)
-        ref = snapshot.parent.parent / "refs" / named
-        if not _COMMIT.fullmatch(named) and not (ref.is_file() and ref.read_text() == commit):
-            ref.parent.mkdir(parents=True, exist_ok=True)
-            ref.write_text(commit)  # as the client writes it
 
     def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
         """Return the results of an action for each file, a few files at a time; the first error ends it."""
@@ -311,9 +271,7 @@ class Repository:
         """
         self._make()
         if branch := self._revision:
-            self._ask(
-                lambda: self._api.create_branch(self.repo, repo_type=self.kind, branch=branch, exist_ok=True)
-            )
+            self._ask(lambda: self._api.create_branch(**self._place, branch=branch, exist_ok=True))
         self._ask(lambda: self._upload_modes([name]))
 
     def check_card(self, page: bytes) -> None:
@@ -329,7 +287,6 @@ class Repository:
 
         Args:
             changes: returns contents by name, None to delete; it calls `files`.
-            message: message of the commit.
 
         Raises:
             HubError: the hub refuses the commit, or others keep committing.
@@ -374,12 +331,11 @@ class Repository:
         self._refuse_ignored(added)
         self._choose_transfer()
         self._api.create_commit(
-            self.repo,
-            [
+            operations=[
                 *(CommitOperationAdd(n, str(c) if isinstance(c, Path) else c) for n, c in added.items()),
                 *(CommitOperationDelete(name) for name in deleted),
             ],
-            repo_type=self.kind,
+            **self._place,
             revision=self._revision,
             commit_message=message,
             parent_commit=self._commit,
@@ -401,7 +357,7 @@ class Repository:
         if not constants.HF_HUB_DISABLE_XET:
             answer = self._request("GET", f"{self.kind}s/{self.repo}/xet-write-token/{self._branch}")
             if not answer.is_success or b"accessToken" not in answer.content:
-                upload_by_lfs()
+                constants.HF_HUB_DISABLE_XET = True
 
     def _upload_modes(self, names: Iterable[str]) -> list[dict[str, Any]]:
         """Return how the hub would take files; it answers only those who may write."""
@@ -410,9 +366,7 @@ class Repository:
 
     def _make(self) -> None:
         private = self._private or None
-        self._ask(
-            lambda: self._api.create_repo(self.repo, repo_type=self.kind, private=private, exist_ok=True)
-        )
+        self._ask(lambda: self._api.create_repo(**self._place, private=private, exist_ok=True))
 
     # -- asking
 
@@ -437,22 +391,16 @@ class Repository:
             hf_raise_for_status(answer)
         return answer.json()
 
-    def _ask[T](self, call: Callable[[], T], where: str = "") -> T:
+    def _ask[T](self, call: Callable[[], T], where: str = "", attempt: int = 0) -> T:
         """Return the result of a client's call; repeat it if the hub is busy or the connection was cut."""
-        for attempt in count():
-            try:
-                with explained(where or self.name):
-                    return call()
-            except HubError as fault:
-                if status(fault) in _CONFLICTS:
-                    raise
-                self._pause(fault, attempt)
-        raise AssertionError("the loop returns or raises")
-
-
-def _snapshot(path: Path, name: str) -> Path:
-    """Return the folder of the client's cache that holds a file of this name."""
-    return path.parents[len(PurePosixPath(name).parts) - 1]
+        try:
+            with explained(where or self.name):
+                return call()
+        except HubError as fault:
+            if status(fault) in _CONFLICTS:
+                raise
+            self._pause(fault, attempt)
+        return self._ask(call, where, attempt + 1)
 
 
 @cache

@@ -1,12 +1,10 @@
 """Keep whole shards of remote sets on this machine, by their sha256, so that later epochs read them locally.
 
 They are files of `$HMA_CACHE/shards` and take at most `$HMA_CACHE_GB` gigabytes (default 20; 0 keeps none).
-The shards unused for longest are deleted to make room, but none that was used in the last hour. A shard that
-does not fit is read by ranges.
+The shards unused for longest are deleted to make room, but none that was used in the last hour.
 """
 
 import fcntl
-import hashlib
 import os
 import shutil
 import time
@@ -14,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from hma_data.errors import ShardError, UsageError
-from hma_data.storage.files import cache_folder, part_of
+from hma_data.storage.files import cache_folder, file_sha256, part_of
 from hma_data.storage.remote import AHEAD, RangeFile, RemotePath
 
 LIMIT, DEFAULT_GB = "HMA_CACHE_GB", 20.0
@@ -28,19 +26,18 @@ def limit_bytes() -> int:
     Raises:
         UsageError: $HMA_CACHE_GB is not a number of gigabytes.
     """
-    stated = os.environ.get(LIMIT, "")
+    stated = os.environ.get(LIMIT) or DEFAULT_GB
     try:
-        gigabytes = float(stated) if stated else DEFAULT_GB
-        return int(gigabytes * 1e9)
+        return int(float(stated) * 1e9)
     except (ValueError, OverflowError) as fault:
-        fault_text = f"{stated!r} is no number of gigabytes"
-        raise UsageError(f"${LIMIT}", fault_text, "give for example 20, or 0 for no cache") from fault
+        text = f"{stated!r} is no number of gigabytes"
+        raise UsageError(f"${LIMIT}", text, "give for example 20, or 0 for no cache") from fault
 
 
 def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
     """Return a shard's copy on this machine; download it if there is none.
 
-    The result is None where the copy does not fit or the cache cannot be written.
+    The result is None where the copy does not fit or the cache cannot be written: read it by ranges.
 
     Args:
         sha256, size: as its manifest states.
@@ -78,14 +75,10 @@ def _is_there(final: Path, size: int) -> bool:
 
 def _download(path: RemotePath, sha256: str, size: int, final: Path) -> Path:
     part = part_of(final)
-    digest = hashlib.sha256()
     try:
         with part.open("wb") as out:
-            source = RangeFile(path, size)
-            while piece := source.read(AHEAD):
-                digest.update(piece)
-                out.write(piece)
-        if digest.hexdigest() != sha256:
+            shutil.copyfileobj(RangeFile(path, size), out, AHEAD)
+        if file_sha256(part) != sha256:
             fault = "its bytes are not those of the manifest (sha256 differs)"
             raise ShardError(path, fault, "run hma shards verify to see what is damaged")
         part.replace(final)
@@ -101,10 +94,9 @@ def _make_room(folder: Path, size: int) -> bool:
         with suppress(OSError):
             facts = path.stat()
             found.append((facts.st_mtime, facts.st_size, path))
-    taken, limit = sum(item[1] for item in found), limit_bytes()
-    disk = shutil.disk_usage(folder)
+    limit, disk = limit_bytes(), shutil.disk_usage(folder)
     usable = disk.free - min(int(SPARE * disk.total), SPARE_BYTES)
-    over = max(taken + size - limit, size - usable)
+    over = max(sum(item[1] for item in found) + size - limit, size - usable)
     old = [item for item in sorted(found) if item[0] < time.time() - IN_USE_S]
     if size > limit or over > sum(item[1] for item in old):
         return False

@@ -1,7 +1,7 @@
 """Read bytes of files wherever fsspec finds them: by ranges, again when the network fails.
 
 File systems raise many kinds of exceptions. Faults that may pass by themselves (a lost connection, a busy
-server) are tried again; faults of the data are not. What remains becomes one SourceError that names the file.
+server) are tried again; faults of the data are not.
 """
 
 import errno
@@ -47,27 +47,32 @@ log = logging.getLogger(__name__)
 # -- faults
 
 
-def retried[T](action: Callable[[], T], where: object, waits_s: Sequence[float]) -> T:
+def retried[T](action: Callable[[], T], where: object, doing: str, waits_s: Sequence[float]) -> T:
     """Return what `action` returns; run it again where a file system failed in a way that may pass.
 
     Args:
-        where: for the log.
+        where, doing: for the error, such as a path and "read".
         waits_s: seconds before the second and further tries.
 
     Raises:
-        Exception: what the last try raised.
+        StorageAwayError: it failed in such a way at every try.
     """
-    for wait_s in waits_s:
-        try:
-            return action()
-        except HMAError:
+    try:
+        return action()
+    except Exception as fault:  # file systems raise exceptions of any kind
+        if isinstance(fault, HMAError) or not may_pass(fault):
             raise
-        except Exception as fault:  # file systems raise exceptions of any kind
-            if not may_pass(fault):
-                raise
-            log.info("%s: %s; trying again", where, said(fault))
-            time.sleep(wait_s)
-    return action()
+        text = f"cannot be {doing}: {said(fault)}"
+        if not waits_s:
+            remedy = (
+                "the network failed again and again: run the same command again, it continues where it was"
+            )
+            if _kinds(fault) & _UNREACHABLE:
+                remedy = "check the network, and the address (AWS_ENDPOINT_URL for s3); " + remedy
+            raise StorageAwayError(where, text, remedy) from fault
+        log.info("%s %s; trying again", where, text)
+    time.sleep(waits_s[0])
+    return retried(action, where, doing, waits_s[1:])
 
 
 def may_pass(fault: BaseException) -> bool:
@@ -79,13 +84,6 @@ def may_pass(fault: BaseException) -> bool:
     if isinstance(fault, OSError) and worth_another_try(fault):
         return True
     return bool(_kinds(fault) & _OF_THE_NETWORK)
-
-
-def address_hint(fault: BaseException) -> str:
-    """Return the first part of a remedy where a server's address may be wrong; else an empty text."""
-    if _kinds(fault) & _UNREACHABLE:
-        return "check the network, and the address (AWS_ENDPOINT_URL for s3); "
-    return ""
 
 
 def said(fault: BaseException) -> str:
@@ -150,24 +148,21 @@ def file_system(uri: str) -> tuple[Any, str]:
         ValueError: no file system is known by that scheme.
     """
     scheme = uri.split("://", 1)[0]
+    options: dict[str, Any] = {}
     try:
-        files, path = fsspec.core.url_to_fs(uri, **_client_options(scheme))
+        if scheme in ("s3", "s3a"):
+            ours = {"connect_timeout": CONNECT_S, "retries": {"total_max_attempts": 1}}
+            options["config_kwargs"] = ours | fsspec.config.conf.get("s3", {}).get("config_kwargs", {})
+        elif scheme in NO_LISTING:
+            import aiohttp
+
+            options["client_kwargs"] = {"timeout": aiohttp.ClientTimeout(total=300, sock_connect=CONNECT_S)}
+        files, path = fsspec.core.url_to_fs(uri, **options)
     except ImportError as fault:
         package = PACKAGES.get(scheme)
         remedy = f"pip install {package}" if package else said(fault)
         raise MissingDependencyError(uri, f"needs the package of {scheme}://", remedy) from fault
     return files, path
-
-
-def _client_options(scheme: str) -> dict[str, Any]:
-    if scheme in ("s3", "s3a"):
-        ours = {"connect_timeout": CONNECT_S, "retries": {"total_max_attempts": 1}}
-        return {"config_kwargs": ours | fsspec.config.conf.get("s3", {}).get("config_kwargs", {})}
-    if scheme in NO_LISTING:
-        import aiohttp
-
-        return {"client_kwargs": {"timeout": aiohttp.ClientTimeout(total=300, sock_connect=CONNECT_S)}}
-    return {}
 
 
 def protocol(files: Any) -> str:
@@ -190,21 +185,17 @@ def is_listless(files: Any) -> bool:
 
 
 def attempt[T](files: Any, path: str, action: Callable[[], T]) -> T:
-    """Return what `action` returns; try again when a remote file system fails in a way that may pass.
+    """Return what `action` returns; read again as `retried` does where the file system is remote.
 
     Raises:
-        SourceError: it fails for good.
-        StorageAwayError: it fails in a way that may pass, at every try.
+        SourceError: it fails for good; StorageAwayError: as `retried` does.
     """
     try:
-        return retried(action, path, () if is_local(files) else WAITS_S)
+        return retried(action, path, "read", () if is_local(files) else WAITS_S)
     except HMAError:
         raise
     except Exception as fault:  # file systems raise exceptions of any kind
         text = f"cannot be read: {said(fault)}"
-        if may_pass(fault):
-            remedy = "the network failed again and again; run it again later, it continues where it was"
-            raise StorageAwayError(path, text, address_hint(fault) + remedy) from fault
         raise SourceError(path, text, "check the path and your access to it") from fault
 
 
@@ -246,12 +237,11 @@ def fetch_whole(files: Any, path: str, limit: int) -> bytes | None:
         SourceError: it cannot be read, or is a local file longer than `limit` bytes.
     """
 
-    def whole() -> bytes | None:
+    def whole() -> Any:
         try:
-            data: bytes = files.cat_file(path)
+            return files.cat_file(path)
         except ABSENT:
             return None
-        return data
 
     if is_local(files):
         size = attempt(files, path, lambda: files.size(path) if files.isfile(path) else 0)

@@ -38,9 +38,11 @@ def atomic_path(final: Path) -> Iterator[Path]:
         OutputError: the folder cannot be written, or the disk is full.
         StorageError: the store refuses it; StorageAwayError: it does not answer.
     """
-    remote = isinstance(final, RemotePath)
-    part = part_of(upload_folder(final.parent) / final.name if isinstance(final, RemotePath) else final)
-    remedy = "free space, or name a folder by $HMA_CACHE" if remote else "free space or choose another --out"
+    where, remedy = final, "free space or choose another --out"
+    part = part_of(final)
+    if isinstance(final, RemotePath):
+        where = part = upload_folder(final.parent) / part.name
+        remedy = "free space, or name a folder by $HMA_CACHE"
     try:
         part.parent.mkdir(parents=True, exist_ok=True)
         yield part
@@ -51,8 +53,7 @@ def atomic_path(final: Path) -> Iterator[Path]:
             part.replace(final)
             sync_folder(final.parent)
     except OSError as fault:
-        text = f"cannot be written: {fault.strerror or fault}"
-        raise OutputError(part if remote else final, text, remedy) from fault
+        raise OutputError(where, f"cannot be written: {fault.strerror or fault}", remedy) from fault
     finally:
         part.unlink(missing_ok=True)
 
@@ -62,9 +63,9 @@ def write_atomic(final: Path, content: str | bytes) -> None:
     data = content.encode() if isinstance(content, str) else content
     if isinstance(final, RemotePath):
         put_bytes(data, final)
-        return
-    with atomic_path(final) as part:
-        part.write_bytes(data)
+    else:
+        with atomic_path(final) as part:
+            part.write_bytes(data)
 
 
 def part_of(final: Path) -> Path:
@@ -98,10 +99,8 @@ def remove_dead_parts(folder: Path) -> None:
 def _is_running(pid: int) -> bool:
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # a process of another user
-        return True
+    except OSError as fault:
+        return isinstance(fault, PermissionError)  # a process of another user
     return True
 
 
@@ -122,11 +121,9 @@ def file_sha256(path: Path) -> str:
 
 def cache_folder() -> Path:
     """Return the folder for files that can be made again: $HMA_CACHE, or `hma` in the user's cache folder."""
-    stated = os.environ.get("HMA_CACHE")
-    if stated:
+    if stated := os.environ.get("HMA_CACHE"):
         return Path(stated)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "hma"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hma"
 
 
 # -- folders
@@ -141,7 +138,8 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    new, old = _beside(folder), _beside(folder)
+    mark = f"{PARTIAL}{uuid.uuid4().hex[:12]}"
+    new, old = folder.with_name(f".{folder.name}{mark}"), folder.with_name(f".{folder.name}{mark}-old")
     new.mkdir()
     try:
         yield new
@@ -162,18 +160,11 @@ def remove_partial(folder: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def _beside(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}{PARTIAL}{uuid.uuid4().hex[:12]}")
-
-
 # -- JSON
 
 
 def parse_json(content: bytes | str) -> Any:
-    """Return the plain values of a JSON text.
-
-    A key may not be given twice: readers differ in which of the two values they take, so the same text would
-    mean one thing here and another elsewhere.
+    """Return the plain values of a JSON text; refuse a key given twice, of which readers take either value.
 
     Raises:
         ValueError: it is not JSON, or an object gives a key twice.

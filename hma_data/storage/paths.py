@@ -30,14 +30,13 @@ def as_text(path: StrPath) -> str:
     text = str(path) if isinstance(path, PurePath) else os.fspath(path)  # a RemotePath has no os.fspath
     if isinstance(text, bytes):
         raise UsageError(repr(text), "is a path of bytes", "give text: os.fsdecode converts it")
-    return _CUT.sub(_whole_scheme, text, count=1) if _CUT.match(text) else text
+    if found := _CUT.match(text):
+        return f"{found[1]}://{'/' if found[1] in ('file', 'local') else ''}{text[found.end() :]}"
+    return text
 
 
 def as_path(path: StrPath) -> Path:
-    """Return a file or folder of this machine as a `Path`; raise the errors of `as_text`.
-
-    A `Path` is returned unchanged.
-    """
+    """Return a file or folder of this machine as a `Path`; raise the errors of `as_text`."""
     return path if isinstance(path, Path) else Path(as_text(path))
 
 
@@ -85,7 +84,3 @@ def shipped(name: str) -> Path:
     package = Path(__file__).resolve().parents[1]
     packed = package / "shipped" / name
     return packed if packed.is_dir() else package.parent / name
-
-
-def _whole_scheme(found: re.Match[str]) -> str:
-    return f"{found[1]}://" + ("/" if found[1] in ("file", "local") else "")

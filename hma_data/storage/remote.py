@@ -1,8 +1,7 @@
 """Use folders and files of object stores like paths: `s3://bucket/set`, `gs://`, `hf://`, `memory://`.
 
 `place` makes a path of what a user wrote. A `RemotePath` can be joined, listed, read by ranges and deleted;
-`put_file` and `put_bytes` upload whole files. Stores raise many kinds of exceptions. A fault that may pass by
-itself is tried again; any other becomes FileNotFoundError, or a StorageError that names the URI.
+`put_file` and `put_bytes` upload whole files.
 """
 
 import errno
@@ -17,7 +16,7 @@ from pathlib import Path, PosixPath, PurePosixPath
 from typing import Any
 
 from hma_data.errors import HMAError, StorageAwayError, StorageError
-from hma_data.storage.fetch import ABSENT, address_hint, file_system, may_pass, retried, said
+from hma_data.storage.fetch import ABSENT, file_system, retried, said
 from hma_data.storage.paths import StrPath, as_text
 
 WAITS_S = (0.3, 1.5, 6.0)  # before the second, third and fourth try
@@ -65,29 +64,21 @@ def attempt[T](where: object, doing: str, action: Callable[[], T]) -> T:
 
     Raises:
         FileNotFoundError: there is no such file.
-        StorageAwayError: it failed in such a way at every try.
-        StorageError: it fails for good.
+        StorageError: it fails for good; StorageAwayError: as `retried` does.
     """
     try:
-        return retried(action, where, WAITS_S)
+        return retried(action, where, doing, WAITS_S)
     except HMAError:
         raise
     except ABSENT as fault:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(where)) from fault
     except Exception as fault:  # stores raise exceptions of any kind
-        text = f"cannot be {doing}: {said(fault)}"
-        if may_pass(fault):
-            remedy = address_hint(fault) + "everything finished is kept: run the same command again"
-            raise StorageAwayError(where, text, remedy) from fault
-        raise StorageError(where, text, _remedy(fault)) from fault
-
-
-def _remedy(fault: BaseException) -> str:
-    if "credential" in said(fault).lower():
-        return "give credentials, in the way its driver reads them (environment or configuration file)"
-    if isinstance(fault, PermissionError) or "401" in said(fault) or "403" in said(fault):
-        return "check the credentials, and what they allow"
-    return "check the URI and your access to it"
+        remedy = "check the URI and your access to it"
+        if "credential" in said(fault).lower():
+            remedy = "give credentials, in the way its driver reads them (environment or configuration file)"
+        elif isinstance(fault, PermissionError) or "401" in said(fault) or "403" in said(fault):
+            remedy = "check the credentials, and what they allow"
+        raise StorageError(where, f"cannot be {doing}: {said(fault)}", remedy) from fault
 
 
 class RemotePath(PosixPath):
@@ -161,8 +152,8 @@ class RemotePath(PosixPath):
         except FileNotFoundError:
             return {}
         begin = f"{self.key}/"
-        sizes = {name: int(found[name]["size"] or 0) for name in sorted(found)}
-        return {name.removeprefix(begin): size for name, size in sizes.items() if name.startswith(begin)}
+        below = (name for name in sorted(found) if name.startswith(begin))
+        return {name.removeprefix(begin): int(found[name]["size"] or 0) for name in below}
 
     def _kind(self) -> str:
         try:
@@ -199,10 +190,9 @@ class RemotePath(PosixPath):
             names = attempt(self, "listed", ask)
         except FileNotFoundError:
             return
-        for name in sorted(names):
-            last = name.rstrip("/").rsplit("/", 1)[-1]
-            if name.rstrip("/") != self.key:
-                yield self / last
+        for name in sorted(item.rstrip("/") for item in names):
+            if name != self.key:
+                yield self / name.rsplit("/", 1)[-1]
 
     def glob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
         """Yield the files below whose path matches the pattern, part by part; folders are not listed."""
@@ -273,11 +263,10 @@ class RemotePath(PosixPath):
         if self.scheme not in WHOLE_PUTS:
             attempt(self, "made", lambda: self.files.makedirs(self.key, exist_ok=True))
 
-    def delete_tree(self, keep: Callable[[str], bool] = lambda name: False) -> None:
-        """Delete every file below, except where `keep` returns True for its name below this folder."""
+    def delete_tree(self) -> None:
+        """Delete every file below."""
         for name in self.listing():
-            if not keep(name):
-                (self / name).unlink(missing_ok=True)
+            (self / name).unlink(missing_ok=True)
 
 
 # -- writing
@@ -346,8 +335,8 @@ class RangeFile(io.RawIOBase):
     """
 
     def __init__(self, path: RemotePath, size: int | None = None) -> None:
-        self._path, self._at, self._last = path, 0, -1
-        self._files, self._key = path.files, path.key
+        self._path, self._files, self._key = path, path.files, path.key
+        self._at, self._last = 0, -1
         self._size = int(path.info()["size"]) if size is None else size
         self._begin, self._kept = 0, b""
 
@@ -359,10 +348,6 @@ class RangeFile(io.RawIOBase):
 
     def tell(self) -> int:
         return self._at
-
-    def size(self) -> int:
-        """Return the bytes of the whole file."""
-        return self._size
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
@@ -411,5 +396,4 @@ def parquet_file(path: Path, **options: Any) -> Any:
     """Open a local or remote pyarrow ParquetFile; a remote row group is read in few requests."""
     import pyarrow.parquet as pq
 
-    remote = is_remote(path)
-    return pq.ParquetFile(parquet_input(path), pre_buffer=remote, **options)
+    return pq.ParquetFile(parquet_input(path), pre_buffer=is_remote(path), **options)

@@ -7,15 +7,17 @@
     training/                    optimizer, sampler and rng state; never published
 
 Every card and every stem holds the SHA-256 of the trunk, and the digests of the tokenizer and of the
-statistics that the stem was trained on. Parts that do not belong together are therefore refused. Only JSON,
-YAML and safetensors files are read.
+statistics that the stem was trained on. Parts that do not belong together are therefore refused.
+
+Files of older format versions are converted when they are read. A release that raises `FORMAT_VERSION` adds
+a step to `STEPS` and a test.
 """
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,14 +25,13 @@ from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import ID_PATTERN, Embodiment
 from hma_data.storage.files import file_sha256, read_json
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.checkpoint import migrate
-from hma_model.checkpoint.weights import read_metadata
 from hma_model.config import HMAConfig
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import TokenizerSpec
 
-LIBRARY = "hma-toolkit"
+Values = dict[str, Any]
+LIBRARY, FORMAT_VERSION = "hma-toolkit", 1
 CONFIG, TRUNK, README, TRAINING = "config.json", "trunk.safetensors", "README.md", "training"
 STEM, HEAD, YAML, STATS, CARD = (
     "stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json",
@@ -39,6 +40,9 @@ PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means 
 SAMPLE = "sample.png"  # optional, shown in the model card
 _APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was cut short: do it again"
+
+# version -> what converts a file's content to the next version, as `converted` calls it
+STEPS: dict[int, Callable[[str, Values], Values]] = {}
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,6 @@ class Checkpoint:
     """A checkpoint's folder, checked as far as possible without reading weights.
 
     Attributes:
-        folder: the path of the folder.
         config: of the network; the tokenizer's spec is in it.
         embodiments: ids present, sorted.
         trunk_sha256: of the trunk, as config.json states it.
@@ -72,7 +75,6 @@ class Checkpoint:
     trunk_sha256: str
     tokenizer: str
     format_version: int
-    _cards: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def open(cls, folder: StrPath) -> "Checkpoint":
@@ -100,14 +102,10 @@ class Checkpoint:
             CheckpointError: it is not the file that config.json names.
         """
         path = inside(self.folder, TRUNK)
-        if self._measured_sha256 != self.trunk_sha256:
+        if file_sha256(path) != self.trunk_sha256:
             remedy = "pull the checkpoint again, into a new folder"
             raise CheckpointError(path, f"is another trunk than {CONFIG} names", remedy)
         return path
-
-    @cached_property
-    def _measured_sha256(self) -> str:
-        return file_sha256(inside(self.folder, TRUNK))
 
     def path(self, embodiment: str, part: str) -> Path:
         """Return the path of a file of an embodiment.
@@ -123,10 +121,10 @@ class Checkpoint:
 
     def card(self, embodiment: str) -> dict[str, Any]:
         """Return card.json of an embodiment."""
-        if embodiment not in self._cards:
-            path = self.path(embodiment, CARD)
-            self._cards[embodiment] = migrate.card(read_json(path), path)
-        return self._cards[embodiment]
+        path = self.path(embodiment, CARD)
+        values = read_json(path)
+        found = values.get("format_version", FORMAT_VERSION)
+        return converted("card", values, found, path) | {"format_version": FORMAT_VERSION}
 
     def embodiment(self, embodiment: str) -> Embodiment:
         """Return the embodiment as it was at training."""
@@ -161,16 +159,36 @@ class Checkpoint:
                 raise CheckpointError(path, f"is not the file that {CARD} names", _CUT_SHORT)
 
 
-def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
-    """Return the network's config, read from the values of config.json.
+def converted(part: str, values: Values, version: object, where: object) -> Values:
+    """Return the content of a file of a format version as the newest version has it.
+
+    Args:
+        part: config, card, trunk, stem or head.
+        values: plain values of JSON, or tensors by name; they do not change.
 
     Raises:
-        CheckpointError: the values are of another library or format version, or are not valid.
+        CheckpointError: this release does not know the version.
+    """
+    oldest = min(STEPS, default=FORMAT_VERSION)
+    if not isinstance(version, int) or not oldest <= version <= FORMAT_VERSION:
+        read = str(FORMAT_VERSION) if oldest == FORMAT_VERSION else f"{oldest} to {FORMAT_VERSION}"
+        fault = f"has format_version {version!r}, this release reads {read}"
+        raise CheckpointError(where, fault, "update hma-toolkit, or save the checkpoint again")
+    for step in range(version, FORMAT_VERSION):
+        values = STEPS[step](part, deepcopy(values))
+    return values
+
+
+def parse_config(values: dict[str, Any], where: object) -> HMAConfig:
+    """Return the network's config, read from the values of config.json of any format version.
+
+    Raises:
+        CheckpointError: the values are of another library or an unknown version, or are not valid.
     """
     if values.get("library") != LIBRARY:
         remedy = "give a checkpoint of hma train; hma hub import converts one of the paper's release"
         raise CheckpointError(where, f"is not of {LIBRARY}: library is {values.get('library')!r}", remedy)
-    values = migrate.config(values, where)
+    values = converted("config", values, values.get("format_version"), where)
     model, tokenizer = values.get("model"), values.get("tokenizer")
     if not isinstance(model, dict) or not isinstance(tokenizer, dict):
         raise CheckpointError(where, "lacks its 'model' or 'tokenizer'", "pull or save the checkpoint again")
@@ -202,6 +220,21 @@ def resolve(folder: StrPath) -> Path:
 def training_checkpoints(run: StrPath) -> list[Path]:
     """Return the checkpoints of a training run (str or path of its folder), oldest first."""
     return sorted(path for path in (as_path(run) / "checkpoints").glob("step-*") if (path / CONFIG).is_file())
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """Read the metadata in the header of a safetensors file.
+
+    Raises:
+        CheckpointError: the file is damaged, truncated or of another format.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:  # the header alone needs no torch
+            return file.metadata() or {}
+    except (SafetensorError, OSError) as fault:
+        raise CheckpointError(path, f"is not whole safetensors: {fault}", "pull or save it again") from fault
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -1,7 +1,6 @@
 """Save a model with all its embodiments; load a trunk with some of them.
 
-A checkpoint is one folder, in the same layout as on the hub. `hma_model.checkpoint.folder` describes and
-checks it.
+`hma_model.checkpoint.folder` describes the layout.
 """
 
 import shutil
@@ -17,6 +16,7 @@ from hma_model.checkpoint import weights
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
+    FORMAT_VERSION,
     HEAD,
     LIBRARY,
     PARTS,
@@ -27,32 +27,18 @@ from hma_model.checkpoint.folder import (
     TRAINING,
     TRUNK,
     YAML,
-    ActionStats,
     Checkpoint,
     action_stats,
     check_id,
     digest,
     inside,
-    parse_config,
-    require_tokenizer,
-    resolve,
-    training_checkpoints,
 )  # fmt: skip
-from hma_model.checkpoint.migrate import FORMAT_VERSION
 from hma_model.checkpoint.model_card import render
 from hma_model.checkpoint.weights import write_tensors
 from hma_model.config import ActionSpace, HMAConfig
 
 if TYPE_CHECKING:
-    from hma_data.tokenizers.base import TokenizerSpec
     from hma_model.network.model import HMA
-
-__all__ = [
-    "CARD", "CONFIG", "HEAD", "LIBRARY", "PARTS", "README", "SAMPLE", "STATS", "STEM", "TRAINING",
-    "TRUNK", "YAML", "ActionStats", "Checkpoint", "action_stats", "add_embodiment", "check_id",
-    "config_json", "digest", "inside", "load", "parse_config", "read_embodiment", "remove",
-    "require_tokenizer", "resolve", "save", "training_checkpoints", "update_card", "write_readme",
-]  # fmt: skip
 
 
 def save(
@@ -62,7 +48,6 @@ def save(
     embodiment_yaml: Mapping[str, str],
     stats: Mapping[str, dict[str, Any]],
     cards: Mapping[str, dict[str, Any]],
-    tokenizer: Mapping[str, Any],
     training: Callable[[Path], None] | None = None,
     base: Checkpoint | None = None,
     samples: Mapping[str, bytes] | None = None,
@@ -75,7 +60,6 @@ def save(
         embodiment_yaml: id -> registry YAML.
         stats: id -> {"action": {"mean", "std", ...}, ...}.
         cards: id -> the known facts of its data and metrics; an id without a card gets an empty one.
-        tokenizer: the spec, plain values.
         training: writes what only a resumed run needs into the folder `training/`, which it is given.
         base: a checkpoint with the same trunk. Its trunk, its configuration and the files of its other
             embodiments are taken over unchanged.
@@ -86,9 +70,8 @@ def save(
     """
     from safetensors import SafetensorError
 
-    folder = Path(folder)
+    folder = as_path(folder)
     _check_parts(model, folder, embodiment_yaml, stats)
-    config = model.config.replace(tokenizer=dict(tokenizer))
     try:
         with new_folder(folder) as new:
             if base:
@@ -96,7 +79,7 @@ def save(
             else:
                 write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"})
                 trunk = file_sha256(new / TRUNK)
-                (new / CONFIG).write_bytes(to_json(config_json(config, trunk)))
+                (new / CONFIG).write_bytes(to_json(config_json(model.config, trunk)))
             for name in sorted(embodiment_yaml):
                 home = new / "embodiments" / name
                 home.mkdir(parents=True)
@@ -104,7 +87,7 @@ def save(
                 (home / STATS).write_bytes(to_json(stats[name]))
                 if samples and name in samples:
                     (home / SAMPLE).write_bytes(samples[name])
-                _write_embodiment(model, home, trunk, digest(tokenizer), cards.get(name, {}))
+                _write_embodiment(model, home, trunk, cards.get(name, {}))
             if training:
                 (new / TRAINING).mkdir()
                 training(new / TRAINING)
@@ -115,19 +98,13 @@ def save(
     return Checkpoint.open(folder)
 
 
-def load(
-    folder: StrPath,
-    embodiments: Iterable[str] | None = None,
-    device: str = "cpu",
-    tokenizer: "TokenizerSpec | None" = None,
-) -> "HMA":
+def load(folder: StrPath, embodiments: Iterable[str] | None = None, device: str = "cpu") -> "HMA":
     """Return the model of a checkpoint with the chosen embodiments; read nothing else.
 
     Args:
         folder: str or path of a checkpoint, or of a training run.
         embodiments: ids; None for all of the checkpoint.
         device: where the model goes.
-        tokenizer: the expected tokenizer; a model that was trained on another one is refused.
 
     Raises:
         CheckpointError: the checkpoint is missing or damaged, or its parts do not belong together.
@@ -135,8 +112,6 @@ def load(
     from hma_model.network.model import HMA
 
     checkpoint = Checkpoint.open(folder)
-    if tokenizer is not None:
-        require_tokenizer(checkpoint.config, tokenizer, checkpoint.folder)
     trunk = weights.trunk(checkpoint)
     model = HMA(checkpoint.config)
     model.load_trunk(trunk)
@@ -171,17 +146,6 @@ def read_embodiment(
         text = f"does not fit {YAML}: {fault.fault}"
         raise CheckpointError(path, text, "pull the embodiment again") from fault
     return space, *weights.embodiment(checkpoint, embodiment, space)
-
-
-def update_card(folder: StrPath, embodiment: str, **facts: Any) -> dict[str, Any]:
-    """Update an embodiment's card (`metrics` is merged, other facts are replaced), and README.md."""
-    checkpoint = Checkpoint.open(folder)
-    card = dict(checkpoint.card(embodiment))
-    metrics = {**card.get("metrics", {}), **facts.pop("metrics", {})}
-    card.update(facts, metrics=metrics)
-    write_atomic(checkpoint.path(embodiment, CARD), to_json(card))
-    write_readme(checkpoint.folder)
-    return card
 
 
 def write_readme(folder: StrPath) -> None:
@@ -232,31 +196,30 @@ def _take_over(base: Checkpoint, new: Path, besides: set[str]) -> str:
     return base.trunk_sha256
 
 
-def _write_embodiment(model: "HMA", home: Path, trunk: str, tokenizer: str, given: dict[str, Any]) -> None:
-    links = {"trunk_sha256": trunk, "tokenizer": tokenizer, "stats_sha256": file_sha256(home / STATS)}
+def _write_embodiment(model: "HMA", home: Path, trunk: str, given: dict[str, Any]) -> None:
+    tokenizer, stats = digest(model.config.tokenizer), file_sha256(home / STATS)
+    links = {"trunk_sha256": trunk, "tokenizer": tokenizer, "stats_sha256": stats}
     metadata = {"format": "pt", "format_version": str(FORMAT_VERSION), "embodiment": home.name, **links}
     write_tensors(home / STEM, model.stem_state(home.name), metadata)
     write_tensors(home / HEAD, model.head_state(home.name), metadata)
-    card = {**_facts(Embodiment.load(home / YAML)), "data": {}, "metrics": {}, **given, **links}
-    card["files"] = {part: file_sha256(home / part) for part in PARTS[:-1]}
-    (home / CARD).write_bytes(to_json(card))
-
-
-def _facts(embodiment: Embodiment) -> dict[str, Any]:
-    unstated = embodiment.frequency_hz == "unknown" and not embodiment.sync.rate_hz
-    return {
+    robot = Embodiment.load(home / YAML)
+    unstated = robot.frequency_hz == "unknown" and not robot.sync.rate_hz
+    facts = {
         "format_version": FORMAT_VERSION,
-        "id": embodiment.id,
-        "description": embodiment.description,
-        "robot": embodiment.robot,
-        "kind": embodiment.kind,
-        "action_space": embodiment.action.space,
-        "action_dim": embodiment.action_dim,
-        "stride": embodiment.stride,
-        "chunk_dim": embodiment.chunk_dim,
-        "effective_hz": None if unstated else embodiment.effective_hz,
-        "license": embodiment.license,
+        "id": robot.id,
+        "description": robot.description,
+        "robot": robot.robot,
+        "kind": robot.kind,
+        "action_space": robot.action.space,
+        "action_dim": robot.action_dim,
+        "stride": robot.stride,
+        "chunk_dim": robot.chunk_dim,
+        "effective_hz": None if unstated else robot.effective_hz,
+        "license": robot.license,
     }
+    files = {part: file_sha256(home / part) for part in PARTS[:-1]}
+    card = {**facts, "data": {}, "metrics": {}, **given, **links, "files": files}
+    (home / CARD).write_bytes(to_json(card))
 
 
 def _check_parts(

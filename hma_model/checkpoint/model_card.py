@@ -40,25 +40,24 @@ def render(
         repo: the name of the checkpoint for a reader; None for the reader's own path.
         samples: ids that have a sample.png.
     """
-    name = repo or "PATH"
+    pictures = [
+        f"### {name}\n\n![A rollout of {name} beside the truth](embodiments/{name}/sample.png)"
+        for name in sorted(set(cards) & set(samples))
+    ]
+    front: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
+    front |= licence(card.get("license") for card in cards.values())
+    front["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
     parts = [
-        _front_matter(cards),
+        f"---\n{write_yaml(front)}---",
         f"# {line((repo or 'HMA world model').rsplit('/', 1)[-1])}",
         _about(config),
         "## Embodiments\n\n" + _table(cards),
-        *(_pictures(cards, samples)),
-        "## How to use\n\n" + _usage(name, cards),
+        *pictures,
+        "## How to use\n\n" + _usage(repo or "PATH", cards),
         f"Format version {line(config.get('format_version'))}. Each `card.json` names its trunk by SHA-256: "
         "parts that do not belong together are refused on loading.",
     ]
     return ("\n\n".join(parts) + "\n").encode()
-
-
-def _front_matter(cards: Mapping[str, Mapping[str, Any]]) -> str:
-    values: dict[str, Any] = {"library_name": "hma-toolkit", "pipeline_tag": "robotics"}
-    values |= licence(card.get("license") for card in cards.values())
-    values["tags"] = [*_TAGS, *(f"embodiment:{name}" for name in sorted(cards))]
-    return f"---\n{write_yaml(values)}---"
 
 
 def _about(config: Mapping[str, Any]) -> str:
@@ -93,14 +92,6 @@ def _table(cards: Mapping[str, Mapping[str, Any]]) -> str:
             line(card.get("license")) or "not stated",
         ])  # fmt: skip
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-def _pictures(cards: Mapping[str, Any], samples: Collection[str]) -> list[str]:
-    shown = sorted(set(cards) & set(samples))
-    return [
-        f"### {name}\n\n![A rollout of {name} beside the truth](embodiments/{name}/sample.png)"
-        for name in shown
-    ]
 
 
 def _usage(name: str, cards: Mapping[str, Any]) -> str:

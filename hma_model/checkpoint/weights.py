@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hma_data.errors import CheckpointError
-from hma_model.checkpoint import migrate
+from hma_model.checkpoint.folder import FORMAT_VERSION, Checkpoint, converted, read_metadata
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from hma_model.checkpoint.folder import Checkpoint
     from hma_model.config import ActionSpace, HMAConfig
 
 State = dict[str, "Tensor"]
@@ -44,17 +43,6 @@ def read_tensors(path: Path) -> State:
         raise CheckpointError(path, f"is not whole safetensors: {fault}", "pull or save it again") from fault
 
 
-def read_metadata(path: Path) -> dict[str, str]:
-    """Read the metadata in the header of a safetensors file; see `read_tensors`."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="np") as file:  # the header alone needs no torch
-            return file.metadata() or {}
-    except (SafetensorError, OSError) as fault:
-        raise CheckpointError(path, f"is not whole safetensors: {fault}", "pull or save it again") from fault
-
-
 def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[str, str]) -> None:
     """Write a safetensors file; the same tensors give the same bytes, whatever device they are on."""
     from safetensors.torch import save_file
@@ -74,7 +62,7 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[st
 # -- the weights of a checkpoint
 
 
-def trunk(checkpoint: "Checkpoint") -> State:
+def trunk(checkpoint: Checkpoint) -> State:
     """Read the trunk's tensors, in the newest format version.
 
     Raises:
@@ -82,13 +70,13 @@ def trunk(checkpoint: "Checkpoint") -> State:
             network.
     """
     path = checkpoint.trunk()
-    state: State = migrate.tensors("trunk", read_tensors(path), checkpoint.format_version, path)
+    state: State = converted("trunk", read_tensors(path), checkpoint.format_version, path)
     _require_values(path, state)
     _require_network(checkpoint.config, state, checkpoint.folder)
     return state
 
 
-def embodiment(checkpoint: "Checkpoint", name: str, space: "ActionSpace") -> tuple[State, State]:
+def embodiment(checkpoint: Checkpoint, name: str, space: "ActionSpace") -> tuple[State, State]:
     """Read the tensors of an embodiment's stem and head; `space` is the action space of its YAML.
 
     Raises:
@@ -100,8 +88,8 @@ def embodiment(checkpoint: "Checkpoint", name: str, space: "ActionSpace") -> tup
         if space.chunk_dim > path.stat().st_size:
             fault = f"is too small for chunks of {space.chunk_dim:,} values, which embodiment.yaml asks for"
             raise CheckpointError(path, fault, "pull the embodiment again")
-        version = read_metadata(path).get("format_version", str(migrate.FORMAT_VERSION))
-        state = migrate.tensors(part, read_tensors(path), int(version) if version.isdecimal() else -1, path)
+        version = read_metadata(path).get("format_version", str(FORMAT_VERSION))
+        state = converted(part, read_tensors(path), int(version) if version.isdecimal() else version, path)
         _require_values(path, state)
         states.append(state)
     return states[0], states[1]
@@ -119,11 +107,7 @@ def _require_values(where: object, state: Mapping[str, "Tensor"]) -> None:
 
 
 def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: object) -> None:
-    """Raise if a network of this configuration has more values than the trunk's file.
-
-    Names and shapes are compared later, on loading. This check limits the size of the network that is built
-    before.
-    """
+    """Raise if a network of this configuration has more values than the trunk's file."""
     for key in _COUNTS:
         value = getattr(config, key)
         for count in value if isinstance(value, tuple) else (value,):

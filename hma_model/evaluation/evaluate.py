@@ -24,7 +24,7 @@ from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import token_column
 from hma_data.storage.paths import StrPath
-from hma_model.checkpoint.io import require_tokenizer
+from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES
 from hma_model.evaluation.metrics import perplexity, psnr, ssim, teacher_forced
 

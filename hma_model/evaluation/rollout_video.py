@@ -15,7 +15,7 @@ from hma_data.loading.dataset import WindowDataset
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.checkpoint.io import require_tokenizer
+from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import Sampling, rollout, shuffled_actions, windows
 
 if TYPE_CHECKING:

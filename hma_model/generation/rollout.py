@@ -5,28 +5,30 @@
     frame = rollout.step(chunk)              # the frame that the chunk leads to
 
 A frame costs one pass for each step of unmasking. The first pass also adds the frame before it, now finished,
-to the cache. `cache=False` computes the whole history in every pass, with the same result.
+to the cache. Attention over time is causal, so the cached keys and values of a past frame never change. A
+frame at time t lies in slot t mod R. With rotary positions there is one slot more than the window has frames,
+for the pass that computes a finished frame and the next one together.
 
-Attention over time is causal, so the cached keys and values of a past frame never change. A frame at time t
-lies in slot t mod R of the cache. With rotary positions the length of a rollout has no limit. There is then
-one slot more than the window has frames, for the pass that computes a finished frame and the next one
-together.
+Each pass of unmasking (arXiv 2202.04200) predicts the tokens that are still masked, and keeps some of them
+for good. The cosine schedule determines how many; they are chosen at random or by confidence.
 
-B batch, P frames of a prompt, h,w token grid, S = h*w, K = stride * action dim, c channels, H,W latent grid,
-N tokens of a frame with its action tokens, L layers, R slots, n frames of a pass.
+B batch, P frames of a prompt, h,w token grid, S = h*w, k tokens unmasked in a pass, C values of a patch,
+D width, K = stride * action dim, c channels, H,W latent grid, N tokens of a frame with its action tokens,
+L layers, R slots, n frames of a pass.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
-from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame
-from hma_model.network.conditioning import ActionConditioning, Groups, condition, no_chunks
-from hma_model.network.embed import unpatchify
-from hma_model.network.masking import masked_after
+from hma_model.network.conditioning import ActionConditioning, Groups, condition, unknown
+from hma_model.network.embed import from_digits, unpatchify
+from hma_model.network.head import LatentReadout, TokenReadout, uniform
 from hma_model.network.model import HMA
 from hma_model.network.trunk import (
     Conditioning,
@@ -37,7 +39,7 @@ from hma_model.network.trunk import (
     window_times,
 )
 
-_NEVER = -(1 << 40)
+_NEVER = -(1 << 40)  # the time of an empty slot
 
 
 class Cache:
@@ -62,17 +64,6 @@ class Cache:
         ]
         self.times = torch.full((self.slots,), _NEVER, device=like.device)
 
-    def clear(self) -> None:
-        """Forget every frame."""
-        self.times.fill_(_NEVER)
-
-    def hold_still(self) -> None:
-        """Mark the addresses of keys and values as static, so that a compiler may write them in place."""
-        for layer in self.layers:
-            for kept in (layer.time, layer.action):
-                if kept is not None:
-                    torch._dynamo.mark_static_address(kept)
-
     def time_positions(self, start: int, frames: int) -> TimePositions:
         """Return the times of a pass over n consecutive frames, and record their times in their slots."""
         positions = torch.arange(start, start + frames, device=self.times.device)
@@ -81,6 +72,104 @@ class Cache:
         age = positions.unsqueeze(1) - self.times
         allowed = (age >= 0) & (age < self.config.frames)
         return TimePositions(positions, allowed, rotary_angles(self.config, positions), slots=slots)
+
+
+@dataclass(frozen=True)
+class Decoding:
+    """The settings of unmasking.
+
+    Attributes:
+        steps: number of passes a frame.
+        temperature: 0 takes the likeliest token, else it divides the logits; for the diffusion head it is the
+            share of fresh noise in a step.
+        order: "random" or "confidence"; patches have no confidence.
+        sample_steps: sampling steps of the diffusion head; None for the configuration's.
+        generator: the generator of every random draw.
+    """
+
+    steps: int = 2
+    temperature: float = 0.0
+    order: str = "random"
+    sample_steps: int | None = None
+    generator: torch.Generator | None = None
+
+
+def masked_after(step: int, steps: int, tokens: int) -> int:
+    """Return how many tokens of a frame stay masked after step `step` of `steps` (cosine schedule)."""
+    if step + 1 >= steps:
+        return 0
+    return min(math.ceil(math.cos((step + 1) / steps * math.pi / 2) * tokens), tokens - 1)
+
+
+class TokenFrame:
+    """A frame of discrete tokens that is unmasked step by step.
+
+    Attributes:
+        values: (B, S) int64 ids; the vocabulary's size means masked.
+    """
+
+    def __init__(self, values: Tensor, mask_id: int, decoding: Decoding) -> None:
+        self.values, self.mask_id, self.decoding = values, mask_id, decoding
+        self.rank = uniform(values.shape, decoding.generator, values.device)
+
+    def unmask(self, readout: TokenReadout, features: Tensor, position: Tensor, count: int) -> None:
+        """Predict tokens from the frame's features (B, S, D) at its time (1,), and keep `count` more."""
+        masked = self.values == self.mask_id
+        if self.decoding.order == "random":
+            chosen = _top(self.rank, masked, count)
+            tokens, _ = self._sample(readout, _gather(features, chosen))
+        else:
+            everything, confidence = self._sample(readout, features)
+            chosen = _top(confidence, masked, count)
+            tokens = everything.gather(1, chosen)
+        self.values = self.values.scatter(1, chosen, tokens)
+
+    def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return token ids (B, k) and the sums (B, k) of the log probabilities of their digits."""
+        digits, confidence = [], torch.zeros(features.shape[:2], device=features.device)
+        for scores in readout(features).split(list(readout.factored), dim=-1):
+            drawn = scores
+            if self.decoding.temperature > 0:  # the largest of these sums is a sample from the softmax
+                noise = uniform(scores.shape, self.decoding.generator, scores.device).clamp(min=1e-20)
+                drawn = scores / self.decoding.temperature - (-noise.log()).log()
+            digits.append(drawn.argmax(-1))
+            if self.decoding.order == "confidence":
+                confidence += scores.log_softmax(-1).gather(-1, digits[-1].unsqueeze(-1)).squeeze(-1)
+        return from_digits(torch.stack(digits, dim=-1), readout.factored), confidence
+
+
+class PatchFrame:
+    """A frame of patches that is unmasked step by step.
+
+    Attributes:
+        values: (B, S, C) scaled patches.
+        masked: (B, S) bool, True for masked patches.
+    """
+
+    def __init__(self, values: Tensor, decoding: Decoding) -> None:
+        self.values, self.decoding = values, decoding
+        self.masked = torch.ones(values.shape[:2], dtype=torch.bool, device=values.device)
+        self.rank = uniform(values.shape[:2], decoding.generator, values.device)
+
+    def unmask(self, readout: LatentReadout, features: Tensor, position: Tensor, count: int) -> None:
+        """Draw `count` more patches from the frame's features (B, S, D) at its time (1,)."""
+        chosen = _top(self.rank, self.masked, count)
+        conditions = _gather(readout(features.unsqueeze(1), position).squeeze(1), chosen).flatten(0, 1)
+        way = self.decoding
+        patches = readout.diffusion.sample(conditions, way.sample_steps, way.temperature, way.generator)
+        patches = patches.view(*chosen.shape, -1)
+        self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
+        self.masked = self.masked.scatter(1, chosen, False)
+
+
+def _top(score: Tensor, masked: Tensor, count: int) -> Tensor:
+    """Return the indices (B, k) of the masked tokens with the highest scores."""
+    return score.masked_fill(~masked, -torch.inf).topk(count, dim=1).indices
+
+
+def _gather(features: Tensor, chosen: Tensor) -> Tensor:
+    """Return the features (B, k, D) of the tokens (B, k) from (B, S, D)."""
+    return features.gather(1, chosen.unsqueeze(-1).expand(-1, -1, features.shape[-1]))
 
 
 class Rollout:
@@ -167,7 +256,11 @@ class Rollout:
                 own = features[:, :tokens]
                 frame.unmask(self.model.readout, own, position, count)  # type: ignore[arg-type]
                 left -= count
-        self._append(frame.values)
+        self.frames = torch.cat([self.frames, frame.values.unsqueeze(1)], dim=1)
+        self.time += 1
+        self.fresh = 1 if self.caching else self.frames.shape[1]
+        if self.caching and self.config.time_position == "rotary":
+            self._keep(1)
         return self._show(frame.values)
 
     # -- one pass -----------------------------------------------------------------------------------------
@@ -206,8 +299,11 @@ class Rollout:
                 like = like.to(torch.get_autocast_dtype(like.device.type))
             tokens = self.config.tokens_per_frame + appended
             self.cache = Cache(self.config, self.batch, tokens, like)
-            if self.compiled is not None:
-                self.cache.hold_still()
+            if self.compiled is not None:  # static addresses: the compiled code writes them in place
+                for layer in self.cache.layers:
+                    for kept in (layer.time, layer.action):
+                        if kept is not None:
+                            torch._dynamo.mark_static_address(kept)
         return self.cache
 
     # -- state --------------------------------------------------------------------------------------------
@@ -221,7 +317,7 @@ class Rollout:
 
     def _condition_on(self, actions: Tensor | None, frames: int) -> ActionConditioning:
         """Return the chunk at each known frame; with `current` alignment `step` adds the last chunk."""
-        given = no_chunks(self.batch, frames, self.width, self.model.device)
+        given = unknown(self.model, self.sorted, frames)
         if actions is None or frames == 1:
             return given
         if actions.shape[1] < frames - 1 or actions.shape[2] < self.width:
@@ -240,7 +336,7 @@ class Rollout:
             raise HMAError("step", "some steps have actions and some have none", "give them always or never")
         self.passive = self.passive and chunk is None
         self.begun = True
-        new = self._condition_on(None, 1)
+        new = unknown(self.model, self.sorted, 1)
         if chunk is not None:
             values = self._chunk(chunk)
             if self.config.action_alignment == "current":
@@ -257,20 +353,13 @@ class Rollout:
             raise HMAError("step", fault, f"give ({self.batch}, {self.width})")
         return self.groups.sort(chunk.to(self.model.device))[:, : self.width].float()
 
-    def _append(self, values: Tensor) -> None:
-        self.frames = torch.cat([self.frames, values.unsqueeze(1)], dim=1)
-        self.time += 1
-        self.fresh = 1 if self.caching else self.frames.shape[1]
-        if self.caching and self.config.time_position == "rotary":
-            self._keep(1)
-
     def _slide(self) -> None:
         """Recompute the window when it moves with learned positions, which change for each of its frames."""
         if self.config.time_position == "learned" and self.time == self.config.frames:
             self._keep(self.config.frames - 1, ahead=1)
             self.fresh = self.time = self.frames.shape[1]
             if self.cache is not None:
-                self.cache.clear()
+                self.cache.times.fill_(_NEVER)
 
     def _keep(self, frames: int, ahead: int = 0) -> None:
         """Drop all but the last frames, and all chunks but theirs and the `ahead` chunks after them."""
@@ -331,13 +420,12 @@ def generate(
     """Continue a prompt by `frames` frames; `HMA.generate` explains the arguments."""
     known = prompt.shape[1]
     rollout = Rollout(model, embodiment, prompt.shape[0], **decoding)  # type: ignore[arg-type]
-    if actions is not None and actions.shape[1] < known + frames - 1:
-        fault = f"there are {actions.shape[1]} chunks for {known} + {frames} frames"
-        raise HMAError("actions", fault, f"give {known + frames}")
+    chunks: Sequence[Tensor | None] = [None] * (known + frames)
+    if actions is not None:
+        if actions.shape[1] < known + frames - 1:
+            fault = f"there are {actions.shape[1]} chunks for {known} + {frames} frames"
+            raise HMAError("actions", fault, f"give {known + frames}")
+        chunks = [*actions.unbind(1), None]
     rollout.prompt(prompt, actions)
-    made = []
-    for index in range(known - 1, known - 1 + frames):
-        chunk = None if actions is None else actions[:, index]
-        last = actions is None or index + 1 >= actions.shape[1]
-        made.append(rollout.step(chunk, None if last else actions[:, index + 1]))  # type: ignore[index]
+    made = [rollout.step(chunks[i], chunks[i + 1]) for i in range(known - 1, known - 1 + frames)]
     return torch.stack(made, dim=1)

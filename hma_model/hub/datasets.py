@@ -93,7 +93,7 @@ def _whole(folder: Path) -> Manifest:
         raise ShardError(folder / MANIFEST, problem, f"hma shards restat {folder} writes it anew")
     for shard in manifest.shards:
         path = folder / shard.path
-        if not path.is_file() or path.stat().st_size != shard.bytes or not _is(path, shard.sha256):
+        if not _is(path, shard.sha256):
             raise ShardError(path, "is not the shard its manifest names", f"run hma shards verify {folder}")
     for name, sha256 in manifest.files.items():
         if name not in SMALL or not _is(folder / name, sha256):
@@ -157,13 +157,17 @@ def _is(path: Path, sha256: str) -> bool:
 def _page(manifest: Manifest, repo: str | None) -> bytes:
     """Return README.md of a set; `repo` is None if the set lies in a folder."""
     name, robot = repo or "PATH", manifest.embodiment
+    usage = (
+        f"```sh\nhma hub pull-data {name} --out shards\nhma shards preview shards --out seen\n```\n\n"
+        f'```python\nfrom datasets import load_dataset\n\nframes = load_dataset("{name}", "frames")\n```'
+    )
     parts = [
         f"---\n{write_yaml(_front(manifest))}---",
         f"# {line(robot.id)}",
         line(robot.description) or "Recordings of one robot, tokenized.",
         _facts(manifest),
         "## Splits\n\n" + _table(manifest),
-        "## How to use\n\n" + _usage(name),
+        "## How to use\n\n" + usage,
         "Made with hma-toolkit: one row is one frame; `manifest.json` lists every file with its SHA-256.",
     ]
     return ("\n\n".join(parts) + "\n").encode()
@@ -188,11 +192,11 @@ def _front(manifest: Manifest) -> dict[str, Any]:
 
 def _facts(manifest: Manifest) -> str:
     robot, tokenizer = manifest.embodiment, manifest.tokenizer
-    unknown = robot.frequency_hz == "unknown"
+    rate = "unknown" if robot.frequency_hz == "unknown" else number(robot.effective_hz)
     facts = {
         "robot": line(robot.robot),
         "actions": f"{robot.action_dim} dims, {line(robot.action.space)}",
-        "frames per second of the model": "unknown" if unknown else number(robot.effective_hz),
+        "frames per second of the model": rate,
         "tokenizer": f"{line(tokenizer.name)}, {'×'.join(map(str, tokenizer.grid))} of "
         f"{tokenizer.image_size} pixels, {line(tokenizer.kind)}",
         "licence": line(robot.license) or "not stated",
@@ -208,10 +212,3 @@ def _table(manifest: Manifest) -> str:
         counted = " | ".join(f"{counts[key]:,}" for key in ("episodes", "frames", "shards"))
         rows.append(f"| {line(split)} | {counted} | {size:,.1f} |")
     return "\n".join(rows)
-
-
-def _usage(name: str) -> str:
-    return (
-        f"```sh\nhma hub pull-data {name} --out shards\nhma shards preview shards --out seen\n```\n\n"
-        f'```python\nfrom datasets import load_dataset\n\nframes = load_dataset("{name}", "frames")\n```'
-    )

@@ -1,17 +1,16 @@
 """Publish to and pull from a folder, on this machine or at any fsspec URI.
 
-A push first writes its files under temporary names. Then it renames them one by one: config and trunk first,
-then the parts of each embodiment with its card last. An embodiment without a card counts as absent, and a
-card holds the digests of its parts. The same push again completes one that was killed. Pushes to a folder of
-this machine wait for one another. In a store nothing is locked: the first config.json stays, and the digests
-reveal a mixture of two pushes of one embodiment.
+A push writes its files under temporary names and renames them one by one: config and trunk first, then the
+parts of each embodiment with its card last. An embodiment without a card counts as absent. The same push
+again completes one that was killed. Pushes to a folder of this machine wait for one another. In a store
+nothing is locked: the first config.json stays, and the digests in the cards reveal a mixture of two pushes.
 """
 
 import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hma_data.errors import HubError, MissingDependencyError, OutputError, StorageAwayError, StorageError
@@ -87,36 +86,32 @@ class FolderStore:
 
     # -- pulling
 
-    def download(self, names: list[str], out: Path) -> None:
-        """Fetch files as `pull` does."""
-        self.pull(names, out)
+    def pull(self, names: list[str]) -> Path:
+        """Return the hub's folder."""
+        return self._root
 
-    def pull(self, names: list[str], out: Path | None) -> Path:
-        """Copy the files that `out` lacks or that differ there; without `out`, return the hub's folder."""
-        if out is None:
-            return self._root
+    def download(self, names: list[str], out: Path) -> None:
+        """Copy the files that `out` lacks or that differ there."""
         for name in names:
-            target = out / name
+            target, ours = out / name, self._root / name
             with _explained(target, "pulled"):
                 remove_dead_parts(target.parent)  # of a killed pull
-                if target.is_file() and self._is_same(self._root / name, target):
-                    continue
-                if name in (CONFIG, TRUNK) and target.is_file() and any(out.glob("embodiments/*/card.json")):
-                    fault = f"has another {name} with embodiments of its own"
-                    raise HubError(out, fault, "pull to another folder")
+                if target.is_file():
+                    sizes = {path.stat().st_size for path in (ours, target)}
+                    if len(sizes) == 1 and file_sha256(ours) == file_sha256(target):
+                        continue
+                    if name in (CONFIG, TRUNK) and any(out.glob("embodiments/*/card.json")):
+                        fault = f"has another {name} with embodiments of its own"
+                        raise HubError(out, fault, "pull to another folder")
                 with atomic_path(target) as part:
-                    _copy(self._root / name, part)
-        return out
-
-    def _is_same(self, ours: Path, target: Path) -> bool:
-        return ours.stat().st_size == target.stat().st_size and file_sha256(ours) == file_sha256(target)
+                    _copy(ours, part)
 
     # -- pushing
 
     def publish(self, changes: Callable[[], Mapping[str, Path | bytes | None]], message: str) -> str:
         """Write all files under temporary names and rename them; make README.md last, from the new state."""
         staged: dict[str, Path] = {}
-        with _explained(self.name, "written"), self._alone():
+        with _explained(self.name, "written"), _locked(self._root):
             files = dict(changes())
             page = files.pop(README, None)
             try:
@@ -164,22 +159,12 @@ class FolderStore:
             if last.endswith(PART) and (final in files or not isinstance(self._root, RemotePath)):
                 (self._root / name).unlink(missing_ok=True)
 
-    @contextmanager
-    def _alone(self) -> Iterator[None]:
-        """Wait for other pushes to this folder; a store has no locks."""
-        with nullcontext() if isinstance(self._root, RemotePath) else _locked(self._root):
-            yield
-
     def _sizes(self) -> dict[str, int]:
         if isinstance(self._root, RemotePath):
             with _explained(self.name, "listed"):
                 return self._root.listing()
-        sizes = {}
-        for folder, _, names in os.walk(self._root):
-            for path in (Path(folder, name) for name in names):
-                if path.is_file():
-                    sizes[path.relative_to(self._root).as_posix()] = path.stat().st_size
-        return sizes
+        files = (path for path in self._root.rglob("*") if path.is_file())
+        return {path.relative_to(self._root).as_posix(): path.stat().st_size for path in files}
 
 
 @contextmanager
@@ -197,7 +182,10 @@ def _explained(where: object, doing: str) -> Iterator[None]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold a lock on a folder itself, which leaves no file behind."""
+    """Wait for other pushes to a folder, and hold a lock on the folder itself; a store has no locks."""
+    if isinstance(folder, RemotePath):
+        yield
+        return
     handle = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):  # some network file systems have no locks

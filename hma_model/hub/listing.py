@@ -3,15 +3,23 @@
 A folder may hold one checkpoint, or many in separate folders. Only JSON files are read.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hma_data.errors import HMAError, HubError, PluginError, TokenizerError
 from hma_data.storage.files import json_object
 from hma_data.storage.paths import StrPath
-from hma_model.checkpoint import migrate
-from hma_model.checkpoint.io import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
-from hma_model.hub.publish import Store, embodiment_ids, open_store, total_bytes
+from hma_model.checkpoint.folder import (
+    CARD,
+    CONFIG,
+    LIBRARY,
+    PARTS,
+    TRUNK,
+    converted,
+    digest,
+    parse_config,
+)  # fmt: skip
+from hma_model.hub.publish import Store, embodiment_ids, open_store
 
 RELEASED_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
@@ -48,15 +56,6 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
     return found
 
 
-def listed(described: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each embodiment in the result of `hub.describe`."""
-    rows = []
-    for name, facts in described["embodiments"].items():
-        row = _row(name, facts["card"], facts["bytes"], [])
-        rows.append({key: row[key] for key in row if key not in ("chunk_dim", "data", "problems")})
-    return rows
-
-
 def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, Any] | None:
     """Describe the checkpoint in a folder of a hub; return None if config.json is of something else."""
     inside = {name.removeprefix(root): size for name, size in files.items() if name.startswith(root)}
@@ -75,25 +74,29 @@ def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, 
 def _ours(
     store: Store, files: Mapping[str, int], root: str, where: str, values: dict[str, Any]
 ) -> dict[str, Any]:
-    size = total_bytes(store, files, [TRUNK])
+    size = _total_bytes(store, files, [TRUNK])
     lacks = "the cache lacks" if store.from_cache else "lacks"
     facts = _facts(where, LIBRARY, size, _tokenizer_problems(values.get("tokenizer")))
     try:
         parse_config(values, f"{where}/{CONFIG}")
-        values = migrate.config(values, where) | {"format_version": values["format_version"]}
+        values = converted("config", values, values["format_version"], where)
     except HMAError as fault:
         facts["problems"].append(f"{fault.fault}: {fault.remedy}")
     facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
     if TRUNK not in files:
         facts["problems"].append(f"{lacks} {TRUNK}")
     store.warm([f"{root}embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
+    tokenizer = values.get("tokenizer")
     for name in embodiment_ids(files):
         parts = {f"embodiments/{name}/{part}": part for part in PARTS}
-        size, path = total_bytes(store, files, parts), f"embodiments/{name}/{CARD}"
+        size, path = _total_bytes(store, files, parts), f"embodiments/{name}/{CARD}"
         try:
             card = json_object(store.read(root + path), f"{where}/{path}", HubError)
             problems = [f"{lacks} {part}" for path, part in parts.items() if path not in files]
-            problems += _card_problems(card, values)
+            if card.get("trunk_sha256") != values.get("trunk_sha256"):
+                problems.append("belongs to another trunk")
+            if isinstance(tokenizer, dict) and card.get("tokenizer") != digest(tokenizer):
+                problems.append("was trained on another tokenizer")
         except HMAError as fault:
             card, problems = {}, [fault.fault]
         facts["embodiments"].append(_row(name, card, size, problems))
@@ -111,6 +114,14 @@ def _released(files: Mapping[str, int], where: str, values: dict[str, Any]) -> d
         rows = zip(domains, dims)
         facts["embodiments"] = [_row(str(name)[:100], {"chunk_dim": dim}, 0, []) for name, dim in rows]
     return facts
+
+
+def _total_bytes(store: Store, files: Mapping[str, int], names: Iterable[str]) -> int | None:
+    """Return the bytes of files; None if the hub is out of reach and the cache lacks one of them."""
+    sizes = [files.get(name) for name in names]
+    if store.from_cache and None in sizes:
+        return None
+    return sum(size or 0 for size in sizes)
 
 
 def _facts(where: str, layout: str, size: int | None, problems: list[str]) -> dict[str, Any]:
@@ -134,16 +145,6 @@ def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[st
         "bytes": size,
         "problems": problems,
     }
-
-
-def _card_problems(card: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    problems = []
-    if card.get("trunk_sha256") != config.get("trunk_sha256"):
-        problems.append("belongs to another trunk")
-    tokenizer = config.get("tokenizer")
-    if isinstance(tokenizer, dict) and card.get("tokenizer") != digest(tokenizer):
-        problems.append("was trained on another tokenizer")
-    return problems
 
 
 def _tokenizer_problems(tokenizer: Any) -> list[str]:

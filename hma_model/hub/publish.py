@@ -2,13 +2,12 @@
 
 A hub is a folder, any fsspec URI, or a repository of the Hugging Face Hub; all hold the layout of
 `hma_model.checkpoint`. `org/name` and `hf://org/name` are repositories; `./org/name` or any other path is a
-folder. A push writes the files of its embodiments and README.md. It writes the trunk only if there is none
-yet.
+folder.
 """
 
 import hashlib
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +17,8 @@ from hma_data.hub.repository import Repository
 from hma_data.registry.embodiment import ID_PATTERN, find
 from hma_data.storage.files import cache_folder, file_sha256, json_object
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
+from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint import migrate
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
@@ -30,7 +29,10 @@ from hma_model.checkpoint.folder import (
     YAML,
     Checkpoint,
     check_id,
+    converted,
     inside,
+    parse_config,
+    resolve,
 )  # fmt: skip
 from hma_model.checkpoint.model_card import render
 from hma_model.hub.folder import FolderStore
@@ -99,10 +101,8 @@ def push(
     _require_publishable(source, ids)
     store = open_store(target, write=True, private=private)
 
-    def changes() -> dict[str, Content]:
-        return _changes(source, ids, store)
-
-    return store.publish(changes, f"Add {', '.join(ids)}" if ids else "Add the trunk")
+    message = f"Add {', '.join(ids)}" if ids else "Add the trunk"
+    return store.publish(lambda: _changes(source, ids, store), message)
 
 
 def pull(
@@ -134,7 +134,6 @@ def _pull(
     source: str | Path, embodiments: Iterable[str] | None, out: Path | None, revision: str | None
 ) -> tuple[Path, list[str]]:
     """Return the checkpoint's folder and the requested ids; the folder may hold older ones too."""
-    source, revision = addressed(source, revision)
     store = open_store(source, revision)
     files = store.files()
     values = _config(store, files)
@@ -154,59 +153,28 @@ def _pull(
         raise HubError(store.name, f"has no {TRUNK}", "have it pushed again")
     names = [f"embodiments/{name}/{part}" for name in wanted for part in (SAMPLE, *PARTS)]
     names = [CONFIG, TRUNK, *(name for name in names if name in files or not name.endswith(SAMPLE))]
-    place = out
-    if place is None and "://" in str(source) and not is_repository(source):
+    place = folder = store.pull(names)
+    if isinstance(folder, RemotePath):
         key = f"{store.name} {values.get('trunk_sha256')}".encode()
         place = cache_folder() / "hub" / hashlib.sha256(key).hexdigest()[:24]
-    folder = store.pull(names, place)
-    if place and folder != place:
-        folder = FolderStore(folder).pull(names, place)
-    pulled = Checkpoint.open(folder)
+    place = out or place
+    if place != folder:
+        FolderStore(folder).download(names, place)
+    pulled = Checkpoint.open(place)
     pulled.trunk()
     for name in wanted:
         pulled.check(name)
         _require_yaml(pulled, name)
     if out:
-        checkpoints.write_readme(folder)
-    return folder, wanted
+        checkpoints.write_readme(out)
+    return place, wanted
 
 
 def list_embodiments(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]:
-    """Return a row for each published embodiment: ids, action, rate, figures, licence, bytes."""
-    from hma_model.hub.listing import listed
+    """Return a row for each published embodiment; see `hma_model.hub.listing.survey`."""
+    from hma_model.hub.listing import survey
 
-    return listed(describe(source, revision))
-
-
-def describe(source: StrPath, revision: str | None = None) -> dict[str, Any]:
-    """Return the published facts: the trunk's hash and bytes, tokenizer, model; each id's `card` and `bytes`.
-
-    Bytes are None if the hub is out of reach and the client's cache does not have the files.
-    """
-    store = open_store(source, revision)
-    files = store.files()
-    values = _config(store, files)
-    store.warm([f"embodiments/{name}/{CARD}" for name in embodiment_ids(files)])
-    return {
-        "source": store.name,
-        **{key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")},
-        "trunk_bytes": total_bytes(store, files, [TRUNK]),
-        "embodiments": {
-            name: {
-                "card": _card(store, name),
-                "bytes": total_bytes(store, files, [f"embodiments/{name}/{part}" for part in PARTS]),
-            }
-            for name in embodiment_ids(files)
-        },
-    }
-
-
-def total_bytes(store: Store, files: Mapping[str, int], names: Iterable[str]) -> int | None:
-    """Return the bytes of files; None if the hub is out of reach and the cache lacks one of them."""
-    sizes = [files.get(name) for name in names]
-    if store.from_cache and None in sizes:
-        return None
-    return sum(size or 0 for size in sizes)
+    return [row for found in survey(source, revision) for row in found["embodiments"]]
 
 
 def from_pretrained(
@@ -218,7 +186,7 @@ def from_pretrained(
     """Load a model as `HMA.from_pretrained` does; the source may also be a training run's folder."""
     address, revision = addressed(as_address(source), revision)
     if not is_repository(address) and "://" not in str(address):
-        address = checkpoints.resolve(Path(address).expanduser())
+        address = resolve(Path(address).expanduser())
     folder, ids = _pull(address, embodiments, None, revision)
     return checkpoints.load(folder, ids, str(device))
 
@@ -238,25 +206,22 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             stats[name] = known.stats(name)
             cards[name] = {key: known.card(name).get(key, {}) for key in ("data", "metrics", "training")}
         else:
-            yaml[name] = _registered(name)
+            try:
+                yaml[name] = find(name).to_yaml()
+            except HMAError as fault:
+                text = "has no YAML where the model was loaded from, nor in the registry"
+                remedy = "save with hma_model.checkpoint.io.save and push the folder"
+                raise HubError(f"embodiment {name}", text, remedy) from fault
             action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
             stats[name] = {"action": action}
     with tempfile.TemporaryDirectory() as folder:
-        made, tokenizer = Path(folder) / "model", model.config.tokenizer
-        checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards, tokenizer=tokenizer)
+        made = Path(folder) / "model"
+        checkpoints.save(model, made, embodiment_yaml=yaml, stats=stats, cards=cards)
         return push(made, target, embodiments)
 
 
-# -- checks before a push
-
-
 def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
-    """Raise unless others can load the embodiments.
-
-    Raises:
-        CheckpointError: parts do not belong together, are damaged, or hold values that no model can use.
-        RegistryError: an embodiment's YAML is not valid.
-    """
+    """Raise unless others can load the embodiments."""
     source.trunk()
     for name in embodiments:
         _require_yaml(source, name)
@@ -276,9 +241,6 @@ def _require_yaml(source: Checkpoint, name: str) -> None:
         raise CheckpointError(path, f"is not the file that {CARD} names", remedy)
 
 
-# -- the changes of a push
-
-
 def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Content]:
     from hma_data.shards.manifest import MANIFEST  # imports pyarrow
 
@@ -291,7 +253,7 @@ def _changes(source: Checkpoint, ids: list[str], store: Store) -> dict[str, Cont
             raise HubError(store.name, "holds a shard set", "push to a place of its own")
         present[CONFIG] = inside(source.folder, CONFIG)
     if TRUNK not in files:
-        present[TRUNK] = source.trunk()
+        present[TRUNK] = inside(source.folder, TRUNK)
     for name in ids:
         sample = source.folder / "embodiments" / name / SAMPLE
         parts = (SAMPLE, *PARTS) if sample.is_file() else PARTS
@@ -323,8 +285,8 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
         raise HubError(store.name, f"has no {CONFIG}", "it is no checkpoint of hma-toolkit; check the name")
     values = json_object(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
     try:
-        checkpoints.parse_config(values, f"{store.name}: {CONFIG}")
-        return migrate.config(values, store.name) | {"format_version": values["format_version"]}
+        parse_config(values, f"{store.name}: {CONFIG}")
+        return converted("config", values, values["format_version"], store.name)
     except CheckpointError as fault:
         raise HubError(fault.where, fault.fault, fault.remedy) from fault
 
@@ -335,23 +297,10 @@ def embodiment_ids(files: Iterable[str]) -> list[str]:
     return sorted(name for name in found if ID_PATTERN.fullmatch(name) and ".." not in name)
 
 
-def _card(store: Store, name: str) -> dict[str, Any]:
-    path = f"embodiments/{name}/{CARD}"
-    return json_object(store.read(path), f"{store.name}: {path}", HubError)
-
-
 def _readable_card(store: Store, name: str) -> dict[str, Any]:
     """Return the card of an embodiment that is not pushed now; an empty card if it cannot be read."""
+    path = f"embodiments/{name}/{CARD}"
     try:
-        return _card(store, name)
+        return json_object(store.read(path), f"{store.name}: {path}", HubError)
     except HubError:
         return {}
-
-
-def _registered(name: str) -> str:
-    try:
-        return find(name).to_yaml()
-    except HMAError as fault:
-        text = "has no YAML where the model was loaded from, nor in the registry"
-        remedy = "save with hma_model.checkpoint.save and push the folder"
-        raise HubError(f"embodiment {name}", text, remedy) from fault

@@ -10,14 +10,13 @@ from hma_data.errors import CheckpointError, UsageError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint.io import SAMPLE, Checkpoint
+from hma_model.checkpoint.folder import SAMPLE, Checkpoint, require_tokenizer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hma_data.loading.dataset import Batch
     from hma_data.shards.reader import ShardSet
-    from hma_data.tokenizers.base import Tokenizer
 
 COLUMNS, SIDE = 6, 128  # pictures in a row, and pixels of a side
 
@@ -46,32 +45,22 @@ def add_samples(checkpoint: StrPath, data: Iterable[StrPath]) -> list[Path]:
             known = ", ".join(source.embodiments) or "none"
             raise CheckpointError(source.folder, f"has no embodiment {name!r}", f"it has: {known}")
         path = source.folder / "embodiments" / name / SAMPLE
-        write_atomic(path, sample(source.folder, shards))
+        write_atomic(path, _picture(source.folder, shards))
         made.append(path)
     checkpoints.write_readme(source.folder)
     return made
 
 
-def sample(checkpoint: StrPath, shards: "ShardSet", tokenizer: "Tokenizer | None" = None) -> bytes:
-    """Return a PNG of one window: truth, prediction, and prediction with other actions, over time.
-
-    Args:
-        checkpoint: str or path of its folder.
-        shards: a shard set of one of its embodiments; validation episodes are preferred.
-        tokenizer: the tokenizer that made the shards; None finds it.
-
-    Raises:
-        CheckpointError: the checkpoint was trained on another tokenizer.
-        UsageError: there is no window as long as the model's.
-    """
+def _picture(checkpoint: Path, shards: "ShardSet") -> bytes:
+    """Return a PNG of one window: truth, prediction, and prediction with other actions, over time."""
     from hma_data.episodes.sheets import grid, png_bytes
     from hma_data.shards.preview import tokenizer_of
     from hma_model.evaluation.evaluate import rollout
 
     model = checkpoints.load(checkpoint, [shards.embodiment.id])
-    checkpoints.require_tokenizer(model.config, shards.spec, shards.folder)
+    require_tokenizer(model.config, shards.spec, shards.folder)
     batch = _window(shards, model.config.frames)
-    tokenizer = tokenizer or tokenizer_of(shards)
+    tokenizer = tokenizer_of(shards)
     true = rollout(model, tokenizer, batch)
     other = rollout(model, tokenizer, batch, actions=batch.actions.flip(1), truth=true.truth)
     picks = np.unique(np.linspace(0, true.truth.shape[1] - 1, COLUMNS).astype(int))
@@ -80,9 +69,8 @@ def sample(checkpoint: StrPath, shards: "ShardSet", tokenizer: "Tokenizer | None
         f"predicted from frame {true.prompt} on": true.predicted[0],
         "with the actions in reverse": other.predicted[0],
     }
-    return png_bytes(
-        grid([[_shown(frame) for frame in frames[picks]] for frames in rows.values()], list(rows))
-    )
+    shown = [[_shown(frame) for frame in frames[picks]] for frames in rows.values()]
+    return png_bytes(grid(shown, list(rows)))
 
 
 def _window(shards: "ShardSet", frames: int) -> "Batch":

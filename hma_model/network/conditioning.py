@@ -1,7 +1,7 @@
 """Compute the trunk's conditioning from a batch's actions, embodiment by embodiment.
 
-A batch may mix embodiments. Its samples are sorted so that the samples of an embodiment lie side by side. The
-trunk then processes the whole batch at once, and each stem and modulation is called once.
+The samples of a mixed batch are sorted by embodiment. The trunk then processes the whole batch at once, and
+each stem and modulation is called once.
 
 B batch, T frames, D width, K = stride * action dim, L layers.
 """
@@ -105,15 +105,10 @@ def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int)
 
 
 def unknown(model: "HMA", groups: Groups, frames: int) -> ActionConditioning:
-    """Return a conditioning without any known chunk: on the absence of actions."""
+    """Return chunks (B, T, K) of zeros, as wide as the widest embodiment's, none of them known."""
     widest = max(model.stem(name).input.in_features for name, _ in groups.parts)
-    return no_chunks(groups.batch, frames, widest, model.device)
-
-
-def no_chunks(batch: int, frames: int, width: int, device: torch.device) -> ActionConditioning:
-    """Return chunks (B, T, K) of zeros, none of them known."""
-    known = torch.zeros((batch, frames), dtype=torch.bool, device=device)
-    return ActionConditioning(torch.zeros(batch, frames, width, device=device), known)
+    known = torch.zeros((groups.batch, frames), dtype=torch.bool, device=model.device)
+    return ActionConditioning(torch.zeros(groups.batch, frames, widest, device=model.device), known)
 
 
 def condition(

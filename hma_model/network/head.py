@@ -1,26 +1,39 @@
 """Read the trunk's features out as video tokens, patches of latents and action chunks.
 
-`DiffusionHead` predicts patches or chunks by diffusion conditioned on the features. A small MLP, modulated
-by the noise level and the condition, predicts the noise (paper section 3, with the layers of arXiv
-2406.11838) or the velocity (arXiv 2202.00512). The velocity determines the sample even at full noise.
-Training draws one of 1000 levels of a cosine schedule by default. Sampling is DDIM with any number of steps
-(arXiv 2010.02502).
+Every draw uses the given generator, on the generator's device, so that a run can be repeated exactly.
 
 B batch, T frames, S tokens of a frame, D width, F digits, V values of a digit, K = stride * action dim,
 M rows, C values of a sample, W width of the diffusion head.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig, Readout
-from hma_model.network.masking import randn, uniform
 from hma_model.network.trunk import rows_at
 
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
+
+
+def uniform(
+    shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
+) -> Tensor:
+    """Return float32 numbers in [0, 1), drawn on the generator's device and moved to `device`."""
+    return torch.rand(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+
+
+def randn(shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str) -> Tensor:
+    """Return standard normal float32 numbers, drawn on the generator's device and moved to `device`."""
+    return torch.randn(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+
+
+def device_of(generator: torch.Generator | None) -> torch.device | str:
+    """Return the device on which a generator draws; without one, torch draws on the CPU."""
+    return "cpu" if generator is None else generator.device
 
 
 class TokenReadout(nn.Module):
@@ -143,7 +156,13 @@ class _Block(nn.Module):
 
 
 class DiffusionHead(nn.Module):
-    """The network that predicts the noise or the velocity of samples of `values` numbers."""
+    """A predictor of samples of `values` numbers by diffusion conditioned on the features.
+
+    A small MLP, modulated by the noise level and the condition, predicts the noise (paper section 3, with the
+    layers of arXiv 2406.11838) or the velocity (arXiv 2202.00512), which determines the sample even at full
+    noise. Training draws a level of a cosine schedule; sampling is DDIM with any number of steps (arXiv
+    2010.02502).
+    """
 
     levels: Tensor
 
@@ -161,17 +180,12 @@ class DiffusionHead(nn.Module):
         self.modulation = nn.Linear(width, 2 * width)
         self.output = nn.Linear(width, values * (2 if config.diffusion_variance else 1))
         self.register_buffer("levels", cosine_levels(config.diffusion_train_steps).float(), persistent=False)
-        self.initialize()
-
-    def initialize(self) -> None:
-        """Initialise the weights; modulations and the output start at zero, so each block is the identity."""
-        for module in self.modules():
+        for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
                 nn.init.zeros_(module.bias)
-        for name, module in self.named_modules():
-            if isinstance(module, nn.Linear) and name.endswith(("modulation", "output")):
-                nn.init.zeros_(module.weight)
+                if name.endswith(("modulation", "output")):  # so each block starts as the identity
+                    nn.init.zeros_(module.weight)
 
     def forward(self, noisy: Tensor, level: Tensor, condition: Tensor) -> Tensor:
         """Predict the target (M, C) float32 from samples (M, C), levels (M,) int64 and conditions (M, D)."""
@@ -179,9 +193,9 @@ class DiffusionHead(nn.Module):
 
     def loss(self, target: Tensor, condition: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return the squared error (M,) float32 of the prediction for samples (M, C), conditions (M, D)."""
-        rows = target.shape[0]
+        rows = len(target)
         target, condition = (x.repeat(self.repeats, 1) for x in (target.float(), condition))
-        draw = uniform((target.shape[0],), generator, target.device)
+        draw = uniform((len(target),), generator, target.device)
         level = (draw * len(self.levels)).long().clamp(max=len(self.levels) - 1)
         noise = randn(target.shape, generator, target.device)
         share = self.levels.float()[level].unsqueeze(-1)
@@ -250,6 +264,7 @@ class DiffusionHead(nn.Module):
         return self.output(x)[..., : self.values].float()
 
     def _level(self, level: Tensor) -> Tensor:
+        """Embed noise levels (M,) as (M, W)."""
         half = _LEVEL_VALUES // 2
         rates = torch.exp(torch.arange(half, device=level.device) * (-math.log(10000) / half))
         angles = level.float().unsqueeze(-1) * rates

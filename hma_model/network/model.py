@@ -19,13 +19,13 @@ from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.paths import StrPath
 from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
-from hma_model.network.embed import LatentEmbedding, TokenEmbedding, patchify
+from hma_model.network.embed import LatentEmbedding, Stem, TokenEmbedding, patchify
 from hma_model.network.head import ActionHead, LatentReadout, TokenReadout
-from hma_model.network.stem import Stem
 from hma_model.network.trunk import Conditioning, TimePositions, Trunk, window_times
 
 if TYPE_CHECKING:
-    from hma_model.network.objectives import Output, Windows
+    from hma_data.loading.rows import Batch
+    from hma_model.network.objectives import Output
 
 
 class HMA(nn.Module):
@@ -164,7 +164,7 @@ class HMA(nn.Module):
     # -- the network ------------------------------------------------------------------------------------
 
     def forward(
-        self, batch: "Windows", objective: str | None = None, generator: torch.Generator | None = None
+        self, batch: "Batch", objective: str | None = None, generator: torch.Generator | None = None
     ) -> "Output":
         """Mask, corrupt and predict a batch of windows.
 
@@ -276,10 +276,8 @@ class HMA(nn.Module):
         else:
             x = self.embed_patches(values, torch.zeros_like(values[..., :1], dtype=torch.bool))
         pooled = self.action_features(self.trunk(x, conditioning, times))
-        chunks = [
-            self._predict(part, name, READOUTS[readout], generator)
-            for part, (name, _) in zip(pooled.split([size for _, size in groups.parts]), groups.parts)
-        ]
+        spans, way = groups.spans(), READOUTS[readout]
+        chunks = [self._predict(pooled[span], name, way, generator) for name, span in spans]
         widest = max(chunk.shape[-1] for chunk in chunks)
         padded = [torch.nn.functional.pad(chunk, (0, widest - chunk.shape[-1])) for chunk in chunks]
         return groups.unsort(torch.cat(padded))

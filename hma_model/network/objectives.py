@@ -1,12 +1,13 @@
-"""Compute the losses of the training objectives (paper section 3).
+"""Hide tokens and chunks, and compute the losses of the training objectives (paper section 3).
 
 `hma_model.config.OBJECTIVES` states what each objective predicts, sees and hides.
 
 B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = stride * action dim.
 """
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,21 +15,12 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition
-from hma_model.network.embed import to_digits
-from hma_model.network.masking import VideoMask, corrupt_tokens, draw_video_mask, drop_chunks, uniform
+from hma_model.network.embed import from_digits, to_digits
+from hma_model.network.head import device_of, uniform
 
 if TYPE_CHECKING:
+    from hma_data.loading.rows import Batch
     from hma_model.network.model import HMA
-
-
-class Windows(Protocol):
-    """The batch of a loader; see `hma_data.loader.Batch`."""
-
-    embodiment: list[str]
-    actions: Tensor
-    action_mask: Tensor
-    tokens: Tensor | None
-    latents: Tensor | None
 
 
 @dataclass
@@ -54,7 +46,20 @@ class Output:
     video_logits: Tensor | None = None
 
 
-def compute(model: "HMA", batch: Windows, objective: str | None, generator: torch.Generator | None) -> Output:
+@dataclass
+class VideoMask:
+    """The masked and corrupted tokens of windows.
+
+    Attributes:
+        masked: (B, T, S) bool, the tokens of the video loss; never those of frame 0.
+        corruption: (B, T) float32, the probability that a digit of a visible token is replaced.
+    """
+
+    masked: Tensor
+    corruption: Tensor
+
+
+def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torch.Generator | None) -> Output:
     """Compute the losses of one batch; `HMA.forward` explains the arguments."""
     config = model.config
     name = objective or draw_objective(config, generator)
@@ -151,7 +156,7 @@ def _video_loss(
 def _action_loss(
     model: "HMA",
     features: Tensor,
-    batch: Windows,
+    batch: "Batch",
     dropped: Tensor,
     readout: Readout,
     groups: Groups,
@@ -182,3 +187,59 @@ def _means(losses: Tensor, sample: Tensor, batch: int) -> Tensor:
     zeros = losses.new_zeros(batch)
     count = zeros.index_add(0, sample, torch.ones_like(losses))
     return zeros.index_add(0, sample, losses.detach()) / count.clamp(min=1)
+
+
+# -- what is hidden
+
+
+def draw_video_mask(
+    config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None
+) -> VideoMask:
+    """Mask the tokens of each frame with probability cos(u pi/2), and corrupt a share of all tokens.
+
+    With `history_probability` a sample keeps a history of at least `history_frames` frames unmasked, and each
+    frame after it is corrupted more than the one before, as in a rollout of the model's own predictions.
+    Each sample has its own draws.
+    """
+    tokens = config.tokens_per_frame
+    where = device_of(generator)
+    index = torch.arange(frames, device=where)
+    draw = uniform((2, batch), generator, where)
+    start = min(config.history_frames, frames - 1)
+    long = (draw[0] < config.history_probability) & (frames > 2)
+    first = torch.where(long, start + (draw[1] * (frames - start)).long(), 1).unsqueeze(1)
+    ratio = torch.cos(uniform((batch, frames), generator, where) * (math.pi / 2))
+    ratio = ratio.clamp(min=config.mask_ratio_min)
+    masked = uniform((batch, frames, tokens), generator, where) < ratio.unsqueeze(-1)
+    masked &= (index >= first).unsqueeze(-1)
+
+    kept = 0.2 + 0.8 * uniform((batch, 1), generator, where)
+    shrink = 0.9 + 0.1 * uniform((batch, frames), generator, where)
+    after = (index >= first) & long.unsqueeze(1)
+    drift = 1 - kept * torch.where(after, shrink, 1.0).cumprod(1)
+    base = config.corrupt_max * uniform((batch, 1), generator, where)
+    corruption = torch.where(after, torch.maximum(drift, base), base)
+    return VideoMask(masked, corruption if config.corrupt_max else torch.zeros_like(corruption))
+
+
+def corrupt_tokens(
+    config: HMAConfig, tokens: Tensor, mask: VideoMask, generator: torch.Generator | None
+) -> Tensor:
+    """Replace digits of token ids (B, T, S) at random, and set masked ids to the vocabulary's size."""
+    digits = to_digits(tokens, config.factored)
+    if config.corrupt_max:
+        values = torch.tensor(config.factored, device=tokens.device)
+        random = (uniform(digits.shape, generator, tokens.device) * values).long()
+        draw = uniform(digits.shape, generator, tokens.device)
+        hit = draw < mask.corruption.to(tokens.device)[..., None, None]
+        digits = torch.where(hit, torch.minimum(random, values - 1), digits)
+    corrupted = from_digits(digits, config.factored)
+    return corrupted.masked_fill(mask.masked.to(tokens.device), config.vocab_size)
+
+
+def drop_chunks(present: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Draw chunks to hide, (B, T) bool: each sample draws a rate U(0, 1) and hides at least one present."""
+    draw = uniform(present.shape, generator, present.device)
+    rate = uniform((present.shape[0], 1), generator, present.device)
+    lowest = torch.where(present, draw, 2.0).argmin(1, keepdim=True)
+    return (draw < rate).scatter(1, lowest, True)

@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
-from hma_model.network.embed import LatentEmbedding, TokenEmbedding
-from hma_model.network.stem import Modulation
+from hma_model.network.embed import LatentEmbedding, Modulation, TokenEmbedding
 
 
 @dataclass
@@ -342,7 +341,14 @@ class Trunk(nn.Module):
             self.modulation = Modulation(config)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(config.width) if config.final_norm else nn.Identity()
-        initialize(self, config)
+        branches = (3 + bool({"modulation", "cross_attention"} & set(config.conditioning))) * config.layers
+        for name, module in self.blocks.named_modules():
+            if isinstance(module, nn.Linear):  # maps keep unit variance, and the branches that of the stream
+                ends = name.endswith(("proj", "fc2", "modulation_out"))
+                std = module.in_features**-0.5 * (branches**-0.5 if ends else 1.0)
+                nn.init.normal_(module.weight, std=std)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
 
     def forward(
         self,
@@ -352,7 +358,13 @@ class Trunk(nn.Module):
         caches: list[LayerCache] | None = None,
     ) -> Tensor:
         """Map embedded tokens (B, T, S, D) to features (B, T, N, D); action tokens come last in a frame."""
-        x = self.embed_norm(self.join(x, conditioning, times))
+        embedding, config = conditioning.embedding, self.config
+        if embedding is not None and "add" in config.conditioning and config.add_at == "input":
+            x = x + embedding.unsqueeze(2)
+        if conditioning.tokens is not None:
+            copies = conditioning.tokens.unsqueeze(2).expand(-1, -1, config.action_tokens, -1)
+            x = torch.cat([x, copies.to(x.dtype)], dim=2)
+        x = self.embed_norm(x + rows_at(self.position, times.positions)[:, : x.shape[2]])
         for layer, block in enumerate(self.blocks):
             cache = None if caches is None else caches[layer]
             if self.checkpointing and self.training and torch.is_grad_enabled():
@@ -360,25 +372,3 @@ class Trunk(nn.Module):
             else:
                 x = block(x, conditioning, layer, times, cache)
         return self.norm(x)
-
-    def join(self, x: Tensor, conditioning: Conditioning, times: TimePositions) -> Tensor:
-        """Add or append the action embeddings, and add the positions."""
-        embedding, config = conditioning.embedding, self.config
-        if embedding is not None and "add" in config.conditioning and config.add_at == "input":
-            x = x + embedding.unsqueeze(2)
-        if conditioning.tokens is not None:
-            copies = conditioning.tokens.unsqueeze(2).expand(-1, -1, config.action_tokens, -1)
-            x = torch.cat([x, copies.to(x.dtype)], dim=2)
-        return x + rows_at(self.position, times.positions)[:, : x.shape[2]]
-
-
-def initialize(trunk: Trunk, config: HMAConfig) -> None:
-    """Initialise maps to keep unit variance; scale the ends of the branches to keep the stream's variance."""
-    branches = (3 + bool({"modulation", "cross_attention"} & set(config.conditioning))) * config.layers
-    for name, module in trunk.blocks.named_modules():
-        if isinstance(module, nn.Linear):
-            ends = name.endswith(("proj", "fc2", "modulation_out"))
-            std = module.in_features**-0.5 * (branches**-0.5 if ends else 1.0)
-            nn.init.normal_(module.weight, std=std)
-            if module.bias is not None:
-                nn.init.zeros_(module.bias)

@@ -88,7 +88,7 @@ def import_released(
         action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
         yaml[name], stats[name] = _yaml(domain, space), {"action": action}
         cards[name] = {"data": {"released_checkpoint": origin, "released_domain": domain}}
-    return save(model, out, embodiment_yaml=yaml, stats=stats, cards=cards, tokenizer=config.tokenizer)
+    return save(model, out, embodiment_yaml=yaml, stats=stats, cards=cards)
 
 
 def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[str] | None = None) -> Path:

@@ -19,7 +19,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import read_json
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import weights
-from hma_model.checkpoint.io import Checkpoint, require_tokenizer
+from hma_model.checkpoint.folder import README, Checkpoint, require_tokenizer, resolve
 from hma_model.config import HMAConfig
 from hma_model.training.runtime import RECIPE, START
 
@@ -54,13 +54,13 @@ class Start:
 
         assert recipe.start is not None
         frozen, place = recipe.freeze == "trunk", out / START
-        if (place / checkpoints.README).is_file():  # written last
+        if (place / README).is_file():  # written last
             _require_source(recipe.start, out)
             return
         source, revision = hub.addressed(recipe.start)
         local = not hub.is_repository(source) and "://" not in source
         if local:
-            found = Checkpoint.open(checkpoints.resolve(Path(source).expanduser()))
+            found = Checkpoint.open(resolve(Path(source).expanduser()))
             require_tokenizer(found.config, _spec(sets), found.folder)
             found.trunk()
             source = str(found.folder)
@@ -151,6 +151,7 @@ def _require_source(source: str, out: Path) -> None:
     The checkpoint is the same if its trunk is, so it may have moved, and it may be gone.
     """
     from hma_model.hub import publish as hub
+    from hma_model.hub.listing import survey
 
     before = read_json(out / RECIPE).get("start") if (out / RECIPE).is_file() else None
     if before in (None, source):
@@ -158,9 +159,9 @@ def _require_source(source: str, out: Path) -> None:
     address, revision = hub.addressed(source)
     path = Path(address).expanduser()
     if hub.is_repository(address) or "://" in address:
-        trunk = hub.describe(address, revision)["trunk_sha256"]
+        trunk = survey(address, revision)[0]["trunk_sha256"]
     else:
-        trunk = Checkpoint.open(checkpoints.resolve(path)).trunk_sha256 if path.exists() else None
+        trunk = Checkpoint.open(resolve(path)).trunk_sha256 if path.exists() else None
     if trunk not in (None, Checkpoint.open(out / START).trunk_sha256):
         fault = f"was started from {before}, not from {source}"
         raise RecipeError(out, fault, "train into another folder, or name the first")

@@ -20,7 +20,7 @@ import yaml
 
 from hma_data.errors import UsageError
 from hma_data.storage.paths import StrPath, as_text
-from hma_model.checkpoint import io as checkpoints
+from hma_model.checkpoint.folder import resolve
 from hma_model.training.logging import RunLog, Tracker, open_trackers, read_metrics
 from hma_model.training.parallel import join
 from hma_model.training.recipe import Recipe, load_recipe
@@ -181,7 +181,7 @@ def _result(run: Run) -> TrainResult:
     lines = read_metrics(run.out)
     return TrainResult(
         out=run.out,
-        checkpoint=checkpoints.resolve(run.out),
+        checkpoint=resolve(run.out),
         step=run.step,
         losses=[(line["step"], line["loss"]) for line in lines if line["kind"] == "train"],
         evaluations=[line for line in lines if line["kind"] == "eval"],

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, RecipeError
 from hma_data.storage.files import file_sha256, finite, read_json, to_json
-from hma_model.checkpoint.io import CONFIG, HEAD, STEM, TRAINING, Checkpoint, inside
-from hma_model.checkpoint.migrate import FORMAT_VERSION
+from hma_model.checkpoint.folder import CONFIG, FORMAT_VERSION, HEAD, STEM, TRAINING, Checkpoint, inside
 from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.config import HMAConfig
 from hma_model.network.model import check_fit, module_key

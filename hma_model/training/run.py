@@ -19,7 +19,7 @@ from hma_data.loading.dataset import Batch, WindowDataset, open_sets
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import remove_partial, to_json, write_atomic
 from hma_model.checkpoint import io as checkpoints
-from hma_model.checkpoint.io import Checkpoint, action_stats, training_checkpoints
+from hma_model.checkpoint.folder import Checkpoint, action_stats, training_checkpoints
 from hma_model.config import OBJECTIVES, ActionSpace, Objective
 from hma_model.evaluation.evaluate import (
     Means,
@@ -359,7 +359,6 @@ class Run:
                 embodiment_yaml={name: s.embodiment.to_yaml() for name, s in self.sets.items()},
                 stats=self.stats,
                 cards={name: self._card(name, s) for name, s in self.sets.items()},
-                tokenizer=model.config.tokenizer,
                 training=lambda folder: write_state(folder, state, moments, weights),
                 base=self.start.checkpoint if self.start and self.start.frozen else None,
                 samples=newest_sheets(self.out, self.sets),

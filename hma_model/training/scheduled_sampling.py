@@ -18,7 +18,7 @@ from torch import Tensor
 from hma_data.loading.dataset import Batch
 from hma_model.config import OBJECTIVES
 from hma_model.network.embed import from_digits, unpatchify
-from hma_model.network.masking import uniform
+from hma_model.network.head import uniform
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA

@@ -1,5 +1,6 @@
 """Small embodiments, models and checkpoints for the tests of this folder."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,13 @@ def save(folder: Path, names: dict[str, int], seed: int = 0, **given: Any) -> HM
         embodiment_yaml={name: yaml(name, dims) for name, dims in names.items()},
         stats={name: stats(dims) for name, dims in names.items()},
         cards={name: {"data": {"windows": 12}, "metrics": {"val_loss": 1.5}} for name in names},
-        tokenizer=SPEC.to_json(),
         **given,
     )
     return model
+
+
+def edit_card(folder: Path, name: str, **facts: Any) -> None:
+    """Change facts of an embodiment's card.json, as a person does, and write README.md anew."""
+    path = folder / "embodiments" / name / "card.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | facts))
+    checkpoint.write_readme(folder)

@@ -13,9 +13,9 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.io import Checkpoint
+from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.checkpoint.weights import read_metadata
-from tests.model.robots import CONFIG, SPEC, make_model, save, yaml
+from tests.model.robots import CONFIG, SPEC, edit_card, make_model, save, yaml
 from tests.model.robots import stats as stats_of
 
 ROBOTS = {"arm": 2, "hand.v2": 3}
@@ -139,7 +139,7 @@ def test_a_checkpoint_of_another_library_is_refused(folder):
 def test_a_tokenizer_other_than_the_models_is_refused_with_the_difference(folder):
     other = {**SPEC.to_json(), "image_size": 32}
     with pytest.raises(CheckpointError, match="image_size is 16 there and 32 here"):
-        checkpoint.load(folder, tokenizer=type(SPEC).from_json(other))
+        require_tokenizer(Checkpoint.open(folder).config, type(SPEC).from_json(other), folder)
 
 
 def test_truncated_weights_are_refused(folder):
@@ -196,7 +196,6 @@ def test_a_model_with_an_embodiment_without_yaml_is_not_saved(tmp_path):
             embodiment_yaml=robots,
             stats=numbers,
             cards={},
-            tokenizer=SPEC.to_json(),
         )
 
 
@@ -213,9 +212,8 @@ def test_a_missing_folder_and_an_empty_one_say_so(tmp_path):
         checkpoint.load(tmp_path)
 
 
-def test_metrics_are_added_to_the_card_and_to_the_readme(folder):
-    checkpoint.update_card(folder, "arm", metrics={"psnr": 21.25})
-    assert Checkpoint.open(folder).card("arm")["metrics"] == {"val_loss": 1.5, "psnr": 21.25}
+def test_metrics_of_the_card_are_in_the_readme(folder):
+    edit_card(folder, "arm", metrics={"psnr": 21.25})
     assert "psnr 21.25" in (folder / "README.md").read_text()
     checkpoint.load(folder)
 
@@ -225,9 +223,7 @@ def test_the_config_comes_back(folder):
 
 
 def test_a_hostile_card_stays_in_its_cell(folder):
-    checkpoint.update_card(
-        folder, "arm", robot="x | y\n\n# Title <script>alert(1)</script> [a](javascript:b)"
-    )
+    edit_card(folder, "arm", robot="x | y\n\n# Title <script>alert(1)</script> [a](javascript:b)")
     page = (folder / "README.md").read_text()
     row = next(line for line in page.splitlines() if line.startswith("| `arm`"))
     assert len(re.findall(r"(?<!\\)\|", row)) == 9

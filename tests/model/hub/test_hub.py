@@ -15,6 +15,7 @@ from hma_model.checkpoint.io import Checkpoint
 from hma_model.hub import folder as hub_folder
 from hma_model.hub import publish as hub
 from hma_model.hub.folder import FolderStore
+from hma_model.hub.listing import survey
 from hma_model.network.model import HMA
 from tests.model.robots import make_model, save
 from tests.model.robots import yaml as robot_yaml
@@ -302,11 +303,11 @@ def test_the_model_card_has_front_matter_and_a_row_for_each_embodiment(source, t
 
 def test_what_is_published_is_described(source, target):
     hub.push(source, target, ["arm"])
-    facts = hub.describe(target)
+    (facts,) = survey(target)
     assert facts["trunk_sha256"] == Checkpoint.open(source).trunk_sha256
     assert facts["trunk_bytes"] == (source / "trunk.safetensors").stat().st_size
-    assert facts["embodiments"]["arm"]["card"]["action_dim"] == 2
-    assert facts["embodiments"]["arm"]["bytes"] > 1000
+    (row,) = facts["embodiments"]
+    assert row["action_dim"] == 2 and row["bytes"] > 1000
     json.dumps(facts)
 
 
@@ -323,8 +324,8 @@ def test_the_list_has_a_row_for_each_embodiment_with_the_same_columns(source, ta
 def test_a_loaded_model_is_pushed_with_what_it_was_loaded_with(source, target):
     model = HMA.from_pretrained(str(source))
     model.push_to_hub(target, embodiments=["arm"])
-    card = hub.describe(target)["embodiments"]["arm"]["card"]
-    assert card["robot"] == "an arm" and card["metrics"] == {"val_loss": 1.5}
+    (row,) = hub.list_embodiments(target)
+    assert row["robot"] == "an arm" and row["val_loss"] == 1.5
 
 
 def test_a_made_model_without_yaml_is_not_pushed(target):

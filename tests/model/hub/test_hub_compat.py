@@ -11,10 +11,9 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.files import file_sha256
+from hma_model.checkpoint import folder as layout
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint import migrate
 from hma_model.checkpoint.io import Checkpoint
-from hma_model.checkpoint.migrate import Step
 from hma_model.checkpoint.weights import read_metadata
 from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
@@ -75,18 +74,18 @@ def version_0(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         card["files"] |= {p: file_sha256(home / p) for p in ("stem.safetensors", "head.safetensors")}
         (home / "card.json").write_text(json.dumps(card))
 
-    def config_to_1(values):
-        model = values.pop("network")
-        return {**values, "model": {"layers": model.pop("depth"), **model}}
-
-    def tensors_to_1(part, tensors):
+    def to_1(part, values):
+        if part == "config":
+            model = values.pop("network")
+            return {**values, "model": {"layers": model.pop("depth"), **model}}
+        if part == "card":
+            return {**values, "metrics": values.pop("scores")}
         return {
             (name.replace("body.", "trunk.") if part == "trunk" else name.removeprefix("old.")): value
-            for name, value in tensors.items()
+            for name, value in values.items()
         }
 
-    step = Step(config_to_1, lambda card: {**card, "metrics": card.pop("scores")}, tensors_to_1)
-    monkeypatch.setitem(migrate.STEPS, 0, step)
+    monkeypatch.setitem(layout.STEPS, 0, to_1)
     return folder
 
 
@@ -114,13 +113,13 @@ def test_a_new_embodiment_joins_an_older_hub(version_0, tmp_path):
 
 
 def test_without_its_step_an_older_version_is_refused(version_0, monkeypatch):
-    monkeypatch.delitem(migrate.STEPS, 0)
+    monkeypatch.delitem(layout.STEPS, 0)
     with pytest.raises(CheckpointError, match="has format_version 0, this release reads 1"):
         checkpoint.load(version_0)
 
 
 def test_every_version_from_the_first_to_the_newest_has_its_step():
-    assert sorted(migrate.STEPS) == list(range(1, migrate.FORMAT_VERSION))
+    assert sorted(layout.STEPS) == list(range(1, layout.FORMAT_VERSION))
 
 
 # -- parts that do not belong together, each with an error of its own

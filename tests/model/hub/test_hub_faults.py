@@ -281,10 +281,10 @@ def test_a_file_that_another_pull_renames_into_place_meanwhile_is_used(published
         new.replace(path.resolve())
 
     def states(entry: Entry, content: Path | bytes) -> bool:
-        if at == "before" and entry.name == STEM:
+        if at == "before" and content == path:
             rename()
         right = plain(entry, content)
-        if at == "after" and entry.name == STEM:
+        if at == "after" and content == path:
             rename()
         return right
 

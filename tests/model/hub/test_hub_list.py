@@ -10,12 +10,11 @@ from safetensors.torch import save_file
 from typer.testing import CliRunner
 
 from hma_data.errors import CheckpointError, HubError, UsageError
-from hma_data.shards.reader import ShardSet
 from hma_model.checkpoint.io import Checkpoint
 from hma_model.cli import app
 from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
-from hma_model.hub.sample import add_samples, sample
+from hma_model.hub.sample import add_samples
 from tests.hub_server import connect, serve
 from tests.model.robots import SPEC, make_model, save
 from tests.model.shards import make_shards
@@ -141,10 +140,10 @@ def test_a_released_repository_is_listed_without_its_weights_being_sent(shelf, t
 # -- the sample picture
 
 
-def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path):
-    shards = ShardSet(make_shards(tmp_path / "shards", "arm"))
-    (tmp_path / "s.png").write_bytes(sample(folder, shards, Flat()))
-    picture = np.asarray(Image.open(tmp_path / "s.png"))
+def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("hma_data.shards.preview.tokenizer_of", lambda shards: Flat())
+    (path,) = add_samples(folder, [make_shards(tmp_path / "shards", "arm")])
+    picture = np.asarray(Image.open(path))
     height, width = picture.shape[:2]
     assert width > height > 3 * 128 and len(np.unique(picture)) > 5
 

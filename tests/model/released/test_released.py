@@ -15,7 +15,7 @@ from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.registry.embodiment import find
 from hma_data.storage.files import to_json
 from hma_model import hub
-from hma_model.checkpoint.io import Checkpoint, require_tokenizer
+from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.cli import app
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA

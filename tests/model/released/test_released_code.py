@@ -228,7 +228,8 @@ def test_the_released_code_reads_an_exported_model(tmp_path: Path, case: str) ->
     ours.eval()
     stats = {s.id: {"action": {"mean": list(s.mean), "std": list(s.std)}} for s in SPACES}
     yaml = {space.id: _yaml(space) for space in SPACES}
-    save(ours, tmp_path / "ours", embodiment_yaml=yaml, stats=stats, cards={}, tokenizer={"name": "x"})
+    ours.config = ours.config.replace(tokenizer={"name": "x"})
+    save(ours, tmp_path / "ours", embodiment_yaml=yaml, stats=stats, cards={})
     hub.export_released(tmp_path / "ours", tmp_path / "out")
     theirs = released.STMaskGIT.from_pretrained(str(tmp_path / "out"), strict=True).eval()
     tokens = torch.randint(0, ours.config.vocab_size + 1, (2, 5, 4, 4))

@@ -9,7 +9,7 @@ import pytest
 
 from hma_data.errors import RecipeError, TrainingError
 from hma_data.shards.writer import EpisodeRows, ShardWriter
-from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.folder import training_checkpoints
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
@@ -58,7 +58,7 @@ def test_the_run_stops_with_episode_and_frames_and_goes_on_from_repaired_shards(
     assert head == f"arm episode {EPISODE} (e{EPISODE}) frames" and int(first) <= ROW <= int(last) + 1
     step = int(caught.value.where.removeprefix("step "))
     before = [step - 1] if step > 1 else []
-    assert [int(p.name[5:]) for p in checkpoint.training_checkpoints(tmp_path / "run")][-1:] == before
+    assert [int(p.name[5:]) for p in training_checkpoints(tmp_path / "run")][-1:] == before
     repaired = recipe(tmp_path / "well")
     if before:
         with pytest.raises(RecipeError, match=r"data\.arm: "):

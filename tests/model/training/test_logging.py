@@ -18,7 +18,7 @@ from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_
 
 from hma_data.errors import MissingDependencyError, OutputError
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.folder import resolve
 from hma_model.training import logging as runlog
 from hma_model.training.logging import RunLog, read_metrics
 from hma_model.training.loop import train
@@ -183,7 +183,7 @@ def test_a_package_that_is_missing_is_said_with_how_to_install_it(
 def test_evaluations_leave_pictures_and_the_card_shows_the_last(run):
     names = sorted(path.name for path in (run / "pictures").iterdir())
     assert names == [f"step-{step:08d}-{name}.png" for step in (3, 6) for name in ("arm", "hand")]
-    folder = checkpoint.resolve(run)
+    folder = resolve(run)
     sample = folder / "embodiments" / "arm" / "sample.png"
     assert sample.read_bytes() == (run / "pictures" / "step-00000006-arm.png").read_bytes()
     assert "embodiments/arm/sample.png" in (folder / "README.md").read_text()

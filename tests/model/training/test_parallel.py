@@ -16,7 +16,7 @@ import torch
 import torch.distributed as dist
 
 from hma_data.errors import HMAError, ShardError, TrainingError
-from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.folder import resolve
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.parallel import ParallelModel, World, join, read_error, report_once, write_error
@@ -102,7 +102,7 @@ def close(one: Path, other: Path) -> None:
 def test_two_ranks_give_the_curve_and_the_weights_of_one(recipe, alone, tmp_path, mode):
     told = spread(recipe(parallel=mode), tmp_path / "run")
     assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4), told
-    close(alone.checkpoint, checkpoint.resolve(tmp_path / "run"))
+    close(alone.checkpoint, resolve(tmp_path / "run"))
     assert f"4 passes a step over 2 ranks, {mode}" in told
     assert json.loads((tmp_path / "run" / "environment.json").read_text())["ranks"] == 2
 
@@ -110,7 +110,7 @@ def test_two_ranks_give_the_curve_and_the_weights_of_one(recipe, alone, tmp_path
 @pytest.mark.slow
 def test_a_sharded_run_cut_on_two_ranks_goes_on_on_one(recipe, alone, tmp_path):
     spread(recipe(parallel="fsdp"), tmp_path / "run", exit_after_five, codes=(9, 9))
-    assert checkpoint.resolve(tmp_path / "run").name == "step-00000004"
+    assert resolve(tmp_path / "run").name == "step-00000004"
     again = train(recipe(), out=tmp_path / "run", show=False)
     assert [loss for _, loss in again.losses] == pytest.approx([loss for _, loss in alone.losses], rel=1e-4)
     close(alone.checkpoint, again.checkpoint)
@@ -122,7 +122,7 @@ def test_a_run_cut_on_one_rank_goes_on_on_two(recipe, alone, tmp_path):
     told = spread(recipe(parallel="fsdp"), tmp_path / "run")
     assert "resuming from step 2" in told
     assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4)
-    close(alone.checkpoint, checkpoint.resolve(tmp_path / "run"))
+    close(alone.checkpoint, resolve(tmp_path / "run"))
 
 
 def test_a_step_shared_otherwise_goes_on_with_windows_anew_and_says_so(recipe, tmp_path):

@@ -14,6 +14,7 @@ import pytest
 
 from hma_data.errors import CheckpointError, HMAError, OutputError, RecipeError, ShardError, TrainingError
 from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.folder import resolve
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
@@ -44,7 +45,7 @@ def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_bit_for_bit(recipe, t
     work = partial(train_quietly, recipe(), tmp_path / "cut")
     killed = partial(kill_at_write, 10, "step-00000004", work)
     run(killed, tmp_path / "said.txt", code=-signal.SIGKILL)
-    assert checkpoint.resolve(tmp_path / "cut").name == "step-00000002"
+    assert resolve(tmp_path / "cut").name == "step-00000002"
     assert {line["step"] for line in read_metrics(tmp_path / "cut")} == {1, 2, 3, 4}
     again = train(recipe(), out=tmp_path / "cut", show=False)
     assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
@@ -72,7 +73,7 @@ def test_the_command_saves_on_sigterm_and_says_how_to_go_on(recipe, tmp_path):
     process.terminate()
     assert end([process], said) == [130]
     assert "run the same command to continue" in said.read_text() and "Traceback" not in said.read_text()
-    step = int(checkpoint.resolve(tmp_path / "run").name.removeprefix("step-"))
+    step = int(resolve(tmp_path / "run").name.removeprefix("step-"))
     assert step == read_metrics(tmp_path / "run")[-1]["step"] > 0
 
 
@@ -98,7 +99,7 @@ def test_a_full_disk_is_one_error_and_leaves_the_last_checkpoint(recipe, tmp_pat
         CheckpointError, match=r"step-00000004: .*No space left.*older checkpoints are intact"
     ):
         train(recipe(), out=tmp_path / "run", show=False)
-    last = checkpoint.resolve(tmp_path / "run")
+    last = resolve(tmp_path / "run")
     assert last.name == "step-00000002" and checkpoint.load(last)
     assert [p.name for p in (tmp_path / "run/checkpoints").iterdir()] == ["step-00000002"]
     monkeypatch.undo()
@@ -108,7 +109,7 @@ def test_a_full_disk_is_one_error_and_leaves_the_last_checkpoint(recipe, tmp_pat
 def test_a_disk_that_takes_no_more_bytes_is_one_error(recipe, tmp_path):
     said = run(partial(train_on_a_small_disk, recipe(), tmp_path / "run"), tmp_path / "said.txt")
     assert said.startswith("CheckpointError") and "cannot be written" in said
-    assert checkpoint.resolve(tmp_path / "run").name == "step-00000002"
+    assert resolve(tmp_path / "run").name == "step-00000002"
 
 
 def train_on_a_small_disk(recipe, out: Path) -> None:
@@ -154,7 +155,7 @@ def test_the_folder_of_another_run_is_refused_with_what_differs(recipe, data, tm
     other = make_shards(tmp_path / "hand", "hand", dims=3)
     with pytest.raises(RecipeError, match=r"seed: 42, now 1; data\.arm: .* now None; data\.hand: None, now "):
         train(recipe(steps=2, data=[str(other)], seed=1), out=tmp_path / "run", show=False)
-    assert checkpoint.resolve(tmp_path / "run").name == "step-00000002"
+    assert resolve(tmp_path / "run").name == "step-00000002"
 
 
 def test_shards_of_another_tokenizer_are_refused_in_the_folder_of_a_run(recipe, tmp_path):

@@ -21,6 +21,7 @@ from hma_data.errors import (
 )
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoint
+from hma_model.checkpoint.folder import resolve
 from hma_model.network.model import HMA
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
@@ -229,7 +230,7 @@ def test_a_loss_that_is_no_number_stops_and_names_the_window(recipe, tmp_path, p
     first = int(batch.frame[1])  # of 4 frames, 2 rows apart
     place = f"{batch.embodiment[1]} episode {number} (e{number}) frames {first} to {first + 6}"
     assert f"windows: {place}" in caught.value.fault and caught.value.where == "step 3"
-    last = checkpoint.resolve(tmp_path / "run")
+    last = resolve(tmp_path / "run")
     assert last.name == "step-00000002"
     assert finite(last)
 
