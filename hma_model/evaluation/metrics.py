@@ -18,7 +18,7 @@ from torch.nn.functional import cross_entropy
 
 from hma_data.errors import UsageError
 from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
-from hma_model.network.embed import to_digits
+from hma_model.network.stem import to_digits
 from hma_model.network.trunk import TimePositions, rotary_angles
 
 if TYPE_CHECKING:

@@ -27,9 +27,9 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
 from hma_model.network.conditioning import ActionConditioning, Groups, condition, unknown
-from hma_model.network.embed import from_digits, unpatchify
 from hma_model.network.head import LatentReadout, TokenReadout, uniform
 from hma_model.network.model import HMA
+from hma_model.network.stem import from_digits, unpatchify
 from hma_model.network.trunk import (
     Conditioning,
     LayerCache,

@@ -19,8 +19,8 @@ from hma_data.errors import CheckpointError, HMAError
 from hma_data.storage.paths import StrPath
 from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
-from hma_model.network.embed import LatentEmbedding, Stem, TokenEmbedding, patchify
 from hma_model.network.head import ActionHead, LatentReadout, TokenReadout
+from hma_model.network.stem import LatentEmbedding, Stem, TokenEmbedding, patchify
 from hma_model.network.trunk import Conditioning, TimePositions, Trunk, window_times
 
 if TYPE_CHECKING:

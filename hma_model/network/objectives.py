@@ -15,8 +15,8 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition
-from hma_model.network.embed import from_digits, to_digits
 from hma_model.network.head import device_of, uniform
+from hma_model.network.stem import from_digits, to_digits
 
 if TYPE_CHECKING:
     from hma_data.loading.rows import Batch

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
-from hma_model.network.embed import LatentEmbedding, Modulation, TokenEmbedding
+from hma_model.network.stem import LatentEmbedding, Modulation, TokenEmbedding
 
 
 @dataclass

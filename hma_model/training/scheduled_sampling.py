@@ -17,8 +17,8 @@ from torch import Tensor
 
 from hma_data.loading.dataset import Batch
 from hma_model.config import OBJECTIVES
-from hma_model.network.embed import from_digits, unpatchify
 from hma_model.network.head import uniform
+from hma_model.network.stem import from_digits, unpatchify
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA

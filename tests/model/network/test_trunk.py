@@ -6,8 +6,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from hma_data.errors import HMAError
 from hma_model.config import ActionSpace
-from hma_model.network.embed import Normalizer
 from hma_model.network.model import HMA
+from hma_model.network.stem import Normalizer
 from hma_model.network.trunk import MLP, rotary_angles, rotate, rotate_qkv
 from tests.model.network_parts import ARM, HAND, small_batch, small_config, small_model
 

@@ -8,7 +8,7 @@ import torch
 from hma_data.errors import RecipeError
 from hma_data.loading.dataset import Batch
 from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.network.embed import to_digits
+from hma_model.network.stem import to_digits
 from hma_model.training.loop import train
 from hma_model.training.parallel import World
 from hma_model.training.recipe import make_recipe
