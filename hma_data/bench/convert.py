@@ -10,18 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench import make_robot, rss_mib
-
-ABOUT = "hma convert over many short episodes: overhead beside the tokenizer, memory of its workers over time"
-DEFAULTS: dict[str, Any] = {
-    "episodes": 10_000,
-    "frames": 8,  # an episode
-    "pixels": 128,  # height and width of the recorded pictures, JPEG
-    "tokenizer": "fsq-8",
-    "workers": 1,
-    "engine": "local",
-    "shard_frames": 4_096,
-}
+from hma_data.bench import Bench, make_robot, rss_mib
 
 
 def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -212,3 +201,18 @@ def _cpu_s(pids: list[int]) -> float:
             user, system = _stat(pid)[11:13]
             ticks += int(user) + int(system)
     return ticks / os.sysconf("SC_CLK_TCK")
+
+
+BENCH = Bench(
+    "hma convert over many short episodes: overhead beside the tokenizer, memory of its workers over time",
+    {
+        "episodes": 10_000,
+        "frames": 8,  # an episode
+        "pixels": 128,  # height and width of the recorded pictures, JPEG
+        "tokenizer": "fsq-8",
+        "workers": 1,
+        "engine": "local",
+        "shard_frames": 4_096,
+    },
+    run,
+)

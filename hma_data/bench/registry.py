@@ -8,8 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-ABOUT = "registry list over many generated YAMLs: seconds of the whole command"
-DEFAULTS: dict[str, Any] = {"embodiments": 10_000, "runs": 3}
+from hma_data.bench import Bench
 
 _YAML = """id: {id}
 description: A generated arm for measuring
@@ -42,17 +41,19 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         environment = {**os.environ, "HMA_CACHE": f"{folder}/cache", "HMA_REGISTRY": str(registry)}
         results = []
         for words in (["list", "--json"], ["list"], ["validate"], ["show", "arm_7"]):
-            seconds = [_seconds(words, folder, environment) for _ in range(settings["runs"] + 1)]
+            command, seconds = [sys.executable, "-m", "hma_model.cli", "registry", *words], list[float]()
+            for _ in range(settings["runs"] + 1):
+                start = time.perf_counter()
+                subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+                seconds.append(round(time.perf_counter() - start, 3))
             cold = seconds[0] if words == ["list", "--json"] else None
-            warm = round(min(seconds[1:]), 3)
-            results.append(
-                {"command": f"registry {' '.join(words)}", "cold_seconds": cold, "warm_seconds": warm}
-            )
+            about = {"command": f"registry {' '.join(words)}", "cold_seconds": cold}
+            results.append({**about, "warm_seconds": min(seconds[1:])})
         return results
 
 
-def _seconds(words: list[str], folder: str, environment: dict[str, str]) -> float:
-    start = time.perf_counter()
-    command = [sys.executable, "-m", "hma_model.cli", "registry", *words]
-    subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
-    return round(time.perf_counter() - start, 3)
+BENCH = Bench(
+    "registry list over many generated YAMLs: seconds of the whole command",
+    {"embodiments": 10_000, "runs": 3},
+    run,
+)

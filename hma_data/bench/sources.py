@@ -27,14 +27,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.bench import make_robot, peak_rss_mib
+from hma_data.bench import Bench, make_robot, peak_rss_mib
 from hma_data.cpu import ordinary_priority, usable_cores
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError, UsageError
 from hma_data.registry.embodiment import Embodiment
 
-ABOUT = "recordings of every format to 256×256 RGB, with one process and with all cores"
-DEFAULTS: dict[str, Any] = {"formats": ["all"], "frames": 600, "episodes": 6, "seed": 0}
 SIZE, BATCH = 256, 32  # pixels of a side; frames requested at once
 DEADLINE_S = 1800
 A, HZ = 7, 30
@@ -441,3 +439,10 @@ CASES = {
         Case("hands-h264-1280x720", "hands", HD, _hands, "left/center", "video", 1, _HANDS),
     )
 }
+
+
+BENCH = Bench(
+    "recordings of every format to 256×256 RGB, with one process and with all cores",
+    {"formats": ["all"], "frames": 600, "episodes": 6, "seed": 0},
+    run,
+)

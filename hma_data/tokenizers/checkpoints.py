@@ -24,8 +24,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from hma_data.errors import TokenizerError
-from hma_data.storage.files import file_sha256, write_atomic
+from hma_data.errors import HMAError, TokenizerError
+from hma_data.storage.files import file_sha256, read_json, write_atomic
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import Entry, find_entry
 
@@ -152,11 +152,11 @@ def digest_of(paths: Iterable[Path]) -> str:
 # -- read
 
 
-def read_tensors(path: Path) -> Tensors:
+def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
     """Read all tensors of a safetensors file or of a torch checkpoint, by name, in their stored dtypes.
 
     Raises:
-        TokenizerError: it is not such a file, is truncated, or holds values that only code could make.
+        error: it is not such a file, is truncated, or holds values that only code could make.
     """
     import pickle
 
@@ -164,55 +164,47 @@ def read_tensors(path: Path) -> Tensors:
         with path.open("rb") as file:
             start = file.read(9)
         if start[8:] == b"{":
-            return _read_safetensors(path)[0]
+            return _read_safetensors(path, error)[0]
         # Only a zip archive can be memory-mapped; torch wrote others before version 1.6.
         values = torch.load(path, map_location="cpu", weights_only=True, mmap=start.startswith(b"PK"))
     except pickle.UnpicklingError as fault:
-        raise TokenizerError(
+        raise error(
             path,
             "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled",
             "save its state_dict as safetensors where it can be trusted",
         ) from fault
-    except TokenizerError:
+    except HMAError:
         raise
     except Exception as fault:  # torch raises many kinds of errors on a damaged file
         text = f"is not a complete safetensors file or torch checkpoint: {type(fault).__name__}"
-        raise TokenizerError(path, f"{text}: {_one_line(fault)}", "download it again") from fault
+        raise error(path, f"{text}: {_one_line(fault)}", "download it again") from fault
     for key in NESTED:
         if isinstance(values, Mapping) and isinstance(values.get(key), Mapping):
             values = values[key]
     named = values.items() if isinstance(values, Mapping) else ()
     tensors = {str(name): value for name, value in named if isinstance(value, Tensor)}
     if not tensors:
-        raise TokenizerError(path, f"holds a {type(values).__name__} without weights by name", OTHER)
+        raise error(path, f"holds a {type(values).__name__} without weights by name", "name another file")
     return tensors
 
 
-def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
+def _read_safetensors(path: Path, error: type[HMAError]) -> tuple[Tensors, dict[str, str]]:
     """Return the tensors and the metadata of a safetensors file."""
     try:
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (SafetensorError, OSError) as fault:
-        raise TokenizerError(
-            path, f"is not a complete safetensors file: {_one_line(fault)}", OTHER
-        ) from fault
+        text = f"is not a complete safetensors file: {_one_line(fault)}"
+        raise error(path, text, "name another file, or download it again") from fault
 
 
 def stated_scale(folder: Path, default: float) -> float:
     """Return the `scaling_factor` that a folder's `config.json` states; `default` if it states none."""
     path = folder / "config.json"
-    try:
-        scale = float(json.loads(path.read_text("utf-8")).get("scaling_factor", default))
-        if not 0 < scale < 1e6:
-            raise ValueError(f"scaling_factor is {scale}")
-    except FileNotFoundError:
-        return default
-    except (OSError, ValueError, TypeError, AttributeError) as fault:
-        raise TokenizerError(
-            path, f"states no usable scaling_factor: {_one_line(fault)}", "repair it"
-        ) from fault
-    return scale
+    scale = read_json(path, TokenizerError).get("scaling_factor", default) if path.is_file() else default
+    if not isinstance(scale, int | float) or not 0 < scale < 1e6:
+        raise TokenizerError(path, f"states no usable scaling_factor: {scale!r}", "repair it")
+    return float(scale)
 
 
 def fill(network: nn.Module, tensors: Mapping[str, Tensor], where: object) -> None:
@@ -274,7 +266,7 @@ def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[
     Raises:
         TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
     """
-    tensors, metadata = _read_safetensors(path)
+    tensors, metadata = _read_safetensors(path, TokenizerError)
     remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
     if metadata.get("format") != form:
         raise TokenizerError(

@@ -81,17 +81,16 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
     if not files:
         raise TokenizerError(path, "is named after neither encoder nor decoder", REMEDY)
     encoder, decoder = (read_program(file) for file in files)
-    discrete, facts = name == "cosmos-di16", {"weights_sha256": digest_of(files)}
-    if discrete:
+    facts = {"weights_sha256": digest_of(files)}
+    if name == "cosmos-di16":
         spec = TokenizerSpec.discrete(name, VERSION, IMAGE_SIZE, STRIDE, DIGITS, dtype="uint16", **facts)
     else:
         spec = TokenizerSpec.continuous(name, VERSION, IMAGE_SIZE, STRIDE, CHANNELS, **facts)
-    cells = spec.grid if discrete else (CHANNELS, *spec.grid)
 
     def encode(pixels: Tensor) -> Tensor:
         # The optimiser rewrites a program after its first runs, which may change the last bits.
         with torch.jit.optimized_execution(place.type != "cpu"):
-            return _output(encoder(pixels), cells)
+            return _output(encoder(pixels), spec.cells)
 
     def decode(tokens: Tensor) -> Tensor:
         return _output(decoder(tokens), (3, IMAGE_SIZE, IMAGE_SIZE))

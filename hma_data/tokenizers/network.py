@@ -51,8 +51,7 @@ class NetworkTokenizer:
         Args:
             encode: pixels (B, 3, S, S) -> int64 ids (B, h, w), or latents (B, c, h, w).
             decode: ids or latents, as `encode` returns them, -> pixels (B, 3, S, S).
-            light: whether it is a network of plain convolutions, small enough for float32 and channels-last
-                on any device.
+            light: whether float32 and channels-last suit its network on any device, as they do a small one.
         """
         cuda = device.type == "cuda"
         self.spec, self.device, self.light = spec, device, light
@@ -72,8 +71,7 @@ class NetworkTokenizer:
             TokenizerError: frames have another shape or dtype, or the network's output cannot be stored.
         """
         check_frames(frames, self.spec)
-        cells = self.spec.grid if self.spec.kind == "discrete" else (self.spec.channels or 0, *self.spec.grid)
-        tokens = np.empty((len(frames), *cells), self.spec.dtype)
+        tokens = np.empty((len(frames), *self.spec.cells), self.spec.dtype)
         self._fill(tokens, self._encode_batch, frames, alone=True)
         return tokens
 
@@ -85,11 +83,6 @@ class NetworkTokenizer:
                 are not finite.
         """
         check_tokens(tokens, self.spec)
-        discrete = self.spec.kind == "discrete"
-        if not discrete and not (np.issubdtype(tokens.dtype, np.floating) and np.isfinite(tokens).all()):
-            raise TokenizerError(
-                self.spec.name, f"decodes finite float latents, was given {tokens.dtype}", "see encode"
-            )
         size = self.spec.image_size
         frames = np.empty((len(tokens), size, size, 3), np.uint8)
         self._fill(frames, self._decode_batch, tokens, alone=self.light)
@@ -115,10 +108,19 @@ class NetworkTokenizer:
 
     @torch.inference_mode()
     def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
-        """Encode at most one batch of frames and check the result."""
+        """Encode at most one batch of frames; check that the spec's dtype can store the result."""
         pixels = self._padded(frames).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
         pixels = pixels.to(self.dtype).contiguous(memory_format=self._format)
-        return self._storable(self._encode(pixels)[: len(frames)])
+        made, spec = self._encode(pixels)[: len(frames)].cpu(), self.spec
+        if spec.kind == "discrete":
+            if made.min() < 0 or made.max() >= (spec.vocab_size or 0):
+                fault = f"its network made id {made.max()}, the vocabulary ends at {spec.vocab_size}"
+                raise TokenizerError(spec.name, fault, OTHER)
+            return made.numpy()
+        latents = made.float().numpy()
+        if not np.abs(latents).max() <= np.finfo(np.float16).max:
+            raise TokenizerError(spec.name, "its network made latents that float16 cannot hold", OTHER)
+        return latents
 
     @torch.inference_mode()
     def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
@@ -129,19 +131,6 @@ class NetworkTokenizer:
         whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
         made: NDArray[np.uint8] = whole.permute(0, 2, 3, 1).cpu().numpy()
         return made[: len(tokens)]
-
-    def _storable(self, made: Tensor) -> NDArray[Any]:
-        """Return ids or latents as an array; check that the spec's dtype can store them."""
-        if self.spec.kind == "discrete":
-            ids = made.cpu().numpy()
-            if ids.size and (ids.min() < 0 or ids.max() >= (self.spec.vocab_size or 0)):
-                fault = f"its network made id {ids.max()}, the vocabulary ends at {self.spec.vocab_size}"
-                raise TokenizerError(self.spec.name, fault, OTHER)
-            return ids
-        latents = made.float().cpu().numpy()
-        if not np.abs(latents).max(initial=0) <= np.finfo(np.float16).max:
-            raise TokenizerError(self.spec.name, "its network made latents that float16 cannot hold", OTHER)
-        return latents
 
     def _padded(self, part: NDArray[Any]) -> Tensor:
         """Return the part on the device, repeated up to a whole batch."""

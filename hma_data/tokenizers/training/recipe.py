@@ -13,8 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 from hma_data.errors import RecipeError
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.yaml_io import read_yaml
-from hma_data.tokenizers.fsq import STRIDE, FsqConfig
-from hma_data.tokenizers.vae import VaeConfig
+from hma_data.tokenizers.embedded import PATCH, FsqConfig, VaeConfig
 
 LOCAL: dict[str, Any] = {"corpus": True, "network": {"latent_scale"}}  # a place, and a measured value
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -44,7 +43,7 @@ class TrainingRecipe(_Strict):
 
     steps: int = Field(gt=0)
     batch: int = Field(gt=0)
-    crop: int = Field(gt=0, multiple_of=STRIDE)
+    crop: int = Field(gt=0, multiple_of=2 * PATCH)
     learning_rate: float = Field(gt=0)
     adam_learning_rate: float = Field(gt=0)
     weight_decay: float = Field(ge=0, default=0.0)

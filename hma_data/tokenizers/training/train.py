@@ -31,17 +31,15 @@ from hma_data.errors import RecipeError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.checkpoints import save_weights
-from hma_data.tokenizers.fsq import FsqAutoencoder, FsqConfig
+from hma_data.tokenizers.embedded import Autoencoder, FsqAutoencoder, FsqConfig, VaeAutoencoder, VaeConfig
 from hma_data.tokenizers.network import open_device
 from hma_data.tokenizers.training.eval import GREY, ssim_map
 from hma_data.tokenizers.training.frames import Pool, draw_batch, load_pools
 from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
-from hma_data.tokenizers.vae import VaeAutoencoder, VaeConfig
 
 START, END = 2**32 - 1, 2**32 - 2  # step numbers of the batches that initialise and measure a network
 ROUNDS = 5  # of the Newton–Schulz iteration; they bring the singular values near 1
 _A, _B, _C = 3.4445, -4.7750, 2.0315  # largest slope at zero that keeps values in (0, 1] near 1
-Autoencoder = FsqAutoencoder | VaeAutoencoder
 
 
 def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
