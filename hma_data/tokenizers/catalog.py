@@ -64,9 +64,7 @@ class Entry:
 
     def size(self) -> int:
         """Return the size of the weights in bytes; 0 if there are none or the user names them."""
-        if self.weights == "embedded":
-            return (EMBEDDED / self.file).stat().st_size
-        return self.bytes or 0
+        return (EMBEDDED / self.file).stat().st_size if self.weights == "embedded" else self.bytes or 0
 
     def state(self) -> str:
         """Return "ready" or what it still needs: an install, a path, or a download on first use."""
@@ -89,14 +87,9 @@ class Entry:
     def to_json(self) -> dict[str, Any]:
         """Return plain values, with the state and the measured size."""
         values = {key: value for key, value in asdict(self).items() if key not in ("module", "arguments")}
-        return values | {
-            "grid": list(self.grid),
-            "imports": list(self.imports),
-            "bytes": self.size(),
-            "missing": self.missing(),
-            "state": self.state(),
-            "usable": self.state() == "ready",
-        }
+        lists = {"grid": list(self.grid), "imports": list(self.imports)}
+        state = {"missing": self.missing(), "state": self.state(), "usable": self.state() == "ready"}
+        return values | lists | {"bytes": self.size()} | state
 
 
 _MAGVIT2 = Entry(

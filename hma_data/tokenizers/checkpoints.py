@@ -12,6 +12,7 @@ format, the network's shape and the facts of the training.
 import hashlib
 import json
 import os
+import pickle
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -66,9 +67,8 @@ def find_weights(name: str, weights: str | None) -> Path:
                 return path
     entry = find_entry(name)
     if not entry.repo:
-        raise TokenizerError(
-            name, "has no weights in the package and no pinned download", "give --weights PATH (weights=PATH)"
-        )
+        fault = "has no weights in the package and no pinned download"
+        raise TokenizerError(name, fault, "give --weights PATH (weights=PATH)")
     return _from_hub(name, entry)
 
 
@@ -77,22 +77,29 @@ def _parse_uri(uri: str) -> Entry:
     form = r"hf://(datasets/)?([\w.-]+/[\w.-]+?)(?:@([\w.-]+))?/([\w./-]+)"
     found = re.fullmatch(form, uri)
     if not found or ".." in uri:
-        raise TokenizerError(
-            uri, "is not the address of a file on the hub", "write hf://ORGANISATION/NAME@REVISION/FILE"
-        )
+        remedy = "write hf://ORGANISATION/NAME@REVISION/FILE"
+        raise TokenizerError(uri, "is not the address of a file on the hub", remedy)
     dataset, repo, revision, file = found.groups()
-    place: dict[str, Any] = {"repo": repo, "file": file, "revision": revision or "main"}
-    place["repo_type"] = "dataset" if dataset else "model"
-    return Entry(uri, "discrete", 0, (0, 0), "", "download", "", **place)
+    return Entry(
+        uri, "discrete", 0, (0, 0), "", "download", "", repo=repo, file=file, revision=revision or "main",
+        repo_type="dataset" if dataset else "model",
+    )  # fmt: skip
 
 
 def _from_hub(name: str, entry: Entry) -> Path:
     """Return the path of a file in the hub's cache; download the file if it is not there."""
     import httpx
+    from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
     from huggingface_hub.errors import GatedRepoError, HFValidationError
 
+    place = {"revision": entry.revision, "repo_type": entry.repo_type}
+    pinned = re.fullmatch(r"[0-9a-f]{40}", entry.revision)  # a branch or a tag can move, a commit cannot
     try:
-        path = Path(_download(entry))
+        found = entry.cached() if pinned else None
+        if found is None:
+            # Ask first: without a connection, the download would retry for half a minute and log each try.
+            get_hf_file_metadata(hf_hub_url(entry.repo, entry.file, **place))
+            found = hf_hub_download(entry.repo, entry.file, **place)
     except (httpx.HTTPError, HFValidationError, OSError) as fault:
         size = f", {entry.bytes / 1e6:.0f} MB" if entry.bytes else ""
         wanted = f"needs {entry.file} of {entry.repo} at {entry.revision[:12]}{size}"
@@ -101,22 +108,10 @@ def _from_hub(name: str, entry: Entry) -> Path:
             remedy = f"accept its licence on the repository's page and log in, or {remedy}"
         text = f"{wanted}, which could not be downloaded: {type(fault).__name__}: {_one_line(fault)}"
         raise TokenizerError(name, text, remedy) from fault
-    if entry.sha256 and file_sha256(path) != entry.sha256:
-        raise TokenizerError(
-            path, f"is not the file that was pinned for {name} (SHA-256 {entry.sha256[:12]}…)", "delete it"
-        )
-    return path
-
-
-def _download(entry: Entry) -> str:
-    from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
-
-    kind, revision = entry.repo_type, entry.revision
-    if re.fullmatch(r"[0-9a-f]{40}", revision) and (cached := entry.cached()):
-        return cached  # a branch or a tag can move, a commit cannot
-    # Ask once first: without a connection, the download would retry for half a minute and log each try.
-    get_hf_file_metadata(hf_hub_url(entry.repo, entry.file, repo_type=kind, revision=revision))
-    return hf_hub_download(entry.repo, entry.file, revision=revision, repo_type=kind)
+    if entry.sha256 and file_sha256(Path(found)) != entry.sha256:
+        fault = f"is not the file that was pinned for {name} (SHA-256 {entry.sha256[:12]}…)"
+        raise TokenizerError(found, fault, "delete it")
+    return Path(found)
 
 
 def one_file(path: Path, names: Sequence[str], what: str) -> Path:
@@ -158,8 +153,6 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
     Raises:
         error: it is not such a file, is truncated, or holds values that only code could make.
     """
-    import pickle
-
     try:
         with path.open("rb") as file:
             start = file.read(9)
@@ -168,11 +161,8 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
         # Only a zip archive can be memory-mapped; torch wrote others before version 1.6.
         values = torch.load(path, map_location="cpu", weights_only=True, mmap=start.startswith(b"PK"))
     except pickle.UnpicklingError as fault:
-        raise error(
-            path,
-            "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled",
-            "save its state_dict as safetensors where it can be trusted",
-        ) from fault
+        text = "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled"
+        raise error(path, text, "save its state_dict as safetensors where it can be trusted") from fault
     except HMAError:
         raise
     except Exception as fault:  # torch raises many kinds of errors on a damaged file
@@ -269,13 +259,11 @@ def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[
     tensors, metadata = _read_safetensors(path, TokenizerError)
     remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
     if metadata.get("format") != form:
-        raise TokenizerError(
-            path, f"does not hold {form} weights (format {metadata.get('format')!r})", remedy
-        )
+        fault = f"does not hold {form} weights (format {metadata.get('format')!r})"
+        raise TokenizerError(path, fault, remedy)
     try:
         shape = config.model_validate_json(metadata.get("config", ""))
-    except ValueError as fault:
-        raise TokenizerError(
-            path, f"its metadata does not describe the network: {_one_line(fault)}", remedy
-        ) from fault
+    except ValueError as error:
+        fault = f"its metadata does not describe the network: {_one_line(error)}"
+        raise TokenizerError(path, fault, remedy) from error
     return shape, tensors, file_sha256(path)

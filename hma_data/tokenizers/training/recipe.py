@@ -1,11 +1,8 @@
-"""Read and check the YAML recipe that trains an embedded tokenizer.
-
-Every value is checked before any data is read or any step is trained; unknown keys are refused.
-"""
+"""Read and check the YAML recipe that trains an embedded tokenizer; unknown keys are refused."""
 
 import hashlib
 import json
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError, model_validator
@@ -55,19 +52,15 @@ class TrainingRecipe(_Strict):
     @model_validator(mode="after")
     def _falls_to_the_end(self) -> "TrainingRecipe":
         steps = [step for step, _ in self.fall]
-        if self.fall and (sorted(set(steps)) != steps or self.fall[0][1] != 1):
-            raise ValueError("fall must begin with share 1 and list ascending steps")
-        if self.fall and self.fall[-1] != (self.steps, 0):
-            raise ValueError(f"fall must end with [{self.steps}, 0]")
+        ends = self.fall and (self.fall[0][1], self.fall[-1]) == (1, (self.steps, 0))
+        if self.fall and not (ends and sorted(set(steps)) == steps):
+            raise ValueError(f"fall must begin with share 1, ascend in steps and end with [{self.steps}, 0]")
         return self
 
     def rate(self, step: int) -> float:
         """Return the share of the highest learning rate at a step; steps count from 0."""
         rise = min(1.0, (step + 1) / max(1, self.warmup_steps))
-        if not self.fall:
-            return rise
-        steps, shares = [point[0] for point in self.fall], [point[1] for point in self.fall]
-        return min(rise, float(np.interp(step, steps, shares)))
+        return min(rise, float(np.interp(step, *zip(*self.fall)))) if self.fall else rise
 
 
 class LossRecipe(_Strict):
@@ -104,6 +97,13 @@ class DrawnSource(_Strict):
     kind: Literal["pusht", "drawn"]
     pictures: int = Field(gt=0, default=200)
     weight: float = Field(gt=0, default=1.0)
+    glob: ClassVar[list[str]] = ["*.png"]
+    frames: ClassVar[int] = 1
+
+    @property
+    def path(self) -> str:
+        """Return the folder below the recipe's `corpus`."""
+        return self.kind
 
 
 class TokenizerRecipe(_Strict):
@@ -120,7 +120,7 @@ class TokenizerRecipe(_Strict):
 
     def digest(self) -> str:
         """Return the SHA-256 of all values except the corpus's location and what training measures."""
-        return _digest(self.model_dump(mode="json", exclude=LOCAL))
+        return self._digest(LOCAL)
 
     def course(self) -> str:
         """Return the SHA-256 of the values that must not change when a run is resumed.
@@ -128,12 +128,11 @@ class TokenizerRecipe(_Strict):
         It covers the values of `digest` except `steps`, `fall` and `threads`. A run can be resumed if this
         digest and the rates of its past steps are the same.
         """
-        values = self.model_dump(mode="json", exclude={**LOCAL, "training": {"steps", "fall", "threads"}})
-        return _digest(values)
+        return self._digest(LOCAL | {"training": {"steps", "fall", "threads"}})
 
-
-def _digest(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    def _digest(self, exclude: dict[str, Any]) -> str:
+        values = self.model_dump(mode="json", exclude=exclude)
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def load_recipe(path: StrPath, overrides: dict[str, Any] | None = None) -> TokenizerRecipe:
