@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
 BENCHES: dict[str, str] = {  # name -> module:object; hma_model adds its own
-    "convert": "hma_data.bench.convert:BENCH",
+    "convert": "hma_data.bench.verbs:CONVERT",
     "lerobot": "hma_data.bench.lerobot:BENCH",
     "loader": "hma_data.bench.shards:LOADER",
-    "registry": "hma_data.bench.registry:BENCH",
+    "registry": "hma_data.bench.verbs:REGISTRY",
     "shards": "hma_data.bench.shards:SHARDS",
     "sources": "hma_data.bench.sources:BENCH",
 }
@@ -74,14 +74,9 @@ def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, 
 
 
 def report(name: str, settings: dict[str, Any], results: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what `--json` prints."""
-    return {"bench": name, "machine": machine(), "settings": settings, "results": results}
-
-
-def machine() -> dict[str, Any]:
-    """Describe the machine on which the figures were measured."""
+    """Return what `--json` prints: the figures, and the machine on which they were measured."""
     models = _values_of("/proc/cpuinfo", "model name")
-    return {
+    machine = {
         "processor": models[0] if models else platform.processor() or platform.machine(),
         "cores": usable_cores(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
@@ -90,6 +85,7 @@ def machine() -> dict[str, Any]:
         "load_average": round(os.getloadavg()[0], 2),
         "date": time.strftime("%Y-%m-%d"),
     }
+    return {"bench": name, "machine": machine, "settings": settings, "results": results}
 
 
 def peak_rss_mib() -> float:
@@ -132,11 +128,8 @@ def make_robot(
     from hma_data.registry.embodiment import Embodiment
 
     usual = {
-        "id": id,
-        "kind": "simulation",
-        "frequency_hz": hz,
+        "id": id, "kind": "simulation", "frequency_hz": hz, "source": {"format": format},
         "action": {"space": "joint_delta", "components": [{"key": action, "dims": dims}]},
         "cameras": [{"name": "main", "key": camera}],
-        "source": {"format": format},
-    }
+    }  # fmt: skip
     return Embodiment.from_values(usual | values, id)

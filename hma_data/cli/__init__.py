@@ -40,7 +40,7 @@ def bench(
 
     Example: hma bench loader frames=1000000 --json
     """
-    from hma_data.bench import BENCHES, load, machine, report, settings_of
+    from hma_data.bench import BENCHES, load, report, settings_of
 
     if name is None:
         benches = {known: load(known) for known in sorted(BENCHES)}
@@ -56,10 +56,11 @@ def bench(
     chosen = load(name)
     values = settings_of(chosen, name, settings or [])
     results = chosen.run(values)
+    told = report(name, values, results)
     if json:
-        print_json(report(name, values, results))
+        print_json(told)
         return
     columns = list(dict.fromkeys(key for result in results for key in result))
     print_table(columns, [[result.get(key) for key in columns] for result in results], title=chosen.about)
-    facts = machine()
+    facts = told["machine"]
     print(f"{facts['processor']}, {facts['cores']} cores, load {facts['load_average']}, {facts['date']}")

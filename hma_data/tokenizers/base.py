@@ -164,7 +164,7 @@ def check_frames(frames: NDArray[Any], spec: TokenizerSpec) -> None:
 
 def check_tokens(tokens: NDArray[Any], spec: TokenizerSpec) -> None:
     """Raise TokenizerError unless tokens have the grid of `spec`, and are ids of its vocabulary or finite."""
-    kind = np.floating if spec.dtype == "float16" else np.integer
+    kind = {"float16": np.floating, "uint8": np.uint8}.get(spec.dtype, np.integer)
     if tokens.shape[1:] != spec.cells or not np.issubdtype(tokens.dtype, kind):
         form = f"{spec.dtype} (N, {', '.join(map(str, spec.cells))})"
         raise TokenizerError(spec.name, f"decodes {form}, was given {tokens.dtype} {tokens.shape}")

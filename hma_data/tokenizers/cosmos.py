@@ -30,14 +30,6 @@ DIGITS = (8 * 8 * 8, 5 * 5 * 5)
 REMEDY = "name the folder with the encoder.jit and decoder.jit of NVIDIA's release"
 
 
-class CosmosNetwork(nn.Module):
-    """A network of `encoder` and `decoder`, each a TorchScript program."""
-
-    def __init__(self, encoder: nn.Module, decoder: nn.Module) -> None:
-        super().__init__()
-        self.encoder, self.decoder = encoder, decoder
-
-
 def read_program(path: Path) -> torch.jit.ScriptModule:
     """Load a TorchScript file, which is trusted; raise TokenizerError if it is no whole program."""
     try:
@@ -80,7 +72,8 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
     files = pair_of(path / "encoder.jit" if path.is_dir() else path)
     if not files:
         raise TokenizerError(path, "is named after neither encoder nor decoder", REMEDY)
-    encoder, decoder = (read_program(file) for file in files)
+    network = nn.Module()
+    network.encoder, network.decoder = encoder, decoder = [read_program(file) for file in files]
     facts = {"weights_sha256": digest_of(files)}
     if name == "cosmos-di16":
         spec = TokenizerSpec.discrete(name, VERSION, IMAGE_SIZE, STRIDE, DIGITS, dtype="uint16", **facts)
@@ -95,6 +88,6 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
     def decode(tokens: Tensor) -> Tensor:
         return _output(decoder(tokens), (3, IMAGE_SIZE, IMAGE_SIZE))
 
-    tokenizer = NetworkTokenizer(spec, CosmosNetwork(encoder, decoder), place, encode, decode)
+    tokenizer = NetworkTokenizer(spec, network, place, encode, decode)
     _try(tokenizer, files)
     return tokenizer

@@ -72,8 +72,7 @@ class NetworkTokenizer:
         """
         check_frames(frames, self.spec)
         tokens = np.empty((len(frames), *self.spec.cells), self.spec.dtype)
-        self._fill(tokens, self._encode_batch, frames, alone=True)
-        return tokens
+        return self._in_batches(self._encode_batch, frames, tokens, alone=True)
 
     def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
         """Decode what `encode` returns to (N, S, S, 3) uint8 RGB.
@@ -85,17 +84,16 @@ class NetworkTokenizer:
         check_tokens(tokens, self.spec)
         size = self.spec.image_size
         frames = np.empty((len(tokens), size, size, 3), np.uint8)
-        self._fill(frames, self._decode_batch, tokens, alone=self.light)
-        return frames
+        return self._in_batches(self._decode_batch, tokens, frames, alone=self.light)
 
-    def _fill(
+    def _in_batches(
         self,
-        out: NDArray[Any],
         step: Callable[[NDArray[Any]], NDArray[Any]],
         items: NDArray[Any],
+        out: NDArray[Any],
         alone: bool,
-    ) -> None:
-        """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time.
+    ) -> NDArray[Any]:
+        """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time, and return it.
 
         With `alone`, on a CPU, several batches are computed at the same time, each on one thread.
         """
@@ -105,6 +103,7 @@ class NetworkTokenizer:
         with single_threads(len(parts)) if several else nullcontext() as pool:
             for start, made in zip(starts, pool.map(step, parts) if pool else map(step, parts), strict=True):
                 out[start : start + self.batch] = made
+        return out
 
     @torch.inference_mode()
     def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:

@@ -35,7 +35,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for mup in (True, False):
         for width in widths:
-            losses = {rate: _end(settings, width, rate, mup, widths[0]) for rate in rates}
+            losses = {rate: _final_loss(settings, width, rate, mup, widths[0]) for rate in rates}
             finite = {rate: loss for rate, loss in losses.items() if math.isfinite(loss)}
             best = min(finite, key=lambda rate: finite[rate]) if finite else None
             rows += [
@@ -53,7 +53,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def _end(settings: dict[str, Any], width: int, rate: float, mup: bool, base_width: int) -> float:
+def _final_loss(settings: dict[str, Any], width: int, rate: float, mup: bool, base_width: int) -> float:
     ends = []
     for seed in range(settings["seeds"]):
         model = make_model(width, settings["layers"], mup, base_width, seed)

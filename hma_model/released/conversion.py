@@ -81,7 +81,7 @@ def import_released(
             raise CheckpointError(weights, f"{name} holds values that are not finite", "download it again")
         if name.endswith(".std") and (tensor < 0).any():
             raise CheckpointError(weights, f"{name} is negative", "download it again")
-    names = _choose(_ids(domains_of(state), weights), embodiments, weights)
+    names = _choose(domains_of(state), embodiments, weights)
     trunk, parts = state_from_released(state, config)
     model = HMA(config)
     model.load_trunk(trunk)
@@ -151,9 +151,8 @@ def _weights(address: str | Path, revision: str | None) -> Path:
     if path.is_file():
         return path
     if path.is_dir():
-        for name in WEIGHTS:
-            if (path / name).is_file():
-                return path / name
+        if found := [path / name for name in WEIGHTS if (path / name).is_file()]:
+            return found[0]
         raise CheckpointError(path, f"has no {' or '.join(WEIGHTS)}", "give a released checkpoint's folder")
     address, revision = addressed(address, revision)
     if not is_repository(address):
@@ -174,8 +173,7 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
     """Raise unless names and shapes fit the released architecture that config.json describes."""
     domains = domains_of(state)
     named = values.get("action_domains") or []
-    lacking = [name for name in named if name not in domains]
-    if lacking:
+    if lacking := [name for name in named if name not in domains]:
         remedy = f"they have {_some(domains) or 'none'}; is it another model's {CONFIG}?"
         raise CheckpointError(path, f"lacks the domains {_some(lacking)} that {CONFIG} names", remedy)
     with torch.device("meta"):  # names and shapes of the layout, from a model without data
@@ -218,8 +216,8 @@ def _some(names: list[str]) -> str:
 # -- describing
 
 
-def _ids(domains: list[str], path: Path) -> dict[str, str]:
-    """Return our id for each released domain."""
+def _choose(domains: list[str], wanted: Iterable[str] | None, path: Path) -> dict[str, str]:
+    """Return our id for each released domain, or for those that are wanted by either name."""
     ids: dict[str, str] = {}
     for domain in domains:
         name = re.sub(r"[^a-z0-9_-]+", "_", domain.lower())[:100]
@@ -228,19 +226,11 @@ def _ids(domains: list[str], path: Path) -> dict[str, str]:
             fault = f"two domains would have the id {name!r}"
             raise CheckpointError(path, fault, "import one of them by embodiments=")
         ids[domain] = name
-    return ids
-
-
-def _choose(ids: dict[str, str], wanted: Iterable[str] | None, path: Path) -> dict[str, str]:
-    if wanted is None:
-        return ids
-    chosen = {}
-    for name in wanted:
-        found = [domain for domain, own in ids.items() if name in (domain, own)]
-        if not found:
+    names = list(ids if wanted is None else wanted)
+    for name in names:
+        if name not in ids and name not in ids.values():
             raise CheckpointError(path, f"has no domain {name!r}", f"it has: {', '.join(ids) or 'none'}")
-        chosen[found[0]] = ids[found[0]]
-    return chosen
+    return {domain: own for domain, own in ids.items() if domain in names or own in names}
 
 
 def _tokenizer_spec(config: HMAConfig, name: str | None, folder: Path) -> TokenizerSpec:
