@@ -238,20 +238,20 @@ def roll_out(made: Demo) -> None:
     from hma_model.evaluation.rollout_video import rollout_video
     from hma_model.network.model import HMA
 
-    def roll(robot: str) -> None:
+    def roll(robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:
         shards = made.sets[robot]
         model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
         tokenizer = tokenizer_of(shards)
-        made.figures[robot] = evaluate(model, tokenizer, shards, count=WINDOWS, batch_size=8)
+        found = evaluate(model, tokenizer, shards, count=WINDOWS, batch_size=8)
         lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
         prompt = max(2, default_prompt(model.config.frames))
         frames = min(LONGEST, max(lengths) // shards.row_stride) - prompt
-        made.films[robot] = rollout_video(model, tokenizer, shards, frames=frames, prompt=prompt)
+        return found, rollout_video(model, tokenizer, shards, frames=frames, prompt=prompt)
 
     with single_threads(len(made.sets)) as pool:
-        list(pool.map(roll, made.sets))
-    for robot in made.sets:
-        found = made.figures[robot]
+        results = list(pool.map(roll, made.sets))
+    for robot, (found, film) in zip(made.sets, results, strict=True):
+        made.figures[robot], made.films[robot] = found, film
         own, other = (f"{found[key]['psnr_last']:.1f} dB" for key in ("true", "shuffled"))
         print(f"  {robot}: last frame PSNR {own} with its actions, {other} with another window's", flush=True)
 

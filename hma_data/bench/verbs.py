@@ -1,7 +1,7 @@
 """Measure two verbs: `hma convert` beside its tokenizer, and `hma registry` over many embodiments.
 
-`convert` also shows whether the memory of its workers stays constant. `registry` runs commands that read every
-YAML, with nothing or everything cached.
+`convert` also shows whether the memory of its workers stays constant. `registry` runs commands that read
+every YAML, with nothing or everything cached.
 """
 
 import os
@@ -114,12 +114,9 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]
 class _Watch:
     """Memory and CPU time of this process and of those it started, sampled while the conversion runs.
 
-    Attributes:
-        cpu_s: CPU seconds until now of the workers (and Ray's actors), of this process without the sampling,
-            and of Ray's other processes.
-        seconds: wall time of the conversion; measured by `stop`.
-        start_seconds, start_frames, start_cpu_s: the figures at the first report of finished frames.
-        samples: share of the frames that are done, and MiB by role.
+    `cpu_s` counts the workers (and Ray's actors), this process without the sampling, and Ray's other
+    processes. `start_*` are the figures at the first report of finished frames. `samples` hold the share of
+    the frames that are done, and MiB by role.
     """
 
     def __init__(self, workers: int, engine: str) -> None:

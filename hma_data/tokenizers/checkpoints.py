@@ -92,7 +92,7 @@ def _from_hub(name: str, entry: Entry) -> Path:
     from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
     from huggingface_hub.errors import GatedRepoError, HFValidationError
 
-    place = {"revision": entry.revision, "repo_type": entry.repo_type}
+    place: dict[str, Any] = {"revision": entry.revision, "repo_type": entry.repo_type}
     pinned = re.fullmatch(r"[0-9a-f]{40}", entry.revision)  # a branch or a tag can move, a commit cannot
     try:
         found = entry.cached() if pinned else None
@@ -109,8 +109,8 @@ def _from_hub(name: str, entry: Entry) -> Path:
         text = f"{wanted}, which could not be downloaded: {type(fault).__name__}: {_one_line(fault)}"
         raise TokenizerError(name, text, remedy) from fault
     if entry.sha256 and file_sha256(Path(found)) != entry.sha256:
-        fault = f"is not the file that was pinned for {name} (SHA-256 {entry.sha256[:12]}…)"
-        raise TokenizerError(found, fault, "delete it")
+        text = f"is not the file that was pinned for {name} (SHA-256 {entry.sha256[:12]}…)"
+        raise TokenizerError(found, text, "delete it")
     return Path(found)
 
 

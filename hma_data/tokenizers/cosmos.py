@@ -30,14 +30,13 @@ DIGITS = (8 * 8 * 8, 5 * 5 * 5)
 REMEDY = "name the folder with the encoder.jit and decoder.jit of NVIDIA's release"
 
 
-def read_program(path: Path) -> torch.jit.ScriptModule:
+def _read_program(path: Path) -> torch.jit.ScriptModule:
     """Load a TorchScript file, which is trusted; raise TokenizerError if it is no whole program."""
     try:
-        program: torch.jit.ScriptModule = torch.jit.load(str(path), map_location="cpu")
+        return torch.jit.load(str(path), map_location="cpu")
     except (RuntimeError, ValueError, EOFError) as fault:
         text = " ".join(str(fault).split())[:160]
         raise TokenizerError(path, f"cannot be loaded as TorchScript: {text}", REMEDY) from fault
-    return program
 
 
 def _output(made: object, shape: tuple[int, ...]) -> Tensor:
@@ -55,9 +54,8 @@ def _try(tokenizer: NetworkTokenizer, files: list[Path]) -> None:
         try:
             values = half(values)
         except (RuntimeError, ValueError) as fault:
-            text = " ".join(str(fault).split())[-160:]
-            fault_text = f"does not do what {tokenizer.spec.name} does: {text}"
-            raise TokenizerError(file, fault_text, REMEDY) from fault
+            text = f"does not do what {tokenizer.spec.name} does: {' '.join(str(fault).split())[-160:]}"
+            raise TokenizerError(file, text, REMEDY) from fault
 
 
 def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
@@ -73,7 +71,7 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
     if not files:
         raise TokenizerError(path, "is named after neither encoder nor decoder", REMEDY)
     network = nn.Module()
-    network.encoder, network.decoder = encoder, decoder = [read_program(file) for file in files]
+    network.encoder, network.decoder = encoder, decoder = [_read_program(file) for file in files]
     facts = {"weights_sha256": digest_of(files)}
     if name == "cosmos-di16":
         spec = TokenizerSpec.discrete(name, VERSION, IMAGE_SIZE, STRIDE, DIGITS, dtype="uint16", **facts)

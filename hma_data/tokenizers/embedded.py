@@ -19,7 +19,7 @@ B pictures, S side, h·w grid, C latent channels. Pixels inside the networks are
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -312,7 +312,7 @@ def load(name: str, *, weights: str | None, device: str, image_size: int) -> Net
     """Return the tokenizer; `hma_data.tokenizers.base.get_tokenizer` states the arguments and the errors."""
     place = open_device(name, device)
     path = Path(weights).expanduser() if weights else EMBEDDED / CATALOG[name].file
-    kind = FsqAutoencoder if name.startswith("fsq") else VaeAutoencoder
+    kind: Any = FsqAutoencoder if name.startswith("fsq") else VaeAutoencoder
     config, tensors, sha256 = read_weights(path, kind.format, kind.shape)
     with torch.device("meta"):
         network: Autoencoder = kind(config)

@@ -27,14 +27,7 @@ Step = Callable[[Tensor], Tensor]
 
 
 class NetworkTokenizer:
-    """A tokenizer with a network; see `hma_data.tokenizers.base.Tokenizer`.
-
-    Attributes:
-        spec: what decides the tokens.
-        network: torch module with `encoder` and `decoder`, in evaluation mode.
-        batch: frames a pass through the network.
-        light: whether to decode each frame on one thread too, which is fast enough for a small network.
-    """
+    """A tokenizer with a network; see `hma_data.tokenizers.base.Tokenizer`."""
 
     def __init__(
         self,
@@ -49,9 +42,11 @@ class NetworkTokenizer:
         """Move the network to the device and set it to evaluation mode.
 
         Args:
+            network: torch module with `encoder` and `decoder`.
             encode: pixels (B, 3, S, S) -> int64 ids (B, h, w), or latents (B, c, h, w).
             decode: ids or latents, as `encode` returns them, -> pixels (B, 3, S, S).
-            light: whether float32 and channels-last suit its network on any device, as they do a small one.
+            light: whether the network is small: it runs in float32 and channels-last on any device, and on a
+                CPU it also decodes each frame on one thread.
         """
         cuda = device.type == "cuda"
         self.spec, self.device, self.light = spec, device, light
@@ -87,11 +82,7 @@ class NetworkTokenizer:
         return self._in_batches(self._decode_batch, tokens, frames, alone=self.light)
 
     def _in_batches(
-        self,
-        step: Callable[[NDArray[Any]], NDArray[Any]],
-        items: NDArray[Any],
-        out: NDArray[Any],
-        alone: bool,
+        self, step: Callable[[Any], NDArray[Any]], items: NDArray[Any], out: NDArray[Any], alone: bool
     ) -> NDArray[Any]:
         """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time, and return it.
 

@@ -215,10 +215,11 @@ def _levels(picture: Frame) -> list[Frame]:
 def _source_files(source: FileSource | DrawnSource, corpus: Path) -> list[Path]:
     folder = corpus / source.path
     files = sorted({path for glob in source.glob for path in folder.glob(glob)})
-    if isinstance(source, DrawnSource) and len(files) != source.pictures:
-        fault = f"holds {len(files)} pictures, the recipe says {source.pictures}"
-        raise RecipeError(folder, fault, f"recipes/tokenizer/draw.py {corpus} makes them")
-    if not files:
+    if isinstance(source, DrawnSource):
+        if len(files) != source.pictures:
+            fault = f"holds {len(files)} pictures, the recipe says {source.pictures}"
+            raise RecipeError(folder, fault, f"recipes/tokenizer/draw.py {corpus} makes them")
+    elif not files:
         fault = f"no file matches {', '.join(source.glob)}"
         raise RecipeError(folder, fault, f"unpack {source.origin} there")
     return files

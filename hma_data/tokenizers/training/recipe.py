@@ -60,7 +60,10 @@ class TrainingRecipe(_Strict):
     def rate(self, step: int) -> float:
         """Return the share of the highest learning rate at a step; steps count from 0."""
         rise = min(1.0, (step + 1) / max(1, self.warmup_steps))
-        return min(rise, float(np.interp(step, *zip(*self.fall)))) if self.fall else rise
+        if not self.fall:
+            return rise
+        steps, shares = [point[0] for point in self.fall], [point[1] for point in self.fall]
+        return min(rise, float(np.interp(step, steps, shares)))
 
 
 class LossRecipe(_Strict):
