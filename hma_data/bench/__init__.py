@@ -122,7 +122,7 @@ def in_fresh_process[T](task: Callable[..., T], *arguments: Any) -> T:
 
 
 def make_robot(
-    id: str, format: str, action: str, camera: str, hz: int = 10, dims: int = 7, **values: Any
+    id: str, format: str, action: str, camera: str, /, hz: int = 10, dims: int = 7, **values: Any
 ) -> "Embodiment":
     """Return an embodiment of one camera, `main`; `values` are further top-level keys of its YAML."""
     from hma_data.registry.embodiment import Embodiment

@@ -58,6 +58,10 @@ def test_a_generated_recording_shows_what_was_drawn(name: str, tmp_path: Path) -
     np.testing.assert_allclose(clip.actions, actions(12, 1), atol=1e-6)
 
 
+def test_every_generated_recording_has_an_embodiment() -> None:
+    assert [case.embodiment().source.format for case in CASES.values()] == [c.format for c in CASES.values()]
+
+
 def test_sources_are_measured_with_units() -> None:
     settings = sources.BENCH.defaults | {"formats": ["rlds-jpeg-256"], "frames": 8, "episodes": 2}
     results = sources.run(settings)
