@@ -1,17 +1,12 @@
-"""Run benchmarks: `hma bench NAME [key=value …]`, one module each.
-
-The module of a benchmark defines `ABOUT` (one line), `DEFAULTS` (its settings) and
-`run(settings) -> results`. The results are one mapping for each case: the values that distinguish the case,
-and the figures, each named with its unit (`frames_per_second`, `peak_rss_mib`). Input is
-generated; nothing is downloaded.
-"""
+"""Run benchmarks: `hma bench NAME [key=value …]`. Input is generated; nothing is downloaded."""
 
 import os
 import platform
 import time
 from collections.abc import Callable, Sequence
-from importlib import import_module
+from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from hma_data.cpu import usable_cores
@@ -20,37 +15,50 @@ from hma_data.errors import UsageError
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
-BENCHES: dict[str, str] = {  # name -> module; hma_model adds its own
-    "convert": "hma_data.bench.convert",
-    "lerobot": "hma_data.bench.lerobot",
-    "loader": "hma_data.bench.loader",
-    "registry": "hma_data.bench.registry",
-    "shards": "hma_data.bench.shards",
-    "sources": "hma_data.bench.sources",
+BENCHES: dict[str, str] = {  # name -> module:object; hma_model adds its own
+    "convert": "hma_data.bench.verbs:CONVERT",
+    "lerobot": "hma_data.bench.lerobot:BENCH",
+    "loader": "hma_data.bench.shards:LOADER",
+    "registry": "hma_data.bench.verbs:REGISTRY",
+    "shards": "hma_data.bench.shards:SHARDS",
+    "sources": "hma_data.bench.sources:BENCH",
 }
 
 
-def load(name: str) -> Any:
-    """Return the module of a benchmark.
+@dataclass(frozen=True)
+class Bench:
+    """A benchmark.
 
-    Raises:
-        UsageError: there is no such benchmark.
+    Attributes:
+        about: one line.
+        defaults: its settings.
+        run: takes the settings; returns one mapping for each case: the values that distinguish the case, and
+            the figures, each named with its unit (`frames_per_second`, `peak_rss_mib`).
     """
+
+    about: str
+    defaults: dict[str, Any]
+    run: Callable[[dict[str, Any]], list[dict[str, Any]]]
+
+
+def load(name: str) -> Bench:
+    """Return a benchmark; raise UsageError if there is no such benchmark."""
     if name not in BENCHES:
         known = ", ".join(sorted(BENCHES))
         raise UsageError(f"benchmark {name!r}", "does not exist", f"known: {known}")
-    return import_module(BENCHES[name])
+    bench: Bench = resolve_name(BENCHES[name])
+    return bench
 
 
-def settings_of(bench: Any, name: str, overrides: Sequence[str]) -> dict[str, Any]:
-    """Return DEFAULTS changed by `key=value` words; each value has the type of its default.
+def settings_of(bench: Bench, name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Return the defaults changed by `key=value` words; each value has the type of its default.
 
     Raises:
         UsageError: there is no such setting, or a value is not of its type.
     """
     from hma_data.storage.yaml_io import parse_yaml
 
-    settings = dict(bench.DEFAULTS)
+    settings = dict(bench.defaults)
     for word in overrides:
         key, given, text = word.partition("=")
         if not given or key not in settings:
@@ -66,14 +74,9 @@ def settings_of(bench: Any, name: str, overrides: Sequence[str]) -> dict[str, An
 
 
 def report(name: str, settings: dict[str, Any], results: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what `--json` prints."""
-    return {"bench": name, "machine": machine(), "settings": settings, "results": results}
-
-
-def machine() -> dict[str, Any]:
-    """Describe the machine on which the figures were measured."""
+    """Return what `--json` prints: the figures, and the machine on which they were measured."""
     models = _values_of("/proc/cpuinfo", "model name")
-    return {
+    machine = {
         "processor": models[0] if models else platform.processor() or platform.machine(),
         "cores": usable_cores(),
         "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
@@ -82,6 +85,7 @@ def machine() -> dict[str, Any]:
         "load_average": round(os.getloadavg()[0], 2),
         "date": time.strftime("%Y-%m-%d"),
     }
+    return {"bench": name, "machine": machine, "settings": settings, "results": results}
 
 
 def peak_rss_mib() -> float:
@@ -118,17 +122,14 @@ def in_fresh_process[T](task: Callable[..., T], *arguments: Any) -> T:
 
 
 def make_robot(
-    id: str, format: str, action: str, camera: str, hz: int = 10, dims: int = 7, **values: Any
+    id: str, format: str, action: str, camera: str, /, hz: int = 10, dims: int = 7, **values: Any
 ) -> "Embodiment":
     """Return an embodiment of one camera, `main`; `values` are further top-level keys of its YAML."""
     from hma_data.registry.embodiment import Embodiment
 
     usual = {
-        "id": id,
-        "kind": "simulation",
-        "frequency_hz": hz,
+        "id": id, "kind": "simulation", "frequency_hz": hz, "source": {"format": format},
         "action": {"space": "joint_delta", "components": [{"key": action, "dims": dims}]},
         "cameras": [{"name": "main", "key": camera}],
-        "source": {"format": format},
-    }
+    }  # fmt: skip
     return Embodiment.from_values(usual | values, id)

@@ -15,13 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench import make_robot
+from hma_data.bench import Bench, make_robot
 from hma_data.bench.sources import HZ, TASK, scene
 from hma_data.lab.writers import LeRobotEpisode, write_lerobot
 from hma_data.registry.embodiment import Embodiment
 
-ABOUT = "a LeRobotDataset read by our source and by lerobot's own reader"
-DEFAULTS: dict[str, Any] = {"episodes": 4, "frames": 400, "height": 480, "width": 640, "seed": 0}
 CAMERA, DIMS, BATCH = "observation.images.main", 7, 32  # BATCH: frames requested at once, in order
 OPEN = {
     "hma": "from hma_data.sources.base import open_source; open_source('lerobot').index(sys.argv[1])",
@@ -110,3 +108,10 @@ def _speed(read: Callable[[list[int]], int], batches: Iterable[list[int]]) -> di
         "frames_per_second": round(frames / wall, 1),
         "frames_per_cpu_second": round(frames / used, 1),
     }
+
+
+BENCH = Bench(
+    "a LeRobotDataset read by our source and by lerobot's own reader",
+    {"episodes": 4, "frames": 400, "height": 480, "width": 640, "seed": 0},
+    run,
+)

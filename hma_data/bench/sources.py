@@ -3,9 +3,6 @@
 The recordings are generated, one of each format and of realistic size. Their pictures are as hard for a codec
 as real ones: textures at every scale, sensor noise, motion; their actions are seven smooth numbers a frame.
 
-Every process opens the source for itself and takes its share of the episodes: read, align, decode, resize.
-Timing starts when every process has read one frame, so imports do not count.
-
 H height, W width, A action dims.
 """
 
@@ -13,28 +10,26 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
 from multiprocessing import get_context
-from multiprocessing.synchronize import Barrier
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.bench import make_robot, peak_rss_mib
+from hma_data.bench import Bench, make_robot, peak_rss_mib
 from hma_data.cpu import ordinary_priority, usable_cores
 from hma_data.episodes.images import Images
 from hma_data.errors import HMAError, UsageError
 from hma_data.registry.embodiment import Embodiment
 
-ABOUT = "recordings of every format to 256×256 RGB, with one process and with all cores"
-DEFAULTS: dict[str, Any] = {"formats": ["all"], "frames": 600, "episodes": 6, "seed": 0}
 SIZE, BATCH = 256, 32  # pixels of a side; frames requested at once
 DEADLINE_S = 1800
 A, HZ = 7, 30
@@ -93,11 +88,10 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
         UsageError: there is no such format.
     """
     wanted = list(CASES) if settings["formats"] == ["all"] else settings["formats"]
-    unknown = [name for name in wanted if name not in CASES]
-    if unknown:
-        raise UsageError(
-            "bench sources", f"the format {unknown[0]!r} does not exist", f"known: {', '.join(CASES)}"
-        )
+    for name in wanted:
+        if name not in CASES:
+            known = f"known: {', '.join(CASES)}"
+            raise UsageError("bench sources", f"the format {name!r} does not exist", known)
     episodes = max(1, min(settings["episodes"], settings["frames"]))
     length = max(2, settings["frames"] // episodes)
     results: list[dict[str, Any]] = []
@@ -107,20 +101,23 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             uri = CASES[name].write(Path(folder), episodes, length, settings["seed"])
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
             for processes in dict.fromkeys((1, min(usable_cores(), episodes))):
-                figures = measure(name, str(uri), processes)
                 about = {"format": name, "processes": processes, "stride": CASES[name].stride}
-                bytes_a_frame = round(size / (episodes * length))
-                results.append({**about, **figures, "recorded_bytes_per_frame": bytes_a_frame})
+                figures = measure(name, str(uri), processes)
+                figures["recorded_bytes_per_frame"] = round(size / (episodes * length))
+                results.append(about | figures)
     return results
 
 
 def measure(name: str, uri: str, processes: int) -> dict[str, Any]:
-    """Return frames per second of wall time and of CPU time, and the most memory that one process held."""
+    """Return frames per second of wall time and of CPU time, and the most memory that one process held.
+
+    Every process opens the source for itself and takes its episodes: read, align, decode, resize.
+    Timing starts when every process has read one frame, so imports do not count.
+    """
     context = get_context("spawn")
-    start = context.Barrier(processes)
-    # Each process waits for the others in its first task, so that none of them takes two.
-    with ProcessPoolExecutor(processes, context, initializer=_keep_start, initargs=(start,)) as pool:
-        jobs = [pool.submit(_work, name, uri, share, processes) for share in range(processes)]
+    with context.Manager() as manager, ProcessPoolExecutor(processes, context) as pool:
+        start = manager.Barrier(processes)  # each process waits for the others, so that none takes two tasks
+        jobs = [pool.submit(_work, name, uri, share, processes, start) for share in range(processes)]
         found = [job.result() for job in jobs]
     frames = sum(one["frames"] for one in found)
     wall = max(one["stop"] for one in found) - min(one["start"] for one in found)
@@ -132,15 +129,7 @@ def measure(name: str, uri: str, processes: int) -> dict[str, Any]:
     }
 
 
-_start: Barrier  # of a process of `measure`
-
-
-def _keep_start(start: Barrier) -> None:
-    global _start
-    _start = start
-
-
-def _work(name: str, uri: str, share: int, shares: int) -> dict[str, Any]:
+def _work(name: str, uri: str, share: int, shares: int, start: Barrier) -> dict[str, Any]:
     """Read every `shares`th episode from the `share`th on, and return the figures."""
     from hma_data.sources.base import open_source
 
@@ -151,9 +140,9 @@ def _work(name: str, uri: str, share: int, shares: int) -> dict[str, Any]:
         names = [ref.id for ref in source.index(uri, robot)]
         _episode(source, uri, names[share % len(names)], robot, limit=1)
     except HMAError:
-        _start.abort()  # the others need not wait
+        start.abort()  # the others need not wait
         raise
-    _start.wait(DEADLINE_S)
+    start.wait(DEADLINE_S)
     began, cpu = time.monotonic(), time.process_time()
     frames = sum(_episode(source, uri, one, robot) for one in names[share::shares])
     stop, used = time.monotonic(), time.process_time() - cpu
@@ -299,6 +288,17 @@ def _bags(kind: str, kept: str, folder: Path, episodes: int, length: int, seed: 
     store.register(get_types_from_msg(_VIDEO_DEFINITION, _TYPES["h264"]))
     serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
     command = "sensor_msgs/msg/JointState"
+    numbered = {"seq": 0} if ros1 else {}
+    form: dict[str, Any] = {"format": kept}
+    if kept == "raw":
+        height, width = VGA
+        shape = {"height": height, "width": width, "step": 3 * width}
+        form = {**shape, "encoding": "rgb8", "is_bigendian": 0}
+    stored: dict[str, Callable[[Iterator[Images]], Iterable[bytes]]] = {
+        "h264": _packets,
+        "jpeg": partial(_encoded, codec="jpeg"),
+        "raw": partial(map, np.ndarray.tobytes),
+    }
     for episode in range(episodes):
         path = folder / f"run_{episode:03d}{'.bag' if ros1 else ''}"
         plugin = None if ros1 else StoragePlugin[kind.upper()]
@@ -306,43 +306,18 @@ def _bags(kind: str, kept: str, folder: Path, episodes: int, length: int, seed: 
         with bag:
             camera = bag.add_connection("/camera", _TYPES[kept], typestore=store)
             arm = bag.add_connection("/command", command, typestore=store)
-            stored = _stored(scene(*VGA, length, seed + episode), kept)
-            for i, (data, values) in enumerate(zip(stored, actions(length, episode), strict=True)):
+            pictures = stored[kept](scene(*VGA, length, seed + episode))
+            for i, (data, values) in enumerate(zip(pictures, actions(length, episode), strict=True)):
                 at = START_NS + i * 10**9 // HZ
-                joints = store.types[command](
-                    header=_header(store, at),
-                    name=[f"joint_{n}" for n in range(A)],
-                    position=values.astype(np.float64),
-                    velocity=np.empty(0),
-                    effort=np.empty(0),
-                )
+                stamp = store.types["builtin_interfaces/msg/Time"](*divmod(at, 10**9))
+                header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="main", **numbered)
+                none, position = np.empty(0), values.astype(np.float64)
+                joints = store.types[command](header, [f"joint_{n}" for n in range(A)], position, none, none)
                 bag.write(arm, at, serialize(joints, command))
-                picture = _picture(store, kept, at, np.frombuffer(data, np.uint8))
+                where = {"timestamp": stamp, "frame_id": "main"} if kept == "h264" else {"header": header}
+                picture = store.types[_TYPES[kept]](**where, **form, data=np.frombuffer(data, np.uint8))
                 bag.write(camera, at, serialize(picture, _TYPES[kept]))
     return folder
-
-
-def _stored(pictures: Iterator[Images], kept: str) -> Iterator[bytes]:
-    if kept == "h264":
-        return _packets(pictures)
-    return iter(_encoded(pictures, "jpeg")) if kept == "jpeg" else (picture.tobytes() for picture in pictures)
-
-
-def _header(store: Any, at: int) -> Any:
-    stamp = store.types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
-    kind = store.types["std_msgs/msg/Header"]
-    numbered = {"seq": 0} if "seq" in kind.__dataclass_fields__ else {}  # ROS 1 has it
-    return kind(stamp=stamp, frame_id="main", **numbered)
-
-
-def _picture(store: Any, kept: str, at: int, data: NDArray[np.uint8]) -> Any:
-    kind, (height, width), header = store.types[_TYPES[kept]], VGA, _header(store, at)
-    if kept == "h264":
-        return kind(timestamp=header.stamp, frame_id="main", data=data, format="h264")
-    if kept == "jpeg":
-        return kind(header=header, format="jpeg", data=data)
-    shape = {"height": height, "width": width, "step": 3 * width}
-    return kind(header=header, **shape, encoding="rgb8", is_bigendian=0, data=data)
 
 
 def _lerobot(encoder: str, folder: Path, episodes: int, length: int, seed: int) -> Path:
@@ -441,3 +416,10 @@ CASES = {
         Case("hands-h264-1280x720", "hands", HD, _hands, "left/center", "video", 1, _HANDS),
     )
 }
+
+
+BENCH = Bench(
+    "recordings of every format to 256×256 RGB, with one process and with all cores",
+    {"formats": ["all"], "frames": 600, "episodes": 6, "seed": 0},
+    run,
+)

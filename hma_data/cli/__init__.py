@@ -40,26 +40,27 @@ def bench(
 
     Example: hma bench loader frames=1000000 --json
     """
-    from hma_data.bench import BENCHES, load, machine, report, settings_of
+    from hma_data.bench import BENCHES, load, report, settings_of
 
     if name is None:
-        modules = {known: load(known) for known in sorted(BENCHES)}
+        benches = {known: load(known) for known in sorted(BENCHES)}
         if json:
-            print_json({known: {"about": m.ABOUT, "settings": m.DEFAULTS} for known, m in modules.items()})
+            print_json({known: {"about": b.about, "settings": b.defaults} for known, b in benches.items()})
             return
         rows = [
-            [known, module.ABOUT, " ".join(f"{key}={value}" for key, value in module.DEFAULTS.items())]
-            for known, module in modules.items()
+            [known, b.about, " ".join(f"{key}={value}" for key, value in b.defaults.items())]
+            for known, b in benches.items()
         ]
         print_table(["bench", "about", "settings"], rows)
         return
-    module = load(name)
-    chosen = settings_of(module, name, settings or [])
-    results = module.run(chosen)
+    chosen = load(name)
+    values = settings_of(chosen, name, settings or [])
+    results = chosen.run(values)
+    told = report(name, values, results)
     if json:
-        print_json(report(name, chosen, results))
+        print_json(told)
         return
     columns = list(dict.fromkeys(key for result in results for key in result))
-    print_table(columns, [[result.get(key) for key in columns] for result in results], title=module.ABOUT)
-    facts = machine()
+    print_table(columns, [[result.get(key) for key in columns] for result in results], title=chosen.about)
+    facts = told["machine"]
     print(f"{facts['processor']}, {facts['cores']} cores, load {facts['load_average']}, {facts['date']}")

@@ -83,6 +83,11 @@ class TokenizerSpec:
         )
 
     @property
+    def cells(self) -> tuple[int, ...]:
+        """Return the shape of a picture's ids, (h, w), or of its latents, (c, h, w)."""
+        return self.grid if self.kind == "discrete" else (self.channels or 0, *self.grid)
+
+    @property
     def digest(self) -> str:
         """Return sixteen hex digits of the SHA-256 over all attributes."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
@@ -158,12 +163,13 @@ def check_frames(frames: NDArray[Any], spec: TokenizerSpec) -> None:
 
 
 def check_tokens(tokens: NDArray[Any], spec: TokenizerSpec) -> None:
-    """Raise TokenizerError unless tokens have the grid of `spec` and lie in its vocabulary."""
-    discrete = spec.kind == "discrete"
-    cells = spec.grid if discrete else (spec.channels or 0, *spec.grid)
-    if tokens.shape[1:] != cells or (discrete and not np.issubdtype(tokens.dtype, np.integer)):
-        form = f"(N, {', '.join(map(str, cells))})"
+    """Raise TokenizerError unless tokens have the grid of `spec`, and are ids of its vocabulary or finite."""
+    kind = {"float16": np.floating, "uint8": np.uint8}.get(spec.dtype, np.integer)
+    if tokens.shape[1:] != spec.cells or not np.issubdtype(tokens.dtype, kind):
+        form = f"{spec.dtype} (N, {', '.join(map(str, spec.cells))})"
         raise TokenizerError(spec.name, f"decodes {form}, was given {tokens.dtype} {tokens.shape}")
+    if not np.isfinite(tokens).all():
+        raise TokenizerError(spec.name, "decodes finite latents, was given others")
     if spec.vocab_size and tokens.size and (int(tokens.max()) >= spec.vocab_size or int(tokens.min()) < 0):
         raise TokenizerError(
             spec.name,

@@ -64,9 +64,7 @@ class Entry:
 
     def size(self) -> int:
         """Return the size of the weights in bytes; 0 if there are none or the user names them."""
-        if self.weights == "embedded":
-            return (EMBEDDED / self.file).stat().st_size
-        return self.bytes or 0
+        return (EMBEDDED / self.file).stat().st_size if self.weights == "embedded" else self.bytes or 0
 
     def state(self) -> str:
         """Return "ready" or what it still needs: an install, a path, or a download on first use."""
@@ -89,14 +87,9 @@ class Entry:
     def to_json(self) -> dict[str, Any]:
         """Return plain values, with the state and the measured size."""
         values = {key: value for key, value in asdict(self).items() if key not in ("module", "arguments")}
-        return values | {
-            "grid": list(self.grid),
-            "imports": list(self.imports),
-            "bytes": self.size(),
-            "missing": self.missing(),
-            "state": self.state(),
-            "usable": self.state() == "ready",
-        }
+        lists = {"grid": list(self.grid), "imports": list(self.imports)}
+        state = {"missing": self.missing(), "state": self.state(), "usable": self.state() == "ready"}
+        return values | lists | {"bytes": self.size()} | state
 
 
 _MAGVIT2 = Entry(
@@ -110,17 +103,17 @@ _ROWS = (
     Entry(
         "fsq-16", "discrete", 256, (16, 16),
         "the default: finite scalar quantisation, 18 bits a token, fast on a CPU",
-        "embedded", "hma_data.tokenizers.fsq", {"image_size": 256}, file="fsq.safetensors",
+        "embedded", "hma_data.tokenizers.embedded", {"image_size": 256}, file="fsq.safetensors",
     ),
     Entry(
         "fsq-8", "discrete", 128, (8, 8),
         "the same network on small pictures, four times cheaper to train on",
-        "embedded", "hma_data.tokenizers.fsq", {"image_size": 128}, file="fsq.safetensors",
+        "embedded", "hma_data.tokenizers.embedded", {"image_size": 128}, file="fsq.safetensors",
     ),
     Entry(
         "vae-8", "continuous", 256, (32, 32),
         "continuous without a download: 4 channels at 1/8 of the side, fast on a CPU",
-        "embedded", "hma_data.tokenizers.vae", {"image_size": 256}, file="vae.safetensors",
+        "embedded", "hma_data.tokenizers.embedded", {"image_size": 256}, file="vae.safetensors",
     ),
     _MAGVIT2,
     replace(
@@ -130,7 +123,7 @@ _ROWS = (
     Entry(
         "svd-vae", "continuous", 256, (32, 32),
         "the paper's continuous one: Stable Video Diffusion's autoencoder, 4 channels",
-        "download", "hma_data.tokenizers.svd_vae", licence="Stability AI Community License",
+        "download", "hma_data.tokenizers.latents", licence="Stability AI Community License",
         repo="stabilityai/stable-video-diffusion-img2vid", bytes=391_000_000,
         file="vae/diffusion_pytorch_model.safetensors", revision="9cf024d5bfa8f56622af86c884f26a52f6676f2e",
         imports=("torch", "diffusers"), extra="pip install diffusers",
@@ -138,7 +131,7 @@ _ROWS = (
     Entry(
         "taesd", "continuous", 256, (32, 32),
         "the latents of Stable Diffusion 1 and 2 by a tiny network, 4 channels",
-        "download", "hma_data.tokenizers.taesd", {"channels": 4}, licence="MIT",
+        "download", "hma_data.tokenizers.latents", {"channels": 4}, licence="MIT",
         repo="madebyollin/taesd", file="diffusion_pytorch_model.safetensors", bytes=9_793_292,
         revision="614f76814bbe30edbe2e627ace1c2234c81a2c0e",
         sha256="db169d69145ec4ff064e49d99c95fa05d3eb04ee453de35824a6d0f325513549",
@@ -146,7 +139,7 @@ _ROWS = (
     Entry(
         "taef2", "continuous", 256, (32, 32),
         "the latents of FLUX.2 by a tiny network, 32 channels: finer pictures, eight times the data",
-        "download", "hma_data.tokenizers.taesd", {"channels": 32}, licence="MIT",
+        "download", "hma_data.tokenizers.latents", {"channels": 32}, licence="MIT",
         repo="madebyollin/taef2", file="taef2.safetensors", bytes=10_000_000,
         revision="bd244ebfe4398c84fbf312a2f1c868c676b500e3",
         sha256="701d31c0ecbef3b609fe236e2e3a65ffb17f3a94237acdd771e8ea3194df557a",

@@ -12,6 +12,7 @@ format, the network's shape and the facts of the training.
 import hashlib
 import json
 import os
+import pickle
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,8 +25,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from hma_data.errors import TokenizerError
-from hma_data.storage.files import file_sha256, write_atomic
+from hma_data.errors import HMAError, TokenizerError
+from hma_data.storage.files import file_sha256, read_json, write_atomic
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import Entry, find_entry
 
@@ -66,9 +67,8 @@ def find_weights(name: str, weights: str | None) -> Path:
                 return path
     entry = find_entry(name)
     if not entry.repo:
-        raise TokenizerError(
-            name, "has no weights in the package and no pinned download", "give --weights PATH (weights=PATH)"
-        )
+        fault = "has no weights in the package and no pinned download"
+        raise TokenizerError(name, fault, "give --weights PATH (weights=PATH)")
     return _from_hub(name, entry)
 
 
@@ -77,22 +77,29 @@ def _parse_uri(uri: str) -> Entry:
     form = r"hf://(datasets/)?([\w.-]+/[\w.-]+?)(?:@([\w.-]+))?/([\w./-]+)"
     found = re.fullmatch(form, uri)
     if not found or ".." in uri:
-        raise TokenizerError(
-            uri, "is not the address of a file on the hub", "write hf://ORGANISATION/NAME@REVISION/FILE"
-        )
+        remedy = "write hf://ORGANISATION/NAME@REVISION/FILE"
+        raise TokenizerError(uri, "is not the address of a file on the hub", remedy)
     dataset, repo, revision, file = found.groups()
-    place: dict[str, Any] = {"repo": repo, "file": file, "revision": revision or "main"}
-    place["repo_type"] = "dataset" if dataset else "model"
-    return Entry(uri, "discrete", 0, (0, 0), "", "download", "", **place)
+    return Entry(
+        uri, "discrete", 0, (0, 0), "", "download", "", repo=repo, file=file, revision=revision or "main",
+        repo_type="dataset" if dataset else "model",
+    )  # fmt: skip
 
 
 def _from_hub(name: str, entry: Entry) -> Path:
     """Return the path of a file in the hub's cache; download the file if it is not there."""
     import httpx
+    from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
     from huggingface_hub.errors import GatedRepoError, HFValidationError
 
+    place: dict[str, Any] = {"revision": entry.revision, "repo_type": entry.repo_type}
+    pinned = re.fullmatch(r"[0-9a-f]{40}", entry.revision)  # a branch or a tag can move, a commit cannot
     try:
-        path = Path(_download(entry))
+        found = entry.cached() if pinned else None
+        if found is None:
+            # Ask first: without a connection, the download would retry for half a minute and log each try.
+            get_hf_file_metadata(hf_hub_url(entry.repo, entry.file, **place))
+            found = hf_hub_download(entry.repo, entry.file, **place)
     except (httpx.HTTPError, HFValidationError, OSError) as fault:
         size = f", {entry.bytes / 1e6:.0f} MB" if entry.bytes else ""
         wanted = f"needs {entry.file} of {entry.repo} at {entry.revision[:12]}{size}"
@@ -101,22 +108,10 @@ def _from_hub(name: str, entry: Entry) -> Path:
             remedy = f"accept its licence on the repository's page and log in, or {remedy}"
         text = f"{wanted}, which could not be downloaded: {type(fault).__name__}: {_one_line(fault)}"
         raise TokenizerError(name, text, remedy) from fault
-    if entry.sha256 and file_sha256(path) != entry.sha256:
-        raise TokenizerError(
-            path, f"is not the file that was pinned for {name} (SHA-256 {entry.sha256[:12]}…)", "delete it"
-        )
-    return path
-
-
-def _download(entry: Entry) -> str:
-    from huggingface_hub import get_hf_file_metadata, hf_hub_download, hf_hub_url
-
-    kind, revision = entry.repo_type, entry.revision
-    if re.fullmatch(r"[0-9a-f]{40}", revision) and (cached := entry.cached()):
-        return cached  # a branch or a tag can move, a commit cannot
-    # Ask once first: without a connection, the download would retry for half a minute and log each try.
-    get_hf_file_metadata(hf_hub_url(entry.repo, entry.file, repo_type=kind, revision=revision))
-    return hf_hub_download(entry.repo, entry.file, revision=revision, repo_type=kind)
+    if entry.sha256 and file_sha256(Path(found)) != entry.sha256:
+        text = f"is not the file that was pinned for {name} (SHA-256 {entry.sha256[:12]}…)"
+        raise TokenizerError(found, text, "delete it")
+    return Path(found)
 
 
 def one_file(path: Path, names: Sequence[str], what: str) -> Path:
@@ -152,67 +147,54 @@ def digest_of(paths: Iterable[Path]) -> str:
 # -- read
 
 
-def read_tensors(path: Path) -> Tensors:
+def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
     """Read all tensors of a safetensors file or of a torch checkpoint, by name, in their stored dtypes.
 
     Raises:
-        TokenizerError: it is not such a file, is truncated, or holds values that only code could make.
+        error: it is not such a file, is truncated, or holds values that only code could make.
     """
-    import pickle
-
     try:
         with path.open("rb") as file:
             start = file.read(9)
         if start[8:] == b"{":
-            return _read_safetensors(path)[0]
+            return _read_safetensors(path, error)[0]
         # Only a zip archive can be memory-mapped; torch wrote others before version 1.6.
         values = torch.load(path, map_location="cpu", weights_only=True, mmap=start.startswith(b"PK"))
     except pickle.UnpicklingError as fault:
-        raise TokenizerError(
-            path,
-            "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled",
-            "save its state_dict as safetensors where it can be trusted",
-        ) from fault
-    except TokenizerError:
+        text = "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled"
+        raise error(path, text, "save its state_dict as safetensors where it can be trusted") from fault
+    except HMAError:
         raise
     except Exception as fault:  # torch raises many kinds of errors on a damaged file
         text = f"is not a complete safetensors file or torch checkpoint: {type(fault).__name__}"
-        raise TokenizerError(path, f"{text}: {_one_line(fault)}", "download it again") from fault
+        raise error(path, f"{text}: {_one_line(fault)}", "download it again") from fault
     for key in NESTED:
         if isinstance(values, Mapping) and isinstance(values.get(key), Mapping):
             values = values[key]
     named = values.items() if isinstance(values, Mapping) else ()
     tensors = {str(name): value for name, value in named if isinstance(value, Tensor)}
     if not tensors:
-        raise TokenizerError(path, f"holds a {type(values).__name__} without weights by name", OTHER)
+        raise error(path, f"holds a {type(values).__name__} without weights by name", "name another file")
     return tensors
 
 
-def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
+def _read_safetensors(path: Path, error: type[HMAError]) -> tuple[Tensors, dict[str, str]]:
     """Return the tensors and the metadata of a safetensors file."""
     try:
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (SafetensorError, OSError) as fault:
-        raise TokenizerError(
-            path, f"is not a complete safetensors file: {_one_line(fault)}", OTHER
-        ) from fault
+        text = f"is not a complete safetensors file: {_one_line(fault)}"
+        raise error(path, text, "name another file, or download it again") from fault
 
 
 def stated_scale(folder: Path, default: float) -> float:
     """Return the `scaling_factor` that a folder's `config.json` states; `default` if it states none."""
     path = folder / "config.json"
-    try:
-        scale = float(json.loads(path.read_text("utf-8")).get("scaling_factor", default))
-        if not 0 < scale < 1e6:
-            raise ValueError(f"scaling_factor is {scale}")
-    except FileNotFoundError:
-        return default
-    except (OSError, ValueError, TypeError, AttributeError) as fault:
-        raise TokenizerError(
-            path, f"states no usable scaling_factor: {_one_line(fault)}", "repair it"
-        ) from fault
-    return scale
+    scale = read_json(path, TokenizerError).get("scaling_factor", default) if path.is_file() else default
+    if not isinstance(scale, int | float) or not 0 < scale < 1e6:
+        raise TokenizerError(path, f"states no usable scaling_factor: {scale!r}", "repair it")
+    return float(scale)
 
 
 def fill(network: nn.Module, tensors: Mapping[str, Tensor], where: object) -> None:
@@ -274,16 +256,14 @@ def read_weights[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[
     Raises:
         TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
     """
-    tensors, metadata = _read_safetensors(path)
+    tensors, metadata = _read_safetensors(path, TokenizerError)
     remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
     if metadata.get("format") != form:
-        raise TokenizerError(
-            path, f"does not hold {form} weights (format {metadata.get('format')!r})", remedy
-        )
+        fault = f"does not hold {form} weights (format {metadata.get('format')!r})"
+        raise TokenizerError(path, fault, remedy)
     try:
         shape = config.model_validate_json(metadata.get("config", ""))
-    except ValueError as fault:
-        raise TokenizerError(
-            path, f"its metadata does not describe the network: {_one_line(fault)}", remedy
-        ) from fault
+    except ValueError as error:
+        fault = f"its metadata does not describe the network: {_one_line(error)}"
+        raise TokenizerError(path, fault, remedy) from error
     return shape, tensors, file_sha256(path)

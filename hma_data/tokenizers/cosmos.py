@@ -30,22 +30,13 @@ DIGITS = (8 * 8 * 8, 5 * 5 * 5)
 REMEDY = "name the folder with the encoder.jit and decoder.jit of NVIDIA's release"
 
 
-class CosmosNetwork(nn.Module):
-    """A network of `encoder` and `decoder`, each a TorchScript program."""
-
-    def __init__(self, encoder: nn.Module, decoder: nn.Module) -> None:
-        super().__init__()
-        self.encoder, self.decoder = encoder, decoder
-
-
-def read_program(path: Path) -> torch.jit.ScriptModule:
+def _read_program(path: Path) -> torch.jit.ScriptModule:
     """Load a TorchScript file, which is trusted; raise TokenizerError if it is no whole program."""
     try:
-        program: torch.jit.ScriptModule = torch.jit.load(str(path), map_location="cpu")
+        return torch.jit.load(str(path), map_location="cpu")
     except (RuntimeError, ValueError, EOFError) as fault:
         text = " ".join(str(fault).split())[:160]
         raise TokenizerError(path, f"cannot be loaded as TorchScript: {text}", REMEDY) from fault
-    return program
 
 
 def _output(made: object, shape: tuple[int, ...]) -> Tensor:
@@ -63,9 +54,8 @@ def _try(tokenizer: NetworkTokenizer, files: list[Path]) -> None:
         try:
             values = half(values)
         except (RuntimeError, ValueError) as fault:
-            text = " ".join(str(fault).split())[-160:]
-            fault_text = f"does not do what {tokenizer.spec.name} does: {text}"
-            raise TokenizerError(file, fault_text, REMEDY) from fault
+            text = f"does not do what {tokenizer.spec.name} does: {' '.join(str(fault).split())[-160:]}"
+            raise TokenizerError(file, text, REMEDY) from fault
 
 
 def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
@@ -80,22 +70,22 @@ def load(name: str, *, weights: str | None, device: str) -> NetworkTokenizer:
     files = pair_of(path / "encoder.jit" if path.is_dir() else path)
     if not files:
         raise TokenizerError(path, "is named after neither encoder nor decoder", REMEDY)
-    encoder, decoder = (read_program(file) for file in files)
-    discrete, facts = name == "cosmos-di16", {"weights_sha256": digest_of(files)}
-    if discrete:
+    network = nn.Module()
+    network.encoder, network.decoder = encoder, decoder = [_read_program(file) for file in files]
+    facts = {"weights_sha256": digest_of(files)}
+    if name == "cosmos-di16":
         spec = TokenizerSpec.discrete(name, VERSION, IMAGE_SIZE, STRIDE, DIGITS, dtype="uint16", **facts)
     else:
         spec = TokenizerSpec.continuous(name, VERSION, IMAGE_SIZE, STRIDE, CHANNELS, **facts)
-    cells = spec.grid if discrete else (CHANNELS, *spec.grid)
 
     def encode(pixels: Tensor) -> Tensor:
         # The optimiser rewrites a program after its first runs, which may change the last bits.
         with torch.jit.optimized_execution(place.type != "cpu"):
-            return _output(encoder(pixels), cells)
+            return _output(encoder(pixels), spec.cells)
 
     def decode(tokens: Tensor) -> Tensor:
         return _output(decoder(tokens), (3, IMAGE_SIZE, IMAGE_SIZE))
 
-    tokenizer = NetworkTokenizer(spec, CosmosNetwork(encoder, decoder), place, encode, decode)
+    tokenizer = NetworkTokenizer(spec, network, place, encode, decode)
     _try(tokenizer, files)
     return tokenizer

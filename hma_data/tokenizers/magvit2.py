@@ -15,7 +15,7 @@ has a group norm whose scale and shift come from the code.
 B pictures, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,22 +88,16 @@ class ResBlock(nn.Module):
         self.norm1, self.norm2 = nn.GroupNorm(GROUPS, before, eps=EPS), nn.GroupNorm(GROUPS, after, eps=EPS)
         self.conv1 = nn.Conv2d(before, after, 3, padding=1, bias=False)
         self.conv2 = nn.Conv2d(after, after, 3, padding=1, bias=False)
-        self.nin_shortcut = None if before == after else nn.Conv2d(before, after, 1, bias=False)
+        self.nin_shortcut = nn.Identity() if before == after else nn.Conv2d(before, after, 1, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         h = self.conv1(functional.silu(self.norm1(x)))
         h = self.conv2(functional.silu(self.norm2(h)))
-        return h + (x if self.nin_shortcut is None else self.nin_shortcut(x))
+        return h + self.nin_shortcut(x)
 
 
-def _blocks(before: int, after: int, count: int) -> nn.ModuleList:
-    return nn.ModuleList(ResBlock(before if i == 0 else after, after) for i in range(count))
-
-
-def _run(blocks: Iterable[nn.Module], x: Tensor) -> Tensor:
-    for block in blocks:
-        x = block(x)
-    return x
+def _blocks(before: int, after: int, count: int) -> nn.Sequential:
+    return nn.Sequential(*(ResBlock(before if i == 0 else after, after) for i in range(count)))
 
 
 class DownLevel(nn.Module):
@@ -112,11 +106,10 @@ class DownLevel(nn.Module):
     def __init__(self, before: int, after: int, count: int, last: bool) -> None:
         super().__init__()
         self.block = _blocks(before, after, count)
-        self.downsample = None if last else nn.Conv2d(after, after, 3, stride=2, padding=1)
+        self.downsample = nn.Identity() if last else nn.Conv2d(after, after, 3, stride=2, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = _run(self.block, x)
-        return x if self.downsample is None else self.downsample(x)
+        return self.downsample(self.block(x))
 
 
 class Upsample(nn.Module):
@@ -141,11 +134,10 @@ class UpLevel(nn.Module):
     def __init__(self, before: int, after: int, count: int, finest: bool) -> None:
         super().__init__()
         self.block = _blocks(before, after, count)
-        self.upsample = None if finest else Upsample(after)
+        self.upsample = nn.Identity() if finest else Upsample(after)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = _run(self.block, x)
-        return x if self.upsample is None else self.upsample(x)
+        return self.upsample(self.block(x))
 
 
 class AdaptiveNorm(nn.Module):
@@ -170,15 +162,15 @@ class Encoder(nn.Module):
         widths = [config.base * m for m in (1, *config.mult)]
         last = len(config.mult) - 1
         self.conv_in = nn.Conv2d(3, config.base, 3, padding=1, bias=False)
-        self.down = nn.ModuleList(
-            DownLevel(widths[i], widths[i + 1], config.res_blocks, i == last) for i in range(last + 1)
+        self.down = nn.Sequential(
+            *(DownLevel(widths[i], widths[i + 1], config.res_blocks, i == last) for i in range(last + 1))
         )
         self.mid_block = _blocks(widths[-1], widths[-1], config.res_blocks)
         self.norm_out = nn.GroupNorm(GROUPS, widths[-1], eps=EPS)
         self.conv_out = nn.Conv2d(widths[-1], config.z, 1)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        x = _run(self.mid_block, _run(self.down, self.conv_in(pixels)))
+        x = self.mid_block(self.down(self.conv_in(pixels)))
         return self.conv_out(functional.silu(self.norm_out(x)))
 
 
@@ -199,7 +191,7 @@ class Decoder(nn.Module):
         self.conv_out = nn.Conv2d(after[0], 3, 3, padding=1)
 
     def forward(self, codes: Tensor) -> Tensor:
-        x = _run(self.mid_block, self.conv_in(codes))
+        x = self.mid_block(self.conv_in(codes))
         for i in reversed(range(len(self.up))):
             if self.adaptive:
                 x = self.adaptive[i](x, codes)

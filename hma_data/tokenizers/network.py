@@ -27,14 +27,7 @@ Step = Callable[[Tensor], Tensor]
 
 
 class NetworkTokenizer:
-    """A tokenizer with a network; see `hma_data.tokenizers.base.Tokenizer`.
-
-    Attributes:
-        spec: what decides the tokens.
-        network: torch module with `encoder` and `decoder`, in evaluation mode.
-        batch: frames a pass through the network.
-        light: whether to decode each frame on one thread too, which is fast enough for a small network.
-    """
+    """A tokenizer with a network; see `hma_data.tokenizers.base.Tokenizer`."""
 
     def __init__(
         self,
@@ -49,10 +42,11 @@ class NetworkTokenizer:
         """Move the network to the device and set it to evaluation mode.
 
         Args:
+            network: torch module with `encoder` and `decoder`.
             encode: pixels (B, 3, S, S) -> int64 ids (B, h, w), or latents (B, c, h, w).
             decode: ids or latents, as `encode` returns them, -> pixels (B, 3, S, S).
-            light: whether it is a network of plain convolutions, small enough for float32 and channels-last
-                on any device.
+            light: whether the network is small: it runs in float32 and channels-last on any device, and on a
+                CPU it also decodes each frame on one thread.
         """
         cuda = device.type == "cuda"
         self.spec, self.device, self.light = spec, device, light
@@ -72,10 +66,8 @@ class NetworkTokenizer:
             TokenizerError: frames have another shape or dtype, or the network's output cannot be stored.
         """
         check_frames(frames, self.spec)
-        cells = self.spec.grid if self.spec.kind == "discrete" else (self.spec.channels or 0, *self.spec.grid)
-        tokens = np.empty((len(frames), *cells), self.spec.dtype)
-        self._fill(tokens, self._encode_batch, frames, alone=True)
-        return tokens
+        tokens = np.empty((len(frames), *self.spec.cells), self.spec.dtype)
+        return self._in_batches(self._encode_batch, frames, tokens, alone=True)
 
     def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
         """Decode what `encode` returns to (N, S, S, 3) uint8 RGB.
@@ -85,24 +77,14 @@ class NetworkTokenizer:
                 are not finite.
         """
         check_tokens(tokens, self.spec)
-        discrete = self.spec.kind == "discrete"
-        if not discrete and not (np.issubdtype(tokens.dtype, np.floating) and np.isfinite(tokens).all()):
-            raise TokenizerError(
-                self.spec.name, f"decodes finite float latents, was given {tokens.dtype}", "see encode"
-            )
         size = self.spec.image_size
         frames = np.empty((len(tokens), size, size, 3), np.uint8)
-        self._fill(frames, self._decode_batch, tokens, alone=self.light)
-        return frames
+        return self._in_batches(self._decode_batch, tokens, frames, alone=self.light)
 
-    def _fill(
-        self,
-        out: NDArray[Any],
-        step: Callable[[NDArray[Any]], NDArray[Any]],
-        items: NDArray[Any],
-        alone: bool,
-    ) -> None:
-        """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time.
+    def _in_batches(
+        self, step: Callable[[Any], NDArray[Any]], items: NDArray[Any], out: NDArray[Any], alone: bool
+    ) -> NDArray[Any]:
+        """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time, and return it.
 
         With `alone`, on a CPU, several batches are computed at the same time, each on one thread.
         """
@@ -112,13 +94,23 @@ class NetworkTokenizer:
         with single_threads(len(parts)) if several else nullcontext() as pool:
             for start, made in zip(starts, pool.map(step, parts) if pool else map(step, parts), strict=True):
                 out[start : start + self.batch] = made
+        return out
 
     @torch.inference_mode()
     def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
-        """Encode at most one batch of frames and check the result."""
+        """Encode at most one batch of frames; check that the spec's dtype can store the result."""
         pixels = self._padded(frames).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
         pixels = pixels.to(self.dtype).contiguous(memory_format=self._format)
-        return self._storable(self._encode(pixels)[: len(frames)])
+        made, spec = self._encode(pixels)[: len(frames)].cpu(), self.spec
+        if spec.kind == "discrete":
+            if made.min() < 0 or made.max() >= (spec.vocab_size or 0):
+                fault = f"its network made id {made.max()}, the vocabulary ends at {spec.vocab_size}"
+                raise TokenizerError(spec.name, fault, OTHER)
+            return made.numpy()
+        latents = made.float().numpy()
+        if not np.abs(latents).max() <= np.finfo(np.float16).max:
+            raise TokenizerError(spec.name, "its network made latents that float16 cannot hold", OTHER)
+        return latents
 
     @torch.inference_mode()
     def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
@@ -129,19 +121,6 @@ class NetworkTokenizer:
         whole = pixels.add(1).mul_(127.5).round_().clamp_(0, 255).to(torch.uint8)
         made: NDArray[np.uint8] = whole.permute(0, 2, 3, 1).cpu().numpy()
         return made[: len(tokens)]
-
-    def _storable(self, made: Tensor) -> NDArray[Any]:
-        """Return ids or latents as an array; check that the spec's dtype can store them."""
-        if self.spec.kind == "discrete":
-            ids = made.cpu().numpy()
-            if ids.size and (ids.min() < 0 or ids.max() >= (self.spec.vocab_size or 0)):
-                fault = f"its network made id {ids.max()}, the vocabulary ends at {self.spec.vocab_size}"
-                raise TokenizerError(self.spec.name, fault, OTHER)
-            return ids
-        latents = made.float().cpu().numpy()
-        if not np.abs(latents).max(initial=0) <= np.finfo(np.float16).max:
-            raise TokenizerError(self.spec.name, "its network made latents that float16 cannot hold", OTHER)
-        return latents
 
     def _padded(self, part: NDArray[Any]) -> Tensor:
         """Return the part on the device, repeated up to a whole batch."""

@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from hma_data.errors import TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
-SIZE = 256
-
 
 class RawTokenizer:
     """A tokenizer that returns its pixels unchanged; see `hma_data.tokenizers.base.Tokenizer`."""
 
     def __init__(self, name: str) -> None:
-        self.spec = TokenizerSpec.continuous(name, 1, SIZE, 1, 3, latent_scale=1 / 255, dtype="uint8")
+        self.spec = TokenizerSpec.continuous(name, 1, 256, 1, 3, latent_scale=1 / 255, dtype="uint8")
 
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return (N, 256, 256, 3) uint8 frames as (N, 3, 256, 256) uint8."""
@@ -27,14 +25,8 @@ class RawTokenizer:
         return np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
 
     def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
-        """Return (N, 3, 256, 256) uint8 tokens as (N, 256, 256, 3) uint8 frames.
-
-        Raises:
-            TokenizerError: the tokens have another shape, or a dtype other than uint8.
-        """
+        """Return (N, 3, 256, 256) uint8 tokens as (N, 256, 256, 3) uint8 frames."""
         check_tokens(tokens, self.spec)
-        if tokens.dtype != np.uint8:
-            raise TokenizerError(self.spec.name, f"decodes uint8 pixels, was given {tokens.dtype}")
         return np.ascontiguousarray(tokens.transpose(0, 2, 3, 1))
 
 

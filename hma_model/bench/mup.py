@@ -14,26 +14,16 @@ from statistics import fmean
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+from hma_data.bench import Bench
 from hma_data.errors import UsageError
 from hma_data.storage.files import write_atomic
 from hma_model.config import ActionSpace, HMAConfig
 
 if TYPE_CHECKING:
     import torch
-    from matplotlib.axes import Axes
 
     from hma_model.network.model import HMA
 
-ABOUT = "loss by learning rate and width, with muP and without: where the best rate lies"
-DEFAULTS: dict[str, Any] = {
-    "widths": "32,64,128",
-    "rates": "0.0005,0.001,0.002,0.004,0.008,0.016,0.032",
-    "steps": 120,
-    "layers": 2,
-    "batch": 8,
-    "seeds": 1,
-    "plot": "",
-}
 SPACE = ActionSpace("mover", 1, 1, (0.0,), (1.0,), (True,))
 _GRID, _FRAMES, _DIGITS, _PATTERNS = (4, 4), 4, (16, 16), 16
 _TAIL = 0.2  # the share of the steps, at the end, over which the loss is averaged
@@ -45,7 +35,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for mup in (True, False):
         for width in widths:
-            losses = {rate: _end(settings, width, rate, mup, widths[0]) for rate in rates}
+            losses = {rate: _final_loss(settings, width, rate, mup, widths[0]) for rate in rates}
             finite = {rate: loss for rate, loss in losses.items() if math.isfinite(loss)}
             best = min(finite, key=lambda rate: finite[rate]) if finite else None
             rows += [
@@ -63,7 +53,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def _end(settings: dict[str, Any], width: int, rate: float, mup: bool, base_width: int) -> float:
+def _final_loss(settings: dict[str, Any], width: int, rate: float, mup: bool, base_width: int) -> float:
     ends = []
     for seed in range(settings["seeds"]):
         model = make_model(width, settings["layers"], mup, base_width, seed)
@@ -145,27 +135,36 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw the loss over the learning rate: one curve a width, its best rate ringed; muP on the left."""
     from matplotlib.figure import Figure
 
-    from hma_model.evaluation.pages import svg_bytes
+    from hma_model.evaluation.pages import COLOURS, MARKERS, STYLES, label_axes, svg_bytes
 
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
+    drawn = sorted((row for row in rows if row["nats_a_token"] is not None), key=lambda row: row["lr"])
     for axes, name in zip(panels, ("muP", "standard")):
-        _panel(axes, name, [row for row in rows if row["parametrisation"] == name])
+        for i, width in enumerate(sorted({row["width"] for row in rows})):
+            chosen = [row for row in drawn if (row["parametrisation"], row["width"]) == (name, width)]
+            points = [(row["lr"], row["nats_a_token"]) for row in chosen]
+            best = [(row["lr"], row["nats_a_token"]) for row in chosen if row["best"]]
+            look = {"color": COLOURS[i % 4], "ls": STYLES[i % 4], "marker": MARKERS[i % 4]}
+            axes.plot(*zip(*points), ms=5, label=f"width {width}", **look)
+            axes.plot(*zip(*best), ls="", marker="o", ms=13, mfc="none", color=COLOURS[i % 4])
+        axes.set_xscale("log", base=2)
+        axes.set_title(name, fontsize=10)
+        label_axes(axes, "learning rate", "loss at the end, nats a token" if name == "muP" else "")
     panels[0].legend(frameon=False, fontsize=9)
     write_atomic(path, svg_bytes(figure))
 
 
-def _panel(axes: "Axes", name: str, rows: list[dict[str, Any]]) -> None:
-    from hma_model.evaluation.pages import COLOURS, MARKERS, STYLES, label_axes
-
-    for i, width in enumerate(sorted({row["width"] for row in rows})):
-        chosen = [row for row in rows if row["width"] == width and row["nats_a_token"] is not None]
-        chosen.sort(key=lambda row: row["lr"])
-        rates, losses = ([row[key] for row in chosen] for key in ("lr", "nats_a_token"))
-        colour, line, marker = COLOURS[i % 4], STYLES[i % 4], MARKERS[i % 4]
-        axes.plot(rates, losses, color=colour, ls=line, marker=marker, ms=5, label=f"width {width}")
-        ring = [(row["lr"], row["nats_a_token"]) for row in chosen if row["best"]]
-        axes.plot(*zip(*ring), ls="", marker="o", ms=13, mfc="none", color=colour)
-    axes.set_xscale("log", base=2)
-    axes.set_title(name, fontsize=10)
-    label_axes(axes, "learning rate", "loss at the end, nats a token" if name == "muP" else "")
+BENCH = Bench(
+    "loss by learning rate and width, with muP and without: where the best rate lies",
+    {
+        "widths": "32,64,128",
+        "rates": "0.0005,0.001,0.002,0.004,0.008,0.016,0.032",
+        "steps": 120,
+        "layers": 2,
+        "batch": 8,
+        "seeds": 1,
+        "plot": "",
+    },
+    run,
+)

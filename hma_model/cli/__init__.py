@@ -102,7 +102,7 @@ def demo(
 
     Example: hma demo --out demo
     """
-    from hma_model.demo.run import demo as run
+    from hma_model.demo import demo as run
 
     report = run(out, episodes=episodes, steps=steps, seed=seed)
     print(f"open {report}")
@@ -192,5 +192,6 @@ def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
 
 mount(app)
 cli_train.mount(app)
-BENCHES.update({name: f"hma_model.bench.{name}" for name in ("generate", "mup", "train", "waiting")})
+BENCHES["mup"] = "hma_model.bench.mup:BENCH"
+BENCHES |= {name: f"hma_model.bench.speed:{name.upper()}" for name in ("generate", "train", "waiting")}
 app.add_typer(hub_app, name="hub")

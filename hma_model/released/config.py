@@ -18,6 +18,7 @@ from hma_model.config import INVERSE, OBJECTIVES, POLICY, HMAConfig
 
 LATENT_SCALE = 0.18215  # the factor by which the released loader multiplies stored latents
 _WHERE = "config.json"
+_REMEDY = "is it a released checkpoint?"
 _LAYOUT: dict[str, Any] = {
     "modulation_out": "embodiment",
     "action_alignment": "current",
@@ -31,6 +32,21 @@ _EXPORTED = ("time_position", "action_alignment", "temporal_norm", "final_norm")
 _CONTINUOUS_NEEDS: dict[str, Any] = {
     "action_loss": "diffusion", "latent_scale": LATENT_SCALE, "diffusion_train_steps": 1000,
     "diffusion_target": "noise",
+}  # fmt: skip
+# Their field: ours with the same meaning.
+_SAME = {
+    "num_layers": "layers", "num_heads": "heads", "d_model": "width", "T": "frames", "mlp_ratio": "mlp_ratio",
+    "mlp_drop": "dropout", "mlp_bias": "mlp_bias", "qkv_bias": "qkv_bias", "proj_bias": "proj_bias",
+    "qk_norm": "qk_norm", "use_mup": "mup", "action_token_size": "action_tokens",
+    "action_loss_weight": "action_loss_weight",
+}  # fmt: skip
+_SAME_DISCRETE = {
+    "max_corrupt_rate": "corrupt_max", "non_mlm_ratio": "history_probability",
+    "num_prompt_frames": "history_frames",
+}  # fmt: skip
+_SAME_CONTINUOUS = {
+    "vae_embed_dim": "channels", "patch_size": "patch", "diffloss_d": "diffusion_depth",
+    "diffloss_w": "diffusion_width", "diffusion_batch_mul": "diffusion_repeats",
 }  # fmt: skip
 # Our objective by their (jointly_predict_actions, jointly_predict_states). Without the first, the second is
 # ignored: video is predicted.
@@ -76,57 +92,44 @@ def config_from_released(
     continuous = bool(config.get("Diffusion", config.get("image_vocab_size", 0) is None))
     given = {key: value for key, value in config.items() if value is not None}
     values = _DEFAULTS | (_CONTINUOUS_DEFAULTS if continuous else {}) | given
-    remedy = "is it a released checkpoint?"
     try:
-        _check_counts(values)
-        shared = _shared(values, continuous)
-        shared["grid"] = _grid(values["S"], (case or {}).get("grid"))
+        for name, most in _COUNTS.items():
+            value = values.get(name, 1)
+            if type(value) is not int or not 1 <= value <= most:
+                raise CheckpointError(
+                    _WHERE, f"{name} is {value!r}, not a whole number from 1 to {most}", _REMEDY
+                )
+        shared = _shared(values, (case or {}).get("grid"))
         own = _continuous(values) if continuous else _discrete(values)
         return HMAConfig(**_LAYOUT, **shared, **own)
     except CheckpointError as error:
         raise CheckpointError(where, error.fault, error.remedy) from error
     except KeyError as error:
-        raise CheckpointError(where, f"lacks {error.args[0]}", remedy) from error
+        raise CheckpointError(where, f"lacks {error.args[0]}", _REMEDY) from error
     except RecipeError as error:
         fault = f"{error.where.removeprefix('model.')}: {error.fault}"
-        raise CheckpointError(where, fault, remedy) from error
+        raise CheckpointError(where, fault, _REMEDY) from error
     except (TypeError, ValueError, ArithmeticError) as error:
-        raise CheckpointError(where, f"has a value of the wrong type: {error}", remedy) from error
+        raise CheckpointError(where, f"has a value of the wrong type: {error}", _REMEDY) from error
 
 
-def _check_counts(values: Mapping[str, Any]) -> None:
-    """Raise unless every count is a whole number, from 1 to its limit."""
-    for name, most in _COUNTS.items():
-        value = values.get(name, 1)
-        if type(value) is not int or not 1 <= value <= most:
-            fault = f"{name} is {value!r}, not a whole number from 1 to {most}"
-            raise CheckpointError(_WHERE, fault, "is it a released checkpoint?")
+def _renamed(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """Return our fields, each with the type of its default."""
+    return {ours: type(getattr(HMAConfig, ours))(values[theirs]) for theirs, ours in names.items()}
 
 
-def _shared(values: Mapping[str, Any], continuous: bool) -> dict[str, Any]:
-    joint, mup = bool(values["jointly_predict_actions"]), bool(values["use_mup"])
-    if mup and continuous and values["d_model"] != 256:
-        fault = f"is continuous with use_mup and width {values['d_model']}"
-        raise CheckpointError(_WHERE, fault, "the released code makes such a model only at width 256")
-    conditioning = _conditioning(str(values["action_network"]))
+def _shared(values: Mapping[str, Any], grid: Any) -> dict[str, Any]:
+    """Return the fields that both kinds of model have."""
+    joint, tokens = bool(values["jointly_predict_actions"]), values["S"]
+    height, width = (math.isqrt(tokens),) * 2 if grid is None else (int(part) for part in grid)
+    if height * width != tokens:
+        raise CheckpointError(_WHERE, f"S is {tokens}, which is not {height} x {width}", "name the grid")
     objective = _OBJECTIVE[joint, bool(values["jointly_predict_states"])]
-    return {
-        "layers": values["num_layers"],
-        "width": values["d_model"],
-        "heads": values["num_heads"],
-        "mlp_ratio": float(values["mlp_ratio"]),
-        "dropout": float(values["mlp_drop"]),
-        "frames": values["T"],
-        "conditioning": conditioning,
-        "action_tokens": values["action_token_size"],
+    return _renamed(values, _SAME) | {
+        "grid": (height, width),
+        "conditioning": _conditioning(str(values["action_network"])),
         "absent_action": "tokens" if joint else "skip",
-        "qkv_bias": bool(values["qkv_bias"]),
-        "proj_bias": bool(values["proj_bias"]),
-        "mlp_bias": bool(values["mlp_bias"]),
-        "qk_norm": bool(values["qk_norm"]),
         "norms": "qk" if values["qk_norm"] else "before",
-        "mup": mup,
-        "action_loss_weight": float(values["action_loss_weight"]),
         "objectives": {objective: 1.0},
     }
 
@@ -150,47 +153,28 @@ def _conditioning(network: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _grid(tokens: int, grid: Any) -> tuple[int, int]:
-    side = math.isqrt(tokens)
-    height, width = (side, side) if grid is None else (int(part) for part in grid)
-    if height * width != tokens:
-        fault = f"S is {tokens}, which is not {height} x {width}"
-        raise CheckpointError(_WHERE, fault, "name the grid")
-    return height, width
-
-
 def _discrete(values: Mapping[str, Any]) -> dict[str, Any]:
     vocab, digits = values["image_vocab_size"], values["num_factored_vocabs"]
     size = round(vocab ** (1 / digits))
     if size**digits != vocab:
         raise CheckpointError(_WHERE, f"image_vocab_size {vocab} is no power of {digits} equal digits")
-    return {
-        "kind": "discrete",
-        "factored": (size,) * digits,
-        "corrupt_max": values["max_corrupt_rate"],
-        "history_probability": values["non_mlm_ratio"],
-        "history_frames": values["num_prompt_frames"],
-    }
+    return {"kind": "discrete", "factored": (size,) * digits, **_renamed(values, _SAME_DISCRETE)}
 
 
 def _continuous(values: Mapping[str, Any]) -> dict[str, Any]:
+    if values["use_mup"] and values["d_model"] != 256:
+        fault = f"is continuous with use_mup and width {values['d_model']}"
+        raise CheckpointError(_WHERE, fault, "the released code makes such a model only at width 256")
+    # The steps of a respacing: `N`, `ddimN`, numbers to add up, or an empty text for all 1000.
+    text = str(values["num_sampling_steps"]).removeprefix("ddim")
     return {
         "kind": "continuous",
-        "channels": values["vae_embed_dim"],
-        "patch": values["patch_size"],
         "latent_scale": LATENT_SCALE,
         "action_loss": "diffusion",
-        "diffusion_depth": values["diffloss_d"],
-        "diffusion_width": values["diffloss_w"],
-        "diffusion_sample_steps": _sample_steps(str(values["num_sampling_steps"])),
-        "diffusion_repeats": values["diffusion_batch_mul"],
+        "diffusion_sample_steps": sum(int(part) for part in text.split(",")) if text else 1000,
         "diffusion_variance": True,
+        **_renamed(values, _SAME_CONTINUOUS),
     }
-
-
-def _sample_steps(text: str) -> int:
-    """Return the steps of a respacing: `N`, `ddimN`, numbers to add up, or an empty text for all 1000."""
-    return sum(int(part) for part in text.removeprefix("ddim").split(",")) if text else 1000
 
 
 def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
@@ -199,47 +183,23 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
     Raises:
         CheckpointError: the released layout cannot express it; the error names every reason.
     """
-    faults = _inexpressible(config)
-    if faults:
+    if faults := _inexpressible(config):
         fault = f"the released layout cannot express {'; '.join(faults)}"
         raise CheckpointError(where, fault, "the released code cannot read it")
+    discrete = config.kind == "discrete"
     named = {"concat": "concat", "modulation": "modulate", "add": "mlp"}
-    network = [theirs for ours, theirs in named.items() if ours in config.conditioning]
-    values = {
-        "num_layers": config.layers,
-        "num_heads": config.heads,
-        "d_model": config.width,
-        "T": config.frames,
+    same = _SAME | _SAME_DISCRETE | ({} if discrete else _SAME_CONTINUOUS)
+    values = {theirs: getattr(config, ours) for theirs, ours in same.items()} | {
         "S": math.prod(config.grid),
-        "image_vocab_size": config.vocab_size if config.kind == "discrete" else None,
-        "use_mup": config.mup,
-        "num_factored_vocabs": len(config.factored) if config.kind == "discrete" else 2,
-        "max_corrupt_rate": config.corrupt_max,
-        "non_mlm_ratio": config.history_probability,
-        "num_prompt_frames": config.history_frames,
-        "action_network": "+".join(network),
+        "image_vocab_size": config.vocab_size if discrete else None,
+        "num_factored_vocabs": len(config.factored) if discrete else 2,
+        "action_network": "+".join(theirs for ours, theirs in named.items() if ours in config.conditioning),
         "jointly_predict_actions": config.absent_action == "tokens",
         "jointly_predict_states": any(OBJECTIVES[name].predicts_video for name in config.objectives),
-        "action_token_size": config.action_tokens,
-        "action_loss_weight": config.action_loss_weight,
-        "qkv_bias": config.qkv_bias,
-        "proj_bias": config.proj_bias,
-        "qk_norm": config.qk_norm,
-        "mlp_ratio": config.mlp_ratio,
-        "mlp_drop": config.dropout,
-        "mlp_bias": config.mlp_bias,
     }
-    if config.kind == "discrete":
-        return values
-    return values | {
-        "Diffusion": True,
-        "patch_size": config.patch,
-        "vae_embed_dim": config.channels,
-        "diffloss_d": config.diffusion_depth,
-        "diffloss_w": config.diffusion_width,
-        "num_sampling_steps": str(config.diffusion_sample_steps),
-        "diffusion_batch_mul": config.diffusion_repeats,
-    }
+    if not discrete:
+        values |= {"Diffusion": True, "num_sampling_steps": str(config.diffusion_sample_steps)}
+    return values
 
 
 def _inexpressible(config: HMAConfig) -> list[str]:

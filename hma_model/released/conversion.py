@@ -10,15 +10,13 @@ refuses a configuration that the layout cannot express, with every reason.
 """
 
 import keyword
-import pickle
 import re
-import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.hub.repository import Repository
@@ -27,16 +25,17 @@ from hma_data.storage.files import new_folder, read_json, to_json
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import find_entry
+from hma_data.tokenizers.checkpoints import read_tensors
 from hma_model.checkpoint.folder import CONFIG, LIBRARY, Checkpoint
 from hma_model.checkpoint.io import load, save
-from hma_model.checkpoint.weights import read_tensors, write_tensors
+from hma_model.checkpoint.weights import write_tensors
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA
 from hma_model.released.config import LATENT_SCALE, config_from_released, config_to_released
 from hma_model.released.state import State, domains_of, state_from_released, state_to_released
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
-_PREFIXES = ("module.", "_orig_mod.")
+_PREFIXES = ("module.", "_orig_mod.")  # which wrappers add to the names of weights
 _SHOWN = 3  # maximum number of names in an error
 
 
@@ -66,22 +65,28 @@ def import_released(
     """
     address = as_address(source)
     weights = _weights(address, revision)
-    folder = weights.parent
+    folder, origin = weights.parent, Path(address).name if Path(address).exists() else str(address)
     values = read_json(folder / CONFIG)
     if values.get("library") == LIBRARY:
         raise CheckpointError(folder, f"is a checkpoint of {LIBRARY} already", "use it as it is")
-    state = _read_state(weights)
+    state = read_tensors(weights, CheckpointError)
+    for prefix in _PREFIXES:
+        if all(name.startswith(prefix) for name in state):
+            state = {name.removeprefix(prefix): value for name, value in state.items()}
     config = config_from_released(values, {"grid": grid} if grid else None, folder / CONFIG)
     config = config.replace(tokenizer=_tokenizer_spec(config, tokenizer, folder).to_json())
     _check_fit(weights, state, config, values)
-    _check_values(weights, state)
-    names = _choose(_ids(domains_of(state), weights), embodiments, weights)
+    for name, tensor in state.items():
+        if not tensor.isfinite().all():
+            raise CheckpointError(weights, f"{name} holds values that are not finite", "download it again")
+        if name.endswith(".std") and (tensor < 0).any():
+            raise CheckpointError(weights, f"{name} is negative", "download it again")
+    names = _choose(domains_of(state), embodiments, weights)
     trunk, parts = state_from_released(state, config)
     model = HMA(config)
     model.load_trunk(trunk)
     for domain, name in names.items():
         model.load_embodiment(name, *parts[domain])
-    origin = Path(address).name if Path(address).exists() else str(address)
     yaml, stats, cards = {}, {}, {}
     for domain, name in names.items():
         space = model.embodiments[name]
@@ -119,7 +124,10 @@ def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[
     values["d_actions"] = [model.embodiments[name].chunk_dim for name in domains.values()] or None
     parts = {domain: (model.stem_state(name), model.head_state(name)) for domain, name in domains.items()}
     state = state_to_released(model.trunk_state(), parts, opened.config)
-    _check_norms(model, opened.folder)
+    for name, tensor in model.trunk_state().items():
+        if ".q_norm." in name and not torch.equal(tensor, model.get_parameter(name.replace(".q_", ".k_"))):
+            fault = f"{name} differs from that of the keys; the released layout has one norm for both"
+            raise CheckpointError(opened.folder, fault, "the released code cannot read it")
     values["action_stats"] = [
         [state[f"action_preprocessor.{domain}.{part}"].tolist() for part in ("mean", "std")]
         for domain in domains
@@ -143,9 +151,8 @@ def _weights(address: str | Path, revision: str | None) -> Path:
     if path.is_file():
         return path
     if path.is_dir():
-        for name in WEIGHTS:
-            if (path / name).is_file():
-                return path / name
+        if found := [path / name for name in WEIGHTS if (path / name).is_file()]:
+            return found[0]
         raise CheckpointError(path, f"has no {' or '.join(WEIGHTS)}", "give a released checkpoint's folder")
     address, revision = addressed(address, revision)
     if not is_repository(address):
@@ -159,33 +166,6 @@ def _weights(address: str | Path, revision: str | None) -> Path:
     return store.pull([CONFIG, *names]) / names[0]
 
 
-def _read_state(path: Path) -> State:
-    """Read the tensors of a weights file, without the prefixes that wrappers add to their names."""
-    state: Any = read_tensors(path) if path.suffix == ".safetensors" else _unpickled(path)
-    for key in ("state_dict", "model"):
-        if isinstance(state, Mapping) and isinstance(state.get(key), Mapping):
-            state = state[key]
-    if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):
-        raise CheckpointError(path, "holds no state dict of tensors", "give a released checkpoint's weights")
-    for prefix in _PREFIXES:
-        if all(str(name).startswith(prefix) for name in state):
-            state = {str(name).removeprefix(prefix): value for name, value in state.items()}
-    return {str(name): value for name, value in state.items()}
-
-
-def _unpickled(path: Path) -> Any:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # warnings of old protocols; the error below covers them
-            return torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as fault:
-        text = "holds more than tensors, or is damaged; it is not opened"
-        raise CheckpointError(path, text, "convert it to safetensors") from fault
-    except Exception as fault:  # torch raises errors of many kinds for a damaged file
-        first = (str(fault).splitlines() or [type(fault).__name__])[0]
-        raise CheckpointError(path, f"cannot be read: {first}", "download it again") from fault
-
-
 # -- checking
 
 
@@ -193,11 +173,16 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
     """Raise unless names and shapes fit the released architecture that config.json describes."""
     domains = domains_of(state)
     named = values.get("action_domains") or []
-    lacking = [name for name in named if name not in domains]
-    if lacking:
+    if lacking := [name for name in named if name not in domains]:
         remedy = f"they have {_some(domains) or 'none'}; is it another model's {CONFIG}?"
         raise CheckpointError(path, f"lacks the domains {_some(lacking)} that {CONFIG} names", remedy)
-    expected = _expected(path, state, config, domains)
+    with torch.device("meta"):  # names and shapes of the layout, from a model without data
+        model = HMA(config)
+        for domain in domains:
+            model.add_embodiment(_space(path, state, domain))
+        parts = {domain: (model.stem_state(domain), model.head_state(domain)) for domain in domains}
+        made = state_to_released(model.trunk_state(), parts, config)
+    expected = {name: tuple(tensor.shape) for name, tensor in made.items()}
     missing, extra = sorted(expected.keys() - state.keys()), sorted(state.keys() - expected.keys())
     shapes = [
         f"{name} is {list(state[name].shape)}, not {list(shape)}"
@@ -208,17 +193,6 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
     if faults := [f"{what} {_some(found)}" for what, found in kinds.items() if found]:
         fault = f"is not the model that {CONFIG} describes: {'; '.join(faults)}"
         raise CheckpointError(path, fault, f"give weights and {CONFIG} of one released checkpoint")
-
-
-def _expected(path: Path, state: State, config: HMAConfig, domains: list[str]) -> dict[str, tuple[int, ...]]:
-    """Return names and shapes of the released layout, by converting a model without data to it."""
-    with torch.device("meta"):
-        model = HMA(config)
-        for domain in domains:
-            model.add_embodiment(_space(path, state, domain))
-        parts = {domain: (model.stem_state(domain), model.head_state(domain)) for domain in domains}
-        released = state_to_released(model.trunk_state(), parts, config)
-    return {name: tuple(tensor.shape) for name, tensor in released.items()}
 
 
 def _space(path: Path, state: State, domain: str) -> ActionSpace:
@@ -234,14 +208,6 @@ def _space(path: Path, state: State, domain: str) -> ActionSpace:
     return ActionSpace(domain, dims, chunk // dims, (0.0,) * dims, (1.0,) * dims, (True,) * dims, "divide")
 
 
-def _check_values(path: Path, state: State) -> None:
-    for name, tensor in state.items():
-        if not bool(torch.isfinite(tensor).all()):
-            raise CheckpointError(path, f"{name} holds values that are not finite", "download it again")
-        if name.endswith(".std") and bool((tensor < 0).any()):
-            raise CheckpointError(path, f"{name} is negative", "download it again")
-
-
 def _some(names: list[str]) -> str:
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
@@ -250,8 +216,8 @@ def _some(names: list[str]) -> str:
 # -- describing
 
 
-def _ids(domains: list[str], path: Path) -> dict[str, str]:
-    """Return our id for each released domain."""
+def _choose(domains: list[str], wanted: Iterable[str] | None, path: Path) -> dict[str, str]:
+    """Return our id for each released domain, or for those that are wanted by either name."""
     ids: dict[str, str] = {}
     for domain in domains:
         name = re.sub(r"[^a-z0-9_-]+", "_", domain.lower())[:100]
@@ -260,19 +226,11 @@ def _ids(domains: list[str], path: Path) -> dict[str, str]:
             fault = f"two domains would have the id {name!r}"
             raise CheckpointError(path, fault, "import one of them by embodiments=")
         ids[domain] = name
-    return ids
-
-
-def _choose(ids: dict[str, str], wanted: Iterable[str] | None, path: Path) -> dict[str, str]:
-    if wanted is None:
-        return ids
-    chosen = {}
-    for name in wanted:
-        found = [domain for domain, own in ids.items() if name in (domain, own)]
-        if not found:
+    names = list(ids if wanted is None else wanted)
+    for name in names:
+        if name not in ids and name not in ids.values():
             raise CheckpointError(path, f"has no domain {name!r}", f"it has: {', '.join(ids) or 'none'}")
-        chosen[found[0]] = ids[found[0]]
-    return chosen
+    return {domain: own for domain, own in ids.items() if domain in names or own in names}
 
 
 def _tokenizer_spec(config: HMAConfig, name: str | None, folder: Path) -> TokenizerSpec:
@@ -341,12 +299,3 @@ def _domains(model: HMA, where: object) -> dict[str, str]:
             raise CheckpointError(where, fault, "export the others by --embodiment")
         domains[domain] = name
     return domains
-
-
-def _check_norms(model: HMA, where: object) -> None:
-    """Raise unless queries and keys have equal norms: the released code has one norm for both."""
-    state = model.trunk_state()
-    for name in state:
-        if ".q_norm." in name and not torch.equal(state[name], state[name.replace(".q_norm.", ".k_norm.")]):
-            fault = f"{name} differs from that of the keys; the released layout has one norm for both"
-            raise CheckpointError(where, fault, "the released code cannot read it")

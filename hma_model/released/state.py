@@ -80,8 +80,12 @@ def state_to_released(
 
     The configuration must be one that `config_to_released` accepts. Tensors may be on the meta device.
     """
-    released = _back(trunk, _renamed(config))
-    released |= _positions_back(trunk, config)
+    position, rows = trunk["trunk.position"], math.prod(config.grid) + config.action_tokens
+    unused = position.new_zeros(position.shape[0], rows - position.shape[1], config.width)
+    released = _back(trunk, _renamed(config)) | {
+        "pos_embed_TSC": torch.cat([position, unused], dim=1).unsqueeze(0),
+        "action_mask_tokens": trunk["trunk.absent"][None, :, None],
+    }
     for theirs, ours in _norms(config):
         released |= _move(trunk, f"{ours}.q_norm", theirs)
     if config.kind == "continuous":
@@ -165,16 +169,6 @@ def _digits(config: HMAConfig) -> dict[str, str]:
     return {f"token_embed.factored_embeds.{i}.weight": f"trunk.embed.digits.{i}" for i in digits}
 
 
-def _positions_back(trunk: Mapping[str, Tensor], config: HMAConfig) -> State:
-    position = trunk["trunk.position"]
-    rows = math.prod(config.grid) + config.action_tokens
-    unused = position.new_zeros(position.shape[0], rows - position.shape[1], config.width)
-    return {
-        "pos_embed_TSC": torch.cat([position, unused], dim=1).unsqueeze(0),
-        "action_mask_tokens": trunk["trunk.absent"][None, :, None],
-    }
-
-
 def _latents(source: State, renamed: State, config: HMAConfig) -> State:
     """Convert embedding, positions and diffusion head of the continuous model; reorder their patches."""
     prefix = "readout.diffusion"
@@ -209,12 +203,12 @@ def _patches_back(trunk: Mapping[str, Tensor], config: HMAConfig) -> State:
 
 def _channels_first(values: Tensor, config: HMAConfig) -> Tensor:
     """Reorder the last axis from a patch's pixels by channels to channels by pixels."""
-    return values.unflatten(-1, (config.patch**2, config.channels)).mT.flatten(-2)
+    return values.unflatten(-1, (-1, config.channels)).mT.flatten(-2)
 
 
 def _pixels_first(values: Tensor, config: HMAConfig) -> Tensor:
     """Reorder the last axis from a patch's channels by pixels to pixels by channels."""
-    return values.unflatten(-1, (config.channels, config.patch**2)).mT.flatten(-2)
+    return values.unflatten(-1, (config.channels, -1)).mT.flatten(-2)
 
 
 def _with_variance(weight: Tensor, bias: Tensor, values: int) -> tuple[Tensor, Tensor]:
@@ -237,22 +231,19 @@ def _stem(source: State, domain: str, config: HMAConfig) -> State:
     }
     for old, new in _STEM.items():
         stem |= _move(source, f"action_mlp.{domain}.{old}", new)
-    return stem | (_modulation(source, domain, config) if "modulation" in config.conditioning else {})
+    if "modulation" not in config.conditioning:
+        return stem
 
-
-def _modulation(source: State, domain: str, config: HMAConfig) -> State:
     def stack(name: str) -> Tensor:
-        keys = [f"decoder.layers.{layer}.action_projectors.{domain}.{name}" for layer in range(config.layers)]
-        return torch.stack([source[key] for key in keys])
+        layers = (f"decoder.layers.{layer}.action_projectors.{domain}" for layer in range(config.layers))
+        return torch.stack([source[f"{layer}.{name}"] for layer in layers])
 
-    stacked = {
-        "modulation.out_weight": stack("linear_out.weight"),
-        "modulation.out_bias": stack("linear_out.bias"),
-    }
+    for part in ("weight", "bias"):
+        stem[f"modulation.out_{part}"] = stack(f"linear_out.{part}")
     for old, suffix in _MODULATION.items():
-        stacked[f"modulation.weight{suffix}"] = stack(f"{old}.weight").mT.contiguous()
-        stacked[f"modulation.bias{suffix}"] = stack(f"{old}.bias").unsqueeze(1)
-    return stacked
+        stem[f"modulation.weight{suffix}"] = stack(f"{old}.weight").mT.contiguous()
+        stem[f"modulation.bias{suffix}"] = stack(f"{old}.bias").unsqueeze(1)
+    return stem
 
 
 def _stem_back(stem: State, trunk: Mapping[str, Tensor], domain: str, config: HMAConfig) -> State:

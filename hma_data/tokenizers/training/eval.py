@@ -14,6 +14,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
+from itertools import batched
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +62,7 @@ def ssim_map(first: Tensor, second: Tensor) -> Tensor:
 
 
 def psnr_db(true: Frames, made: Frames) -> NDArray[np.float64]:
-    """Return the peak signal-to-noise ratio of each frame in dB; equal frames give inf.
-
-    (N, S, S, 3) uint8 -> (N,).
-    """
+    """Return the peak signal-to-noise ratio in dB, (N, S, S, 3) uint8 -> (N,); equal frames give inf."""
     error = np.square(true.astype(np.float64) - made).mean(axis=(1, 2, 3))
     with np.errstate(divide="ignore"):
         return 10 * np.log10(255.0**2 / error)
@@ -73,8 +71,8 @@ def psnr_db(true: Frames, made: Frames) -> NDArray[np.float64]:
 def ssim(true: Frames, made: Frames) -> NDArray[np.float64]:
     """Return the structural similarity of each frame in grey, (N, S, S, 3) uint8 -> (N,)."""
     weights = torch.tensor(GREY, dtype=torch.float64) / 255
-    grey = [torch.from_numpy(frames).to(torch.float64) @ weights for frames in (true, made)]
-    return ssim_map(grey[0][:, None], grey[1][:, None]).mean(dim=(1, 2, 3)).numpy()
+    first, second = ((torch.from_numpy(frames).double() @ weights)[:, None] for frames in (true, made))
+    return ssim_map(first, second).mean(dim=(1, 2, 3)).numpy()
 
 
 def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
@@ -157,28 +155,18 @@ class LatentMoments:
     """The mean and spread of continuous latents, as a model sees them (times `latent_scale`)."""
 
     def __init__(self, spec: TokenizerSpec) -> None:
-        self.scale, self.count, self.total, self.squares = spec.latent_scale, 0, 0.0, 0.0
+        self.scale, self.moments = spec.latent_scale, list[tuple[float, float]]()
 
     def add(self, latents: NDArray[Any]) -> None:
         """Count (N, c, h, w) latents."""
-        scaled = latents.astype(np.float64) * self.scale
-        self.count += scaled.size
-        self.total += float(scaled.sum())
-        self.squares += float(np.square(scaled).sum())
+        for scaled in latents.astype(np.float64) * self.scale:
+            self.moments.append((scaled.mean(), np.square(scaled).mean()))
 
     def result(self) -> dict[str, Any]:
         """Return the mean and standard deviation of all latents."""
-        mean = self.total / self.count
-        deviation = math.sqrt(max(0.0, self.squares / self.count - mean**2))
-        return {"latent_mean_scaled": round(mean, 4), "latent_std_scaled": round(deviation, 4)}
-
-
-def bits_per_frame(spec: TokenizerSpec) -> float:
-    """Return the number of bits of a frame's tokens or latents before any entropy coding."""
-    cells = spec.grid[0] * spec.grid[1]
-    if spec.kind == "discrete":
-        return cells * math.log2(spec.vocab_size or 1)
-    return cells * (spec.channels or 1) * np.dtype(spec.dtype).itemsize * 8.0
+        mean, square = np.mean(self.moments, axis=0)
+        deviation = math.sqrt(max(0.0, square - mean**2))
+        return {"latent_mean_scaled": round(float(mean), 4), "latent_std_scaled": round(deviation, 4)}
 
 
 # -- everything together
@@ -200,16 +188,17 @@ def evaluate(
         perceptual: measures LPIPS, see `open_lpips`.
 
     Returns:
-        frames, psnr_db (mean over frames, lossless frames counted as 99), psnr_db_min, ssim, bits_per_frame,
-        encode_frames_per_second, decode_frames_per_second (resizing not counted); `lpips` if it is
-        measured; the fields of `CodebookUse.result` or `LatentMoments.result`; if `worst` is above 0,
-        `worst_frames`, a list of (psnr, index, frame, made).
+        frames, psnr_db (mean over frames, lossless frames counted as 99), psnr_db_min, ssim, bits_per_frame
+        (before any entropy coding), encode_frames_per_second, decode_frames_per_second (resizing not
+        counted); `lpips` if it is measured; the fields of `CodebookUse.result` or `LatentMoments.result`;
+        if `worst` is above 0, `worst_frames`, a list of (psnr, index, frame, made).
 
     Raises:
         TokenizerError: there is no frame, or the frames do not fit.
     """
     spec = tokenizer.spec
     use = CodebookUse(spec) if spec.kind == "discrete" else LatentMoments(spec)
+    bits = math.log2(spec.vocab_size) if spec.vocab_size else np.dtype(spec.dtype).itemsize * 8.0
     psnr, similarity, distance = list[float](), list[float](), list[float]()
     lowest = list[tuple[float, int, Frames, Frames]]()
     encode_s = decode_s = 0.0
@@ -239,7 +228,7 @@ def evaluate(
         "psnr_db": round(float(np.mean(psnr)), 3),
         "psnr_db_min": round(min(psnr), 3),
         "ssim": round(float(np.mean(similarity)), 4),
-        "bits_per_frame": bits_per_frame(spec),
+        "bits_per_frame": math.prod(spec.cells) * bits,
         "encode_frames_per_second": round(len(psnr) / encode_s, 1),
         "decode_frames_per_second": round(len(psnr) / decode_s, 1),
         **use.result(),
@@ -253,14 +242,9 @@ def evaluate(
 
 def _batches(frames_iter: Iterable[Frames]) -> Iterator[Frames]:
     """Stack single frames and regroup batches into batches of `BATCH`."""
-    waiting: list[Frames] = []
-    for item in frames_iter:
-        waiting.extend([item] if item.ndim == 3 else list(item))
-        while len(waiting) >= BATCH:
-            yield np.stack(waiting[:BATCH])
-            del waiting[:BATCH]
-    if waiting:
-        yield np.stack(waiting)
+    single = (frame for item in frames_iter for frame in ([item] if item.ndim == 3 else item))
+    for batch in batched(single, BATCH):
+        yield np.stack(batch)
 
 
 # -- report

@@ -198,33 +198,28 @@ class Pool:
 
 def _levels(picture: Frame) -> list[Frame]:
     """Return the picture shrunk by area averaging to LARGEST, then to halves down to about 160 pixels."""
-    levels = [_shrunk(picture, LARGEST)]
-    while (short := min(levels[-1].shape[:2])) > 160:
-        levels.append(_shrunk(levels[-1], short // 2))
+    import cv2
+
+    levels, wanted = list[Frame](), LARGEST
+    while not levels or min(picture.shape[:2]) > 160:
+        height, width = picture.shape[:2]
+        scale = wanted / min(height, width)
+        if scale < 1:
+            size = round(width * scale), round(height * scale)
+            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        levels.append(picture)
+        wanted = min(picture.shape[:2]) // 2
     return levels
 
 
-def _shrunk(picture: Frame, short_side: int) -> Frame:
-    import cv2
-
-    height, width = picture.shape[:2]
-    scale = short_side / min(height, width)
-    if scale >= 1:
-        return picture
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
 def _source_files(source: FileSource | DrawnSource, corpus: Path) -> list[Path]:
-    if isinstance(source, DrawnSource):
-        files = sorted((corpus / source.kind).glob("*.png"))
-        if len(files) != source.pictures:
-            fault = f"holds {len(files)} pictures, the recipe says {source.pictures}"
-            raise RecipeError(corpus / source.kind, fault, f"recipes/tokenizer/draw.py {corpus} makes them")
-        return files
     folder = corpus / source.path
     files = sorted({path for glob in source.glob for path in folder.glob(glob)})
-    if not files:
+    if isinstance(source, DrawnSource):
+        if len(files) != source.pictures:
+            fault = f"holds {len(files)} pictures, the recipe says {source.pictures}"
+            raise RecipeError(folder, fault, f"recipes/tokenizer/draw.py {corpus} makes them")
+    elif not files:
         fault = f"no file matches {', '.join(source.glob)}"
         raise RecipeError(folder, fault, f"unpack {source.origin} there")
     return files
@@ -240,24 +235,21 @@ def load_pools(sources: Sequence[FileSource | DrawnSource], corpus: Path) -> tup
     pools = []
     for source in sources:
         pictures = []
-        name, frames = (source.kind, 1) if isinstance(source, DrawnSource) else (source.path, source.frames)
         for file in _source_files(source, corpus):
             with suppress(TokenizerError):  # a glob may match a file that is no picture
-                for picture in read_pictures(file, frames):
+                for picture in read_pictures(file, source.frames):
                     if min(picture.shape[:2]) >= SMALLEST:
                         pictures.append(_levels(picture))
                         digest.update(pictures[-1][-1].tobytes())
         if not pictures:
-            raise RecipeError(corpus / name, "holds no picture that can be decoded and is large enough")
-        pools.append(Pool(name, source.weight, pictures))
+            fault = "holds no picture that can be decoded and is large enough"
+            raise RecipeError(corpus / source.path, fault)
+        pools.append(Pool(source.path, source.weight, pictures))
     return pools, digest.hexdigest()
 
 
 def draw_batch(pools: list[Pool], side: int, count: int, seed: int, step: int) -> NDArray[np.float32]:
-    """Return the crops of a training step, (N, S, S, 3) float32 in [-1, 1].
-
-    The same arguments always give the same crops.
-    """
+    """Return the crops of a training step, (N, S, S, 3) float32 in [-1, 1]; the arguments decide them."""
     weights = np.array([pool.weight for pool in pools])
     crops = np.empty((count, side, side, 3), np.float32)
     for index in range(count):
@@ -298,11 +290,7 @@ def _crop(levels: list[Frame], side: int, rng: np.random.Generator) -> Frame:
 
 
 def _recolour(crop: Frame, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Change brightness, contrast, gamma, saturation and colour cast, and add blur and noise.
-
-    Returns:
-        float32 in [-1, 1].
-    """
+    """Return the crop in [-1, 1] with changed brightness, contrast and colour, with blur and noise."""
     import cv2
 
     x = crop.astype(np.float32) / 255.0

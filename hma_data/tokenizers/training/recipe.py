@@ -1,11 +1,8 @@
-"""Read and check the YAML recipe that trains an embedded tokenizer.
-
-Every value is checked before any data is read or any step is trained; unknown keys are refused.
-"""
+"""Read and check the YAML recipe that trains an embedded tokenizer; unknown keys are refused."""
 
 import hashlib
 import json
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError, model_validator
@@ -13,8 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 from hma_data.errors import RecipeError
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.yaml_io import read_yaml
-from hma_data.tokenizers.fsq import STRIDE, FsqConfig
-from hma_data.tokenizers.vae import VaeConfig
+from hma_data.tokenizers.embedded import PATCH, FsqConfig, VaeConfig
 
 LOCAL: dict[str, Any] = {"corpus": True, "network": {"latent_scale"}}  # a place, and a measured value
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -44,7 +40,7 @@ class TrainingRecipe(_Strict):
 
     steps: int = Field(gt=0)
     batch: int = Field(gt=0)
-    crop: int = Field(gt=0, multiple_of=STRIDE)
+    crop: int = Field(gt=0, multiple_of=2 * PATCH)
     learning_rate: float = Field(gt=0)
     adam_learning_rate: float = Field(gt=0)
     weight_decay: float = Field(ge=0, default=0.0)
@@ -56,10 +52,9 @@ class TrainingRecipe(_Strict):
     @model_validator(mode="after")
     def _falls_to_the_end(self) -> "TrainingRecipe":
         steps = [step for step, _ in self.fall]
-        if self.fall and (sorted(set(steps)) != steps or self.fall[0][1] != 1):
-            raise ValueError("fall must begin with share 1 and list ascending steps")
-        if self.fall and self.fall[-1] != (self.steps, 0):
-            raise ValueError(f"fall must end with [{self.steps}, 0]")
+        ends = self.fall and (self.fall[0][1], self.fall[-1]) == (1, (self.steps, 0))
+        if self.fall and not (ends and sorted(set(steps)) == steps):
+            raise ValueError(f"fall must begin with share 1, ascend in steps and end with [{self.steps}, 0]")
         return self
 
     def rate(self, step: int) -> float:
@@ -105,6 +100,13 @@ class DrawnSource(_Strict):
     kind: Literal["pusht", "drawn"]
     pictures: int = Field(gt=0, default=200)
     weight: float = Field(gt=0, default=1.0)
+    glob: ClassVar[list[str]] = ["*.png"]
+    frames: ClassVar[int] = 1
+
+    @property
+    def path(self) -> str:
+        """Return the folder below the recipe's `corpus`."""
+        return self.kind
 
 
 class TokenizerRecipe(_Strict):
@@ -121,7 +123,7 @@ class TokenizerRecipe(_Strict):
 
     def digest(self) -> str:
         """Return the SHA-256 of all values except the corpus's location and what training measures."""
-        return _digest(self.model_dump(mode="json", exclude=LOCAL))
+        return self._digest(LOCAL)
 
     def course(self) -> str:
         """Return the SHA-256 of the values that must not change when a run is resumed.
@@ -129,12 +131,11 @@ class TokenizerRecipe(_Strict):
         It covers the values of `digest` except `steps`, `fall` and `threads`. A run can be resumed if this
         digest and the rates of its past steps are the same.
         """
-        values = self.model_dump(mode="json", exclude={**LOCAL, "training": {"steps", "fall", "threads"}})
-        return _digest(values)
+        return self._digest(LOCAL | {"training": {"steps", "fall", "threads"}})
 
-
-def _digest(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    def _digest(self, exclude: dict[str, Any]) -> str:
+        values = self.model_dump(mode="json", exclude=exclude)
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def load_recipe(path: StrPath, overrides: dict[str, Any] | None = None) -> TokenizerRecipe:

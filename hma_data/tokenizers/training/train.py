@@ -31,17 +31,15 @@ from hma_data.errors import RecipeError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.checkpoints import save_weights
-from hma_data.tokenizers.fsq import FsqAutoencoder, FsqConfig
+from hma_data.tokenizers.embedded import Autoencoder, FsqAutoencoder, FsqConfig, VaeAutoencoder, VaeConfig
 from hma_data.tokenizers.network import open_device
 from hma_data.tokenizers.training.eval import GREY, ssim_map
 from hma_data.tokenizers.training.frames import Pool, draw_batch, load_pools
 from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
-from hma_data.tokenizers.vae import VaeAutoencoder, VaeConfig
 
 START, END = 2**32 - 1, 2**32 - 2  # step numbers of the batches that initialise and measure a network
 ROUNDS = 5  # of the Newton–Schulz iteration; they bring the singular values near 1
 _A, _B, _C = 3.4445, -4.7750, 2.0315  # largest slope at zero that keeps values in (0, 1] near 1
-Autoencoder = FsqAutoencoder | VaeAutoencoder
 
 
 def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
@@ -54,13 +52,10 @@ def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tupl
     if weights.gradient:
         loss = loss + weights.gradient * _gradient_loss(made, true)
     if weights.ssim:
-        loss = loss + weights.ssim * (1 - ssim_map(_grey(made), _grey(true)).mean())
+        shares = made.new_tensor(GREY).view(1, 3, 1, 1)
+        grey = [(pictures * shares).sum(1, keepdim=True) for pictures in (made, true)]
+        loss = loss + weights.ssim * (1 - ssim_map(*grey).mean())
     return loss, squared.detach()
-
-
-def _grey(pictures: Tensor) -> Tensor:
-    weights = pictures.new_tensor(GREY).view(1, 3, 1, 1)
-    return (pictures * weights).sum(1, keepdim=True)
 
 
 def _gradient_loss(made: Tensor, true: Tensor) -> Tensor:
@@ -139,19 +134,16 @@ class Run:
                 self.average[name].lerp_(parameter, 1 - decay)
         return float(squared)
 
+    @torch.no_grad()
     def write_weights(self, path: Path, facts: dict[str, Any]) -> None:
         """Write the averaged weights as a tokenizer's file, with the facts of the training."""
         config = self.recipe.network
-        if isinstance(config, VaeConfig):
-            config = config.model_copy(update={"latent_scale": self._latent_scale(config)})
+        if isinstance(config, VaeConfig):  # measure its scale on the averaged encoder
+            network = VaeAutoencoder(config)
+            network.load_state_dict(self.average)
+            scale = round(1 / float(network.encoder(self.batch(END, 128)).std()), 4)
+            config = config.model_copy(update={"latent_scale": scale})
         save_weights(path, self.network.format, config, self.average, facts)
-
-    @torch.no_grad()
-    def _latent_scale(self, config: VaeConfig) -> float:
-        """Return the inverse standard deviation of the averaged encoder's latents over a batch."""
-        network = VaeAutoencoder(config)
-        network.load_state_dict(self.average)
-        return round(1 / float(network.encoder(self.batch(END, 128)).std()), 4)
 
     def save(self, path: Path) -> None:
         """Write what `resume` needs, atomically."""
@@ -187,20 +179,17 @@ class Run:
         past = (metadata.get("course"), metadata.get("rates"))
         if past != (self.recipe.course(), self._past_rates(step)):
             raise RecipeError(path, "is the state of a training with other settings", remedy)
-        self._restore(state)
         self.step, self.seconds = step, float(metadata.get("seconds", 0))
-
-    def _restore(self, state: dict[str, Tensor]) -> None:
         with torch.no_grad():
             for name, parameter in self.network.named_parameters():
                 parameter.copy_(state[f"network.{name}"])
                 self.average[name].copy_(state[f"average.{name}"])
         for number, optimizer in enumerate(self.optimizers):
             moments: dict[int, dict[str, Tensor]] = {}
-            for name, tensor in state.items():
-                kind, *place = name.split(".")
-                if kind == "moment" and int(place[0]) == number:
-                    moments.setdefault(int(place[1]), {})[place[2]] = tensor
+            for name in state:
+                if name.startswith(f"moment.{number}."):
+                    index, key = name.split(".")[2:]
+                    moments.setdefault(int(index), {})[key] = state[name]
             groups = optimizer.state_dict()["param_groups"]
             optimizer.load_state_dict({"state": moments, "param_groups": groups})
 

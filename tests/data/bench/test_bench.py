@@ -2,8 +2,6 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +14,8 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import UsageError
 from hma_data.sources.base import open_source
 
-TOY: Any = SimpleNamespace(
-    ABOUT="a toy",
-    DEFAULTS={"frames": 4, "share": 0.5, "name": "x", "kinds": ["a"]},
-    run=lambda settings: [settings],
+TOY = bench.Bench(
+    "a toy", {"frames": 4, "share": 0.5, "name": "x", "kinds": ["a"]}, lambda settings: [settings]
 )
 
 
@@ -41,7 +37,7 @@ def test_a_bench_that_is_not_there_names_those_that_are() -> None:
 
 
 def test_the_report_has_the_promised_form() -> None:
-    said = json.loads(json.dumps(bench.report("toy", TOY.DEFAULTS, TOY.run({"frames": 1}))))
+    said = json.loads(json.dumps(bench.report("toy", TOY.defaults, TOY.run({"frames": 1}))))
     assert list(said) == ["bench", "machine", "settings", "results"]
     assert said["machine"]["cores"] >= 1 and said["results"] == [{"frames": 1}]
 
@@ -62,8 +58,12 @@ def test_a_generated_recording_shows_what_was_drawn(name: str, tmp_path: Path) -
     np.testing.assert_allclose(clip.actions, actions(12, 1), atol=1e-6)
 
 
+def test_every_generated_recording_has_an_embodiment() -> None:
+    assert [case.embodiment().source.format for case in CASES.values()] == [c.format for c in CASES.values()]
+
+
 def test_sources_are_measured_with_units() -> None:
-    settings = sources.DEFAULTS | {"formats": ["rlds-jpeg-256"], "frames": 8, "episodes": 2}
+    settings = sources.BENCH.defaults | {"formats": ["rlds-jpeg-256"], "frames": 8, "episodes": 2}
     results = sources.run(settings)
     assert {one["processes"] for one in results} <= {1, 2} and results[0]["frames"] == 8
     units = ("frames_per_second", "frames_per_cpu_second", "peak_rss_mib", "recorded_bytes_per_frame")
@@ -72,7 +72,7 @@ def test_sources_are_measured_with_units() -> None:
 
 def test_a_format_that_is_not_there_is_refused() -> None:
     with pytest.raises(UsageError, match="known: rlds-jpeg-256"):
-        sources.run(sources.DEFAULTS | {"formats": ["vhs"]})
+        sources.run(sources.BENCH.defaults | {"formats": ["vhs"]})
 
 
 @pytest.mark.slow

@@ -285,7 +285,7 @@ def test_row_groups_of_large_frames_hold_fewer_of_them(tmp_path: Path) -> None:
 def test_the_benchmark_of_shards_runs() -> None:
     from hma_data.bench import shards
 
-    results = shards.run(shards.DEFAULTS | {"frames": 400, "episode": 20})
+    results = shards.measure_shards(shards.SHARDS.defaults | {"frames": 400, "episode": 20})
     assert [result["step"] for result in results] == ["write", "read", "verify", "verify --quick"]
     assert all(result["frames_per_second"] > 0 and result["peak_rss_mib"] > 0 for result in results)
     assert results[0]["bytes_per_frame"] > results[0]["token_bytes_per_frame"] > 500

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
-from hma_data.tokenizers.svd_vae import derive_config
+from hma_data.tokenizers.latents import derive_svd_config
 from tests.data.tokenizer_files import frames
 
 NAME = "diffusion_pytorch_model.safetensors"
@@ -46,7 +46,7 @@ def test_without_diffusers_the_command_that_installs_it_is_named(tmp_path, monke
 
 
 def test_sizes_are_read_off_the_weights(folder, theirs):
-    derived = derive_config(load_file(folder / NAME))
+    derived = derive_svd_config(load_file(folder / NAME))
     assert all(tuple(np.atleast_1d(theirs.config[k])) == tuple(np.atleast_1d(v)) for k, v in derived.items())
 
 

@@ -18,7 +18,7 @@ from hma_data.shards.preview import preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
-from hma_data.tokenizers.taesd import read_network
+from hma_data.tokenizers.latents import read_tiny
 from tests.conftest import write_toy
 from tests.data.tokenizer_files import frames, tiny_halves, write_tiny_pair, write_tiny_whole
 
@@ -98,7 +98,7 @@ def test_taef2_gives_photographs_of_hands_back(real_data, taef2):
 @pytest.mark.parametrize("pooled", [0, 16])
 def test_the_network_is_the_one_written_out(tmp_path, pooled):
     encoder, decoder = tiny_halves(width=8, pooled=pooled)
-    network = read_network(
+    network = read_tiny(
         [write_tiny_pair(tmp_path, pooled=pooled) / f"taesd_{half}.pth" for half in ("encoder", "decoder")]
     )
 

@@ -13,8 +13,9 @@ from safetensors.torch import load_file
 from hma_data.errors import RecipeError, TokenizerError
 from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.catalog import EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights
-from hma_data.tokenizers.fsq import FORMAT, WEIGHTS, FsqConfig
+from hma_data.tokenizers.embedded import FsqAutoencoder, FsqConfig
 from hma_data.tokenizers.training.eval import psnr_db
 from hma_data.tokenizers.training.frames import draw_batch, load_pools
 from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
@@ -147,7 +148,7 @@ def test_crops_depend_on_seed_and_step_alone(tmp_path):
 
 
 def test_the_shipped_recipe_is_valid_and_makes_the_shipped_network():
-    config, _, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
+    config, _, _ = read_weights(EMBEDDED / "fsq.safetensors", FsqAutoencoder.format, FsqConfig)
     assert load_recipe(RECIPE).network == config
 
 

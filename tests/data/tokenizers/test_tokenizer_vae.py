@@ -10,15 +10,16 @@ import torch
 from hma_data.errors import TokenizerError
 from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
+from hma_data.tokenizers.catalog import EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
-from hma_data.tokenizers.fsq import WEIGHTS as FSQ_WEIGHTS
+from hma_data.tokenizers.embedded import VaeAutoencoder, VaeConfig
 from hma_data.tokenizers.training.eval import evaluate, psnr_db
 from hma_data.tokenizers.training.recipe import load_recipe
 from hma_data.tokenizers.training.train import train
-from hma_data.tokenizers.vae import FORMAT, WEIGHTS, VaeAutoencoder, VaeConfig
 from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "vae.yaml"
+FORMAT, WEIGHTS = VaeAutoencoder.format, EMBEDDED / "vae.safetensors"
 SMALL = VaeConfig(width=8, hidden=8, encoder_blocks=1, decoder_blocks=(1, 1), fine_width=4)
 
 
@@ -58,7 +59,7 @@ def test_latents_of_another_shape_are_refused(vae, shape):
 
 def test_weights_of_the_discrete_tokenizer_are_refused():
     with pytest.raises(TokenizerError, match=r"does not hold hma-vae-1 weights \(format 'hma-fsq-1'\)"):
-        get_tokenizer("vae-8", weights=str(FSQ_WEIGHTS))
+        get_tokenizer("vae-8", weights=str(EMBEDDED / "fsq.safetensors"))
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,16 @@ from safetensors.torch import load_file, save_file
 from hma_data.errors import TokenizerError
 from hma_data.storage.paths import shipped
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
-from hma_data.tokenizers.catalog import CATALOG
+from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
 from hma_data.tokenizers.checkpoints import read_weights, save_weights
-from hma_data.tokenizers.fsq import FORMAT, WEIGHTS, FsqAutoencoder, FsqConfig, Quantizer
+from hma_data.tokenizers.embedded import FsqAutoencoder, FsqConfig, Quantizer
 from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ssim, to_markdown
 from hma_data.tokenizers.training.frames import read_frames
 from hma_data.tokenizers.training.recipe import load_recipe
 from tests.data.tokenizer_files import draw_scene
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
+FORMAT, WEIGHTS = FsqAutoencoder.format, EMBEDDED / "fsq.safetensors"
 SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
 
 
@@ -161,7 +162,7 @@ def test_threads_may_encode_at_the_same_time(fsq8, threads):
 @pytest.mark.parametrize("levels", [((8, 8, 8), (8, 8, 8)), ((16, 4), (3,))])
 def test_ids_and_levels_are_one_to_one(levels):
     quantizer = Quantizer(FsqConfig(levels=levels))
-    count = int(np.prod(quantizer.factored))
+    count = int(np.prod(quantizer.sizes))
     ids = torch.arange(count).view(1, 1, count)
     assert torch.equal(quantizer.to_ids(quantizer.to_digits(ids)), ids)
 

@@ -8,9 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
-from hma_model.bench import generate as bench_generate
-from hma_model.bench import train as bench_train
-from hma_model.bench import waiting as bench_waiting
+from hma_data.tokenizers.network import NetworkTokenizer
+from hma_model.bench import speed
 from hma_model.cli import app
 
 SMALL = {
@@ -19,7 +18,7 @@ SMALL = {
 
 
 def _generate(**changes: Any) -> dict[str, Any]:
-    return bench_generate.DEFAULTS | SMALL | {"frames": 1, "ddim_steps": 2} | changes
+    return speed.GENERATE.defaults | SMALL | {"frames": 1, "ddim_steps": 2} | changes
 
 
 def test_a_results_settings_and_figures_are_named() -> None:
@@ -35,29 +34,28 @@ def test_a_results_settings_and_figures_are_named() -> None:
 
 
 def test_each_kind_is_measured_with_the_cache_and_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_generate, "in_fresh_process", lambda task, settings, *case: {"case": case})
-    cases = [result["case"] for result in bench_generate.run(_generate())]
+    monkeypatch.setattr(speed, "in_fresh_process", lambda task, settings, *case: {"case": case})
+    cases = [result["case"] for result in speed.generate(_generate())]
     assert cases == [(kind, cache) for kind in ("discrete", "continuous") for cache in (True, False)]
-    assert len(bench_generate.run(_generate(kind="discrete", cache=False))) == 1
+    assert len(speed.generate(_generate(kind="discrete", cache=False))) == 1
 
 
 @pytest.mark.parametrize("cache", [True, False])
 def test_latents_are_measured_in_either_precision(cache: bool) -> None:
-    result = bench_generate.measure(_generate(precision="bf16"), "continuous", cache)
+    result = speed.measure_frames(_generate(precision="bf16"), "continuous", cache)
     assert (result["ddim_steps"], result["precision"], result["cache"]) == (2, "bf16", cache)
 
 
 def test_frames_are_decoded_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = []
-    made = bench_generate._decoder
+    decode = NetworkTokenizer.decode
 
-    def decoder(kind: str, device: str) -> Any:
-        decode = made(kind, device)
-        return lambda frame: decoded.append(decode(frame).shape)
+    def seen(self: NetworkTokenizer, tokens: Any) -> Any:
+        decoded.append(decode(self, tokens).shape)
 
-    monkeypatch.setattr(bench_generate, "_decoder", decoder)
-    bench_generate.measure(_generate(decode=True, batch=2), "discrete", True)
-    assert decoded == [(2, 256, 256, 3)] * (bench_generate._WARMUP + 1)
+    monkeypatch.setattr(NetworkTokenizer, "decode", seen)
+    speed.measure_frames(_generate(decode=True, batch=2), "discrete", True)
+    assert decoded == [(2, 256, 256, 3)] * (speed.WARMUP + 1)
 
 
 @pytest.mark.parametrize(
@@ -72,13 +70,13 @@ def test_frames_are_decoded_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> 
 )
 def test_a_wrong_setting_is_named(change: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        bench_generate.run(_generate(**change))
+        speed.generate(_generate(**change))
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 @pytest.mark.parametrize("changes", [{}, {"checkpointing": True, "optimizer": False, "precision": "bf16"}])
 def test_a_training_step_is_measured(kind: str, changes: dict[str, Any]) -> None:
-    result = bench_train.measure(bench_train.DEFAULTS | SMALL | {"steps": 1} | changes, kind)
+    result = speed.measure_steps(speed.TRAIN.defaults | SMALL | {"steps": 1} | changes, kind)
     assert result["windows_per_second"] == pytest.approx(2 / result["seconds_per_step"], rel=0.05)
     assert result["kind"] == kind
 
@@ -88,12 +86,12 @@ def test_ways_of_waiting_are_measured_each_in_its_own_environment(monkeypatch: p
     seen = []
 
     def fake(task: Any, settings: dict[str, Any]) -> dict[str, float]:
-        seen.append({key: os.environ[key] for key in bench_waiting._OURS if key in os.environ})
+        seen.append({key: os.environ[key] for key in speed.OPENMP if key in os.environ})
         return {"steps_per_second": float(len(seen))}
 
-    monkeypatch.setattr(bench_waiting, "in_fresh_process", fake)
-    results = bench_waiting.run(bench_waiting.DEFAULTS | {"beside": "nothing", "rounds": 3})
-    assert seen == list(bench_waiting.WAITS.values()) * 3
-    assert [result["wait"] for result in results] == list(bench_waiting.WAITS)
+    monkeypatch.setattr(speed, "in_fresh_process", fake)
+    results = speed.waiting(speed.WAITING.defaults | {"beside": "nothing", "rounds": 3})
+    assert seen == list(speed.WAITS.values()) * 3
+    assert [result["wait"] for result in results] == list(speed.WAITS)
     assert results[0] == {"wait": "PASSIVE", "beside": "nothing", "steps_per_second": 1 + len(results)}
     assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"

@@ -7,7 +7,7 @@ import pytest
 
 from hma_data.errors import OutputError
 from hma_data.shards.verify import verify
-from hma_model.demo import run as demos
+from hma_model import demo as demos
 
 
 @pytest.mark.slow

@@ -292,7 +292,7 @@ def _another(folder: Path) -> None:
 
 
 BAD = {
-    "truncated": (_truncate, "not whole safetensors"),
+    "truncated": (_truncate, "not a complete safetensors file"),
     "missing key": (_edit(lambda s: s.pop("out_x_proj.bias")), r"lacks out_x_proj\.bias"),
     "missing statistics": (_edit(lambda s: s.pop("action_preprocessor.arm.mean")), "preprocessor.arm.mean"),
     "extra key": (_edit(lambda s: s.update(lora=torch.zeros(2))), "has unknown lora"),
@@ -305,9 +305,9 @@ BAD = {
         "not the model that config.json describes: lacks .* and .* more",
     ),
     "pickle of objects": (_pickle, "holds more than tensors"),
-    "pickle of a list": (_saved([torch.zeros(2)]), "no state dict"),
-    "empty": (_saved({}), "no state dict"),
-    "a file of noise": (_noise, "damaged"),
+    "pickle of a list": (_saved([torch.zeros(2)]), "a list without weights by name"),
+    "empty": (_saved({}), "without weights by name"),
+    "a file of noise": (_noise, "is not a torch checkpoint"),
     "no weights": (lambda f: (f / "model.safetensors").unlink(), "has no model.safetensors or pytorch_model"),
     "no config": (lambda f: (f / "config.json").unlink(), "config.json"),
     "broken config": (lambda f: (f / "config.json").write_text("{"), "not valid JSON"),

@@ -10,19 +10,19 @@ import json
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data import lab
 from hma_data.console import human_bytes, human_seconds, progress
-from hma_data.conversion.engines.base import Attempt, Retry
+from hma_data.conversion.engines.base import Attempt, Report, Retry, Work
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
@@ -51,6 +51,7 @@ ROBOTS = ("pusht_fast", "pusht_slow")
 TOKENIZER = "fsq-8"
 TAU = 3.0
 TIMINGS, RESULTS = "timings.json", "results.json"
+OURS = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, RESULTS}
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
 LONGEST = 24  # frames of the film
 
@@ -112,7 +113,10 @@ def demo(out: StrPath, *, episodes: int = 24, steps: int | None = None, seed: in
         MissingDependencyError: gym-pusht is not installed.
     """
     out = as_path(out)
-    _refuse_foreign(out)
+    if out.exists() and not out.is_dir():
+        raise OutputError(out, "is not a folder", "choose another --out")
+    if foreign := sorted({item.name for item in out.glob("*")} - OURS):
+        raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
     made = Demo(out)
     with made.stage(1, "record and convert"):
         record_and_convert(made, episodes, seed)
@@ -124,42 +128,38 @@ def demo(out: StrPath, *, episodes: int = 24, steps: int | None = None, seed: in
         publish(made)
     with made.stage(5, "roll out"):
         roll_out(made)
-    write_results(made)
+    names = {"true": "psnr_last", "shuffled": "psnr_last_shuffled", "copy": "psnr_last_copy"}
+    figures = {
+        robot: {name: found[key]["psnr_last"] for key, name in names.items()}
+        for robot, found in made.figures.items()
+    }
+    results = {"seconds": sum(made.seconds.values()), "embodiments": figures}
+    write_atomic(out / RESULTS, json.dumps(results, indent=1))
     return write_report(made)
 
 
-@dataclass(frozen=True)
-class Recording:
-    """A picklable factory of the function by which a worker records and converts a robot."""
+def _worker(out: Path, episodes: int, seed: int, workers: int) -> Work:
+    """Return the function that records and converts a robot; it reports (stage, episodes so far).
 
-    out: Path
-    episodes: int
-    seed: int
+    It returns the robot, its recording, and whether more episodes than allowed are in quarantine.
+    """
 
-    def __call__(
-        self, workers: int
-    ) -> Callable[[str, Callable[[Any], None], Attempt], tuple[str, Path, bool]]:
-        """Return the function; it reports ("recorded" or "converted", episodes so far).
+    def work(robot: str, report: Report, attempt: Attempt) -> tuple[str, Path, bool]:
+        folder = out / "recordings"
+        recording = next(iter(sorted(folder.glob(f"{robot}*"))), None)
+        if recording is None:
+            recording = lab.record(
+                robot, folder, episodes, seed, lambda done, total: report(("recorded", done))
+            )
+        report(("recorded", episodes))
+        summary = convert(
+            find(robot), str(recording), TOKENIZER, out / "shards" / robot,
+            settings=Settings(val_fraction=0.15),
+            on_progress=lambda state: report(("converted", state.episodes)),
+        )  # fmt: skip
+        return robot, recording, summary.too_many
 
-        It returns the robot, its recording, and whether more episodes than allowed are in quarantine.
-        """
-
-        def work(robot: str, report: Callable[[Any], None], attempt: Attempt) -> tuple[str, Path, bool]:
-            folder = self.out / "recordings"
-            recording = next(iter(sorted(folder.glob(f"{robot}*"))), None)
-            if recording is None:
-                recording = lab.record(
-                    robot, folder, self.episodes, self.seed, lambda done, total: report(("recorded", done))
-                )
-            report(("recorded", self.episodes))
-            summary = convert(
-                find(robot), str(recording), TOKENIZER, self.out / "shards" / robot,
-                settings=Settings(val_fraction=0.15),
-                on_progress=lambda state: report(("converted", state.episodes)),
-            )  # fmt: skip
-            return robot, recording, summary.too_many
-
-        return work
+    return work
 
 
 def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
@@ -177,7 +177,7 @@ def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
                 counts[number, event[0]] = event[1]
                 update(sum(counts.values()))
 
-        results = list(run_local(ROBOTS, Recording(made.out, episodes, seed), workers, show))
+        results = list(run_local(ROBOTS, partial(_worker, made.out, episodes, seed), workers, show))
     for robot, recording, refused in sorted(results):
         folder = made.out / "shards" / robot
         problems = verify(folder)
@@ -234,48 +234,26 @@ def roll_out(made: Demo) -> None:
     The robots run in parallel, each in one thread, because a second thread speeds up small products little.
     """
     from hma_data.tokenizers.network import single_threads
-
-    with single_threads(len(made.sets)) as pool:
-        results = list(pool.map(lambda robot: _rolled_out(made, robot), made.sets))
-    for robot, (found, film) in zip(made.sets, results, strict=True):
-        made.figures[robot], made.films[robot] = found, film
-        own, other = (f"{found[key]['psnr_last']:.1f} dB" for key in ("true", "shuffled"))
-        print(f"  {robot}: last frame PSNR {own} with its actions, {other} with another window's", flush=True)
-
-
-def write_results(made: Demo) -> None:
-    """Write results.json: the total seconds, and the PSNR of each robot's last frames."""
-    names = {"true": "psnr_last", "shuffled": "psnr_last_shuffled", "copy": "psnr_last_copy"}
-    figures = {
-        robot: {name: found[key]["psnr_last"] for key, name in names.items()}
-        for robot, found in made.figures.items()
-    }
-    results = {"seconds": sum(made.seconds.values()), "embodiments": figures}
-    write_atomic(made.out / RESULTS, json.dumps(results, indent=1))
-
-
-def _rolled_out(made: Demo, robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:
     from hma_model.evaluation.evaluate import default_prompt, evaluate
     from hma_model.evaluation.rollout_video import rollout_video
     from hma_model.network.model import HMA
 
-    shards = made.sets[robot]
-    model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
-    tokenizer = tokenizer_of(shards)
-    found = evaluate(model, tokenizer, shards, count=WINDOWS, batch_size=8)
-    lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
-    prompt = max(2, default_prompt(model.config.frames))
-    frames = min(LONGEST, max(lengths) // shards.row_stride) - prompt
-    return found, rollout_video(model, tokenizer, shards, frames=frames, prompt=prompt)
+    def roll(robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:
+        shards = made.sets[robot]
+        model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
+        tokenizer = tokenizer_of(shards)
+        found = evaluate(model, tokenizer, shards, count=WINDOWS, batch_size=8)
+        lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
+        prompt = max(2, default_prompt(model.config.frames))
+        frames = min(LONGEST, max(lengths) // shards.row_stride) - prompt
+        return found, rollout_video(model, tokenizer, shards, frames=frames, prompt=prompt)
 
-
-def _refuse_foreign(out: Path) -> None:
-    ours = {"recordings", "shards", "run", "hub", "pulled", "report.html", TIMINGS, RESULTS}
-    if out.exists() and not out.is_dir():
-        raise OutputError(out, "is not a folder", "choose another --out")
-    foreign = sorted({item.name for item in out.glob("*")} - ours)
-    if foreign:
-        raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
+    with single_threads(len(made.sets)) as pool:
+        results = list(pool.map(roll, made.sets))
+    for robot, (found, film) in zip(made.sets, results, strict=True):
+        made.figures[robot], made.films[robot] = found, film
+        own, other = (f"{found[key]['psnr_last']:.1f} dB" for key in ("true", "shuffled"))
+        print(f"  {robot}: last frame PSNR {own} with its actions, {other} with another window's", flush=True)
 
 
 def _size(path: Path) -> int:
@@ -294,7 +272,7 @@ def write_report(made: Demo) -> Path:
     machine = f"{usable_cores()} cores, {platform.machine()}, {versions}"
     lead = f"Recorded, tokenized, trained, published and rolled out by hma demo on {machine}."
     page = Page("HMA Toolkit: two robots, one world model", lead)
-    for section in (_headline, _robots, _reconstructions, _mixture, _training, _rollouts):
+    for section in (_headline, _robots, _reconstructions, _mixture_and_training, _rollouts):
         section(page, made)
     page.section("Sizes and timings")
     page.table(["what", "size"], [[name, human_bytes(size)] for name, size in made.sizes.items()])
@@ -349,43 +327,31 @@ def _reconstructions(page: Page, made: Demo) -> None:
     about = "Recorded frames, and the same decoded from their tokens. The model predicts tokens only."
     page.section("What the tokens keep", about)
     for robot, shards in made.sets.items():
-        rows, labels = [], []
+        own, spec, rows, labels = find(robot), shards.spec, [], []
+        source, camera = open_source(own.source.format), own.primary_camera
         for row in [row for row in shards.episodes.to_pylist() if row["split"] == "val"][:2]:
             picks = np.linspace(0, row["length"] - 1, 7).astype(int)
             tokens = shards.tokens(shards.episode_rows(row["episode_index"], ["tokens"])["tokens"])
-            rows.append(list(_recorded_frames(made, shards, row["id"], picks)))
+            clip = to_clip(source.read(str(made.recordings[robot]), row["id"], own), own)
+            seen = clip.frames_at(camera.name, picks)  # then as the tokenizer saw them
+            rows.append(list(prepare(seen, camera, spec.image_size, spec.resize_filter)))
             rows.append(list(tokenizer_of(shards).decode(tokens[picks])))
             labels += [f"{robot} {row['id']}: recorded", "from its tokens"]
         caption = f"{robot}: recorded frames above, reconstructions below"
         page.picture(png_bytes(grid(rows, labels)), "png", caption)
 
 
-def _recorded_frames(
-    made: Demo, shards: ShardSet, episode: str, picks: NDArray[np.int64]
-) -> NDArray[np.uint8]:
-    """Return recorded frames (n, S, S, 3), as the tokenizer saw them."""
-    robot = find(shards.embodiment.id)
-    source = open_source(robot.source.format)
-    clip = to_clip(source.read(str(made.recordings[robot.id]), episode, robot), robot)
-    camera, spec = robot.primary_camera, shards.spec
-    return prepare(clip.frames_at(camera.name, picks), camera, spec.image_size, spec.resize_filter)
-
-
-def _mixture(page: Page, made: Demo) -> None:
+def _mixture_and_training(page: Page, made: Demo) -> None:
     assert made.mixture is not None
     page.section("The mixture", "Probability of a training sample, p ∝ windows^(1/τ) with τ = 3.")
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mixture.svg"
         plot_mixture(made.mixture, TAU, path)
         page.picture(path.read_bytes(), "svg+xml", "How often each robot is drawn")
-
-
-def _training(page: Page, made: Demo) -> None:
-    result = made.training
     page.section("Training")
+    result, name = made.training, "both robots"
     validation = [(line["step"], line["loss"]) for line in result.evaluations]
-    curves = {"both robots": result.losses}, {"both robots": validation}
-    plot = loss_curves(*curves, "loss, nats a token", result.baseline)
+    plot = loss_curves({name: result.losses}, {name: validation}, "loss, nats a token", result.baseline)
     caption = "Loss over training (line: masked tokens; markers: held-out windows, whole frames masked)"
     page.picture(plot, "svg+xml", caption)
 

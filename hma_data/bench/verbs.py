@@ -1,6 +1,12 @@
-"""Measure the cost of `hma convert` beside its tokenizer, and whether its workers' memory stays constant."""
+"""Measure two verbs: `hma convert` beside its tokenizer, and `hma registry` over many embodiments.
+
+`convert` also shows whether the memory of its workers stays constant. `registry` runs commands that read
+every YAML, with nothing or everything cached.
+"""
 
 import os
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -10,21 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.bench import make_robot, rss_mib
-
-ABOUT = "hma convert over many short episodes: overhead beside the tokenizer, memory of its workers over time"
-DEFAULTS: dict[str, Any] = {
-    "episodes": 10_000,
-    "frames": 8,  # an episode
-    "pixels": 128,  # height and width of the recorded pictures, JPEG
-    "tokenizer": "fsq-8",
-    "workers": 1,
-    "engine": "local",
-    "shard_frames": 4_096,
-}
+from hma_data.bench import Bench, make_robot, rss_mib
 
 
-def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+def measure_convert(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Time the tokenizer alone on as many frames, then run the conversion and measure its processes."""
     from hma_data.conversion.engines.base import Limits
     from hma_data.conversion.job import convert
@@ -99,8 +94,6 @@ def _record(path: Path, settings: dict[str, Any]) -> None:
 
 def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]:
     """Return seconds and CPU seconds for `rows` frames in a worker's batches, measured on a part of them."""
-    import sys
-
     from hma_data.conversion.worker import BATCH
     from hma_data.cpu import usable_cores
     from hma_data.tokenizers.base import get_tokenizer
@@ -121,12 +114,9 @@ def _tokenizer_alone(settings: dict[str, Any], rows: int) -> tuple[float, float]
 class _Watch:
     """Memory and CPU time of this process and of those it started, sampled while the conversion runs.
 
-    Attributes:
-        cpu_s: CPU seconds until now of the workers (and Ray's actors), of this process without the sampling,
-            and of Ray's other processes.
-        seconds: wall time of the conversion; measured by `stop`.
-        start_seconds, start_frames, start_cpu_s: the figures at the first report of finished frames.
-        samples: share of the frames that are done, and MiB by role.
+    `cpu_s` counts the workers (and Ray's actors), this process without the sampling, and Ray's other
+    processes. `start_*` are the figures at the first report of finished frames. `samples` hold the share of
+    the frames that are done, and MiB by role.
     """
 
     def __init__(self, workers: int, engine: str) -> None:
@@ -212,3 +202,69 @@ def _cpu_s(pids: list[int]) -> float:
             user, system = _stat(pid)[11:13]
             ticks += int(user) + int(system)
     return ticks / os.sysconf("SC_CLK_TCK")
+
+
+CONVERT = Bench(
+    "hma convert over many short episodes: overhead beside the tokenizer, memory of its workers over time",
+    {
+        "episodes": 10_000,
+        "frames": 8,  # an episode
+        "pixels": 128,  # height and width of the recorded pictures, JPEG
+        "tokenizer": "fsq-8",
+        "workers": 1,
+        "engine": "local",
+        "shard_frames": 4_096,
+    },
+    measure_convert,
+)
+
+
+# -- registry
+
+_YAML = """id: {id}
+description: A generated arm for measuring
+robot: arm {id}
+kind: simulation
+frequency_hz: {hz}
+action:
+  space: eef_delta
+  components:
+    - {{key: actions, slice: [0, 3], dims: 3, names: [dx, dy, dz], unit: m}}
+    - {{key: actions, slice: [3, 6], dims: 3, names: [drx, dry, drz], unit: rad, representation: axis_angle}}
+    - {{key: actions, slice: [6, 7], dims: 1, names: [gripper], normalize: false, gripper: open_is_low}}
+state: {{components: [{{key: obs/joint_pos, dims: 7, unit: rad}}]}}
+cameras:
+  - {{name: front, key: obs/front_image, size: [480, 640]}}
+  - {{name: wrist, key: obs/wrist_image, size: [480, 640]}}
+source: {{format: hdf5, uri: data/{id}.hdf5, episodes: 10}}
+provenance: {{frequency_hz: generated, action: generated}}
+"""
+
+
+def measure_registry(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Run each command once cold, then warm, each time in a new process, as a user starts it."""
+    with tempfile.TemporaryDirectory() as folder:
+        registry = Path(folder) / "registry"
+        for i in range(settings["embodiments"]):
+            place = registry / f"group_{i // 500}"
+            place.mkdir(parents=True, exist_ok=True)
+            (place / f"arm_{i}.yaml").write_text(_YAML.format(id=f"arm_{i}", hz=1 + i % 50))
+        environment = {**os.environ, "HMA_CACHE": f"{folder}/cache", "HMA_REGISTRY": str(registry)}
+        results = []
+        for words in (["list", "--json"], ["list"], ["validate"], ["show", "arm_7"]):
+            command, seconds = [sys.executable, "-m", "hma_model.cli", "registry", *words], list[float]()
+            for _ in range(settings["runs"] + 1):
+                start = time.perf_counter()
+                subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+                seconds.append(round(time.perf_counter() - start, 3))
+            cold = seconds[0] if words == ["list", "--json"] else None
+            about = {"command": f"registry {' '.join(words)}", "cold_seconds": cold}
+            results.append({**about, "warm_seconds": min(seconds[1:])})
+        return results
+
+
+REGISTRY = Bench(
+    "registry list over many generated YAMLs: seconds of the whole command",
+    {"embodiments": 10_000, "runs": 3},
+    measure_registry,
+)

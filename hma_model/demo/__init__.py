@@ -1,1 +1,0 @@
-"""Walk the whole road, small: `hma demo`."""
