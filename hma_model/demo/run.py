@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hma_data import lab
 from hma_data.console import human_bytes, human_seconds, progress
-from hma_data.conversion.engines.base import Attempt, Retry
+from hma_data.conversion.engines import Attempt, Retry
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
