@@ -79,9 +79,8 @@ def read_features(text: bytes, where: str) -> dict[str, Feature]:
     try:
         return {leaf.name: leaf for leaf in _leaves(json.loads(text), "", ())}
     except (ValueError, KeyError, TypeError, AttributeError) as fault:
-        raise SourceError(
-            where, f"is not a TFDS features.json: {fault!r}", "write it again with tensorflow_datasets"
-        ) from fault
+        said = f"is not a TFDS features.json: {fault!r}"
+        raise SourceError(where, said, "write it again with tensorflow_datasets") from fault
 
 
 def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
@@ -103,23 +102,19 @@ def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
 
 
 def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feature:
-    shape, dtype = _shape(content.get("shape")), str(content.get("dtype") or "")
+    stated, dtype = content.get("shape"), str(content.get("dtype") or "")
+    shape = tuple(map(_size, (stated.get("dimensions") if isinstance(stated, dict) else stated) or ()))
     if kind in FIXED:
         return Feature(name, *FIXED[kind], nesting)
     if kind in ("Image", "LabeledImage", "Video"):
-        if kind == "Video":
-            nesting = (*nesting, shape[0] if shape else None)
+        nesting = (*nesting, *(shape[:1] or (None,))) if kind == "Video" else nesting
         codec = content.get("encodingFormat") or content.get("encoding_format") or "png"
         return Feature(name, "picture", shape[-3:] or (None, None, 3), dtype or "uint8", nesting, codec=codec)
-    if kind in ("Tensor", "Scalar"):
-        encoding = str(content.get("encoding") or "none").lower()
-        if dtype in ("string", "object", "str"):
-            return Feature(name, "text", shape, "string", nesting)
-        return _tensor(name, shape, dtype, nesting, encoding)
-    return Feature(name, "other", shape, dtype or kind, nesting)
-
-
-def _tensor(name: str, shape: Shape, dtype: str, nesting: Shape, encoding: str) -> Feature:
+    if kind not in ("Tensor", "Scalar"):
+        return Feature(name, "other", shape, dtype or kind, nesting)
+    if dtype in ("string", "object", "str"):
+        return Feature(name, "text", shape, "string", nesting)
+    encoding = str(content.get("encoding") or "none").lower()
     try:
         readable = dtype == BFLOAT16 or np.dtype(dtype).kind in "fiub"
     except TypeError:  # float8 and the like
@@ -140,12 +135,6 @@ def _content(node: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         if node.get(key) is not None:
             return kind, node[key]
     return str(node.get("pythonClassName") or "").rsplit(".", 1)[-1], {}
-
-
-def _shape(value: Any) -> Shape:
-    if isinstance(value, dict):
-        value = value.get("dimensions")
-    return tuple(_size(item) for item in value or ())
 
 
 def _size(value: Any) -> int | None:
@@ -227,7 +216,7 @@ class Steps:
         if feature.name not in self.example:
             return None
         if feature.kind in ("picture", "text") or feature.encoding != "none":
-            count = self.example.count(feature.name)
+            count = len(self.example.blobs(feature.name))
             return count // feature.width if feature.kind == "text" and feature.width else count
         return len(self.example.numbers(feature.name)) // feature.width if feature.width else None
 
@@ -241,9 +230,8 @@ class Steps:
         for level in range(len(feature.nesting) - 1):
             lengths = self.example.ints(f"{feature.name}/ragged_row_lengths_{level}")
             if len(lengths) != math.prod(sizes):
-                raise EpisodeError(
-                    self.name, f"{feature.name} has {len(lengths)} rows for {math.prod(sizes)}"
-                )
+                said = f"{feature.name} has {len(lengths)} rows for {math.prod(sizes)}"
+                raise EpisodeError(self.name, said)
             if len(lengths) and (lengths != lengths[0]).any():
                 said = f"{feature.name} varies from {lengths.min()} to {lengths.max()} entries a step"
                 raise EpisodeError(self.name, said)
