@@ -54,16 +54,11 @@ _REMEDY = (
 
 @dataclass(frozen=True)
 class HandModels:
-    """The bytes of both models.
+    """The bytes of both models."""
 
-    Attributes:
-        palm, hand: content of the .tflite files.
-        where: what they were read from.
-    """
-
-    palm: bytes
+    palm: bytes  # content of the .tflite file, as of `hand`
     hand: bytes
-    where: str
+    where: str  # what they were read from
 
     @property
     def digest(self) -> str:
@@ -150,16 +145,12 @@ class Network:
 class Hand:
     """One hand in one picture.
 
-    Attributes:
-        side: left or right, the person's own.
-        score: probability that there is a hand, 0..1.
-        points: (21, 2) x and y as fractions of the picture's width and height; may lie outside it.
-            Point 0 is the wrist; four points of each finger follow, thumb first, tips at 4, 8, 12, 16, 20.
+    Of the points, 0 is the wrist; four of each finger follow, thumb first, tips at 4, 8, 12, 16, 20.
     """
 
-    side: str
-    score: float
-    points: Floats
+    side: str  # left or right, the person's own
+    score: float  # probability that there is a hand, 0..1
+    points: Floats  # (21, 2) x and y as fractions of the picture's width and height; may lie outside it
 
 
 @dataclass(frozen=True)
@@ -181,17 +172,11 @@ class Square:
 
 @dataclass(frozen=True)
 class Track:
-    """A tracked hand.
+    """A tracked hand."""
 
-    Attributes:
-        square: where the next picture is searched for it.
-        right: sum of P(right) over the pictures it was seen in.
-        seen: number of them.
-    """
-
-    square: Square
-    right: float = 0.0
-    seen: int = 0
+    square: Square  # where the next picture is searched for it
+    right: float = 0.0  # sum of P(right) over the pictures it was seen in
+    seen: int = 0  # number of them
 
 
 class MediaPipeHands:
@@ -224,7 +209,9 @@ class MediaPipeHands:
         height, width = picture.shape[:2]
         tracks = self._tracks
         if len(tracks) < HANDS:
-            tracks = tracks + self._new_tracks(picture, [track.square for track in tracks])
+            squares = [square_of_palm(palm) for palm in self._palms(picture)[:HANDS]]
+            fresh = (s for s in squares if not any(_overlap(s, track.square) > SAME for track in tracks))
+            tracks = [*tracks, *map(Track, fresh)]
         found: list[tuple[Track, float, Floats]] = []
         for track in tracks:
             score, points, p_right = self._look(picture, track.square)
@@ -241,10 +228,6 @@ class MediaPipeHands:
             for side, (_, score, points) in zip(sides, found, strict=True)
             if side
         ]
-
-    def _new_tracks(self, picture: Images, known: list[Square]) -> list[Track]:
-        squares = [square_of_palm(palm) for palm in self._palms(picture)[:HANDS]]
-        return [Track(square) for square in squares if not any(_overlap(square, old) > SAME for old in known)]
 
     def _palms(self, picture: Images) -> list[Floats]:
         """Return the palms in a picture, the surest first: (9, 2) two corners and seven points in pixels."""
@@ -352,10 +335,9 @@ def square_of_points(points: Floats) -> Square:
     """Return the square in which the hand of those points (21, 2) is expected in the next picture."""
     ahead = ((points[5] + points[13]) / 2 + points[9]) / 2
     angle = _upright(points[0], ahead)
-    known = points[_KNUCKLES]
     cos, sin = math.cos(angle), math.sin(angle)
     turn = np.array([[cos, -sin], [sin, cos]])  # from the hand's own axes to the picture's
-    own = known @ turn
+    own = points[_KNUCKLES] @ turn
     low, high = own.min(axis=0), own.max(axis=0)
     width, height = high - low
     return _grown(turn @ ((low + high) / 2), width, height, angle, scale=2.0, up=0.1)
@@ -369,20 +351,13 @@ def _upright(start: Floats, end: Floats) -> float:
 
 def _grown(centre: Floats, width: float, height: float, angle: float, scale: float, up: float) -> Square:
     """Return the square round a rotated box, moved along the hand by `up` of its height and scaled."""
-    return Square(
-        float(centre[0] + height * up * math.sin(angle)),
-        float(centre[1] - height * up * math.cos(angle)),
-        float(max(width, height, 1.0) * scale),
-        angle,
-    )
+    x, y = centre + height * up * np.array([math.sin(angle), -math.cos(angle)])
+    return Square(float(x), float(y), float(max(width, height, 1.0) * scale), angle)
 
 
 def _overlap(one: Square, other: Square) -> float:
-    corners = [
-        np.array([[s.x - s.side / 2, s.y - s.side / 2], [s.x + s.side / 2, s.y + s.side / 2]])
-        for s in (one, other)
-    ]
-    return float(box_overlap(corners[0], corners[1][None])[0])
+    mine, theirs = (np.array([s.x, s.y]) + np.array([[-0.5], [0.5]]) * s.side for s in (one, other))
+    return float(box_overlap(mine, theirs[None])[0])
 
 
 def _same(points: Floats, others: Floats) -> bool:
