@@ -1,7 +1,4 @@
-"""Sum up training steps, and detect bad ones: a loss that is not finite, or a gradient far above its mean.
-
-The recipe decides what the run does at a bad step: stop and name the windows, or skip the step and count it.
-"""
+"""Sum up training steps, and detect bad ones: a loss that is not finite, or a gradient far above its mean."""
 
 import math
 import resource
@@ -28,12 +25,7 @@ SETTLED = 20  # steps before a norm can be a spike
 
 
 class StepMetrics:
-    """Sums of losses, kept on the device of the losses, so that a step needs only one transfer.
-
-    Args:
-        names: the ids of the embodiments.
-        device: the device of the losses.
-    """
+    """Sums of losses by embodiment, kept on their device, so that a step needs only one transfer."""
 
     def __init__(self, names: list[str], device: torch.device) -> None:
         self._names = sorted(names)
@@ -96,9 +88,7 @@ def suspects(
 ) -> list[tuple[float, str]]:
     """Return the windows of this rank that may be the cause of a bad step, each with its loss.
 
-    Args:
-        batches: the batches of the step, each with the loss (B,) of its windows.
-        sets: shard sets by embodiment, for the episodes' names.
+    Each batch of the step comes with the loss (B,) of its windows; the shard sets have the episodes' names.
     """
     found: list[tuple[Any, ...]] = []
     for batch, losses in batches:
