@@ -35,9 +35,6 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
 class Pendulum:
     """The environment at a given start.
 
-    Args:
-        angle, speed: angle and speed at the start.
-
     Raises:
         MissingDependencyError: gymnasium or pygame is not installed.
     """
@@ -74,10 +71,8 @@ class Pendulum:
         import cv2
 
         edge = (DRAWN - ZOOMED) // 2
-        pixels = self._env.render()[edge : edge + ZOOMED, edge : edge + ZOOMED]
-        small: NDArray[np.uint8] = cv2.resize(
-            np.ascontiguousarray(pixels), (SIZE, SIZE), interpolation=cv2.INTER_AREA
-        )
+        pixels = np.ascontiguousarray(self._env.render()[edge : edge + ZOOMED, edge : edge + ZOOMED])
+        small: NDArray[np.uint8] = cv2.resize(pixels, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
         return small
 
     def advance(self, action: NDArray[np.float32]) -> None:

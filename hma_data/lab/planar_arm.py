@@ -63,11 +63,7 @@ def _as_lerobot(demo: Demo) -> LeRobotEpisode:
 
 
 class Arm:
-    """The arm and its blocks.
-
-    Args:
-        joints: (J,) angles at the start.
-        blocks: (B, 3) x, y, angle of each block at the start.
+    """The arm and its blocks, at start with joint angles (J,) and blocks (B, 3): x, y, angle of each.
 
     Raises:
         MissingDependencyError: pymunk is not installed.
