@@ -6,10 +6,7 @@ The arm stands in the middle of a walled square and pushes three loose blocks. E
 limited torque, and the elbow has stops; friction with the table slows the blocks. The velocities in a
 frame are applied between its picture and the next. Joint angles and velocities are recorded beside them.
 The reward is the distance that the blocks moved, in px. An episode is a success if some block ends 20 px
-or more from its first place.
-
-A driver runs random manoeuvres one after another: go to a point or to a block, weave, hold a velocity,
-rest.
+or more from its first place. A driver runs random manoeuvres one after another.
 
 Lengths are pixels of the 512 × 512 arena with y downward, angles radians (the shoulder's clockwise from
 +x, the elbow's from the upper arm on), velocities rad/s. J = 2 joints, B = 3 blocks, T frames.

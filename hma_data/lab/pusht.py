@@ -1,7 +1,6 @@
 """Record gym-pusht as two robots: one position-controlled to HDF5, one velocity-controlled to MCAP.
 
-Both push a T toward its goal pose in the environment's own physics, and its own renderer draws the pictures.
-They share nothing else:
+Both push a T toward its goal pose in the environment's own physics, drawn by its own renderer:
 
     pusht_fast  10 Hz   action (x, y): target of the pusher in px, the environment's native action
     pusht_slow   5 Hz   action (vx, vy, lift): velocity in px/s; lift 1 raises the pusher over the T,
@@ -74,9 +73,8 @@ class Arena:
         bars = sorted(sorted(shape.get_vertices()) for shape in self._env.block.shapes)  # a set has no order
         boxes = [(np.min(corners, axis=0), np.max(corners, axis=0)) for corners in bars]
         body, (pusher,) = self._env.block, self._env.agent.shapes
-        self.tee = Tee(
-            np.array(boxes), np.array(body.center_of_gravity), body.mass, body.moment, pusher.radius
-        )
+        center = np.array(body.center_of_gravity)
+        self.tee = Tee(np.array(boxes), center, body.mass, body.moment, pusher.radius)
         self.goal: Floats = np.asarray(self._env.goal_pose, dtype=np.float64)
         if start == "near":
             self._env.reset(options={"reset_to_state": self._near_goal(rng)})

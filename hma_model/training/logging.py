@@ -16,7 +16,6 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from hma_data.console import human_seconds
@@ -186,12 +185,10 @@ class RunLog:
             self._live.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *fault: Any) -> None:
         self._present(force=True)
         if self._live:
-            self._live.__exit__(kind, fault, trace)
+            self._live.__exit__(*fault)
         if self._file:
             self._file.close()
         for tracker in self._trackers:

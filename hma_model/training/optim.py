@@ -91,11 +91,8 @@ def _growing_matrices(model: "HMA") -> set[str]:
         for space in model.embodiments.values():
             wider.add_embodiment(space)
     shapes = {name: parameter.shape for name, parameter in wider.named_parameters()}
-    return {
-        name
-        for name, parameter in model.named_parameters()
-        if sum(a != b for a, b in zip(parameter.shape, shapes[name])) >= 2
-    }
+    grown = {n: sum(a != b for a, b in zip(p.shape, shapes[n])) for n, p in model.named_parameters()}
+    return {name for name, sides in grown.items() if sides >= 2}
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:

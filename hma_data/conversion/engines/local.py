@@ -69,9 +69,8 @@ class WorkerProcess:
     def __init__(self, make_work: Callable[[int], Work], workers: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(
-            target=serve, args=(theirs, make_work, workers), daemon=True, name="hma-worker"
-        )
+        given = theirs, make_work, workers
+        self.process = context.Process(target=serve, args=given, daemon=True, name="hma-worker")
         self.process.start()
         theirs.close()
         self.ready = False  # whether it can take a unit
@@ -207,11 +206,8 @@ class Pool:
 def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> None:
     """Run units that come by the pipe and report on them until it closes; a worker's process calls this.
 
-    Args:
-        pipe: receives (unit, attempt); sends (kind, value), where kind is ready, event, done, failed or
-            short of memory.
-        make_work: called once.
-        workers: number of workers of the whole run.
+    The pipe receives (unit, attempt) and sends (kind, value), where kind is ready, event, done, failed or
+    short of memory. `workers` is the number of workers of the whole run.
     """
     take_ordinary_priority()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -109,9 +110,8 @@ class Worker:
         self, make_work: Callable[[int], Work], workers: int, quiet_s: float | None, answer_s: float
     ) -> None:
         self.limits = Limits(quiet_s)
-        self.pool = Pool(
-            lambda: WorkerProcess(make_work, workers), 1, self, lambda _, event: self._events.append(event)
-        )
+        start = partial(WorkerProcess, make_work, workers)
+        self.pool = Pool(start, 1, self, lambda _, event: self._events.append(event))
         self._answer_s = answer_s
         self._unit: tuple[int, Any, Attempt] | None = None
         self._opening = False

@@ -7,9 +7,8 @@ hands are tracked. The constants are those of MediaPipe's published graphs: palm
 palm_detection_detection_to_roi, hand_landmark_cpu, hand_landmark_landmarks_to_roi and
 hand_landmark_tracking_cpu.
 
-Left and right are the person's own hands in a picture that is not mirrored. MediaPipe's graph assumes
-mirrored pictures, as front cameras show them, and so calls a right hand in a plain picture "Left". The
-model's number itself is the probability of a right hand in a plain picture.
+Left and right are the person's own hands. The model's handedness is the probability of a right hand in a
+picture that is not mirrored; MediaPipe's graph assumes mirrored pictures, and calls such a hand "Left".
 
 Geometry is in pixels, angles in radians, x to the right and y down.
 """
@@ -104,7 +103,6 @@ class Network:
         content: of the .tflite file.
         side: pixels of its square input.
         widths: of the wanted outputs, each the product of its shape; equal ones in the order of names.
-        where: for errors.
 
     Raises:
         SourceError: it is another model.
@@ -182,9 +180,7 @@ class Track:
 class MediaPipeHands:
     """A detector of at most one left and one right hand in each picture of a video, in order.
 
-    Args:
-        models: their files; None takes $HMA_HAND_MODELS.
-        mirrored: the pictures are mirrored, as front cameras show them.
+    `mirrored` pictures are as front cameras show them. Without models it takes those of $HMA_HAND_MODELS.
 
     Raises:
         SourceError: there are no models, or they are other models.
@@ -271,8 +267,7 @@ def cut(picture: Images, square: Square, size: int) -> NDArray[np.float32]:
 def palm_anchors() -> Floats:
     """Return the palm model's anchors, (2016, 2) x and y in 0..1: two a cell of 24×24, six of 12×12."""
     found = []
-    for stride, copies in ((8, 2), (16, 6)):
-        cells = PALM_SIDE // stride
+    for cells, copies in ((24, 2), (12, 6)):
         y, x = np.mgrid[:cells, :cells]
         centres = (np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / cells
         found.append(np.repeat(centres, copies, axis=0))
@@ -301,11 +296,9 @@ def decode_palms(values: NDArray[Any], scores: NDArray[Any], anchors: Floats) ->
 
 
 def merge_overlapping(shapes: Floats, chances: Floats) -> list[Floats]:
-    """Merge overlapping shapes by weighted non-maximum suppression; probabilities are the weights.
+    """Merge overlapping shapes (n, 9, 2) by non-maximum suppression, weighted by their probabilities (n,).
 
-    Args:
-        shapes: (n, 9, 2), the first two rows corners of a box; the surest first.
-        chances: (n,).
+    The first two rows of a shape are corners of its box; the surest shape is first.
     """
     merged = []
     while len(shapes):

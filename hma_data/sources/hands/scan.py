@@ -76,8 +76,7 @@ def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrore
     Args:
         folder: str or path of a folder of videos, or of one video.
         out: str or path of the file to write, .parquet.
-        models: str or path of a folder or bundle; None takes $HMA_HAND_MODELS.
-        mirrored: the pictures are mirrored.
+        models, mirrored: see `load_models` and MediaPipeHands.
 
     Returns:
         the number of hands found.

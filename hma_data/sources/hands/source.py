@@ -16,9 +16,9 @@ needed hand does: see the module `runs`.
 
 With annotations, each run of at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain
 name `clip.mp4` is the longest run. Runs of one video share a group, so that they come into one split. The
-detector runs while an episode is read, not while episodes are counted; with it, a video is one episode,
-`clip.mp4`: its longest run. `detect` writes a table of labels, with which all runs become episodes. The
-episode's metadata and flags count the frames that are held, masked and left out.
+detector runs only while an episode is read; so with it, a video is one episode, `clip.mp4`: its longest run.
+`scan.detect` writes a table of labels, with which all runs become episodes. The episode's metadata and flags
+count the frames that are held, masked and left out.
 
 T frames of an episode.
 """
@@ -248,11 +248,8 @@ def _episode(
     state = [_signal(embodiment.state, file, labels, span, not steady)] if embodiment.state else []
     # Frames in no run count in the first run, or in the only one that is read.
     left = len(labels) - (stop - start - 1) if number is None else counts["dropped"] if number == 0 else 0
-    flags = {
-        "held_frames": int(runs.held[start : stop - 1].sum()),
-        "masked_frames": int(runs.missing[start : stop - 1].sum()),
-        "dropped_frames": left,
-    }
+    held, masked = (int(marked[start : stop - 1].sum()) for marked in (runs.held, runs.missing))
+    flags = {"held_frames": held, "masked_frames": masked, "dropped_frames": left}
     return Episode(
         id=episode_id,
         streams={camera.name: stream for camera in embodiment.cameras},

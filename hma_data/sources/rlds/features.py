@@ -43,25 +43,15 @@ FIXED: dict[str, tuple[str, Shape, str]] = {  # class -> kind, shape and dtype
 
 @dataclass(frozen=True)
 class Feature:
-    """One leaf of features.json.
+    """One leaf of features.json."""
 
-    Attributes:
-        name: flattened, as records name it: steps/observation/image.
-        kind: number, text, picture or other (stored in a way that is not read here).
-        shape: of one value, with None where a size varies; pictures are (H, W, C).
-        dtype: of one value, e.g. float32; "string" for text.
-        nesting: lengths of the sequences around it, outermost first, with None where they vary.
-        encoding: none, bytes or zlib.
-        codec: png or jpeg for pictures, as stated; the pictures themselves may differ.
-    """
-
-    name: str
-    kind: str
-    shape: Shape
-    dtype: str
-    nesting: Shape = ()
-    encoding: str = "none"
-    codec: str | None = None
+    name: str  # flattened, as records name it: steps/observation/image
+    kind: str  # number, text, picture or other (stored in a way that is not read here)
+    shape: Shape  # of one value, with None where a size varies; pictures are (H, W, C)
+    dtype: str  # of one value, e.g. float32; "string" for text
+    nesting: Shape = ()  # lengths of the sequences around it, outermost first, with None where they vary
+    encoding: str = "none"  # none, bytes or zlib
+    codec: str | None = None  # png or jpeg for pictures, as stated; the pictures themselves may differ
 
     @property
     def width(self) -> int | None:
@@ -89,11 +79,8 @@ def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
         children = content.get("features", content)
         if isinstance(children.get("type"), str):  # legacy, and a feature is named "features"
             children = content
-        return [
-            leaf
-            for key, child in children.items()
-            for leaf in _leaves(child, f"{name}/{key}" if name else key, nesting)
-        ]
+        home = f"{name}/" if name else ""
+        return [leaf for key, child in children.items() for leaf in _leaves(child, home + key, nesting)]
     if kind in ("Sequence", "Dataset"):
         return _leaves(content["feature"], name, (*nesting, _size(content.get("length"))))
     if kind == "Translation":
@@ -145,12 +132,7 @@ def _size(value: Any) -> int | None:
 
 
 class Steps:
-    """One record and its columns over the steps.
-
-    Args:
-        example: the record.
-        features: those over the steps, by their path in a step.
-        name: the episode's id, for errors.
+    """One record and its columns over the steps; `features` are by their path in a step.
 
     Raises:
         EpisodeError: (here and in every method) there are no steps, or a feature is missing, of another

@@ -29,9 +29,7 @@ def inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
     lengths, first = _survey(folder, refs, chosen, survey)
     if first is None:
         found = survey.findings(())
-        why = next(
-            (one for one in reversed(found) if one.check == "files"), found[0] if found else "is empty"
-        )
+        why = next((one for one in reversed(found) if one.check == "files"), found[0])
         raise SourceError(uri, f"holds no readable episode: {why}", "copy its files again")
     keys = tuple(survey.key(_key_info(first, key, survey)) for key in folder.step_features)
     return Inspection(
@@ -98,12 +96,9 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
 def _facts(folder: Folder) -> dict[str, str]:
     """Return facts about the dataset: name, version, splits, and the keys outside the steps."""
     splits = [f"{name} {sum(shard.count() for shard in shards)}" for name, shards in folder.splits.items()]
-    found = {
-        "dataset": folder.name,
-        "version": folder.version,
-        "splits": ", ".join(splits),
-        "episode keys": ", ".join(name for name in folder.features if not name.startswith("steps/")),
-    }
+    outside = [name for name in folder.features if not name.startswith("steps/")]
+    found = {"dataset": folder.name, "version": folder.version}
+    found |= {"splits": ", ".join(splits), "episode keys": ", ".join(outside)}
     return {name: value for name, value in found.items() if value}
 
 
@@ -131,10 +126,7 @@ def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
 
 
 def _codec(steps: Steps, key: str) -> str:
-    """Return the codec of a key's pictures, from the first bytes of the first one.
-
-    TFDS stores the files as they were given, whatever features.json states.
-    """
+    """Return the codec of a key's first picture; TFDS stores files as given, whatever is stated."""
     if steps.features[key].kind != "picture":
         return "raw"
     head = bytes(steps.blobs(key)[0][:8])

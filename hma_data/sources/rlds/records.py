@@ -9,8 +9,6 @@ offset of a record, so a record is found by its number.
 
 Where the records of a file lie is kept in `$HMA_CACHE/rlds`, by default `~/.cache/hma/rlds`, while the file
 keeps its state (size and date, or ETag). Deleting it costs a new scan.
-
-N records.
 """
 
 import hashlib
@@ -47,21 +45,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Framing:
-    """The positions of the records of a file.
+    """The positions of the N records of a file."""
 
-    Attributes:
-        offsets: (N,) int64, first byte of each record's data; in an ArrayRecord file the record's number.
-        lengths: (N,) int64, bytes of data.
-        checks: (N,) uint32, checksum of the data as stored.
-        fault: why reading stopped after the last record; empty where the file ends there.
-        whole: whether the file was read to its end (or to `fault`).
-    """
-
-    offsets: NDArray[np.int64]
-    lengths: NDArray[np.int64]
-    checks: NDArray[np.uint32]
-    fault: str = ""
-    whole: bool = True
+    offsets: NDArray[np.int64]  # first byte of each record's data; in an ArrayRecord file the record's number
+    lengths: NDArray[np.int64]  # bytes of data
+    checks: NDArray[np.uint32]  # checksums of the data as stored
+    fault: str = ""  # why reading stopped after the last record; empty where the file ends there
+    whole: bool = True  # whether the file was read to its end (or to `fault`)
 
     def __len__(self) -> int:
         return len(self.offsets)
@@ -165,7 +155,7 @@ def _save_index(path: Path, frames: Framing) -> None:
     try:
         with atomic_path(path) as part, part.open("wb") as file:
             np.savez(file, **vars(frames))
-    except OutputError as fault:
+    except (OSError, OutputError) as fault:
         log.info("the index of records cannot be kept: %s", fault)
 
 
@@ -199,13 +189,8 @@ def scan_tfrecord(files: Any, path: str, size: int, known: Framing = EMPTY, limi
             lengths.append(end - position - HEADER.size)
             checks.append(FOOTER.unpack_from(tail)[0])
             header, position = tail[FOOTER.size :], end + FOOTER.size
-    return Framing(
-        np.array(offsets, np.int64),
-        np.array(lengths, np.int64),
-        np.array(checks, np.uint32),
-        fault,
-        bool(fault) or position >= size,
-    )
+    columns = np.array(offsets, np.int64), np.array(lengths, np.int64), np.array(checks, np.uint32)
+    return Framing(*columns, fault, bool(fault) or position >= size)
 
 
 def _data_end(header: bytes, position: int, size: int) -> tuple[int, str]:
@@ -304,7 +289,6 @@ def _open_array_record(path: str) -> Any:
     try:
         from array_record.python.array_record_module import ArrayRecordReader
     except ImportError as fault:
-        raise MissingDependencyError(
-            path, "ArrayRecord files need the package array-record", "uv sync --extra arrayrecord"
-        ) from fault
+        said = "ArrayRecord files need the package array-record"
+        raise MissingDependencyError(path, said, "uv sync --extra arrayrecord") from fault
     return ArrayRecordReader(path, RANDOM_ACCESS)

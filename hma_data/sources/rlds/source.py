@@ -80,11 +80,10 @@ class RldsSource:
         steps = Steps(example, folder.step_features, episode_id)
         hz = embodiment.frequency_hz
         times = rate_times(steps.count, hz if isinstance(hz, float) else embodiment.rate_hz)
+        cameras = {camera.name: steps.decoder(camera.key) for camera in embodiment.cameras}
         return Episode(
             id=episode_id,
-            streams={
-                camera.name: Pictures(times, steps.decoder(camera.key)) for camera in embodiment.cameras
-            },
+            streams={name: Pictures(times, decode) for name, decode in cameras.items()},
             actions=_signals(steps, embodiment.action, times),
             states=_signals(steps, embodiment.state, times),
             instruction=_instruction(folder, steps, embodiment.source.instruction),
@@ -125,10 +124,8 @@ def _remote_refs(split: str, shard: Shard, own: str | None, rate: float) -> list
     fingerprint = hashlib.sha256(mark(found).encode()).hexdigest()[:24]
     records = shard.stated or 1
     frames = max(1, round(rate * found["size"] / records))
-    return [
-        EpisodeRef(episode_id(split, shard.first + position), frames, own, fingerprint)
-        for position in range(records)
-    ]
+    ids = (episode_id(split, shard.first + position) for position in range(records))
+    return [EpisodeRef(name, frames, own, fingerprint) for name in ids]
 
 
 def _steps_per_byte(folder: Folder, split: str) -> float:
@@ -156,9 +153,8 @@ def is_camera(feature: Feature) -> bool:
     """Check whether a feature holds a colour picture a step, encoded or as a tensor."""
     if feature.dtype != "uint8" or len(feature.nesting) != 1:
         return False
-    return feature.kind == "picture" or (
-        feature.kind == "number" and len(feature.shape) == 3 and feature.shape[2] == 3
-    )
+    colours = feature.kind == "number" and len(feature.shape) == 3 and feature.shape[2] == 3
+    return feature.kind == "picture" or colours
 
 
 def _check_keys(folder: Folder, embodiment: Embodiment) -> None:

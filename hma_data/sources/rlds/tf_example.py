@@ -18,11 +18,7 @@ Span = tuple[int, int]
 
 
 class Example:
-    """The features of one record.
-
-    Args:
-        data: the serialized message.
-        where: the episode, for errors.
+    """The features of one record of the episode `where`.
 
     Raises:
         EpisodeError: (here and in every method) the bytes are not an Example, a feature is missing
