@@ -282,14 +282,12 @@ def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
 
 
 def _weave(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
-    """Return a manoeuvre that moves each joint by its own slow sine."""
     strength, hz, phase = rng.uniform(0.8, 2.4, 2), rng.uniform(0.2, 0.9, 2), rng.uniform(0, 2 * np.pi, 2)
     seconds = iter(np.arange(STEPS) / HZ)
     return lambda arm: strength * np.sin(2 * np.pi * hz * next(seconds) + phase)
 
 
 def _hold(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
-    """Return a manoeuvre that holds one velocity; sometimes only one joint moves."""
     velocities = rng.uniform(-SPEED, SPEED, 2)
     if rng.random() < 0.4:
         velocities[rng.integers(2)] = 0.0

@@ -233,8 +233,9 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
             turn = ros_value(vector, 0.0, 0.0, 0.0)
             fields = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
         stamp = EPOCH_NS + episode * 60_000_000_000 + tick * round(TICK_S * 1e9)
-        frame, *delay = ("camera", 12e6, 20e6) if event == "camera" else ("arena", 5e5, 2e6)
-        received = stamp + int(rng.integers(*map(int, delay)))
+        camera = event == "camera"
+        delay = rng.integers(12_000_000, 20_000_000) if camera else rng.integers(500_000, 2_000_000)
+        frame, received = "camera" if camera else "arena", stamp + int(delay)
         messages.append(Message(topic, stamp, received, kind, frame, fields))
     facts = {"success": str(arena.success).lower(), "start": STARTS[episode % len(STARTS)], "seed": str(seed)}
     write_mcap(path, messages, {"robot": "pusht_slow", **facts})

@@ -29,14 +29,13 @@ class StepMetrics:
 
     def __init__(self, names: list[str], device: torch.device) -> None:
         self._names = sorted(names)
-        self._place = {name: i for i, name in enumerate(self._names)}
         self._loss = torch.zeros(1, device=device)
         self._sums = torch.zeros(2, len(names), device=device)
         self._objectives = torch.zeros(len(OBJECTIVES), device=device)
 
     def add(self, embodiment: list[str], output: "Output") -> None:
         """Add the loss of a pass, the loss of each sample, and the objective."""
-        index = torch.tensor([self._place[name] for name in embodiment], device=self._sums.device)
+        index = torch.tensor([self._names.index(name) for name in embodiment], device=self._sums.device)
         losses = output.per_sample.to(self._sums)
         self._loss += output.loss.detach().to(self._loss)
         self._sums.index_add_(1, index, torch.stack([losses, torch.ones_like(losses)]))

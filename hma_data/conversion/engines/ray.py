@@ -199,7 +199,6 @@ class _Actors:
         self._placed = time.monotonic()  # when an actor was last ready
 
     def turn(self) -> Iterator[Any]:
-        """Hand out units, then process the answers of the actors; yield results."""
         while len(self._slots) < self._count:
             actor = self._class.remote(*self._arguments)
             self._slots.append(_Slot(actor, actor.open.remote()))
@@ -259,7 +258,6 @@ class _Actors:
                 raise HMAError("the Ray cluster", fault, INSTALLED)
 
     def close(self) -> None:
-        """End every actor; its process ends with it."""
         for slot in self._slots:
             self._ray.kill(slot.actor)
 

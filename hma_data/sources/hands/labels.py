@@ -303,10 +303,7 @@ class Ego4dFho:
 
 
 def _compact(item: dict[str, Any]) -> Any:
-    """Return what is kept of an object while fho_main.json is parsed, innermost objects first.
-
-    The whole file would not fit in memory.
-    """
+    """Return what is kept of an object while fho_main.json, too large for memory, is parsed from inside."""
     if "object_type" in item:
         box, kind = item.get("bbox"), item["object_type"]
         sides = ("x", "y", "width", "height")

@@ -171,7 +171,6 @@ class _Pictures:
         self._file, self._indices = file, indices
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
         return self._file.frames(self._indices[np.asarray(indices, np.int64)])
 
 

@@ -36,8 +36,6 @@ NAMED = (  # forms of file names: the suffix after the number, or before it as T
 
 
 class _StatedSplit(BaseModel):
-    """One split in dataset_info.json."""
-
     model_config = ConfigDict(alias_generator=to_camel)
 
     name: str = ""
@@ -46,8 +44,6 @@ class _StatedSplit(BaseModel):
 
 
 class _DatasetInfo(BaseModel):
-    """The part of dataset_info.json that is used."""
-
     model_config = ConfigDict(alias_generator=to_camel)
 
     name: str = ""
@@ -56,7 +52,6 @@ class _DatasetInfo(BaseModel):
     splits: tuple[_StatedSplit, ...] = ()
 
     def shard_path(self, split: _StatedSplit, number: int) -> str:
-        """Return the path of a split's shard, relative to the folder."""
         shards = len(split.shard_lengths)
         digits = max(5, len(str(shards)))
         place, total = f"{number:0{digits}d}", f"{shards:0{digits}d}"
@@ -239,7 +234,6 @@ def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) 
 
 
 def _dataset_info(files: Any, path: str) -> _DatasetInfo:
-    """Return the content of dataset_info.json; all defaults where there is none."""
     data = fetch_whole(files, path, LONGEST_JSON)
     try:
         return _DatasetInfo() if data is None else _DatasetInfo.model_validate_json(data)
@@ -284,10 +278,7 @@ def _stated_shards(
 def _named_shards(
     files: Any, root: str, info: _DatasetInfo, listing: Iterable[str]
 ) -> tuple[dict[str, list[Shard]], list[str]]:
-    """Return the shards found by their names alone, and what is missing.
-
-    This serves a renamed dataset, or one without dataset_info.json.
-    """
+    """Return the same for a renamed dataset, or one without dataset_info.json, by the shards' names alone."""
     stated = {split.name: split.shard_lengths for split in info.splits}
     shards: dict[str, list[Shard]] = {}
     totals: dict[str, int] = {}

@@ -94,7 +94,6 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
 
 
 def _facts(folder: Folder) -> dict[str, str]:
-    """Return facts about the dataset: name, version, splits, and the keys outside the steps."""
     splits = [f"{name} {sum(shard.count() for shard in shards)}" for name, shards in folder.splits.items()]
     outside = [name for name in folder.features if not name.startswith("steps/")]
     found = {"dataset": folder.name, "version": folder.version}

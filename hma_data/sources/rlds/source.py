@@ -238,10 +238,7 @@ def _instruction(folder: Folder, steps: Steps, key: str | None) -> str:
 
 
 def _success(folder: Folder, steps: Steps) -> bool | None:
-    """Return whether the episode succeeded, as it states itself; None where it is unknown.
-
-    Without a statement, an episode succeeds where its last step is terminal and has a positive reward.
-    """
+    """Return the stated success; else True where the last step is terminal with a positive reward, or None."""
     stated = folder.features.get("episode_metadata/success")
     if stated:
         value = scalar(steps.example, stated)
@@ -253,7 +250,6 @@ def _success(folder: Folder, steps: Steps) -> bool | None:
 
 
 def _metadata(folder: Folder, example: Example) -> dict[str, Any]:
-    """Return the single values outside the steps."""
     found = {
         name.removeprefix("episode_metadata/"): scalar(example, feature)
         for name, feature in folder.features.items()
