@@ -238,7 +238,7 @@ def _instruction(folder: Folder, steps: Steps, key: str | None) -> str:
 
 
 def _success(folder: Folder, steps: Steps) -> bool | None:
-    """Return the stated success; else True where the last step is terminal with a positive reward, or None."""
+    """Return the stated success; without one, True where the last step is terminal and has a reward > 0."""
     stated = folder.features.get("episode_metadata/success")
     if stated:
         value = scalar(steps.example, stated)
