@@ -96,7 +96,7 @@ def _curves(page: Page, recipe: dict[str, Any], steps: Lines, evaluations: Lines
     discrete = any("perplexity" in line for line in evaluations)
     label = "loss, nats a token" if video and discrete else "loss"
     page.section("Losses")
-    plot = loss_curves(*curves, label)
+    plot = loss_curves(curves[0], curves[1], label)
     page.picture(plot, "svg+xml", "Training (lines) and held-out (markers) loss by robot")
 
 
