@@ -22,7 +22,7 @@ import numpy as np
 
 from hma_data import lab
 from hma_data.console import human_bytes, human_seconds, progress
-from hma_data.conversion.engines.base import Attempt, Report, Retry, Work
+from hma_data.conversion.engines import Attempt, Report, Retry, Work
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings

@@ -21,7 +21,7 @@ from hma_data.bench import Bench, make_robot, rss_mib
 
 def measure_convert(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Time the tokenizer alone on as many frames, then run the conversion and measure its processes."""
-    from hma_data.conversion.engines.base import Limits
+    from hma_data.conversion.engines import Limits
     from hma_data.conversion.job import convert
     from hma_data.conversion.plan import Settings
 

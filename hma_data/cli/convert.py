@@ -131,7 +131,7 @@ def _run_all(jobs: "list[ConversionJob]", run: "Callable[[ConversionJob], bool]"
 
 def _convert(job: "ConversionJob", json: bool, extend: bool, overwrite: bool, share: "Share | None") -> bool:
     """Run a conversion, or a share of it; return False if too many episodes are in quarantine."""
-    from hma_data.conversion.engines.base import Limits
+    from hma_data.conversion.engines import Limits
     from hma_data.conversion.job import convert as run
     from hma_data.conversion.job import convert_share
 

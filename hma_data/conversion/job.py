@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from hma_data.conversion.engines.base import LIMITS, Limits, Retry
+from hma_data.conversion.engines import LIMITS, Limits, Retry
 from hma_data.conversion.engines.local import run as run_local
 from hma_data.conversion.extend import content_of, extended
 from hma_data.conversion.output import (

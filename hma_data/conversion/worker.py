@@ -21,7 +21,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.conversion.engines.base import FIRST, Attempt, Report, Step, Work
+from hma_data.conversion.engines import FIRST, Attempt, Report, Step, Work
 from hma_data.conversion.extend import Content, kept_frames
 from hma_data.conversion.output import Made
 from hma_data.conversion.plan import ShardUnit

@@ -61,9 +61,8 @@ def record(
             import_module(module).record(Path(folder) / name, robot, _counted(episodes, on_progress), seed)
             (Path(folder) / name).rename(final)
     except OSError as fault:
-        raise OutputError(
-            final, f"cannot be written: {fault}", "check the free space and the permissions"
-        ) from fault
+        remedy = "check the free space and the permissions"
+        raise OutputError(final, f"cannot be written: {fault}", remedy) from fault
     return final
 
 
@@ -79,12 +78,8 @@ def _counted(episodes: int, on_progress: Progress | None) -> Iterator[int]:
 def imported(package: str, install: str) -> Iterator[None]:
     """Import a third-party package, without pygame's greeting and the warnings that imports make.
 
-    Args:
-        package: name of the package, for the error.
-        install: the command that installs it.
-
     Raises:
-        MissingDependencyError: a module of the package cannot be imported.
+        MissingDependencyError: it cannot be imported; `install` is the command for that.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:

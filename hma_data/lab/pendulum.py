@@ -1,11 +1,9 @@
 """Record gymnasium's Pendulum-v1 to RLDS: a rod on an axle, driven by a torque at 20 Hz.
 
 The physics and the picture are the environment's own. The camera is zoomed in on the rod, and an arrow round
-the axle shows the last torque. The torque in a step is applied between its picture and the next.
-
-The driver changes from episode to episode, in the order of DRIVERS: swing up and balance, smooth random
-torques, full torque one way or the other, random torques held for a while. Episodes begin at random angles
-and speeds and last 5 s.
+the axle shows the last torque. The torque in a step is applied between its picture and the next. Episodes
+begin at random angles and speeds and last 5 s; the driver changes from one to the next, in the order of
+DRIVERS.
 
 Angles are radians from upright, speeds rad/s, torques N·m. T frames.
 """
@@ -34,9 +32,6 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
 
 class Pendulum:
     """The environment at a given start.
-
-    Args:
-        angle, speed: angle and speed at the start.
 
     Raises:
         MissingDependencyError: gymnasium or pygame is not installed.
@@ -74,10 +69,8 @@ class Pendulum:
         import cv2
 
         edge = (DRAWN - ZOOMED) // 2
-        pixels = self._env.render()[edge : edge + ZOOMED, edge : edge + ZOOMED]
-        small: NDArray[np.uint8] = cv2.resize(
-            np.ascontiguousarray(pixels), (SIZE, SIZE), interpolation=cv2.INTER_AREA
-        )
+        pixels = np.ascontiguousarray(self._env.render()[edge : edge + ZOOMED, edge : edge + ZOOMED])
+        small: NDArray[np.uint8] = cv2.resize(pixels, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
         return small
 
     def advance(self, action: NDArray[np.float32]) -> None:
@@ -132,7 +125,6 @@ def _upward(rng: np.random.Generator) -> Driver:
 
 
 def _smooth(rng: np.random.Generator) -> Driver:
-    """Return a driver that sums three sine waves of random frequency."""
     hz, phase = rng.uniform(0.1, 1.5, 3), rng.uniform(0, 2 * np.pi, 3)
     strength = rng.uniform(0.4, 1.6, 3)
     seconds = iter(np.arange(STEPS) * PERIOD_S)
@@ -140,7 +132,6 @@ def _smooth(rng: np.random.Generator) -> Driver:
 
 
 def _held(torque: Callable[[], float], shortest: int, longest: int, rng: np.random.Generator) -> Driver:
-    """Return a driver that holds a torque for some steps, then another."""
     values: list[float] = []
 
     def drive(angle: float, speed: float) -> float:

@@ -6,10 +6,7 @@ The arm stands in the middle of a walled square and pushes three loose blocks. E
 limited torque, and the elbow has stops; friction with the table slows the blocks. The velocities in a
 frame are applied between its picture and the next. Joint angles and velocities are recorded beside them.
 The reward is the distance that the blocks moved, in px. An episode is a success if some block ends 20 px
-or more from its first place.
-
-A driver runs random manoeuvres one after another: go to a point or to a block, weave, hold a velocity,
-rest.
+or more from its first place. A driver runs random manoeuvres one after another.
 
 Lengths are pixels of the 512 × 512 arena with y downward, angles radians (the shoulder's clockwise from
 +x, the elbow's from the upper arm on), velocities rad/s. J = 2 joints, B = 3 blocks, T frames.
@@ -63,11 +60,7 @@ def _as_lerobot(demo: Demo) -> LeRobotEpisode:
 
 
 class Arm:
-    """The arm and its blocks.
-
-    Args:
-        joints: (J,) angles at the start.
-        blocks: (B, 3) x, y, angle of each block at the start.
+    """The arm and its blocks, at start with joint angles (J,) and blocks (B, 3): x, y, angle of each.
 
     Raises:
         MissingDependencyError: pymunk is not installed.
@@ -289,14 +282,12 @@ def _go(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
 
 
 def _weave(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
-    """Return a manoeuvre that moves each joint by its own slow sine."""
     strength, hz, phase = rng.uniform(0.8, 2.4, 2), rng.uniform(0.2, 0.9, 2), rng.uniform(0, 2 * np.pi, 2)
     seconds = iter(np.arange(STEPS) / HZ)
     return lambda arm: strength * np.sin(2 * np.pi * hz * next(seconds) + phase)
 
 
 def _hold(arm: Arm, rng: np.random.Generator) -> Manoeuvre:
-    """Return a manoeuvre that holds one velocity; sometimes only one joint moves."""
     velocities = rng.uniform(-SPEED, SPEED, 2)
     if rng.random() < 0.4:
         velocities[rng.integers(2)] = 0.0

@@ -35,20 +35,13 @@ def rotation(angle: float) -> Floats:
 
 @dataclass(frozen=True)
 class Tee:
-    """The T in its own frame, as the environment built it.
+    """The T in its own frame, as the environment built it."""
 
-    Attributes:
-        boxes: (2, 2, 2) lower and upper corner of its two bars.
-        center: (2,) centre of mass.
-        mass, moment: mass and moment of inertia of the body.
-        radius: radius of the pusher.
-    """
-
-    boxes: Floats
-    center: Floats
+    boxes: Floats  # (2, 2, 2) lower and upper corner of its two bars
+    center: Floats  # (2,) centre of mass
     mass: float
-    moment: float
-    radius: float
+    moment: float  # of inertia
+    radius: float  # of the pusher
 
     def distance(self, points: Floats) -> Floats:
         """Return the (...,) signed distance of points (..., 2) to the outline, negative inside."""
@@ -94,14 +87,9 @@ class Tee:
         return nodes[self.distance(nodes) > self.radius + CLEARANCE]
 
     @cached_property
-    def between_corners(self) -> Floats:
-        """Return the (N, N) lengths between corners, see `legs`."""
-        return self.legs(self.corners, self.corners)
-
-    @cached_property
-    def to_standoffs(self) -> Floats:
-        """Return the (N, C) lengths from corners to standoffs, see `legs`."""
-        return self.legs(self.corners, self.standoffs)
+    def from_corners(self) -> tuple[Floats, Floats]:
+        """Return the lengths from corners to corners (N, N) and to standoffs (N, C), see `legs`."""
+        return self.legs(self.corners, self.corners), self.legs(self.corners, self.standoffs)
 
     def legs(self, start: Floats, stop: Floats) -> Floats:
         """Return the (len(start), len(stop)) length of each straight way, infinite if the T blocks it."""
@@ -154,11 +142,7 @@ def plan(
     inward = tee.contacts[1][contact] @ turn.T
     end = np.clip(standoffs[contact] + inward * (GAP + LENGTHS[length]), LOW, HIGH)
     retreat = np.clip(end - inward * 2 * GAP, LOW, HIGH)
-    return [
-        (np.array([*corners, standoffs[contact]]), fly),
-        (end[None], False),
-        (retreat[None], False),
-    ]
+    return [(np.array([*corners, standoffs[contact]]), fly), (end[None], False), (retreat[None], False)]
 
 
 def predicted_costs(tee: Tee, pose: Floats, goal: Floats) -> Floats:
@@ -190,13 +174,14 @@ def _walks(tee: Tee, agent: Floats, pose: Floats) -> tuple[Floats, Callable[[int
     usable = _inside(tee.corners @ turn.T + pose[:2])
     reach = np.where(usable, tee.legs(local, tee.corners)[0], np.inf)
     previous: NDArray[np.int64] = np.full(len(reach), -1)
+    to_corners, to_standoffs = tee.from_corners
     for _ in range(len(reach)):
-        longer = reach[:, None] + tee.between_corners
+        longer = reach[:, None] + to_corners
         better = (longer.min(axis=0) < reach - 1e-9) & usable
         previous = np.where(better, longer.argmin(axis=0), previous)
         reach = np.where(better, longer.min(axis=0), reach)
     direct = tee.legs(local, tee.standoffs)[0]
-    around = reach[:, None] + tee.to_standoffs
+    around = reach[:, None] + to_standoffs
 
     def corners(contact: int) -> list[int]:
         if direct[contact] <= around[:, contact].min():
@@ -230,13 +215,7 @@ class Planned:
         self._phases: Phases = []
 
     def act(self, pose: Floats, agent: Floats, seconds: float) -> tuple[Floats, bool]:
-        """Return the setpoint (2,) `seconds` from now, and whether the pusher is up.
-
-        Args:
-            pose: (3,) pose of the T.
-            agent: (2,) centre of the pusher.
-            seconds: time until the next call.
-        """
+        """Return the setpoint (2,) `seconds` from now, at the next call, and whether the pusher is up."""
         if not self._phases:
             self._phases = plan(self._tee, pose, self._goal, agent, self._speed, self._fly, self._rng)
         way, up = self._phases[0]

@@ -1,7 +1,6 @@
 """Record gym-pusht as two robots: one position-controlled to HDF5, one velocity-controlled to MCAP.
 
-Both push a T toward its goal pose in the environment's own physics, and its own renderer draws the pictures.
-They share nothing else:
+Both push a T toward its goal pose in the environment's own physics, drawn by its own renderer:
 
     pusht_fast  10 Hz   action (x, y): target of the pusher in px, the environment's native action
     pusht_slow   5 Hz   action (vx, vy, lift): velocity in px/s; lift 1 raises the pusher over the T,
@@ -13,9 +12,8 @@ after success, or else after a fixed time.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +29,7 @@ STARTS = ("near", "random", "near", "far", "near")
 EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episodes are a minute apart
 
 
-@dataclass(frozen=True)
-class Look:
+class Look(NamedTuple):
     """The side of a robot's square pictures in px, and the names of their colours."""
 
     size: int
@@ -48,10 +45,7 @@ LEAST_S, REST_S = 4.0, 0.6  # shortest episode, and time recorded after success
 
 
 def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
-    """Record `pusht_fast` as a file of robomimic's layout, `pusht_slow` as a folder of MCAP files.
-
-    See `hma_data.lab`.
-    """
+    """Record `pusht_fast` as a file of robomimic's layout, `pusht_slow` as a folder of MCAP files."""
     if robot == "pusht_fast":
         kwargs = {"observation_width": FAST_LOOK.size, "observation_height": FAST_LOOK.size}
         env_args = {"env_name": "gym_pusht/PushT-v0", "type": 2, "env_kwargs": kwargs}
@@ -63,12 +57,7 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
 
 
 class Arena:
-    """The environment, with the parts of its state that the robots need.
-
-    Args:
-        look: colours and picture size.
-        start: near, far or random, see STARTS.
-        rng: generator of the episode.
+    """The environment, with the parts of its state that the robots need; `start` is one of STARTS.
 
     Raises:
         MissingDependencyError: gym-pusht is not installed.
@@ -84,9 +73,8 @@ class Arena:
         bars = sorted(sorted(shape.get_vertices()) for shape in self._env.block.shapes)  # a set has no order
         boxes = [(np.min(corners, axis=0), np.max(corners, axis=0)) for corners in bars]
         body, (pusher,) = self._env.block, self._env.agent.shapes
-        self.tee = Tee(
-            np.array(boxes), np.array(body.center_of_gravity), body.mass, body.moment, pusher.radius
-        )
+        center = np.array(body.center_of_gravity)
+        self.tee = Tee(np.array(boxes), center, body.mass, body.moment, pusher.radius)
         self.goal: Floats = np.asarray(self._env.goal_pose, dtype=np.float64)
         if start == "near":
             self._env.reset(options={"reset_to_state": self._near_goal(rng)})
@@ -224,35 +212,30 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
             arena.advance(_within(setpoint + velocity * (LAG_S - ticks * TICK_S / 2)), ticks)
             if arena.success and not before:
                 stop = min(stop, max(round(LEAST_S / TICK_S), tick + round(REST_S / TICK_S)))
-        stamp = EPOCH_NS + episode * 60_000_000_000 + tick * round(TICK_S * 1e9)
+        fields: dict[str, Any]
         if event == "camera":
-            late = stamp + int(rng.integers(12_000_000, 20_000_000))
+            topic, kind = "/camera/image/compressed", "sensor_msgs/msg/CompressedImage"
             _, png = cv2.imencode(".png", arena.picture()[..., ::-1])
             fields = {"format": "png", "data": png.reshape(-1)}
-            kind = "sensor_msgs/msg/CompressedImage"
-            messages.append(Message("/camera/image/compressed", stamp, late, kind, "camera", fields))
         elif event == "joints":
-            late = stamp + int(rng.integers(500_000, 2_000_000))
+            topic, kind = "/joint_states", "sensor_msgs/msg/JointState"
             place, motion = np.append(arena.agent, arena.raised), np.append(arena.velocity, 0.0)
-            fields = {
-                "name": ["x", "y", "lift"],
-                "position": place,
-                "velocity": motion,
-                "effort": np.empty(0),
-            }
-            kind = "sensor_msgs/msg/JointState"
-            messages.append(Message("/joint_states", stamp, late, kind, "arena", fields))
+            fields = {"name": ["x", "y", "lift"], "position": place, "velocity": motion}
+            fields["effort"] = np.empty(0)
         else:
+            topic, kind = "/command", "geometry_msgs/msg/TwistStamped"
             ahead, up = policy.act(arena.pose, arena.agent, 0.2)
             velocity = np.zeros(2) if arena.success else (ahead - setpoint) / 0.2
             up = up and not arena.success
             arena.lift(up)
-            late = stamp + int(rng.integers(500_000, 2_000_000))
             vector = "geometry_msgs/msg/Vector3"
             linear = ros_value(vector, *np.append(velocity, up).tolist())
             turn = ros_value(vector, 0.0, 0.0, 0.0)
             fields = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
-            kind = "geometry_msgs/msg/TwistStamped"
-            messages.append(Message("/command", stamp, late, kind, "arena", fields))
+        stamp = EPOCH_NS + episode * 60_000_000_000 + tick * round(TICK_S * 1e9)
+        camera = event == "camera"
+        delay = rng.integers(12_000_000, 20_000_000) if camera else rng.integers(500_000, 2_000_000)
+        frame, received = "camera" if camera else "arena", stamp + int(delay)
+        messages.append(Message(topic, stamp, received, kind, frame, fields))
     facts = {"success": str(arena.success).lower(), "start": STARTS[episode % len(STARTS)], "seed": str(seed)}
     write_mcap(path, messages, {"robot": "pusht_slow", **facts})

@@ -7,10 +7,11 @@ T frames of an episode, A action dims, S state dims.
 
 import json
 import struct
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from pathlib import Path
 from typing import Any
 
@@ -31,23 +32,14 @@ _CORE = "tensorflow_datasets.core.features"
 
 @dataclass(frozen=True)
 class Demo:
-    """One episode of T frames for HDF5.
+    """One episode of T frames for HDF5."""
 
-    Attributes:
-        actions: (T, A) float32.
-        observations: key -> (T, …); uint8 (T, H, W, 3) are pictures.
-        states: (T, S) float64, the states of the simulator.
-        rewards: (T,) float64.
-        success: whether the task was done at the end.
-        facts: plain values that are stored as attributes.
-    """
-
-    actions: NDArray[np.float32]
-    observations: Mapping[str, NDArray[Any]]
-    states: NDArray[np.float64]
-    rewards: NDArray[np.float64]
-    success: bool
-    facts: Mapping[str, str | int | float]
+    actions: NDArray[np.float32]  # (T, A)
+    observations: Mapping[str, NDArray[Any]]  # key -> (T, …); uint8 (T, H, W, 3) are pictures
+    states: NDArray[np.float64]  # (T, S), the states of the simulator
+    rewards: NDArray[np.float64]  # (T,)
+    success: bool  # whether the task was done at the end
+    facts: Mapping[str, str | int | float]  # stored as attributes
 
 
 def write_hdf5(path: Path, demos: Iterable[Demo], env_args: Mapping[str, Any]) -> None:
@@ -95,17 +87,11 @@ def _write_demo(group: h5py.Group, demo: Demo) -> None:
 
 @dataclass(frozen=True)
 class RldsEpisode:
-    """One episode of T steps for RLDS.
+    """One episode of T steps for RLDS."""
 
-    Attributes:
-        pictures: path inside a step -> T files, JPEG or PNG.
-        vectors: path inside a step -> (T, A) float32.
-        instruction: the task in words.
-    """
-
-    pictures: Mapping[str, list[bytes]]
-    vectors: Mapping[str, NDArray[np.float32]]
-    instruction: str
+    pictures: Mapping[str, list[bytes]]  # path inside a step -> T files, JPEG or PNG
+    vectors: Mapping[str, NDArray[np.float32]]  # path inside a step -> (T, A)
+    instruction: str  # the task in words
 
 
 def write_rlds(
@@ -120,7 +106,7 @@ def write_rlds(
         name: name of the dataset.
         sizes: path of each camera -> (height, width).
         codec: jpeg or png.
-        episodes: the episodes; all have the same keys.
+        episodes: all have the same keys.
     """
     folder.mkdir(parents=True)
     count, widths = 0, {}
@@ -147,10 +133,7 @@ def _features(sizes: Mapping[str, tuple[int, int]], codec: str, widths: Mapping[
     nested: dict[str, Any] = {}
     for path, leaf in leaves.items():
         *parents, last = path.split("/")
-        at = nested
-        for parent in parents:
-            at = at.setdefault(parent, {})
-        at[last] = leaf
+        reduce(lambda at, parent: at.setdefault(parent, {}), parents, nested)[last] = leaf
     steps = {"feature": _dict(nested), "length": "-1"}
     return _dict({"steps": {"pythonClassName": f"{_CORE}.Dataset", "sequence": steps}})
 
@@ -193,19 +176,12 @@ def _record(data: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class LeRobotEpisode:
-    """One episode of T frames for LeRobot.
+    """One episode of T frames for LeRobot."""
 
-    Attributes:
-        pictures: camera feature -> (T, H, W, 3) uint8 RGB.
-        action: (T, A) float32, the command issued at each frame.
-        state: (T, S) float32, seen at each frame.
-        task: the task in words.
-    """
-
-    pictures: Mapping[str, NDArray[np.uint8]]
-    action: NDArray[np.float32]
-    state: NDArray[np.float32]
-    task: str
+    pictures: Mapping[str, NDArray[np.uint8]]  # camera feature -> (T, H, W, 3) RGB
+    action: NDArray[np.float32]  # (T, A), the command issued at each frame
+    state: NDArray[np.float32]  # (T, S), seen at each frame
+    task: str  # in words
 
 
 def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRobotEpisode]) -> None:
@@ -215,13 +191,13 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
 
     Args:
         folder: folder to make.
-        embodiment: an embodiment that has a state, and a whole number of frames a second.
-        episodes: the episodes; each has the embodiment's cameras and widths.
+        embodiment: one that has a state, and a whole number of frames a second.
+        episodes: each has the embodiment's cameras and widths.
 
     Raises:
         MissingDependencyError: lerobot cannot be imported.
     """
-    assert embodiment.frequency_hz and embodiment.frequency_hz == int(embodiment.frequency_hz)
+    assert embodiment.frequency_hz
     with imported("lerobot", "pip install 'lerobot[dataset]'"):
         from lerobot.configs.video import RGBEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -268,23 +244,14 @@ def _quiet() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Message:
-    """A message for MCAP.
+    """A message for MCAP."""
 
-    Attributes:
-        topic: name with leading slash.
-        stamp_ns: time of the event, in the message's header; nanoseconds since 1970.
-        received_ns: the later time at which the recorder received it.
-        type: e.g. sensor_msgs/msg/JointState; a type with a header.
-        frame: frame_id of the header.
-        fields: values of the other fields.
-    """
-
-    topic: str
-    stamp_ns: int
-    received_ns: int
-    type: str
-    frame: str
-    fields: Mapping[str, Any]
+    topic: str  # name with leading slash
+    stamp_ns: int  # time of the event, in the message's header; nanoseconds since 1970
+    received_ns: int  # the later time at which the recorder received it
+    type: str  # one with a header, e.g. sensor_msgs/msg/JointState
+    frame: str  # frame_id of the header
+    fields: Mapping[str, Any]  # values of the other fields
 
 
 def ros_value(kind: str, *values: Any, **named: Any) -> Any:
@@ -302,7 +269,7 @@ def write_mcap(path: Path, messages: Sequence[Message], facts: Mapping[str, str]
     store = _types()
     channels: dict[str, int] = {}
     schemas: dict[str, int] = {}
-    sequence: dict[str, int] = {}
+    sequence: Counter[str] = Counter()
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=256 * 1024, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="hma_data.lab")
@@ -316,7 +283,7 @@ def write_mcap(path: Path, messages: Sequence[Message], facts: Mapping[str, str]
                 channels[message.topic] = writer.register_channel(
                     message.topic, "cdr", schemas[message.type], {"offered_qos_profiles": ""}
                 )
-            sequence[message.topic] = sequence.get(message.topic, 0) + 1
+            sequence[message.topic] += 1
             stamp = ros_value("builtin_interfaces/msg/Time", *divmod(message.stamp_ns, 1_000_000_000))
             header = ros_value("std_msgs/msg/Header", stamp=stamp, frame_id=message.frame)
             content = ros_value(message.type, header=header, **message.fields)

@@ -1,7 +1,4 @@
-"""Sum up training steps, and detect bad ones: a loss that is not finite, or a gradient far above its mean.
-
-The recipe decides what the run does at a bad step: stop and name the windows, or skip the step and count it.
-"""
+"""Sum up training steps, and detect bad ones: a loss that is not finite, or a gradient far above its mean."""
 
 import math
 import resource
@@ -28,23 +25,17 @@ SETTLED = 20  # steps before a norm can be a spike
 
 
 class StepMetrics:
-    """Sums of losses, kept on the device of the losses, so that a step needs only one transfer.
-
-    Args:
-        names: the ids of the embodiments.
-        device: the device of the losses.
-    """
+    """Sums of losses by embodiment, kept on their device, so that a step needs only one transfer."""
 
     def __init__(self, names: list[str], device: torch.device) -> None:
         self._names = sorted(names)
-        self._place = {name: i for i, name in enumerate(self._names)}
         self._loss = torch.zeros(1, device=device)
         self._sums = torch.zeros(2, len(names), device=device)
         self._objectives = torch.zeros(len(OBJECTIVES), device=device)
 
     def add(self, embodiment: list[str], output: "Output") -> None:
         """Add the loss of a pass, the loss of each sample, and the objective."""
-        index = torch.tensor([self._place[name] for name in embodiment], device=self._sums.device)
+        index = torch.tensor([self._names.index(name) for name in embodiment], device=self._sums.device)
         losses = output.per_sample.to(self._sums)
         self._loss += output.loss.detach().to(self._loss)
         self._sums.index_add_(1, index, torch.stack([losses, torch.ones_like(losses)]))
@@ -96,9 +87,7 @@ def suspects(
 ) -> list[tuple[float, str]]:
     """Return the windows of this rank that may be the cause of a bad step, each with its loss.
 
-    Args:
-        batches: the batches of the step, each with the loss (B,) of its windows.
-        sets: shard sets by embodiment, for the episodes' names.
+    Each batch of the step comes with the loss (B,) of its windows; the shard sets have the episodes' names.
     """
     found: list[tuple[Any, ...]] = []
     for batch, losses in batches:

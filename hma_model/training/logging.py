@@ -16,7 +16,6 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from hma_data.console import human_seconds
@@ -60,13 +59,7 @@ def _package(tracker: str, module: str, install: str) -> Any:
 
 
 class Remote:
-    """A tracker for trackio or wandb, which have the same functions.
-
-    Args:
-        name: the name of the package.
-        recipe: the recipe, which is recorded with the run.
-        out: the run's folder; its name is the name of the run.
-    """
+    """A tracker for trackio or wandb, which have the same functions; the run has the name of its folder."""
 
     def __init__(self, name: str, recipe: Recipe, out: Path) -> None:
         self._package = _package(name, name, f"pip install {name}")
@@ -93,11 +86,8 @@ class Remote:
 class EventFile:
     """A TensorBoard event file, written with the protocol buffers of the `tensorboard` package.
 
+    Every session adds a file to the folder; figures of steps after `step` in older files are superseded.
     `torch.utils.tensorboard.SummaryWriter` is not used: it imports TensorFlow wherever that is installed.
-
-    Args:
-        folder: the folder, made if it does not exist; every session adds a file.
-        step: figures of later steps in older files are superseded.
     """
 
     def __init__(self, folder: Path, step: int = 0) -> None:
@@ -141,12 +131,7 @@ Tracker = EventFile | Remote
 
 
 def open_trackers(recipe: Recipe, out: Path, step: int) -> list[Tracker]:
-    """Open the trackers that a recipe names.
-
-    Args:
-        recipe: `track` names them.
-        out: the run's folder.
-        step: number of finished steps; later figures of an earlier, killed session are superseded.
+    """Open the trackers that a recipe names, for the run in folder `out` with `step` finished steps.
 
     Raises:
         MissingDependencyError: a package is not installed.
@@ -182,10 +167,8 @@ class RunLog:
             write_atomic(self._path, "".join(_line(values) for values in kept))
         self._recent: dict[str, deque[float]] = {}
         self._last: dict[str, Any] = {}
-        self._evaluation: dict[str, Any] = {}
-        for line in kept:
-            if line["kind"] == "eval":
-                self._evaluation = line
+        evaluations = (line for line in reversed(kept) if line["kind"] == "eval")
+        self._evaluation: dict[str, Any] = next(evaluations, {})
         self._paces: deque[float] = deque(maxlen=PACING)  # seconds of steps of this session
         self._spent, self._shown, self._said = 0.0, 0.0, ""
         self._opened = time.monotonic()
@@ -202,12 +185,10 @@ class RunLog:
             self._live.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *fault: Any) -> None:
         self._present(force=True)
         if self._live:
-            self._live.__exit__(kind, fault, trace)
+            self._live.__exit__(*fault)
         if self._file:
             self._file.close()
         for tracker in self._trackers:

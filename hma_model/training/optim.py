@@ -3,9 +3,6 @@
 Matrices have weight decay; norms, biases, embeddings, positions and mask vectors have none. With muP,
 matrices of which both sides grow with the width learn at lr / (width / base_width). Their decay is multiplied
 by width / base_width, so that lr and decay found at one width suit another (Yang et al. 2022, table 8).
-
-After each step the average of the weights moves towards them by 1 - decay. In the first steps it moves by
-more, so that it soon forgets the initial weights (decay is at most (1 + step) / (10 + step)).
 """
 
 import math
@@ -14,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 
-from hma_model.training.parallel import gathered, is_sharded, like, local, whole
+from hma_model.training.parallel import gathered, like, local, whole
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -65,9 +63,9 @@ def parameter_groups(model: "HMA", lr: float, weight_decay: float) -> list[dict[
     for name, parameter in model.named_parameters():
         if not parameter.requires_grad:
             continue
-        decays, scaled, sharded = name not in plain, name in matrices, is_sharded(parameter)
-        base_lr = lr / multiplier if scaled else lr
-        decay = weight_decay * (multiplier if scaled else 1.0) if decays else 0.0
+        decays, scaled, sharded = name not in plain, name in matrices, isinstance(parameter, DTensor)
+        factor = multiplier if scaled else 1.0
+        base_lr, decay = lr / factor, weight_decay * factor if decays else 0.0
         fresh = {"params": [], "names": [], "lr": base_lr, "base_lr": base_lr, "weight_decay": decay}
         group = groups.setdefault((decays, scaled, sharded), fresh)
         group["params"].append(parameter)
@@ -93,11 +91,8 @@ def _growing_matrices(model: "HMA") -> set[str]:
         for space in model.embodiments.values():
             wider.add_embodiment(space)
     shapes = {name: parameter.shape for name, parameter in wider.named_parameters()}
-    return {
-        name
-        for name, parameter in model.named_parameters()
-        if sum(a != b for a, b in zip(parameter.shape, shapes[name])) >= 2
-    }
+    grown = {n: sum(a != b for a, b in zip(p.shape, shapes[n])) for n, p in model.named_parameters()}
+    return {name for name, sides in grown.items() if sides >= 2}
 
 
 def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -128,9 +123,8 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, T
 class Average:
     """A moving average of a network's parameters; each rank averages its part.
 
-    Args:
-        model: the network in training.
-        decay: the decay of the average, 0 to 1.
+    After each step it moves towards the weights by 1 - decay. In the first steps it moves by more, so that it
+    soon forgets the initial weights (the decay is at most (1 + step) / (10 + step)).
     """
 
     def __init__(self, model: nn.Module, decay: float) -> None:
@@ -142,7 +136,7 @@ class Average:
     def update(self, step: int) -> None:
         """Update the average with the weights after step `step`, counted from 1."""
         weight = 1 - min(self.decay, (1 + step) / (10 + step))
-        moving = {n: p for n, p in self._model.named_parameters() if n in self._own}
+        moving = dict(self._model.named_parameters())
         own = [local(value) for value in self._own.values()]
         torch._foreach_lerp_(own, [local(moving[name].detach()) for name in self._own], weight)
 

@@ -7,10 +7,9 @@ of ranks. DDP keeps the whole network on every rank. FSDP2 shards the trunk's bl
 and readouts stay whole, because the ranks may use different ones in the same step.
 
 The error that ends a run is reported exactly once. A rank that fails writes its error into the store of the
-run. A rank that has only lost the others finds it there. The first failing rank to claim the report prints
-its error; the others exit silently. A rank exits only after the report is claimed, and the reporting rank
-ignores the signal by which torchrun then ends it. The claim needs a store that outlives the ranks; torchrun
-has one. Ranks that are started in another way each print their own error.
+run; a rank that has only lost the others finds it there. The first failing rank to claim the report prints
+its error, and ignores the signal by which torchrun then ends it; the others exit silently. The claim needs
+torchrun's store, which outlives the ranks. Ranks that are started in another way each print their own error.
 """
 
 import os
@@ -26,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor, distribute_tensor
 
 from hma_data.errors import HMAError, RecipeError, TrainingError
 
@@ -73,11 +73,8 @@ class World:
             try:
                 outcome[0] = action()
             except Exception as fault:  # any error: the others must not wait for a rank that has ended
-                text = f"{type(fault).__name__}: {fault}"
-                own, outcome[1] = (
-                    fault,
-                    fault if isinstance(fault, HMAError) else TrainingError("rank 0", text),
-                )
+                told = TrainingError("rank 0", f"{type(fault).__name__}: {fault}")
+                own, outcome[1] = fault, fault if isinstance(fault, HMAError) else told
         dist.broadcast_object_list(outcome, src=0)
         if own is not None:
             raise own
@@ -88,10 +85,7 @@ class World:
 
 @contextmanager
 def join(device: torch.device) -> Iterator[World]:
-    """Join the ranks that torchrun has started, or run as a single process.
-
-    Args:
-        device: the device of the run; it decides how the ranks communicate.
+    """Join the ranks that torchrun has started, or run as a single process; ranks communicate by `device`.
 
     Raises:
         RecipeError: the ranks cannot find each other.
@@ -111,8 +105,7 @@ def join(device: torch.device) -> Iterator[World]:
             raise
         raise error from fault
     finally:
-        waits = device.type == "cuda" and sys.exc_info()[0] is not None  # NCCL waits for ended ranks
-        if not waits:
+        if device.type != "cuda" or sys.exc_info()[0] is None:  # NCCL would wait for ended ranks
             dist.destroy_process_group()
 
 
@@ -211,13 +204,7 @@ class _DDP(nn.parallel.DistributedDataParallel):
 
 
 class ParallelModel:
-    """A network that is distributed over the ranks of a run.
-
-    Args:
-        model: the model on its device, the same on every rank; fsdp shards it in place.
-        world: the ranks.
-        mode: ddp or fsdp; it has no effect with one rank.
-    """
+    """A model, the same on every rank, that is distributed over the ranks; `mode` fsdp shards it in place."""
 
     def __init__(self, model: "HMA", world: World, mode: str) -> None:
         self.model, self.world = model, world
@@ -245,7 +232,7 @@ class ParallelModel:
         """Average, after the last pass, the gradients that neither DDP nor FSDP has averaged."""
         if self.sharded:
             trained = (p for p in self.model.parameters() if p.requires_grad)
-            _average([p for p in trained if not is_sharded(p)], self.world)
+            _average([p for p in trained if not isinstance(p, DTensor)], self.world)
 
     def clip(self, limit: float) -> float:
         """Scale the gradients to at most this norm over all ranks, and return the norm they had."""
@@ -255,7 +242,7 @@ class ParallelModel:
         squares = torch.zeros(2, device=self.model.device)
         for p in parameters:
             assert p.grad is not None
-            squares[int(is_sharded(p))] += local(p.grad).float().square().sum()
+            squares[int(isinstance(p, DTensor))] += local(p.grad).float().square().sum()
         norm = float((squares[0] + self.world.sum(squares[1:].clone())[0]).sqrt())
         for p in parameters:
             assert p.grad is not None
@@ -268,8 +255,7 @@ def _shard(model: "HMA", world: World) -> None:
     from torch.distributed.fsdp import fully_shard
 
     mesh = init_device_mesh(model.device.type, (world.size,))
-    whole = {id(p) for block in model.trunk.blocks for p in block.parameters()}
-    kept = {p for p in model.parameters() if id(p) not in whole}
+    kept = set(model.parameters()) - set(model.trunk.blocks.parameters())
     for block in model.trunk.blocks:
         fully_shard(block, mesh=mesh)
     fully_shard(model, mesh=mesh, ignored_params=kept)
@@ -288,30 +274,20 @@ def _average(parameters: list[nn.Parameter], world: World) -> None:
         p.grad.copy_(part.view_as(p))
 
 
-def is_sharded(tensor: Tensor) -> bool:
-    """Check whether each rank holds only a part of the tensor."""
-    from torch.distributed.tensor import DTensor
-
-    return isinstance(tensor, DTensor)
-
-
 def local(tensor: Tensor) -> Tensor:
     """Return the part of a tensor that this rank holds; the tensor itself if it is not sharded."""
-    return tensor.to_local() if is_sharded(tensor) else tensor  # type: ignore[attr-defined]
+    return tensor.to_local() if isinstance(tensor, DTensor) else tensor
 
 
 def whole(tensor: Tensor) -> Tensor:
     """Return the unsharded tensor; every rank must call it, in the same order."""
-    return tensor.full_tensor() if is_sharded(tensor) else tensor  # type: ignore[attr-defined]
+    return tensor.full_tensor() if isinstance(tensor, DTensor) else tensor
 
 
 def like(tensor: Tensor, own: Tensor) -> Tensor:
     """Distribute a tensor, the same on all ranks, as `own` is distributed, on the device of `own`."""
-    if not is_sharded(own):
-        return tensor.to(own.device)
-    from torch.distributed.tensor import distribute_tensor
-
-    return distribute_tensor(tensor.to(own.device), own.device_mesh, own.placements)  # type: ignore[attr-defined]
+    tensor = tensor.to(own.device)
+    return distribute_tensor(tensor, own.device_mesh, own.placements) if isinstance(own, DTensor) else tensor
 
 
 def gathered(named: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:

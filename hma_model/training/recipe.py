@@ -90,13 +90,8 @@ class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-_TYPES: dict[Any, Any] = {
-    int: Count,
-    float: Number,
-    bool: StrictBool,
-    str: str,
-    tuple[str, ...]: Annotated[Any, AfterValidator(_words)],
-}
+_WORDS = Annotated[Any, AfterValidator(_words)]
+_TYPES: dict[Any, Any] = {int: Count, float: Number, bool: StrictBool, str: str, tuple[str, ...]: _WORDS}
 _NETWORK: dict[str, Any] = {
     name: (_TYPES[kind], None) for name, kind in get_type_hints(HMAConfig).items() if name not in _DERIVED
 }
@@ -225,18 +220,15 @@ def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
             HMAConfig(**{"patch": 1, **recipe.model, "objectives": recipe.objectives, "grid": (side, side)})
             return recipe
         except RecipeError as fault:
-            faults.append(
-                f"{fault.where.replace('model.objectives', 'objectives')}: {fault.fault}: {fault.remedy}"
-            )
+            key = fault.where.replace("model.objectives", "objectives")
+            faults.append(f"{key}: {fault.fault}: {fault.remedy}")
     raise RecipeError(where, "; ".join(faults), "correct the recipe or the override")
 
 
 def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
     """Return the file of a recipe: a path, or a name below the shipped `recipes/` or `recipes/train/`.
 
-    Args:
-        name_or_path: the path or name.
-        where: the recipe that extends it, for the error.
+    `where` is the recipe that extends it, for the error.
 
     Raises:
         RecipeError: there is no such recipe.

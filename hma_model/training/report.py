@@ -51,7 +51,8 @@ def write_report(out: StrPath) -> None:
         ("Environment", ["what", "is"], ground.items()),
     ):
         page.section(title)
-        page.table(columns, [[key, _plain(value)] for key, value in values])
+        plain = ((k, v if isinstance(v, str) else json.dumps(v, ensure_ascii=False)) for k, v in values)
+        page.table(columns, list(map(list, plain)))
     write_atomic(out / REPORT, page.html())
 
 
@@ -94,8 +95,8 @@ def _curves(page: Page, recipe: dict[str, Any], steps: Lines, evaluations: Lines
     video = any(OBJECTIVES[name].predicts_video for name in recipe["objectives"])
     discrete = any("perplexity" in line for line in evaluations)
     label = "loss, nats a token" if video and discrete else "loss"
-    plot = loss_curves(curves[0], curves[1], label)
     page.section("Losses")
+    plot = loss_curves(curves[0], curves[1], label)
     page.picture(plot, "svg+xml", "Training (lines) and held-out (markers) loss by robot")
 
 
@@ -125,7 +126,3 @@ def _mean(values: list[Any]) -> float:
 
 def _short(value: float | None) -> str:
     return "" if value is None else f"{value:.3f}"
-
-
-def _plain(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

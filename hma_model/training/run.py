@@ -5,7 +5,7 @@ writes files.
 """
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -20,39 +20,18 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import remove_partial, to_json, write_atomic
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import Checkpoint, action_stats, training_checkpoints
-from hma_model.config import OBJECTIVES, ActionSpace, Objective
-from hma_model.evaluation.evaluate import (
-    Means,
-    digit_frequencies,
-    unconditional_baseline,
-    validation_losses,
-    windows,
-)
+from hma_model.config import OBJECTIVES, ActionSpace
+from hma_model.evaluation import evaluate
 from hma_model.evaluation.metrics import perplexity
 from hma_model.evaluation.rollout_video import newest_sheets, write_sheets
 from hma_model.network.model import HMA
+from hma_model.training import guards, optim
 from hma_model.training.data import TrainData
-from hma_model.training.guards import (
-    GradientSpikeDetector,
-    StepMetrics,
-    listed,
-    peak_memory_mib,
-    suspects,
-    worst,
-)
-from hma_model.training.init_from import Start
-from hma_model.training.optim import (
-    Average,
-    load_optimizer_state,
-    lr_scale,
-    make_optimizer,
-    optimizer_state,
-    set_lr,
-)
 from hma_model.training.parallel import ParallelModel, World, gathered
 from hma_model.training.recipe import Recipe
 from hma_model.training.resume import (
     OtherVersionError,
+    Start,
     State,
     TrainingState,
     data_digests,
@@ -66,25 +45,8 @@ from hma_model.training.runtime import ENVIRONMENT, RECIPE, environment, require
 from hma_model.training.scheduled_sampling import forwarded, share_at
 
 
-def main_objective(weights: Mapping[str, float]) -> Objective:
-    """Return the objective that is drawn most often; evaluations compute its loss."""
-    return OBJECTIVES[max(weights, key=lambda name: weights[name])]
-
-
 class Run:
-    """A training run: its model, optimizer, data and progress.
-
-    Args:
-        recipe: the recipe of the run.
-        out: the run's folder, which must exist.
-        device: the device of the model.
-        world: the ranks of the run.
-
-    Attributes:
-        step, skipped, seconds: finished steps, how many of them were skipped, and the time they took.
-        evaluation: the figures of the last evaluation.
-        notes: texts for the user that nobody has shown yet.
-    """
+    """A training run in an existing folder `out`: its model, optimizer, data and progress."""
 
     def __init__(self, recipe: Recipe, out: Path, device: torch.device, world: World | None = None) -> None:
         if not recipe.data:
@@ -99,14 +61,13 @@ class Run:
             self.world.once(lambda: Start.bring(recipe, self.sets, self.out))
             self.start = Start.open(recipe, self.sets, self.out)
         elif recipe.freeze == "trunk":
-            raise RecipeError(
-                "recipe: freeze",
-                "freezes a trunk that nothing has trained",
-                "name a trained checkpoint with start=…",
-            )
+            fault = "freezes a trunk that nothing has trained"
+            raise RecipeError("recipe: freeze", fault, "name a trained checkpoint with start=…")
         if self.start and "frames" not in recipe.model_fields_set:
             recipe = recipe.model_copy(update={"frames": self.start.checkpoint.config.frames})
         self.recipe = recipe
+        often = max(recipe.objectives, key=lambda name: recipe.objectives[name])
+        self.objective = OBJECTIVES[often]  # whose loss the evaluations compute
         self.train_data = TrainData(recipe, self.sets, self.world)
         self.digests = data_digests(self.sets)
         self.stats = {name: shards.manifest.stats for name, shards in self.sets.items()}
@@ -117,11 +78,11 @@ class Run:
         self.model = self._fresh_model()
         held_out = ((name, s, WindowDataset(s, "val", recipe.frames)) for name, s in self.sets.items())
         self.held_out = {name: shards for name, shards, dataset in held_out if len(dataset)}
-        self.step, self.skipped, self.seconds = 0, 0, 0.0
-        self.spike_detector = GradientSpikeDetector(recipe.spike)
-        self.evaluation: dict[str, Any] = {}
-        self.notes: list[str] = []
-        self._baseline: Means | None = None
+        self.step, self.skipped, self.seconds = 0, 0, 0.0  # finished steps, and the time they took
+        self.spike_detector = guards.GradientSpikeDetector(recipe.spike)
+        self.evaluation: dict[str, Any] = {}  # the figures of the last one
+        self.notes: list[str] = []  # texts for the user that nobody has shown yet
+        self._baseline: evaluate.Means | None = None
         self._twin: HMA | None = None
         self._sheet_seconds = [0.0]  # of each evaluation's pictures
 
@@ -147,8 +108,7 @@ class Run:
     @property
     def nats(self) -> bool:
         """Check whether the losses are nats a token."""
-        video = main_objective(self.recipe.objectives).predicts_video
-        return self.model.config.kind == "discrete" and video
+        return self.model.config.kind == "discrete" and self.objective.predicts_video
 
     def note_settings(self) -> None:
         """Note what the user may not expect of the recipe and the data."""
@@ -171,7 +131,7 @@ class Run:
         if plain or self.start:
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
-        shares = [[p * digit for digit in digit_frequencies(shards)] for p, shards in drawn]
+        shares = [[p * digit for digit in evaluate.digit_frequencies(shards)] for p, shards in drawn]
         bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
@@ -182,10 +142,10 @@ class Run:
             for block in self.model.trunk.blocks:
                 block.compile()
         self.parallel_model = ParallelModel(self.model, self.world, self.recipe.parallel)
-        self.optimizer = make_optimizer(self.model, self.recipe)
-        self.average = Average(self.model, self.recipe.ema) if self.recipe.ema else None
+        self.optimizer = optim.make_optimizer(self.model, self.recipe)
+        self.average = optim.Average(self.model, self.recipe.ema) if self.recipe.ema else None
         if kept:
-            load_optimizer_state(self.optimizer, kept.moments)
+            optim.load_optimizer_state(self.optimizer, kept.moments)
             if self.average:
                 self.average.load(kept.averages)
 
@@ -194,9 +154,9 @@ class Run:
     def advance(self) -> dict[str, Any]:
         """Update the weights once, and return the step's line of metrics.jsonl."""
         recipe, begun = self.recipe, time.monotonic()
-        lr = set_lr(self.optimizer, lr_scale(self.step, recipe))
+        lr = optim.set_lr(self.optimizer, optim.lr_scale(self.step, recipe))
         self.optimizer.zero_grad(set_to_none=True)
-        metrics, seen, waited = StepMetrics(list(self.sets), self.device), [], 0.0
+        metrics, seen, waited = guards.StepMetrics(list(self.sets), self.device), [], 0.0
         batches = self.train_data.step()
         for _ in self.train_data.own:
             asked = time.monotonic()
@@ -229,7 +189,7 @@ class Run:
             "windows": recipe.windows_per_step,
             "step_seconds": round(spent, 6),
             "data_seconds": round(waited, 6),
-            "memory_mib": peak_memory_mib(self.device),
+            "memory_mib": guards.peak_memory_mib(self.device),
             "skipped": self.skipped,
         }
 
@@ -260,12 +220,10 @@ class Run:
         if self.recipe.nonfinite == "skip":
             self.skipped += 1
             return
-        suspected = [item for part in self.world.gather(suspects(seen, self.sets)) for item in part]
-        raise TrainingError(
-            f"step {self.step}",
-            f"{fault}; windows: {listed([text for _, text in worst(suspected)])}",
-            "look at them with hma shards preview, lower lr, or skip such steps with nonfinite=skip",
-        )
+        suspected = [item for part in self.world.gather(guards.suspects(seen, self.sets)) for item in part]
+        names = guards.listed([text for _, text in guards.worst(suspected)])
+        remedy = "look at them with hma shards preview, lower lr, or skip such steps with nonfinite=skip"
+        raise TrainingError(f"step {self.step}", f"{fault}; windows: {names}", remedy)
 
     # -- evaluation and checkpoints
 
@@ -292,21 +250,21 @@ class Run:
 
     def _evaluated(self, model: HMA) -> dict[str, Any]:
         recipe, begun = self.recipe, time.monotonic()
-        objective = main_objective(recipe.objectives)
-        video = objective.predicts_video and objective.sees_actions
+        video = self.objective.predicts_video and self.objective.sees_actions
         with self._autocast(), torch.compiler.set_stance("force_eager"):
-            drawn = "forward" if video else objective.name
-            losses, accuracy = validation_losses(model, self._held_out_batches(), recipe.seed, drawn)
+            drawn = "forward" if video else self.objective.name
+            batches = self._held_out_batches()
+            losses, accuracy = evaluate.validation_losses(model, batches, recipe.seed, drawn)
             facts: dict[str, Any] = {
                 "step": self.step,
-                "objective": objective.name,
+                "objective": self.objective.name,
                 "loss": losses.mean(),
                 "loss_by_embodiment": losses.by_embodiment(),
                 "windows": sum(losses.counts.values()),
             }
             if video and model.config.kind == "discrete":
                 if self._baseline is None:
-                    self._baseline = unconditional_baseline(self.sets, self._held_out_batches())
+                    self._baseline = evaluate.unconditional_baseline(self.sets, self._held_out_batches())
                 facts["perplexity"] = perplexity(facts["loss"])
                 facts["accuracy"] = accuracy.mean()
                 facts["accuracy_by_embodiment"] = accuracy.by_embodiment()
@@ -319,7 +277,7 @@ class Run:
     def _held_out_batches(self) -> Iterator[Batch]:
         recipe = self.recipe
         for shards in self.held_out.values():
-            yield from windows(shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size)
+            yield from evaluate.windows(shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size)
 
     def _write_sheets(self, model: HMA) -> None:
         """Write pictures of rollouts: after the last step always, after others if the time allows."""
@@ -327,10 +285,8 @@ class Run:
         spare = recipe.pictures_share * self.seconds - sum(self._sheet_seconds) - self._sheet_seconds[-1]
         if not recipe.pictures or (self.step < recipe.steps and spare <= 0):
             return
-        fault = write_sheets(
-            model, self.held_out, self.out, self.step,
-            frames=recipe.frames, count=recipe.pictures, seed=recipe.seed,
-        )  # fmt: skip
+        facts = {"frames": recipe.frames, "count": recipe.pictures, "seed": recipe.seed}
+        fault = write_sheets(model, self.held_out, self.out, self.step, **facts)
         if fault and len(self._sheet_seconds) == 1:  # noted once
             self.notes.append(fault)
         self._sheet_seconds.append(time.monotonic() - begun)
@@ -338,7 +294,7 @@ class Run:
     def save(self) -> Path:
         """Write checkpoints/step-N, and delete all but the last few; every rank must call it."""
         model, sampler = self.shown(), self.train_data.state(self.world)
-        moments = optimizer_state(self.optimizer)
+        moments = optim.optimizer_state(self.optimizer)
         weights = gathered(self.model.state_dict().items()) if self.average else {}
         state = State(
             step=self.step,

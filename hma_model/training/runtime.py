@@ -46,23 +46,21 @@ def choose_device(name: str) -> torch.device:
 
 def environment(device: torch.device) -> dict[str, Any]:
     """Return the facts besides the recipe on which the run's figures may depend."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
+        revision = done.stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        revision = ""
     return {
         "hma_toolkit": version("hma-toolkit"),
-        "git_revision": _git_revision(),
+        "git_revision": revision,
         "python": platform.python_version(),
         "torch": torch.__version__,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
         "threads": torch.get_num_threads(),
         "platform": platform.platform(),
     }
-
-
-def _git_revision() -> str:
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return ""
 
 
 @contextmanager
@@ -127,13 +125,9 @@ def run_errors(out: Path) -> Iterator[None]:
 
 
 def require_memory(config: "HMAConfig", device: torch.device, parts: int, frozen: bool) -> None:
-    """Refuse a network that is too large for the memory, with its gradients and moments.
+    """Refuse a network that is too large for the memory, with its gradients and moments (none if `frozen`).
 
-    Args:
-        config: the configuration of the network.
-        device: the device of the network.
-        parts: the number of ranks over which the network is sharded.
-        frozen: the trunk's weights have no gradients and moments.
+    `parts` is the number of ranks over which the network is sharded.
 
     Raises:
         RecipeError: the smallest estimate is above the memory of the device.

@@ -1,10 +1,9 @@
 """Replace past frames by the model's own predictions in training, so that long rollouts drift less.
 
-In a rollout the model continues from its own frames. Here, in some windows of a batch, a few past frames are
-replaced by the model's predictions, one after the other. Each is predicted from the true frames before it and
-those already replaced. The target of the loss stays the true frame. The share of such windows may rise over
-the run, because predictions of an untrained model teach nothing. (The paper corrupts the past at random
-instead; see `corrupt_max` and `history_probability` of the model.)
+In some windows of a batch, a few past frames are replaced by the model's predictions, one after the other.
+Each is predicted from the true frames before it and those already replaced. The target of the loss stays the
+true frame. The share of such windows may rise over the run, because predictions of an untrained model teach
+nothing. (The paper corrupts the past at random instead; see `corrupt_max` and `history_probability`.)
 
 B batch, T frames, h,w token grid, c,H,W latents, D frames replaced.
 """
@@ -54,7 +53,6 @@ def forwarded(
         share: the probability that a window gets predicted frames.
         depth: D, the number of consecutive frames that are replaced. Their start is drawn; the first and the
             last frame of the window stay true.
-        generator: the generator of every draw.
     """
     true = batch.tokens if batch.tokens is not None else batch.latents
     assert true is not None

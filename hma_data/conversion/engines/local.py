@@ -11,20 +11,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
-from hma_data.conversion.engines.base import (
-    FIRST,
-    LIMITS,
-    Attempt,
-    Cause,
-    Ledger,
-    Limits,
-    OnEvent,
-    Step,
-    Work,
-)
+from hma_data.conversion.engines import FIRST, LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Step, Work
 from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import HMAError
 
@@ -52,7 +43,7 @@ def run(
     if workers < 1:
         work = make_work(1)
         for number, unit in enumerate(units):
-            yield work(unit, _reporter(on_event, number), FIRST)
+            yield work(unit, partial(_report, on_event, number), FIRST)
         return
     ledger = Ledger(units, limits, on_event)
     count = min(workers, len(ledger.units))
@@ -61,39 +52,30 @@ def run(
         while ledger.open:
             pool.fill()
             yield from pool.turn()
-        ledger.raise_failures()
+        if ledger.failures:
+            raise ledger.failures[0]
     finally:
         pool.close()
 
 
-def _reporter(on_event: OnEvent, number: int) -> Callable[[Any], None]:
-    def report(event: Any) -> None:
-        if not isinstance(event, Step):
-            on_event(number, event)
-
-    return report
+def _report(on_event: OnEvent, number: int, event: Any) -> None:
+    if not isinstance(event, Step):
+        on_event(number, event)
 
 
 class WorkerProcess:
-    """A spawned process that runs one unit after the other.
-
-    Attributes:
-        ready: whether it can take a unit.
-        unit: the number of the unit it is at; None if it has none.
-        step: the last step that the unit reported.
-    """
+    """A spawned process that runs one unit after the other."""
 
     def __init__(self, make_work: Callable[[int], Work], workers: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(
-            target=serve, args=(theirs, make_work, workers), daemon=True, name="hma-worker"
-        )
+        given = theirs, make_work, workers
+        self.process = context.Process(target=serve, args=given, daemon=True, name="hma-worker")
         self.process.start()
         theirs.close()
-        self.ready = False
-        self.unit: int | None = None
-        self.step, self._heard = "", time.monotonic()
+        self.ready = False  # whether it can take a unit
+        self.unit: int | None = None  # the number of the unit it is at
+        self.step, self._heard = "", time.monotonic()  # the last step that the unit reported
 
     def start_unit(self, number: int, unit: Any, attempt: Attempt) -> None:
         """Hand a unit to the process."""
@@ -135,32 +117,19 @@ class WorkerProcess:
 
 
 class Units(Protocol):
-    """The units of a pool: the Ledger, or the one unit of an actor."""
+    """The units of a pool: the Ledger, or the one unit of an actor; see Ledger for the methods."""
 
     limits: Limits
 
-    def take(self) -> tuple[int, Any, Attempt] | None:
-        """Return the next unit to start; None if none may start now."""
-        ...
+    def take(self) -> tuple[int, Any, Attempt] | None: ...
 
-    def finished(self, number: int) -> None:
-        """Record that the unit is done."""
-        ...
+    def finished(self, number: int) -> None: ...
 
-    def lost(self, number: int, cause: Cause, step: str, how: str) -> None:
-        """Record that a unit lost its process."""
-        ...
+    def lost(self, number: int, cause: Cause, step: str, how: str) -> None: ...
 
 
 class Pool:
-    """The processes of one run.
-
-    Args:
-        start: starts a process.
-        count: number of processes.
-        units: hands out the units, and records how they end.
-        on_event: called with (number of a unit, what it reported).
-    """
+    """The processes of one run: `count` of them, each made by `start`."""
 
     def __init__(
         self, start: Callable[[], WorkerProcess], count: int, units: Units, on_event: OnEvent
@@ -237,11 +206,8 @@ class Pool:
 def serve(pipe: Connection, make_work: Callable[[int], Work], workers: int) -> None:
     """Run units that come by the pipe and report on them until it closes; a worker's process calls this.
 
-    Args:
-        pipe: receives (unit, attempt); sends (kind, value), where kind is ready, event, done, failed or
-            short of memory.
-        make_work: called once.
-        workers: number of workers of the whole run.
+    The pipe receives (unit, attempt) and sends (kind, value), where kind is ready, event, done, failed or
+    short of memory. `workers` is the number of workers of the whole run.
     """
     take_ordinary_priority()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C

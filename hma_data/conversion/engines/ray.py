@@ -1,8 +1,7 @@
 """Run work units on a Ray cluster, one actor a worker, with the tokenizer on the actor's GPU if it has one.
 
-Units and output bytes are the same as with the local engine; only the machine differs. The output folder
-must be one that every node sees. When a node is lost, its actors are lost too, and their units are done again
-elsewhere. `RAY_ADDRESS` names the cluster; without it, Ray starts on this machine.
+The output folder must be one that every node sees. When a node is lost, its actors are lost too, and their
+units are done again elsewhere. `RAY_ADDRESS` names the cluster; without it, Ray starts on this machine.
 
 An actor keeps one worker process of the local engine. So the threads and buffers of Ray are in another
 process than the tokenizer, and the exit code of the process is known. The actor collects events, so that the
@@ -15,10 +14,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 from typing import Any
 
-from hma_data.conversion.engines.base import LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Work
+from hma_data.conversion.engines import LIMITS, Attempt, Cause, Ledger, Limits, OnEvent, Work
 from hma_data.conversion.engines.local import Pool, WorkerProcess
 from hma_data.errors import HMAError, MissingDependencyError
 
@@ -41,8 +41,7 @@ def run(
     """Run every unit and yield each result when it is ready; see engines.local.run.
 
     Args:
-        workers: number of actors.
-        gpus: GPUs of each actor.
+        workers: number of actors, each with `gpus` GPUs.
 
     Raises:
         HMAError: a unit failed for a reason that is not its data, its worker was lost too often, or the
@@ -58,7 +57,8 @@ def run(
     try:
         while ledger.open:
             yield from actors.turn()
-        ledger.raise_failures()
+        if ledger.failures:
+            raise ledger.failures[0]
     finally:
         actors.close()
         if ours:
@@ -88,43 +88,10 @@ def _join(ray: Any) -> None:
 # -- in an actor
 
 
-@dataclass(frozen=True)
-class Opened:
-    """The process is ready for its first unit."""
-
-
-@dataclass(frozen=True)
-class Done:
-    """A unit is done, with this result."""
-
-    result: Any
-
-
-@dataclass(frozen=True)
-class Lost:
-    """The unit's process is gone or ran out of memory; see engines.base.Ledger.lost."""
-
-    cause: Cause
-    step: str
-    how: str
-
-
-@dataclass(frozen=True)
-class Failed:
-    """An error that ends the job."""
-
-    fault: HMAError
-
-
-End = Opened | Done | Lost | Failed
-
-
-@dataclass(frozen=True)
-class Answer:
-    """The events of a unit since the last answer, without its steps; and its end, if it is over."""
-
-    events: tuple[Any, ...]
-    end: End | None = None
+# How an actor's task ends: ("ready", None) for its first unit, ("done", result), ("failed", the error that
+# ends the job), or ("lost", (cause, step, how)), see Ledger.lost.
+End = tuple[str, Any]
+Answer = tuple[list[Any], End | None]  # a unit's events since the last answer; and its end, if it is over
 
 
 class Worker:
@@ -134,9 +101,8 @@ class Worker:
     process the actor is what the Ledger is to a local pool.
 
     Args:
-        make_work: called in the process.
-        workers: number of workers of the whole run.
-        quiet_s: see engines.base.Limits.
+        make_work, workers: see `local.serve`.
+        quiet_s: see Limits.
         answer_s: seconds for which events are collected, unless the unit ends before.
     """
 
@@ -144,7 +110,8 @@ class Worker:
         self, make_work: Callable[[int], Work], workers: int, quiet_s: float | None, answer_s: float
     ) -> None:
         self.limits = Limits(quiet_s)
-        self.pool = Pool(lambda: WorkerProcess(make_work, workers), 1, self, self._add_event)
+        start = partial(WorkerProcess, make_work, workers)
+        self.pool = Pool(start, 1, self, lambda _, event: self._events.append(event))
         self._answer_s = answer_s
         self._unit: tuple[int, Any, Attempt] | None = None
         self._opening = False
@@ -152,7 +119,7 @@ class Worker:
         self._end: End | None = None
 
     def open(self) -> Answer:
-        """Start the process; its last answer carries Opened."""
+        """Start the process; its last answer ends with "ready"."""
         self._opening = True
         return self.go_on()
 
@@ -169,17 +136,14 @@ class Worker:
                 self.pool.fill()
             try:
                 for result in self.pool.turn():
-                    self._end = Done(result)
+                    self._end = "done", result
             except HMAError as fault:
-                self._end = Failed(fault)
+                self._end = "failed", fault
             if self._opening and any(process.ready for process in self.pool.processes):
-                self._opening, self._end = False, Opened()
-        answer = Answer(tuple(self._events), self._end)
+                self._opening, self._end = False, ("ready", None)
+        answer = self._events, self._end
         self._events, self._end = [], None
         return answer
-
-    def _add_event(self, number: int, event: Any) -> None:
-        self._events.append(event)
 
     def take(self) -> tuple[int, Any, Attempt] | None:
         """Return the unit if it has not been started."""
@@ -191,7 +155,7 @@ class Worker:
 
     def lost(self, number: int, cause: Cause, step: str, how: str) -> None:
         """Tell the driver that the unit lost its process."""
-        self._end = Lost(cause, step, how)
+        self._end = "lost", (cause, step, how)
 
 
 @contextmanager
@@ -222,14 +186,9 @@ class _Actors:
     """The actors of one run. Each has at most one unit, so that a slow one delays no other unit."""
 
     def __init__(
-        self,
-        ray: Any,
-        make_work: Callable[[int], Work],
-        count: int,
-        gpus: float,
-        ledger: Ledger,
-        on_event: OnEvent,
-    ) -> None:
+        self, ray: Any, make_work: Callable[[int], Work], count: int, gpus: float,
+        ledger: Ledger, on_event: OnEvent,
+    ) -> None:  # fmt: skip
         self._ray, self._ledger, self._on_event, self._count = ray, ledger, on_event, count
         answer_s = max(ANSWER_S, count / ANSWERS_A_S)
         self._arguments = ray.put(make_work), count, ledger.limits.quiet_s, answer_s
@@ -237,10 +196,9 @@ class _Actors:
         self._class = ray.remote(num_cpus=1, num_gpus=gpus, max_restarts=0, enable_task_events=False)(Worker)
         self._slots: list[_Slot] = []
         self._lost_starts = 0
-        self._placed = time.monotonic()
+        self._placed = time.monotonic()  # when an actor was last ready
 
     def turn(self) -> Iterator[Any]:
-        """Hand out units, then process the answers of the actors; yield results."""
         while len(self._slots) < self._count:
             actor = self._class.remote(*self._arguments)
             self._slots.append(_Slot(actor, actor.open.remote()))
@@ -254,33 +212,39 @@ class _Actors:
         heard, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
         for ref in heard:
             yield from self._listen(waiting[ref])
-        self._check_room()
+        if any(slot.ready for slot in self._slots):
+            self._placed = time.monotonic()
+        elif time.monotonic() - self._placed > NO_ROOM_S:
+            remedy = "see `ray status`; every worker needs a CPU, and a GPU with --device cuda"
+            raise HMAError("the Ray cluster", f"has had no room for a worker for {NO_ROOM_S:g} s", remedy)
 
     def _listen(self, slot: _Slot) -> Iterator[Any]:
         try:
-            answer: Answer = self._ray.get(slot.answer)
+            events, end = self._ray.get(slot.answer)
         except self._ray.exceptions.RayTaskError as fault:
             raise HMAError("the Ray cluster", f"cannot work: {_first_line(fault)}", INSTALLED) from fault
         except self._ray.exceptions.RayError as fault:
             self._bury(slot, "was lost: " + _first_line(fault))
             return
-        for event in answer.events:
+        for event in events:
             assert slot.unit is not None
             self._on_event(slot.unit, event)
-        end = answer.end
-        slot.answer = slot.actor.go_on.remote() if end is None else None
-        if isinstance(end, Failed):
-            raise end.fault
-        if isinstance(end, Opened):
+        if end is None:
+            slot.answer = slot.actor.go_on.remote()
+            return
+        slot.answer, (kind, value) = None, end
+        if kind == "failed":
+            raise value
+        if kind == "ready":
             slot.ready, self._lost_starts = True, 0
-        elif end is not None:
-            number, slot.unit = slot.unit, None
-            assert number is not None
-            if isinstance(end, Lost):
-                self._ledger.lost(number, end.cause, end.step, end.how)
-            else:
-                self._ledger.finished(number)
-                yield end.result
+            return
+        number, slot.unit = slot.unit, None
+        assert number is not None
+        if kind == "lost":
+            self._ledger.lost(number, *value)
+        else:
+            self._ledger.finished(number)
+            yield value
 
     def _bury(self, slot: _Slot, how: str) -> None:
         self._slots.remove(slot)
@@ -293,15 +257,7 @@ class _Actors:
                 fault = f"lost {self._lost_starts} workers in a row at their start; the last {how}"
                 raise HMAError("the Ray cluster", fault, INSTALLED)
 
-    def _check_room(self) -> None:
-        if any(slot.ready for slot in self._slots):
-            self._placed = time.monotonic()
-        elif time.monotonic() - self._placed > NO_ROOM_S:
-            remedy = "see `ray status`; every worker needs a CPU, and a GPU with --device cuda"
-            raise HMAError("the Ray cluster", f"has had no room for a worker for {NO_ROOM_S:g} s", remedy)
-
     def close(self) -> None:
-        """End every actor; its process ends with it."""
         for slot in self._slots:
             self._ray.kill(slot.actor)
 

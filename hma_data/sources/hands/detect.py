@@ -7,9 +7,8 @@ hands are tracked. The constants are those of MediaPipe's published graphs: palm
 palm_detection_detection_to_roi, hand_landmark_cpu, hand_landmark_landmarks_to_roi and
 hand_landmark_tracking_cpu.
 
-Left and right are the person's own hands in a picture that is not mirrored. MediaPipe's graph assumes
-mirrored pictures, as front cameras show them, and so calls a right hand in a plain picture "Left". The
-model's number itself is the probability of a right hand in a plain picture.
+Left and right are the person's own hands. The model's handedness is the probability of a right hand in a
+picture that is not mirrored; MediaPipe's graph assumes mirrored pictures, and calls such a hand "Left".
 
 Geometry is in pixels, angles in radians, x to the right and y down.
 """
@@ -54,16 +53,11 @@ _REMEDY = (
 
 @dataclass(frozen=True)
 class HandModels:
-    """The bytes of both models.
+    """The bytes of both models."""
 
-    Attributes:
-        palm, hand: content of the .tflite files.
-        where: what they were read from.
-    """
-
-    palm: bytes
+    palm: bytes  # content of the .tflite file, as of `hand`
     hand: bytes
-    where: str
+    where: str  # what they were read from
 
     @property
     def digest(self) -> str:
@@ -109,7 +103,6 @@ class Network:
         content: of the .tflite file.
         side: pixels of its square input.
         widths: of the wanted outputs, each the product of its shape; equal ones in the order of names.
-        where: for errors.
 
     Raises:
         SourceError: it is another model.
@@ -150,16 +143,12 @@ class Network:
 class Hand:
     """One hand in one picture.
 
-    Attributes:
-        side: left or right, the person's own.
-        score: probability that there is a hand, 0..1.
-        points: (21, 2) x and y as fractions of the picture's width and height; may lie outside it.
-            Point 0 is the wrist; four points of each finger follow, thumb first, tips at 4, 8, 12, 16, 20.
+    Of the points, 0 is the wrist; four of each finger follow, thumb first, tips at 4, 8, 12, 16, 20.
     """
 
-    side: str
-    score: float
-    points: Floats
+    side: str  # left or right, the person's own
+    score: float  # probability that there is a hand, 0..1
+    points: Floats  # (21, 2) x and y as fractions of the picture's width and height; may lie outside it
 
 
 @dataclass(frozen=True)
@@ -181,25 +170,17 @@ class Square:
 
 @dataclass(frozen=True)
 class Track:
-    """A tracked hand.
+    """A tracked hand."""
 
-    Attributes:
-        square: where the next picture is searched for it.
-        right: sum of P(right) over the pictures it was seen in.
-        seen: number of them.
-    """
-
-    square: Square
-    right: float = 0.0
-    seen: int = 0
+    square: Square  # where the next picture is searched for it
+    right: float = 0.0  # sum of P(right) over the pictures it was seen in
+    seen: int = 0  # number of them
 
 
 class MediaPipeHands:
     """A detector of at most one left and one right hand in each picture of a video, in order.
 
-    Args:
-        models: their files; None takes $HMA_HAND_MODELS.
-        mirrored: the pictures are mirrored, as front cameras show them.
+    `mirrored` pictures are as front cameras show them. Without models it takes those of $HMA_HAND_MODELS.
 
     Raises:
         SourceError: there are no models, or they are other models.
@@ -224,7 +205,9 @@ class MediaPipeHands:
         height, width = picture.shape[:2]
         tracks = self._tracks
         if len(tracks) < HANDS:
-            tracks = tracks + self._new_tracks(picture, [track.square for track in tracks])
+            squares = [square_of_palm(palm) for palm in self._palms(picture)[:HANDS]]
+            fresh = (s for s in squares if not any(_overlap(s, track.square) > SAME for track in tracks))
+            tracks = [*tracks, *map(Track, fresh)]
         found: list[tuple[Track, float, Floats]] = []
         for track in tracks:
             score, points, p_right = self._look(picture, track.square)
@@ -241,10 +224,6 @@ class MediaPipeHands:
             for side, (_, score, points) in zip(sides, found, strict=True)
             if side
         ]
-
-    def _new_tracks(self, picture: Images, known: list[Square]) -> list[Track]:
-        squares = [square_of_palm(palm) for palm in self._palms(picture)[:HANDS]]
-        return [Track(square) for square in squares if not any(_overlap(square, old) > SAME for old in known)]
 
     def _palms(self, picture: Images) -> list[Floats]:
         """Return the palms in a picture, the surest first: (9, 2) two corners and seven points in pixels."""
@@ -288,8 +267,7 @@ def cut(picture: Images, square: Square, size: int) -> NDArray[np.float32]:
 def palm_anchors() -> Floats:
     """Return the palm model's anchors, (2016, 2) x and y in 0..1: two a cell of 24×24, six of 12×12."""
     found = []
-    for stride, copies in ((8, 2), (16, 6)):
-        cells = PALM_SIDE // stride
+    for cells, copies in ((24, 2), (12, 6)):
         y, x = np.mgrid[:cells, :cells]
         centres = (np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / cells
         found.append(np.repeat(centres, copies, axis=0))
@@ -318,11 +296,9 @@ def decode_palms(values: NDArray[Any], scores: NDArray[Any], anchors: Floats) ->
 
 
 def merge_overlapping(shapes: Floats, chances: Floats) -> list[Floats]:
-    """Merge overlapping shapes by weighted non-maximum suppression; probabilities are the weights.
+    """Merge overlapping shapes (n, 9, 2) by non-maximum suppression, weighted by their probabilities (n,).
 
-    Args:
-        shapes: (n, 9, 2), the first two rows corners of a box; the surest first.
-        chances: (n,).
+    The first two rows of a shape are corners of its box; the surest shape is first.
     """
     merged = []
     while len(shapes):
@@ -352,10 +328,9 @@ def square_of_points(points: Floats) -> Square:
     """Return the square in which the hand of those points (21, 2) is expected in the next picture."""
     ahead = ((points[5] + points[13]) / 2 + points[9]) / 2
     angle = _upright(points[0], ahead)
-    known = points[_KNUCKLES]
     cos, sin = math.cos(angle), math.sin(angle)
     turn = np.array([[cos, -sin], [sin, cos]])  # from the hand's own axes to the picture's
-    own = known @ turn
+    own = points[_KNUCKLES] @ turn
     low, high = own.min(axis=0), own.max(axis=0)
     width, height = high - low
     return _grown(turn @ ((low + high) / 2), width, height, angle, scale=2.0, up=0.1)
@@ -369,20 +344,13 @@ def _upright(start: Floats, end: Floats) -> float:
 
 def _grown(centre: Floats, width: float, height: float, angle: float, scale: float, up: float) -> Square:
     """Return the square round a rotated box, moved along the hand by `up` of its height and scaled."""
-    return Square(
-        float(centre[0] + height * up * math.sin(angle)),
-        float(centre[1] - height * up * math.cos(angle)),
-        float(max(width, height, 1.0) * scale),
-        angle,
-    )
+    x, y = centre + height * up * np.array([math.sin(angle), -math.cos(angle)])
+    return Square(float(x), float(y), float(max(width, height, 1.0) * scale), angle)
 
 
 def _overlap(one: Square, other: Square) -> float:
-    corners = [
-        np.array([[s.x - s.side / 2, s.y - s.side / 2], [s.x + s.side / 2, s.y + s.side / 2]])
-        for s in (one, other)
-    ]
-    return float(box_overlap(corners[0], corners[1][None])[0])
+    mine, theirs = (np.array([s.x, s.y]) + np.array([[-0.5], [0.5]]) * s.side for s in (one, other))
+    return float(box_overlap(mine, theirs[None])[0])
 
 
 def _same(points: Floats, others: Floats) -> bool:

@@ -7,9 +7,8 @@
 - `egoexo4d_hand_pose`: Ego-Exo4D's ego_pose/<split>/hand/{automatic,annotation}/<take>.json: frame number ->
   joints of one camera in pixels. A take's videos lie in a folder with the take's name.
 
-A file of another form raises one clear error. JSON is parsed once, and only arrays stay in memory. Nothing is
-unpickled: the instructions of EPIC-KITCHENS's files are read one by one, and only a list of byte strings is
-accepted.
+Nothing is unpickled: the instructions of EPIC-KITCHENS's files are read one by one, and only a list of byte
+strings is accepted.
 
 R rows of a table, one a hand.
 """
@@ -27,8 +26,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import first_bytes, local_path
-from hma_data.sources.hands.layout import HandsLayout, Video
-from hma_data.sources.hands.runs import SIDES, HandLabels, labels_from_rows
+from hma_data.sources.hands.runs import SIDES, HandLabels, HandsLayout, Video, labels_from_rows
 
 PICKLES, TABLES = (".pkl", ".pickle"), (".parquet", ".csv")
 _FINGERS = ("thumb", "index", "middle", "ring", "pinky")
@@ -37,13 +35,9 @@ _FHO = "give fho_main.json of the annotations that Ego4D's command fetches (benc
 
 
 class LabelSet(Protocol):
-    """The labels of a set of videos.
+    """The labels of a set of videos."""
 
-    Attributes:
-        known: the names that the labels use for their videos.
-    """
-
-    known: list[str]
+    known: list[str]  # the names that the labels use for their videos
 
     def of(self, video: Video) -> HandLabels | None:
         """Return the labels of a video; None where it has none.
@@ -128,10 +122,6 @@ class HandTable:
     | x, y | center; with wrist_x, wrist_y beside them or alone: wrist |
 
     A value that is not finite says that there is no hand.
-
-    Args:
-        path: of the file.
-        layout: of the source.
 
     Raises:
         SourceError: it cannot be read, lacks a column, or has another kind of value.
@@ -313,10 +303,7 @@ class Ego4dFho:
 
 
 def _compact(item: dict[str, Any]) -> Any:
-    """Return what is kept of an object while fho_main.json is parsed, innermost objects first.
-
-    The whole file would not fit in memory.
-    """
+    """Return what is kept of an object while fho_main.json, too large for memory, is parsed from inside."""
     if "object_type" in item:
         box, kind = item.get("bbox"), item["object_type"]
         sides = ("x", "y", "width", "height")
@@ -348,16 +335,8 @@ def _labels_of_actions(actions: list[Any], layout: HandsLayout) -> HandLabels | 
         return None
     table = np.array(rows, np.float64)
     frames, sides = table[:, :2].astype(np.int64).T
-    return labels_from_rows(
-        frames,
-        sides,
-        np.ones(len(table)),
-        {"center": table[:, 2:]},
-        looked_at,
-        pixels=True,
-        irregular=True,
-        texts=tuple(sorted(texts)),
-    )
+    facts = {"pixels": True, "irregular": True, "texts": tuple(sorted(texts))}
+    return labels_from_rows(frames, sides, np.ones(len(table)), {"center": table[:, 2:]}, looked_at, **facts)
 
 
 # -- Ego-Exo4D
@@ -381,7 +360,11 @@ class EgoExoHands:
             except (KeyError, TypeError, ValueError) as fault:
                 raise SourceError(path, f"is not Ego-Exo4D's takes.json: {fault!r}") from fault
         self._uids = {uid: uid for uid in self._files}
-        self._uids |= {names.get(uid) or _take_name(path): uid for uid, path in self._files.items()}
+        for uid, path in self._files.items():
+            if uid not in names:
+                stated = re.search(rb'"take_name"\s*:\s*"([^"]+)"', first_bytes(path, 1 << 16))
+                names[uid] = stated[1].decode(errors="replace") if stated else uid
+            self._uids[names[uid]] = uid
         self.known = list(self._uids)
 
     def of(self, video: Video) -> HandLabels | None:
@@ -391,12 +374,6 @@ class EgoExoHands:
         if called is None or (called != place.stem and place.stem != self._layout.camera):
             return None
         return _joints_of(self._files[self._uids[called]], self._layout)
-
-
-def _take_name(path: Path) -> str:
-    """Return the take's name, as its first labelled frame states it; else the file's own name."""
-    stated = re.search(rb'"take_name"\s*:\s*"([^"]+)"', first_bytes(path, 1 << 16))
-    return stated[1].decode(errors="replace") if stated else path.stem
 
 
 def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
@@ -420,10 +397,7 @@ def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
     if not frames:
         remedy = f"its cameras: {', '.join(sorted(cameras)) or 'none'}"
         raise EpisodeError(path, f"has no hands in camera {layout.camera}", remedy)
-    parts = {
-        "wrist": points[:, 0],
-        "center": (points.min(axis=1) + points.max(axis=1)) / 2,
-        "landmarks": points.reshape(-1, 42),
-    }
+    center = (points.min(axis=1) + points.max(axis=1)) / 2
+    parts = {"wrist": points[:, 0], "center": center, "landmarks": points.reshape(-1, 42)}
     scores = np.ones(len(frames))
     return labels_from_rows(np.array(frames), np.array(sides), scores, parts, looked_at, pixels=True)

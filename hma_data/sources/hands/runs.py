@@ -1,21 +1,50 @@
-"""Represent the labelled hands of a video, and cut them into runs of frames that have the needed hands.
+"""Cut the labelled hands of a video into episodes: runs of frames that have the needed hands.
 
 A point is a side and a part of the hand: `left/center`, `right/wrist`, `left/landmarks`. A component's key is
 a point, with `/next` for its value at the next labelled frame of the run, or `/delta` for next minus current.
 
+`source.layout` of an embodiment with format `hands`; all values are text, as in every layout:
+
+| key | values | default |
+|---|---|---|
+| labels | detector, landmarks, epic_kitchens_hand_objects, ego4d_fho, egoexo4d_hand_pose | detector |
+| annotations | file or folder of the labels, absolute or below the videos' folder | that folder |
+| models | of the detector: folder of .tflite files or a .task bundle | $HMA_HAND_MODELS |
+| missing | what a frame without a needed hand does, see below: split, hold, mask | split |
+| max_hold | most labelled frames in a row for which the last position is held | no limit; with mask 0 |
+| min_frames | runs with fewer frames (with hands) are left out | 12 |
+| min_score | labels with a lower score are ignored | 0.5 |
+| max_gap_s | most seconds between labels of one run, where labels are irregular | 3 |
+| pictures | labelled: frames with a label; every: all from the first to the last of a run | labelled |
+| first_frame | number of a video's first frame in the labels | 1 for EPIC-KITCHENS, else 0 |
+| label_size | WIDTHxHEIGHT of the pictures on which pixel labels were made | the video's |
+| camera | Ego-Exo4D: which camera's labels and videos | cam01 |
+| mirrored | true for mirrored pictures (front cameras): swaps the detector's left and right | false |
+
+missing: `split` ends the run. `hold` keeps the hand's last position for at most `max_hold` frames, and then
+ends the run. `mask` continues the run: the values that need the hand are unknown; with `max_hold` they are
+held first, and unknown after that.
+
 N labelled frames of a video, n of a run, w values of a point (2, or 42 for landmarks).
 """
 
+import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
-from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.hands.layout import HandsLayout, Header
+from hma_data.errors import EpisodeError, RegistryError, SourceError
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.base import local_path, nothing_there
+from hma_data.sources.common.video_file import opened
+from hma_data.sources.hands import VIDEO_SUFFIXES
 
 Floats = NDArray[np.float64]
 Frames = NDArray[np.int64]
@@ -26,6 +55,133 @@ POINTS = {f"{side}/{part}": width for side in SIDES for part, width in PARTS.ite
 KEYS = tuple(point + suffix for point in POINTS for suffix in ("", "/next", "/delta"))
 BEYOND = 0.05  # share of the picture's side by which a label may lie outside; it is moved to the edge
 LATE = 0.01  # share of a video's frames by which labels may continue after its end
+
+
+def _width_and_height(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    sides = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", value)
+    if not sides:
+        raise ValueError("give WIDTHxHEIGHT, such as 1920x1080")
+    return int(sides[1]), int(sides[2])
+
+
+Labels = Literal["detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose"]
+
+
+class HandsLayout(BaseModel):
+    """The values of `source.layout`; see the module."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    labels: Labels = "detector"
+    annotations: str | None = None
+    models: str | None = None
+    missing: Literal["split", "hold", "mask"] = "split"
+    max_hold: int | None = Field(None, ge=0)
+    min_frames: int = Field(12, ge=0)
+    min_score: FiniteFloat = Field(0.5, ge=0)
+    max_gap_s: FiniteFloat = Field(3.0, ge=0)
+    pictures: Literal["labelled", "every"] = "labelled"
+    first_frame: int | None = Field(None, ge=0)
+    label_size: Annotated[tuple[int, int] | None, BeforeValidator(_width_and_height)] = None
+    camera: str = "cam01"
+    mirrored: bool = False
+
+    @property
+    def frame_offset(self) -> int:
+        """Return the number to subtract from a label's frame number to get the frame's index."""
+        if self.first_frame is not None:
+            return self.first_frame
+        return int(self.labels == "epic_kitchens_hand_objects")
+
+
+def layout_of(embodiment: Embodiment | None) -> HandsLayout:
+    """Return an embodiment's layout; all defaults without one.
+
+    Raises:
+        RegistryError: an unknown key, or a value that is not allowed.
+    """
+    if embodiment is None:
+        return HandsLayout()
+    try:
+        return HandsLayout.model_validate(embodiment.source.layout or {})
+    except ValidationError as fault:
+        first = fault.errors()[0]
+        where = f"embodiment {embodiment.id}: source.layout.{first['loc'][0]}"
+        if first["type"] == "extra_forbidden":
+            known = ", ".join(HandsLayout.model_fields)
+            raise RegistryError(where, "is not a key of hand videos", f"allowed: {known}") from fault
+        said = first["msg"].removeprefix("Value error, ")
+        raise RegistryError(where, f"is {first['input']!r}", said) from fault
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video file of the source."""
+
+    path: Path
+    name: str  # its path within the folder; the id of its episode
+    aliases: tuple[str, ...]  # names that labels may use for it, the most exact first
+
+
+def videos_of(uri: str) -> dict[str, Video]:
+    """Return the videos of a file or folder by name, in natural order.
+
+    Raises:
+        SourceError: there are none.
+    """
+    root = local_path(uri)
+    files = [root] if root.is_file() else sorted(root.rglob("*"), key=lambda path: _natural_order(str(path)))
+    folder = root.parent if root.is_file() else root
+    paths = {
+        path.relative_to(folder).as_posix(): path
+        for path in files
+        if path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+    }
+    if not paths:
+        raise nothing_there(uri, root, "holds no videos", f"looked for {', '.join(VIDEO_SUFFIXES)}")
+    short = {name: sorted({PurePosixPath(name).name, PurePosixPath(name).stem}) for name in paths}
+    uses = Counter(alias for aliases in short.values() for alias in aliases)
+    videos = {}
+    for name, path in paths.items():
+        unique = (alias for alias in short[name] if uses[alias] == 1)
+        videos[name] = Video(path, name, (name, str(PurePosixPath(name).with_suffix("")), *unique))
+    return videos
+
+
+def _natural_order(name: str) -> list[tuple[int, int, str]]:
+    """Return a sort key that puts clip_2 before clip_10."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]
+
+
+@dataclass(frozen=True)
+class Header:
+    """The facts of a video file's header, known without reading its packets."""
+
+    frames: int  # how many; 0 where the header does not state it
+    hz: float  # stated rate; 0 where none is stated
+    width: int  # pixels, as stored
+    height: int
+    codec: str  # h264, av1, …
+
+
+def header_of(path: Path) -> Header:
+    """Return the header of a video file.
+
+    Raises:
+        EpisodeError: it is not a video, or it is damaged.
+    """
+    with opened(path) as (container, stream):
+        hz = float(stream.average_rate or 0)
+        seconds = float(stream.duration * stream.time_base) if stream.duration else 0.0
+        if not seconds and container.duration:
+            seconds = container.duration / 1e6
+        frames = stream.frames or round(seconds * hz)
+        return Header(frames, hz, stream.width, stream.height, stream.codec.canonical_name)
+
+
+# -- labels and runs
 
 
 def point_of(key: str, where: str) -> str:
@@ -42,21 +198,13 @@ def point_of(key: str, where: str) -> str:
 
 @dataclass(frozen=True)
 class HandLabels:
-    """The positions of the hands in one video.
+    """The positions of the hands in one video."""
 
-    Attributes:
-        frames: (N,) rising indices of the labelled frames of the video.
-        points: point -> (N, w); NaN where there is no such hand. Every point is a key.
-        pixels: whether values are pixels, not fractions.
-        irregular: whether labels are few, at any spacing; otherwise a frame without a label has no hand.
-        texts: (frame, what the person does from this frame on).
-    """
-
-    frames: Frames
-    points: dict[str, Floats]
-    pixels: bool = False
-    irregular: bool = False
-    texts: tuple[tuple[int, str], ...] = ()
+    frames: Frames  # (N,) rising indices of the labelled frames of the video
+    points: dict[str, Floats]  # point -> (N, w); NaN where there is no such hand. Every point is a key.
+    pixels: bool = False  # whether values are pixels, not fractions
+    irregular: bool = False  # labels are few, at any spacing; else a frame without a label has no hand
+    texts: tuple[tuple[int, str], ...] = ()  # (frame, what the person does from this frame on)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -104,21 +252,13 @@ def labels_from_rows(
 
 @dataclass(frozen=True)
 class Runs:
-    """A video's labels, cut into runs.
+    """A video's labels, cut into runs."""
 
-    Attributes:
-        labels: as fractions, with gaps of regular labels filled in and hands held.
-        spans: [from, to) into the labels, one a run; the last frame of a run only ends it.
-        missing: (N,) whether a label lacks a needed hand; held ones do not count.
-        held: (N,) whether a needed hand keeps its last position.
-        counts: numbers of frames: labelled, without_hands, outside, held, dropped.
-    """
-
-    labels: HandLabels
-    spans: tuple[tuple[int, int], ...]
-    missing: NDArray[np.bool_]
-    held: NDArray[np.bool_]
-    counts: dict[str, int]
+    labels: HandLabels  # as fractions, with gaps of regular labels filled in and hands held
+    spans: tuple[tuple[int, int], ...]  # [from, to) into the labels; the last frame of a run only ends it
+    missing: NDArray[np.bool_]  # (N,) whether a label lacks a needed hand; held ones do not count
+    held: NDArray[np.bool_]  # (N,) whether a needed hand keeps its last position
+    counts: dict[str, int]  # numbers of frames: labelled, without_hands, outside, held, dropped
 
 
 def cut_into_runs(
@@ -221,9 +361,8 @@ def _as_fractions(
                 x, y = raw[beyond][0, :2]
                 fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the picture of "
                 fault += f"{size[0]}×{size[1]} pixels, the first at {x:.4g}, {y:.4g}"
-                raise EpisodeError(
-                    where, fault, "check that these are its labels, and source.layout.label_size"
-                )
+                remedy = "check that these are its labels, and source.layout.label_size"
+                raise EpisodeError(where, fault, remedy)
         points[point] = np.where(beyond[:, None], np.nan, np.clip(values, 0, 1))
     return replace(labels, points=points, pixels=False), int(lost.sum())
 

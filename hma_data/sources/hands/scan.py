@@ -1,8 +1,8 @@
 """Run the detector over whole videos: for labels, for a table of labels, and for `hma inspect`.
 
 `detect` writes a table for a folder once, and `labels: landmarks` then reads it: all runs become episodes,
-and the table can be corrected by hand. `scan_cached` is used by `labels: detector` while it reads: detections
-are cached by the content of the video and the models, so a second conversion does not run the detector again.
+and the table can be corrected by hand. `labels: detector` uses `scan_cached` while it reads: detections are
+cached by the content of the video and the models.
 
 R hands found.
 """
@@ -22,8 +22,17 @@ from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands, load_models
-from hma_data.sources.hands.layout import HandsLayout, Header, Video, header_of, videos_of
-from hma_data.sources.hands.runs import POINTS, SIDES, HandLabels, labels_from_rows
+from hma_data.sources.hands.runs import (
+    POINTS,
+    SIDES,
+    HandLabels,
+    HandsLayout,
+    Header,
+    Video,
+    header_of,
+    labels_from_rows,
+    videos_of,
+)
 from hma_data.storage.files import atomic_path, cache_folder
 from hma_data.storage.paths import StrPath, as_path, as_text
 
@@ -32,11 +41,7 @@ LOOKED_AT, FRAMES = 5, 12  # most videos that are searched for hands by an inspe
 
 
 def scan(name: str, video: VideoFile, detector: MediaPipeHands, frames: Iterable[int] | None = None) -> Any:
-    """Run a detector over a video's frames in order.
-
-    Args:
-        name: of the video, for the table.
-        frames: which frames, all by default; the detector treats them as consecutive.
+    """Run a detector over a video's frames in order; the detector treats `frames`, if given, as consecutive.
 
     Returns:
         an arrow table of R rows as `labels: landmarks` reads it: video, frame, side, score, landmarks.
@@ -71,8 +76,7 @@ def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrore
     Args:
         folder: str or path of a folder of videos, or of one video.
         out: str or path of the file to write, .parquet.
-        models: str or path of a folder or bundle; None takes $HMA_HAND_MODELS.
-        mirrored: the pictures are mirrored.
+        models, mirrored: see `load_models` and MediaPipeHands.
 
     Returns:
         the number of hands found.
@@ -110,11 +114,10 @@ def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout
     table = pq.read_table(kept)
     scores = table["score"].to_numpy()
     good = scores >= layout.min_score
-    sides = np.array([SIDES.index(side) for side in table["side"].to_pylist()], np.int64)
-    landmarks = table["landmarks"].combine_chunks().flatten().to_numpy().reshape(-1, 42)
-    every = range(len(video))
-    frames = table["frame"].to_numpy()
-    return labels_from_rows(frames[good], sides[good], scores[good], {"landmarks": landmarks[good]}, every)
+    sides = np.array([SIDES.index(side) for side in table["side"].to_pylist()], np.int64)[good]
+    landmarks = table["landmarks"].combine_chunks().flatten().to_numpy().reshape(-1, 42)[good]
+    frames = table["frame"].to_numpy()[good]
+    return labels_from_rows(frames, sides, scores[good], {"landmarks": landmarks}, range(len(video)))
 
 
 def _write(final: Path, table: Any) -> None:

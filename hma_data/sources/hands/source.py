@@ -12,13 +12,13 @@ A key ends in `/next` for the value at the next labelled frame, in `/delta` for 
 ending for the current value. Left and right are the person's own.
 
 Labels come from a detector or from annotations. `source.layout` says from which, and what a frame without a
-needed hand does: see the module `layout`.
+needed hand does: see the module `runs`.
 
 With annotations, each run of at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain
 name `clip.mp4` is the longest run. Runs of one video share a group, so that they come into one split. The
-detector runs while an episode is read, not while episodes are counted; with it, a video is one episode,
-`clip.mp4`: its longest run. `detect` writes a table of labels, with which all runs become episodes. The
-episode's metadata and flags count the frames that are held, masked and left out.
+detector runs only while an episode is read; so with it, a video is one episode, `clip.mp4`: its longest run.
+`scan.detect` writes a table of labels, with which all runs become episodes. The episode's metadata and flags
+count the frames that are held, masked and left out.
 
 T frames of an episode.
 """
@@ -41,20 +41,23 @@ from hma_data.sources.common.survey import listed
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import HandModels, MediaPipeHands, load_models
 from hma_data.sources.hands.labels import LabelSet, open_labels
-from hma_data.sources.hands.layout import HandsLayout, Header, Video, header_of, layout_of, videos_of
 from hma_data.sources.hands.runs import (
     POINTS,
     HandLabels,
+    HandsLayout,
+    Header,
     Runs,
+    Video,
     cut_into_runs,
     episode_frames,
+    header_of,
+    layout_of,
     point_of,
     values_of,
+    videos_of,
 )
-from hma_data.sources.hands.scan import detect, inspect_videos, scan_cached
+from hma_data.sources.hands.scan import inspect_videos, scan_cached
 from hma_data.storage.paths import StrPath, as_text
-
-__all__ = ["CAMERA", "HandsSource", "detect", "open"]
 
 CAMERA = "video"
 RATE_TOLERANCE = 0.01  # of the rate
@@ -168,13 +171,10 @@ class _Pictures:
         self._file, self._indices = file, indices
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
-        """See Stream."""
         return self._file.frames(self._indices[np.asarray(indices, np.int64)])
 
 
-def open() -> HandsSource:
-    """Return the source."""
-    return HandsSource()
+open = HandsSource
 
 
 def _needed(embodiment: Embodiment) -> tuple[str, ...]:
@@ -200,10 +200,7 @@ def _whole(video: Video, digest: str) -> EpisodeRef:
 def _runs_of(
     video: Video, labels: LabelSet, needed: tuple[str, ...], layout: HandsLayout
 ) -> list[EpisodeRef] | None:
-    """Return one ref a run; None for a video without labels.
-
-    A video with damaged labels becomes one ref, which `read` refuses.
-    """
+    """Return one ref a run; None for a video without labels; for damaged ones a ref that `read` refuses."""
     try:
         found = labels.of(video)
         if found is None:
@@ -247,21 +244,16 @@ def _episode(
     if steady and not labels.irregular:
         _check_rate(file.path, _measured_hz(file.timestamps[marks[:-1]]), embodiment)
     text = "; ".join(dict.fromkeys(words for frame, words in labels.texts if marks[0] <= frame < marks[-1]))
-    state: tuple[Signal, ...] = ()
-    if embodiment.state:
-        state = (_signal(embodiment.state, file, labels, span, to_last=not steady),)
+    state = [_signal(embodiment.state, file, labels, span, not steady)] if embodiment.state else []
     # Frames in no run count in the first run, or in the only one that is read.
     left = len(labels) - (stop - start - 1) if number is None else counts["dropped"] if number == 0 else 0
-    flags = {
-        "held_frames": int(runs.held[start : stop - 1].sum()),
-        "masked_frames": int(runs.missing[start : stop - 1].sum()),
-        "dropped_frames": left,
-    }
+    held, masked = (int(marked[start : stop - 1].sum()) for marked in (runs.held, runs.missing))
+    flags = {"held_frames": held, "masked_frames": masked, "dropped_frames": left}
     return Episode(
         id=episode_id,
         streams={camera.name: stream for camera in embodiment.cameras},
         actions=(_signal(embodiment.action, file, labels, span),),
-        states=state,
+        states=tuple(state),
         rate_stamped=steady,
         instruction=text,
         source=str(file.path),
@@ -291,8 +283,6 @@ def _signal(
 def _check_rate(path: Path, measured: float, embodiment: Embodiment) -> None:
     stated = embodiment.frequency_hz
     if isinstance(stated, float) and measured and abs(stated - measured) > RATE_TOLERANCE * measured:
-        raise EpisodeError(
-            path,
-            f"is labelled at {measured:.4g} Hz, embodiment {embodiment.id} says frequency_hz {stated:g}",
-            "correct frequency_hz, or set frequency_hz: null and sync.rate_hz to bring videos onto one rate",
-        )
+        fault = f"is labelled at {measured:.4g} Hz, embodiment {embodiment.id} says frequency_hz {stated:g}"
+        remedy = "correct frequency_hz, or set frequency_hz: null and sync.rate_hz for one rate of all videos"
+        raise EpisodeError(path, fault, remedy)

@@ -43,25 +43,15 @@ FIXED: dict[str, tuple[str, Shape, str]] = {  # class -> kind, shape and dtype
 
 @dataclass(frozen=True)
 class Feature:
-    """One leaf of features.json.
+    """One leaf of features.json."""
 
-    Attributes:
-        name: flattened, as records name it: steps/observation/image.
-        kind: number, text, picture or other (stored in a way that is not read here).
-        shape: of one value, with None where a size varies; pictures are (H, W, C).
-        dtype: of one value, e.g. float32; "string" for text.
-        nesting: lengths of the sequences around it, outermost first, with None where they vary.
-        encoding: none, bytes or zlib.
-        codec: png or jpeg for pictures, as stated; the pictures themselves may differ.
-    """
-
-    name: str
-    kind: str
-    shape: Shape
-    dtype: str
-    nesting: Shape = ()
-    encoding: str = "none"
-    codec: str | None = None
+    name: str  # flattened, as records name it: steps/observation/image
+    kind: str  # number, text, picture or other (stored in a way that is not read here)
+    shape: Shape  # of one value, with None where a size varies; pictures are (H, W, C)
+    dtype: str  # of one value, e.g. float32; "string" for text
+    nesting: Shape = ()  # lengths of the sequences around it, outermost first, with None where they vary
+    encoding: str = "none"  # none, bytes or zlib
+    codec: str | None = None  # png or jpeg for pictures, as stated; the pictures themselves may differ
 
     @property
     def width(self) -> int | None:
@@ -79,9 +69,8 @@ def read_features(text: bytes, where: str) -> dict[str, Feature]:
     try:
         return {leaf.name: leaf for leaf in _leaves(json.loads(text), "", ())}
     except (ValueError, KeyError, TypeError, AttributeError) as fault:
-        raise SourceError(
-            where, f"is not a TFDS features.json: {fault!r}", "write it again with tensorflow_datasets"
-        ) from fault
+        said = f"is not a TFDS features.json: {fault!r}"
+        raise SourceError(where, said, "write it again with tensorflow_datasets") from fault
 
 
 def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
@@ -90,11 +79,8 @@ def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
         children = content.get("features", content)
         if isinstance(children.get("type"), str):  # legacy, and a feature is named "features"
             children = content
-        return [
-            leaf
-            for key, child in children.items()
-            for leaf in _leaves(child, f"{name}/{key}" if name else key, nesting)
-        ]
+        home = f"{name}/" if name else ""
+        return [leaf for key, child in children.items() for leaf in _leaves(child, home + key, nesting)]
     if kind in ("Sequence", "Dataset"):
         return _leaves(content["feature"], name, (*nesting, _size(content.get("length"))))
     if kind == "Translation":
@@ -103,23 +89,19 @@ def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[Feature]:
 
 
 def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> Feature:
-    shape, dtype = _shape(content.get("shape")), str(content.get("dtype") or "")
+    stated, dtype = content.get("shape"), str(content.get("dtype") or "")
+    shape = tuple(map(_size, (stated.get("dimensions") if isinstance(stated, dict) else stated) or ()))
     if kind in FIXED:
         return Feature(name, *FIXED[kind], nesting)
     if kind in ("Image", "LabeledImage", "Video"):
-        if kind == "Video":
-            nesting = (*nesting, shape[0] if shape else None)
+        nesting = (*nesting, *(shape[:1] or (None,))) if kind == "Video" else nesting
         codec = content.get("encodingFormat") or content.get("encoding_format") or "png"
         return Feature(name, "picture", shape[-3:] or (None, None, 3), dtype or "uint8", nesting, codec=codec)
-    if kind in ("Tensor", "Scalar"):
-        encoding = str(content.get("encoding") or "none").lower()
-        if dtype in ("string", "object", "str"):
-            return Feature(name, "text", shape, "string", nesting)
-        return _tensor(name, shape, dtype, nesting, encoding)
-    return Feature(name, "other", shape, dtype or kind, nesting)
-
-
-def _tensor(name: str, shape: Shape, dtype: str, nesting: Shape, encoding: str) -> Feature:
+    if kind not in ("Tensor", "Scalar"):
+        return Feature(name, "other", shape, dtype or kind, nesting)
+    if dtype in ("string", "object", "str"):
+        return Feature(name, "text", shape, "string", nesting)
+    encoding = str(content.get("encoding") or "none").lower()
     try:
         readable = dtype == BFLOAT16 or np.dtype(dtype).kind in "fiub"
     except TypeError:  # float8 and the like
@@ -142,12 +124,6 @@ def _content(node: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     return str(node.get("pythonClassName") or "").rsplit(".", 1)[-1], {}
 
 
-def _shape(value: Any) -> Shape:
-    if isinstance(value, dict):
-        value = value.get("dimensions")
-    return tuple(_size(item) for item in value or ())
-
-
 def _size(value: Any) -> int | None:
     return None if value is None or int(value) < 0 else int(value)
 
@@ -156,12 +132,7 @@ def _size(value: Any) -> int | None:
 
 
 class Steps:
-    """One record and its columns over the steps.
-
-    Args:
-        example: the record.
-        features: those over the steps, by their path in a step.
-        name: the episode's id, for errors.
+    """One record and its columns over the steps; `features` are by their path in a step.
 
     Raises:
         EpisodeError: (here and in every method) there are no steps, or a feature is missing, of another
@@ -227,7 +198,7 @@ class Steps:
         if feature.name not in self.example:
             return None
         if feature.kind in ("picture", "text") or feature.encoding != "none":
-            count = self.example.count(feature.name)
+            count = len(self.example.blobs(feature.name))
             return count // feature.width if feature.kind == "text" and feature.width else count
         return len(self.example.numbers(feature.name)) // feature.width if feature.width else None
 
@@ -241,9 +212,8 @@ class Steps:
         for level in range(len(feature.nesting) - 1):
             lengths = self.example.ints(f"{feature.name}/ragged_row_lengths_{level}")
             if len(lengths) != math.prod(sizes):
-                raise EpisodeError(
-                    self.name, f"{feature.name} has {len(lengths)} rows for {math.prod(sizes)}"
-                )
+                said = f"{feature.name} has {len(lengths)} rows for {math.prod(sizes)}"
+                raise EpisodeError(self.name, said)
             if len(lengths) and (lengths != lengths[0]).any():
                 said = f"{feature.name} varies from {lengths.min()} to {lengths.max()} entries a step"
                 raise EpisodeError(self.name, said)

@@ -36,8 +36,6 @@ NAMED = (  # forms of file names: the suffix after the number, or before it as T
 
 
 class _StatedSplit(BaseModel):
-    """One split in dataset_info.json."""
-
     model_config = ConfigDict(alias_generator=to_camel)
 
     name: str = ""
@@ -46,8 +44,6 @@ class _StatedSplit(BaseModel):
 
 
 class _DatasetInfo(BaseModel):
-    """The part of dataset_info.json that is used."""
-
     model_config = ConfigDict(alias_generator=to_camel)
 
     name: str = ""
@@ -56,7 +52,6 @@ class _DatasetInfo(BaseModel):
     splits: tuple[_StatedSplit, ...] = ()
 
     def shard_path(self, split: _StatedSplit, number: int) -> str:
-        """Return the path of a split's shard, relative to the folder."""
         shards = len(split.shard_lengths)
         digits = max(5, len(str(shards)))
         place, total = f"{number:0{digits}d}", f"{shards:0{digits}d}"
@@ -74,21 +69,13 @@ class _DatasetInfo(BaseModel):
 
 @dataclass(frozen=True)
 class Shard:
-    """One TFRecord or ArrayRecord file of a split.
+    """One TFRecord or ArrayRecord file of a split."""
 
-    Attributes:
-        files: fsspec file system of the path.
-        path: on it.
-        number: its place in the split.
-        stated: how many records dataset_info.json states; None where it states none.
-        first: index within the split of its first record.
-    """
-
-    files: Any
+    files: Any  # fsspec file system of the path
     path: str
-    number: int
-    stated: int | None
-    first: int = 0
+    number: int  # its place in the split
+    stated: int | None  # how many records dataset_info.json states; None where it states none
+    first: int = 0  # index within the split of its first record
 
     @property
     def records(self) -> RecordFile:
@@ -107,11 +94,9 @@ class Shard:
         """
         frames = self.records.framing(limit)
         if self.stated is not None and len(frames) > self.stated:
-            raise SourceError(
-                self.path,
-                f"has {len(frames)} records, dataset_info.json says {self.stated}",
-                "write dataset_info.json again, or remove it: then the records are counted",
-            )
+            fault = f"has {len(frames)} records, dataset_info.json says {self.stated}"
+            remedy = "write dataset_info.json again, or remove it: then the records are counted"
+            raise SourceError(self.path, fault, remedy)
         return frames
 
     def count(self) -> int:
@@ -124,34 +109,22 @@ class Shard:
 
 @dataclass(frozen=True)
 class Folder:
-    """One version of a TFDS dataset.
+    """One version of a TFDS dataset."""
 
-    Attributes:
-        uri: as given.
-        features: leaves of features.json by name.
-        splits: name -> the shards that are there, in order.
-        remote: whether every read of a file is a request over the network.
-        name, version: of the dataset; empty when not stated.
-        problems: contradictions in the dataset, one sentence each.
-    """
-
-    uri: str
-    features: dict[str, Feature]
-    splits: dict[str, tuple[Shard, ...]]
-    remote: bool
-    name: str
+    uri: str  # as given
+    features: dict[str, Feature]  # leaves of features.json by name
+    splits: dict[str, tuple[Shard, ...]]  # the shards that are there, in order
+    remote: bool  # whether every read of a file is a request over the network
+    name: str  # of the dataset; empty when not stated, as is `version`
     version: str
-    problems: tuple[str, ...]
+    problems: tuple[str, ...]  # contradictions in the dataset, one sentence each
 
     @cached_property
     def step_features(self) -> dict[str, Feature]:
         """Return the features over the steps by their path in a step; without `steps`, by their name."""
-        inside = {
-            name.removeprefix("steps/"): leaf
-            for name, leaf in self.features.items()
-            if name.startswith("steps/")
-        }
-        return inside or {name: leaf for name, leaf in self.features.items() if leaf.nesting}
+        found = self.features.items()
+        inside = {name.removeprefix("steps/"): leaf for name, leaf in found if name.startswith("steps/")}
+        return inside or {name: leaf for name, leaf in found if leaf.nesting}
 
     def example(self, episode_id: str) -> tuple[Example, str]:
         """Return an episode's parsed record and the path of its shard.
@@ -162,9 +135,8 @@ class Folder:
         split, _, index = episode_id.partition("/")
         shards = self.splits.get(split, ())
         if not shards or not index.isdecimal():
-            raise EpisodeError(
-                episode_id, f"is not in {self.uri}; an id is like {next(iter(self.splits))}/000000"
-            )
+            like = f"{next(iter(self.splits))}/000000"
+            raise EpisodeError(episode_id, f"is not in {self.uri}; an id is like {like}")
         shard = shards[max(0, bisect_right([item.first for item in shards], int(index)) - 1)]
         position = int(index) - shard.first
         if not 0 <= position < shard.count():
@@ -233,11 +205,8 @@ def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) 
     """Make the folder of `open_folder`; `only` is the path of the one shard that the user chose, or empty."""
     described = fetch_whole(files, f"{root}/features.json", LONGEST_JSON)
     if described is None:
-        raise SourceError(
-            uri,
-            "has no features.json, without which its records cannot be understood",
-            "copy it from where the records are from, or write it with TFDS",
-        )
+        fault = "has no features.json, without which its records cannot be understood"
+        raise SourceError(uri, fault, "copy it from where the records are from, or write it with TFDS")
     info = _dataset_info(files, f"{root}/dataset_info.json")
     listing = [only] if only else None
     if not only and not is_listless(files):
@@ -265,7 +234,6 @@ def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) 
 
 
 def _dataset_info(files: Any, path: str) -> _DatasetInfo:
-    """Return the content of dataset_info.json; all defaults where there is none."""
     data = fetch_whole(files, path, LONGEST_JSON)
     try:
         return _DatasetInfo() if data is None else _DatasetInfo.model_validate_json(data)
@@ -310,10 +278,7 @@ def _stated_shards(
 def _named_shards(
     files: Any, root: str, info: _DatasetInfo, listing: Iterable[str]
 ) -> tuple[dict[str, list[Shard]], list[str]]:
-    """Return the shards found by their names alone, and what is missing.
-
-    This serves a renamed dataset, or one without dataset_info.json.
-    """
+    """Return the same for a renamed dataset, or one without dataset_info.json, by the shards' names alone."""
     stated = {split.name: split.shard_lengths for split in info.splits}
     shards: dict[str, list[Shard]] = {}
     totals: dict[str, int] = {}
@@ -337,9 +302,8 @@ def _named_shards(
 
 
 def _missing(split: str, present: int, shards: int) -> list[str]:
-    return (
-        [f"{shards - present} of {shards} shards of split {split} are not there"] if present < shards else []
-    )
+    said = f"{shards - present} of {shards} shards of split {split} are not there"
+    return [said] if present < shards else []
 
 
 def _split_of(stem: str, dataset: str, stated: Iterable[str]) -> str:

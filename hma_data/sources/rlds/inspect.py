@@ -28,7 +28,9 @@ def inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
     chosen = sampled(len(refs), episodes)
     lengths, first = _survey(folder, refs, chosen, survey)
     if first is None:
-        raise SourceError(uri, f"holds no readable episode: {_why(survey, folder)}", "copy its files again")
+        found = survey.findings(())
+        why = next((one for one in reversed(found) if one.check == "files"), found[0])
+        raise SourceError(uri, f"holds no readable episode: {why}", "copy its files again")
     keys = tuple(survey.key(_key_info(first, key, survey)) for key in folder.step_features)
     return Inspection(
         format="rlds",
@@ -49,14 +51,12 @@ def _survey(
 ) -> tuple[tuple[int, ...], Steps | None]:
     """Sample the chosen episodes; return the lengths of the episodes read, and the first of them."""
     wanted = set(chosen)
-    others = (
-        [] if folder.remote else [i for i in range(min(len(refs), INSPECTED_EPISODES)) if i not in wanted]
-    )
+    more = range(0 if folder.remote else min(len(refs), INSPECTED_EPISODES))
     lengths: dict[int, int] = {}
     first: Steps | None = None
     budget = INSPECTED_BYTES
     pairs = max(1, checks.PAIRS // max(len(chosen), 1))
-    for i in [*chosen, *others]:
+    for i in [*chosen, *(i for i in more if i not in wanted)]:
         if budget < 0 and i not in wanted:
             break
         name = refs[i].id
@@ -79,7 +79,10 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
     for key, feature in steps.features.items():
         try:
             if is_camera(feature):
-                _pictures(steps, key, survey, pairs)
+                decode, codec = steps.decoder(key), _codec(steps, key)
+                for run in checks.runs(checks.choose(steps.count, pairs)):
+                    for start, frames in checks.stacked([decode(int(i)) for i in run]):
+                        survey.pictures(steps.name, key, frames, run[start : start + len(frames)], codec)
             elif feature.kind == "number" and 0 < (feature.width or 0) <= MAX_VECTOR:
                 values = steps.numbers(key)
                 survey.numbers(steps.name, key, values)
@@ -90,29 +93,11 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
             survey.fault(f"{steps.name} {key}", fault)
 
 
-def _pictures(steps: Steps, key: str, survey: Survey, pairs: int) -> None:
-    decode, codec = steps.decoder(key), _codec(steps, key)
-    for run in checks.runs(checks.choose(steps.count, pairs)):
-        for start, frames in checks.stacked([decode(int(i)) for i in run]):
-            survey.pictures(steps.name, key, frames, run[start : start + len(frames)], codec)
-
-
-def _why(survey: Survey, folder: Folder) -> str:
-    found = survey.findings(())
-    of_files = [one for one in found if one.check == "files"]
-    said = of_files[-1:] or found[:1]
-    return str(said[0]) if said else f"{folder.uri} is empty"
-
-
 def _facts(folder: Folder) -> dict[str, str]:
-    """Return facts about the dataset: name, version, splits, and the keys outside the steps."""
     splits = [f"{name} {sum(shard.count() for shard in shards)}" for name, shards in folder.splits.items()]
-    found = {
-        "dataset": folder.name,
-        "version": folder.version,
-        "splits": ", ".join(splits),
-        "episode keys": ", ".join(name for name in folder.features if not name.startswith("steps/")),
-    }
+    outside = [name for name in folder.features if not name.startswith("steps/")]
+    found = {"dataset": folder.name, "version": folder.version}
+    found |= {"splits": ", ".join(splits), "episode keys": ", ".join(outside)}
     return {name: value for name, value in found.items() if value}
 
 
@@ -140,10 +125,7 @@ def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
 
 
 def _codec(steps: Steps, key: str) -> str:
-    """Return the codec of a key's pictures, from the first bytes of the first one.
-
-    TFDS stores the files as they were given, whatever features.json states.
-    """
+    """Return the codec of a key's first picture; TFDS stores files as given, whatever is stated."""
     if steps.features[key].kind != "picture":
         return "raw"
     head = bytes(steps.blobs(key)[0][:8])

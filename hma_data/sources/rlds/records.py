@@ -1,17 +1,14 @@
 """Find and read the records of TFRecord and ArrayRecord files, with their checksums verified.
 
 A TFRecord is its length (uint64), the masked CRC-32C of those eight bytes, the data, and the masked CRC-32C
-of the data; all little endian (format: TensorFlow's TFRecord). A scan needs only the length and the
-checksums, 16 bytes a record, so any record of a large file is found without reading the data of the
-others. A remote file is read no further than the record that is asked for.
+of the data; all little endian (format: TensorFlow's TFRecord). A scan reads only the length and the
+checksums, 16 bytes a record. A remote file is read no further than the record that is asked for.
 
 ArrayRecord files are read from this machine only, with the `array_record` package. It does not tell the
 offset of a record, so a record is found by its number.
 
-Where the records of a file lie is kept in `$HMA_CACHE/rlds`, by default `~/.cache/hma/rlds`, for the next
-process that opens the file in the same state (size and date, or ETag). Deleting it costs a new scan.
-
-N records.
+Where the records of a file lie is kept in `$HMA_CACHE/rlds`, by default `~/.cache/hma/rlds`, while the file
+keeps its state (size and date, or ETag). Deleting it costs a new scan.
 """
 
 import hashlib
@@ -32,9 +29,9 @@ import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
+from hma_data.errors import EpisodeError, MissingDependencyError, OutputError, SourceError
 from hma_data.storage.fetch import attempt, fetch, info, is_local, mark, protocol
-from hma_data.storage.files import PART, cache_folder
+from hma_data.storage.files import atomic_path, cache_folder
 
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
@@ -48,21 +45,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Framing:
-    """The positions of the records of a file.
+    """The positions of the N records of a file."""
 
-    Attributes:
-        offsets: (N,) int64, first byte of each record's data; in an ArrayRecord file the record's number.
-        lengths: (N,) int64, bytes of data.
-        checks: (N,) uint32, checksum of the data as stored.
-        fault: why reading stopped after the last record; empty where the file ends there.
-        whole: whether the file was read to its end (or to `fault`).
-    """
-
-    offsets: NDArray[np.int64]
-    lengths: NDArray[np.int64]
-    checks: NDArray[np.uint32]
-    fault: str = ""
-    whole: bool = True
+    offsets: NDArray[np.int64]  # first byte of each record's data; in an ArrayRecord file the record's number
+    lengths: NDArray[np.int64]  # bytes of data
+    checks: NDArray[np.uint32]  # checksums of the data as stored
+    fault: str = ""  # why reading stopped after the last record; empty where the file ends there
+    whole: bool = True  # whether the file was read to its end (or to `fault`)
 
     def __len__(self) -> int:
         return len(self.offsets)
@@ -76,14 +65,7 @@ EMPTY = Framing(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uin
 
 
 class RecordFile:
-    """One record file in one state.
-
-    Args:
-        files: the fsspec file system.
-        path: on it.
-        size: bytes of the file.
-        state: changes when the file does.
-    """
+    """One record file of `size` bytes, on an fsspec file system; `state` changes when the file does."""
 
     def __init__(self, files: Any, path: str, size: int, state: str) -> None:
         self._files, self._path, self._size = files, path, size
@@ -93,7 +75,7 @@ class RecordFile:
         digest = hashlib.sha256(f"{protocol(files)}://{path}\n{state}".encode()).hexdigest()[:32]
         self._index = cache_folder() / "rlds" / f"{digest}.npz"
         self._frames: Framing | None = None
-        self._kept = 0
+        self._kept = 0  # records in the index on disk
         self._lock = Lock()
 
     def framing(self, limit: int = -1) -> Framing:
@@ -116,10 +98,7 @@ class RecordFile:
             return self._frames
 
     def read(self, index: int, where: str) -> bytes:
-        """Return the data of a record, with its checksum verified.
-
-        Args:
-            where: the episode, for the error.
+        """Return the data of a record, with its checksum verified; `where` is the episode, for the error.
 
         Raises:
             EpisodeError: there is no such record, or it is damaged.
@@ -173,14 +152,11 @@ def _load_index(path: Path) -> Framing:
 
 def _save_index(path: Path, frames: Framing) -> None:
     """Write an index to disk; log a failure and continue without it."""
-    part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
+        with atomic_path(path) as part, part.open("wb") as file:
             np.savez(file, **vars(frames))
-        part.replace(path)
-    except OSError as fault:
-        log.info("%s: the index of records cannot be kept: %s", path, fault)
+    except (OSError, OutputError) as fault:
+        log.info("the index of records cannot be kept: %s", fault)
 
 
 # -- TFRecord
@@ -193,13 +169,7 @@ def masked_crc(data: Any) -> int:
 
 
 def scan_tfrecord(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
-    """Return the framing of a TFRecord file; begin where `known` ends.
-
-    Args:
-        files: the fsspec file system.
-        path: on it.
-        size: bytes of the file.
-        limit: stop after this many records; -1 for all.
+    """Return the framing of a TFRecord file: begin where `known` ends, stop after `limit` records (-1: none).
 
     Raises:
         SourceError: the file cannot be read, or is compressed.
@@ -219,13 +189,8 @@ def scan_tfrecord(files: Any, path: str, size: int, known: Framing = EMPTY, limi
             lengths.append(end - position - HEADER.size)
             checks.append(FOOTER.unpack_from(tail)[0])
             header, position = tail[FOOTER.size :], end + FOOTER.size
-    return Framing(
-        np.array(offsets, np.int64),
-        np.array(lengths, np.int64),
-        np.array(checks, np.uint32),
-        fault,
-        bool(fault) or position >= size,
-    )
+    columns = np.array(offsets, np.int64), np.array(lengths, np.int64), np.array(checks, np.uint32)
+    return Framing(*columns, fault, bool(fault) or position >= size)
 
 
 def _data_end(header: bytes, position: int, size: int) -> tuple[int, str]:
@@ -271,15 +236,7 @@ class _Window:
 
 
 def read_tfrecord(files: Any, path: str, frames: Framing, index: int, where: str) -> bytes:
-    """Return the data of one record of a TFRecord file; check it against its checksum.
-
-    Args:
-        where: the episode, for the error.
-
-    Raises:
-        EpisodeError: its checksum fails.
-        SourceError: the file cannot be read.
-    """
+    """Return the data of one record of a TFRecord file; see `RecordFile.read`."""
     offset, length = int(frames.offsets[index]), int(frames.lengths[index])
     data = fetch(files, path, offset, offset + length)
     if masked_crc(data) != frames.checks[index]:
@@ -293,15 +250,19 @@ def read_tfrecord(files: Any, path: str, frames: Framing, index: int, where: str
 def scan_array_record(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
     """Return the numbers, lengths and CRC-32C of an ArrayRecord file's records.
 
-    Every record is read once. A damaged record gets length 0, and fails when it is read. The arguments are
-    those of `scan_tfrecord`; only `path` is used.
+    Every record is read once; a damaged one gets length 0, and fails when it is read. Of the arguments, those
+    of `scan_tfrecord`, only `path` is used.
 
     Raises:
         MissingDependencyError: the array_record package is not installed.
     """
     reader = _open_array_record(path)
     if not reader.ok():
-        return replace(EMPTY, fault=_array_record_fault(reader), whole=True)
+        try:
+            reader.read([0])  # its error says why
+        except RuntimeError as fault:
+            return replace(EMPTY, fault=str(fault), whole=True)
+        return replace(EMPTY, fault="is no ArrayRecord file", whole=True)
     count = reader.num_records()
     lengths, checks = np.zeros(count, np.int64), np.zeros(count, np.uint32)
     for index in range(count):
@@ -314,14 +275,7 @@ def scan_array_record(files: Any, path: str, size: int, known: Framing = EMPTY, 
 
 
 def read_array_record(files: Any, path: str, frames: Framing, index: int, where: str) -> bytes:
-    """Return the data of one record of an ArrayRecord file; check it against the framing.
-
-    Args:
-        where: the episode, for the error.
-
-    Raises:
-        EpisodeError: it is damaged, or does not match the framing.
-    """
+    """Return the data of one record of an ArrayRecord file; see `RecordFile.read`."""
     try:
         [data] = _open_array_record(path).read([index])
     except RuntimeError as fault:
@@ -335,16 +289,6 @@ def _open_array_record(path: str) -> Any:
     try:
         from array_record.python.array_record_module import ArrayRecordReader
     except ImportError as fault:
-        raise MissingDependencyError(
-            path, "ArrayRecord files need the package array-record", "uv sync --extra arrayrecord"
-        ) from fault
+        said = "ArrayRecord files need the package array-record"
+        raise MissingDependencyError(path, said, "uv sync --extra arrayrecord") from fault
     return ArrayRecordReader(path, RANDOM_ACCESS)
-
-
-def _array_record_fault(reader: Any) -> str:
-    """Return why a reader is not ok, from the error of its first read."""
-    try:
-        reader.read([0])
-    except RuntimeError as fault:
-        return str(fault)
-    return "is no ArrayRecord file"

@@ -31,11 +31,6 @@ MAX_VECTOR = 4096  # most values of an action or a state
 log = logging.getLogger(__name__)
 
 
-def open() -> "RldsSource":
-    """Return the source; see `hma_data.sources.base.Source`."""
-    return RldsSource()
-
-
 class RldsSource:
     """A reader of TFDS folders in the RLDS form."""
 
@@ -61,17 +56,15 @@ class RldsSource:
             raise SourceError(uri, f"has no split {wanted!r}", f"its splits: {', '.join(folder.splits)}")
         for problem in folder.problems:
             log.warning("%s: %s", uri, problem)
-        names = [wanted] if wanted else list(folder.splits)
-        refs = []
+        names, refs = [wanted] if wanted else list(folder.splits), []
         for name in names:
             own = None if len(names) == 1 else "train" if name == "train" else "val"
             rate = _steps_per_byte(folder, name)
             for shard in folder.splits[name]:
                 refs += (_remote_refs if folder.remote and shard.stated else _refs)(name, shard, own, rate)
         if not any(ref.fingerprint for ref in refs):
-            raise SourceError(
-                uri, "holds no readable episode", "its files are empty or damaged; copy them again"
-            )
+            remedy = "its files are empty or damaged; copy them again"
+            raise SourceError(uri, "holds no readable episode", remedy)
         return refs
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
@@ -87,11 +80,10 @@ class RldsSource:
         steps = Steps(example, folder.step_features, episode_id)
         hz = embodiment.frequency_hz
         times = rate_times(steps.count, hz if isinstance(hz, float) else embodiment.rate_hz)
+        cameras = {camera.name: steps.decoder(camera.key) for camera in embodiment.cameras}
         return Episode(
             id=episode_id,
-            streams={
-                camera.name: Pictures(times, steps.decoder(camera.key)) for camera in embodiment.cameras
-            },
+            streams={name: Pictures(times, decode) for name, decode in cameras.items()},
             actions=_signals(steps, embodiment.action, times),
             states=_signals(steps, embodiment.state, times),
             instruction=_instruction(folder, steps, embodiment.source.instruction),
@@ -109,6 +101,9 @@ class RldsSource:
         from hma_data.sources.rlds.inspect import inspect
 
         return inspect(as_text(uri), self.index(uri), episodes)
+
+
+open = RldsSource
 
 
 def _refs(split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
@@ -129,10 +124,8 @@ def _remote_refs(split: str, shard: Shard, own: str | None, rate: float) -> list
     fingerprint = hashlib.sha256(mark(found).encode()).hexdigest()[:24]
     records = shard.stated or 1
     frames = max(1, round(rate * found["size"] / records))
-    return [
-        EpisodeRef(episode_id(split, shard.first + position), frames, own, fingerprint)
-        for position in range(records)
-    ]
+    ids = (episode_id(split, shard.first + position) for position in range(records))
+    return [EpisodeRef(name, frames, own, fingerprint) for name in ids]
 
 
 def _steps_per_byte(folder: Folder, split: str) -> float:
@@ -160,9 +153,8 @@ def is_camera(feature: Feature) -> bool:
     """Check whether a feature holds a colour picture a step, encoded or as a tensor."""
     if feature.dtype != "uint8" or len(feature.nesting) != 1:
         return False
-    return feature.kind == "picture" or (
-        feature.kind == "number" and len(feature.shape) == 3 and feature.shape[2] == 3
-    )
+    colours = feature.kind == "number" and len(feature.shape) == 3 and feature.shape[2] == 3
+    return feature.kind == "picture" or colours
 
 
 def _check_keys(folder: Folder, embodiment: Embodiment) -> None:
@@ -171,11 +163,8 @@ def _check_keys(folder: Folder, embodiment: Embodiment) -> None:
         feature = _step_feature(folder, camera.key)
         if not is_camera(feature):
             pictures = [key for key, found in folder.step_features.items() if is_camera(found)]
-            raise SourceError(
-                folder.uri,
-                f"{camera.key} is {_described(feature)} of {feature.dtype}, not a colour picture",
-                f"its pictures: {', '.join(pictures) or 'none'}",
-            )
+            fault = f"{camera.key} is {_described(feature)} of {feature.dtype}, not a colour picture"
+            raise SourceError(folder.uri, fault, f"its pictures: {', '.join(pictures) or 'none'}")
     for part in embodiment.action.components + (embodiment.state.components if embodiment.state else ()):
         _check_component(folder, part)
     if embodiment.source.instruction:
@@ -188,11 +177,8 @@ def _check_component(folder: Folder, part: Component) -> None:
         raise SourceError(folder.uri, f"{part.key} is {_described(feature)} of {feature.dtype}, not numbers")
     wanted = part.slice[1] if part.slice else part.dims
     if feature.width is not None and (feature.width < wanted or (not part.slice and feature.width > wanted)):
-        raise SourceError(
-            folder.uri,
-            f"{part.key} has {feature.width} values a step, the embodiment says {wanted}",
-            "correct dims or give slice in the YAML",
-        )
+        fault = f"{part.key} has {feature.width} values a step, the embodiment says {wanted}"
+        raise SourceError(folder.uri, fault, "correct dims or give slice in the YAML")
 
 
 def _step_feature(folder: Folder, key: str) -> Feature:
@@ -201,11 +187,8 @@ def _step_feature(folder: Folder, key: str) -> Feature:
     if key in found:
         return found[key]
     near = get_close_matches(key, found, n=3) or [name for name in found if name.endswith("/" + key)]
-    raise SourceError(
-        folder.uri,
-        f"has no key {key!r} in its steps",
-        f"did you mean {', '.join(near)}?" if near else f"its keys: {', '.join(found) or 'none'}",
-    )
+    remedy = f"did you mean {', '.join(near)}?" if near else f"its keys: {', '.join(found) or 'none'}"
+    raise SourceError(folder.uri, f"has no key {key!r} in its steps", remedy)
 
 
 def _text_feature(folder: Folder, key: str) -> Feature:
@@ -255,10 +238,7 @@ def _instruction(folder: Folder, steps: Steps, key: str | None) -> str:
 
 
 def _success(folder: Folder, steps: Steps) -> bool | None:
-    """Return whether the episode succeeded, as it states itself; None where it is unknown.
-
-    Without a statement, an episode succeeds where its last step is terminal and has a positive reward.
-    """
+    """Return the stated success; without one, True where the last step is terminal and has a reward > 0."""
     stated = folder.features.get("episode_metadata/success")
     if stated:
         value = scalar(steps.example, stated)
@@ -270,7 +250,6 @@ def _success(folder: Folder, steps: Steps) -> bool | None:
 
 
 def _metadata(folder: Folder, example: Example) -> dict[str, Any]:
-    """Return the single values outside the steps."""
     found = {
         name.removeprefix("episode_metadata/"): scalar(example, feature)
         for name, feature in folder.features.items()

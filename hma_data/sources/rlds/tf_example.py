@@ -1,7 +1,7 @@
 """Read a tf.train.Example from its protobuf wire format, one feature at a time, on demand.
 
-An Example maps names to lists of bytes, float32 or int64. Parsing only finds where each list lies. NumPy
-decodes the numbers, and byte strings stay views into the record, so a feature that is not read costs nothing.
+An Example maps names to lists of bytes, float32 or int64. Parsing only finds where each list lies; byte
+strings stay views into the record. So a feature that is not read costs nothing.
 (Format: protobuf encoding; messages Example, Features, Feature of TensorFlow.)
 """
 
@@ -18,11 +18,7 @@ Span = tuple[int, int]
 
 
 class Example:
-    """The features of one record.
-
-    Args:
-        data: the serialized message.
-        where: the episode, for errors.
+    """The features of one record of the episode `where`.
 
     Raises:
         EpisodeError: (here and in every method) the bytes are not an Example, a feature is missing
@@ -44,22 +40,14 @@ class Example:
         """Return the number of bytes of the record."""
         return len(self._data)
 
-    def names(self) -> list[str]:
-        """Return the names of all features."""
-        return list(self._lists)
-
     def blobs(self, name: str) -> list[memoryview]:
         """Return the byte strings of a feature, as views into the record."""
         return self._items(name, "bytes")
 
-    def count(self, name: str) -> int:
-        """Count the byte strings of a feature."""
-        return len(self._items(name, "bytes"))
-
     def numbers(self, name: str) -> NDArray[np.float32] | NDArray[np.int64]:
         """Return the (n,) numbers of a feature, float32 or int64 as stored."""
         if self._list(name)[0] == "float":
-            return self._joined(name, "float", _floats)
+            return self._joined(name, "float", lambda data: data.view("<f4"))
         return self.ints(name)
 
     def ints(self, name: str) -> NDArray[np.int64]:
@@ -87,10 +75,6 @@ class Example:
             return [view[slice(*span)] for number, _, span in fields(self._data, start, stop) if number == 1]
         except ValueError as fault:
             raise EpisodeError(self._where, f"{name}: {fault}") from fault
-
-
-def _floats(data: NDArray[np.uint8]) -> NDArray[np.float32]:
-    return data.view("<f4")
 
 
 def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:

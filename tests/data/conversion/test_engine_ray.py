@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hma_data.conversion.engines.base import Limits, Retry
+from hma_data.conversion.engines import Limits, Retry
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import HMAError, MissingDependencyError, TokenizerError
@@ -157,7 +157,7 @@ from pathlib import Path
 import ray
 import hma_data.conversion.job as conversion
 from hma_data.registry.embodiment import Embodiment
-from hma_data.conversion.engines.base import Limits
+from hma_data.conversion.engines import Limits
 from tests.conftest import ARM_YAML
 from tests.data.conversion.test_engine_ray import SETTINGS
 from tests.data.conversion.test_ray_actor import Slow

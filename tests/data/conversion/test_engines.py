@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from hma_data.conversion.engines.base import Attempt, Ledger, Limits, Report, Retry, Step
+from hma_data.conversion.engines import Attempt, Ledger, Limits, Report, Retry, Step
 from hma_data.conversion.engines.local import run, serve
 from hma_data.errors import HMAError, TokenizerError
 

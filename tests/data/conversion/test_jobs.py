@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from hma_data.conversion import worker as shard_work
-from hma_data.conversion.engines.base import Limits
+from hma_data.conversion.engines import Limits
 from hma_data.conversion.job import convert, convert_share
 from hma_data.conversion.output import LOCK, Share, locked
 from hma_data.conversion.plan import Settings
@@ -253,7 +253,7 @@ from pathlib import Path
 from hma_data.conversion import worker as shard_work
 from hma_data.conversion.job import convert
 from hma_data.registry.embodiment import Embodiment
-from hma_data.conversion.engines.base import Limits
+from hma_data.conversion.engines import Limits
 from hma_data.conversion.plan import Settings
 from hma_data.sources.hdf5.source import Hdf5Source
 from hma_data.tokenizers import base

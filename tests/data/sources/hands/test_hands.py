@@ -14,13 +14,15 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import find
 from hma_data.sources.base import detect, open_source
-from hma_data.sources.hands.layout import HandsLayout, Header, layout_of
 from hma_data.sources.hands.runs import (
     KEYS,
     POINTS,
+    HandsLayout,
+    Header,
     cut_into_runs,
     find_spans,
     labels_from_rows,
+    layout_of,
     values_of,
 )
 from tests.data import hands_files as made

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, RegistryError, SourceError
 from hma_data.sources.base import open_source
-from hma_data.sources.hands.layout import layout_of, videos_of
+from hma_data.sources.hands.runs import layout_of, videos_of
 from tests.data import hands_files as made
 from tests.data.videos import HEIGHT, WIDTH, encode
 

@@ -31,7 +31,7 @@ from hma_data.sources.hands.detect import (
     square_of_palm,
     square_of_points,
 )
-from hma_data.sources.hands.source import detect
+from hma_data.sources.hands.scan import detect
 from tests.data import hands_files as made
 from tests.data.videos import encode
 

@@ -21,8 +21,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import VideoFile
-from hma_data.sources.hands.layout import HandsLayout, Header
-from hma_data.sources.hands.runs import cut_into_runs, labels_from_rows
+from hma_data.sources.hands.runs import HandsLayout, Header, cut_into_runs, labels_from_rows
 from tests.data import hands_files as made
 from tests.data.videos import encode, number_of
 
