@@ -65,7 +65,9 @@ class Offset:
     def said(self) -> str:
         """Return as text how commands come."""
         if self.after_ms is None:
-            return f"commands come at no steady time between pictures, {self.measured}"
+            return (
+                f"commands are not tied to pictures, the last one is {_ms(self.age_ms)} old at each picture"
+            )
         median, spread = self.after_ms
         side = "before" if median < 0 else "after"
         come = f"commands come {_ms((abs(median), spread))} {side} each picture"
@@ -84,7 +86,8 @@ class Offset:
 
 
 def _ms(measured: tuple[float, float]) -> str:
-    return f"{measured[0]:.1f} ± {measured[1]:.1f} ms"
+    places = 1 if max(measured) >= 0.95 or max(measured) < 0.005 else 2
+    return f"{measured[0]:.{places}f} ± {measured[1]:.{places}f} ms"
 
 
 def measure(runs: Sequence[tuple[Floats, Floats]], camera: str = "") -> Offset | None:
@@ -118,7 +121,7 @@ def measure(runs: Sequence[tuple[Floats, Floats]], camera: str = "") -> Offset |
     if after is None or np.mean(after > 0) <= AFTER:
         return found
     tolerance = float(np.median(after) + 0.5) * period  # as far from this command as from the next
-    return replace(found, tolerance_ms=round(tolerance, 0 if tolerance >= 10 else 1))
+    return replace(found, tolerance_ms=round(tolerance) if tolerance >= 10 else round(tolerance, 1))
 
 
 def _after(parts: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -22,7 +22,7 @@ def proposed(offsets: dict[str, Offset]) -> Iterator[Finding]:
     for name, offset in offsets.items():
         if offset.tolerance_ms and offset.after_ms:
             numbers = {"after_ms": offset.after_ms[0], "tolerance_ms": offset.tolerance_ms}
-            said = f"{name}: {offset.said} of {offset.camera}"
+            said = f"{name} beside {offset.camera}: {offset.said}"
             yield Finding("offset", "info", said, f"set sync: {{{offset.pairing}}}", name, numbers)
 
 
