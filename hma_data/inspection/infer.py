@@ -101,9 +101,9 @@ def from_inspection(found: Inspection, embodiment_id: str) -> str:
         head = "A copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
         return f"# {head}\n{_yaml_text(values)}"
     values = _Draft(found).values(embodiment_id)
-    head = [f"Inferred from source.uri; answer every {TODO}, then: hma registry validate FILE"]
-    head += [said] if (said := _in_registry(found, values)) else []
-    return "".join(f"# {line}\n" for line in head) + _yaml_text(values)
+    head = f"# Inferred from source.uri; answer every {TODO}, then: hma registry validate FILE\n"
+    known = _in_registry(found, values)
+    return head + (f"# {known}\n" if known else "") + _yaml_text(values)
 
 
 def commands(found: Inspection) -> dict[str, Offset]:
@@ -258,7 +258,12 @@ class _Draft:
         ]
 
     def _sync(self, primary: str) -> dict[str, Any]:
-        sync = {"primary": primary, "images": "nearest", "actions": "hold", "states": "interpolate"}
+        sync: dict[str, Any] = {
+            "primary": primary,
+            "images": "nearest",
+            "actions": "hold",
+            "states": "interpolate",
+        }
         tolerance = infer_topics.tolerance_ms(self.offsets.values())
         skew = infer_topics.max_skew_ms(self.seen.keys[1:], self.action.keys, self.states)
         late = infer_topics.needs_receive_times(self.used)

@@ -60,9 +60,9 @@ def _astray(key: str, offset: Offset, runs: list[tuple[Floats, Floats]], sync: S
     off = np.concatenate(apart)
     for side, share in (("before", float(np.mean(off < 0))), ("after", float(np.mean(off > 0)))):
         if share >= ASTRAY:
-            given = sync.actions + (f", tolerance_ms {sync.tolerance_ms:g}" if sync.tolerance_ms else "")
+            stated = sync.actions + (f", tolerance_ms {sync.tolerance_ms:g}" if sync.tolerance_ms else "")
             fault = f"{share:.0%} of pictures get the command of the picture {side} them"
-            said = f"{key}: {fault} by actions: {given}; {offset.said}"
+            said = f"{key}: {fault} by actions: {stated}; {offset.said}"
             remedy = f"set sync: {{{offset.pairing}}}" + (
                 "" if offset.tolerance_ms else " without tolerance_ms"
             )

@@ -168,7 +168,7 @@ def test_mono_cameras_are_pictures_without_a_question(tmp_path: Path, encoding: 
     assert values["cameras"][0].get("levels") == ([0, 4095] if encoding == "mono16" else None)
     shown = first_clip(path, values).frames_at("primary", np.arange(1))[0]
     grey = pictures(1, 1)[0, ..., 0]
-    expected = np.rint(grey * 16 / 4095 * 255) if encoding == "mono16" else grey
+    expected = np.rint(grey * 16.0 / 4095 * 255) if encoding == "mono16" else grey
     np.testing.assert_array_equal(shown, np.repeat(expected[..., None], 3, -1))
 
 
