@@ -228,7 +228,13 @@ def registry_infer(
         return
     write_atomic(out, f"# yaml-language-server: $schema={_schema_for(out)}\n{text}")
     print(f"wrote {out}")
-    for path, question in todos(parse_yaml(text, str(out))):
+    values = parse_yaml(text, str(out))
+    for line in text.splitlines()[1:2]:
+        if line.startswith("# "):
+            print(line[2:])
+    if pairing := values.get("provenance", {}).get("sync"):
+        print(pairing)
+    for path, question in todos(values):
         print(f"answer {path}: {question}")
 
 

@@ -11,7 +11,7 @@ refused.
 Times are float64 seconds. T target times, S source times, A values a sample.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from hma_data.registry.components import Component, Sync
 from hma_data.registry.embodiment import Embodiment
 
 Moved = tuple[NDArray[np.int64], Floats]
-Timed = tuple[str, Floats, str]  # name, times and method of a stream
+Timed = tuple[str, Floats, str, float]  # name, times, method and tolerance in seconds of a stream
 ROUNDING_S = 1e-7  # the error of periods added up over hours; far below any sensor's interval
 
 
@@ -52,16 +52,17 @@ def nearest(source_times: Floats, target_times: Floats) -> Moved:
     return index, np.abs(source_times[index] - target_times) * 1e3
 
 
-def hold(source_times: Floats, target_times: Floats) -> Moved:
-    """Return the index (T,) of the sample in force at each target time, and its age in ms (T,).
+def hold(source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -> Moved:
+    """Return the index (T,) of the sample in force at each target time, and its distance in ms (T,).
 
-    The sample in force is the last one stamped at or before the target time. Target times before the first
-    sample get index 0 and a negative age; `to_clip` trims them.
+    The sample in force is the last one stamped at or before the target time, or at most `tolerance_s` after
+    it. Target times before the first sample get index 0 and a negative distance; `to_clip` trims them.
     """
     close = rounding(source_times, target_times)
-    found = np.searchsorted(source_times, target_times + close, side="right") - 1
+    found = np.searchsorted(source_times, target_times + tolerance_s + close, side="right") - 1
     index = np.maximum(found, 0)
     age = target_times - source_times[index]
+    age = np.where((found < 0) | (age > -close), age, -age)
     return index, np.where(found < 0, age, np.maximum(age, 0)) * 1e3
 
 
@@ -73,11 +74,14 @@ def interpolate(
     return np.stack(columns, axis=1).astype(np.float32), nearest(source_times, target_times)[1]
 
 
-_INDEX: dict[str, Callable[[Floats, Floats], Moved]] = {
-    "nearest": nearest,
-    "hold": hold,
-    "interpolate": nearest,
-}
+def matched(method: str, source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -> Moved:
+    """Return the index (T,) of the sample that a method gives each target time, and skew_ms (T,).
+
+    The tolerance is for `hold` alone. For `interpolate`, the result is that of `nearest`.
+    """
+    if method == "hold":
+        return hold(source_times, target_times, tolerance_s)
+    return nearest(source_times, target_times)
 
 
 def to_clip(episode: Episode, embodiment: Embodiment) -> Clip:
@@ -170,9 +174,11 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     """Build the clip of a bag: move every stream onto the grid by the method that the embodiment names."""
     sync, primary = embodiment.sync, embodiment.primary_camera.name
     signals = _signals(episode, embodiment)
-    timed: list[Timed] = [(name, stream.timestamps, sync.images) for name, stream in episode.streams.items()]
-    timed += [(name, signal.timestamps, method) for name, signal, _, method in signals]
-    for name, times, _ in timed:
+    tolerances = [(sync.tolerance_ms or 0) / 1e3] * len(episode.actions) + [0.0] * len(episode.states)
+    timed: list[Timed] = [(name, one.timestamps, sync.images, 0.0) for name, one in episode.streams.items()]
+    for (name, signal, _, method), tolerance_s in zip(signals, tolerances, strict=True):
+        timed.append((name, signal.timestamps, method, tolerance_s))
+    for name, times, *_ in timed:
         _check_times(episode.id, name, times)
     frames = np.unique(episode.streams[primary].timestamps)
     repeated = len(episode.streams[primary].timestamps) - len(frames)
@@ -185,11 +191,11 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     skew: dict[str, Floats] = {}
     indices: dict[str, NDArray[np.int64]] = {}
     for name, stream in episode.streams.items():
-        indices[name], skew[name] = _INDEX[sync.images](stream.timestamps, grid)
+        indices[name], skew[name] = matched(sync.images, stream.timestamps, grid)
     limit = sync.max_skew_ms and sync.max_skew_ms + 1e3 * rounding(grid, frames)
     moved, marks = [], []
-    for name, signal, components, method in signals:
-        values, known, off = _moved(signal, components, method, grid)
+    for (name, signal, components, method), tolerance_s in zip(signals, tolerances, strict=True):
+        values, known, off = _moved(signal, components, method, grid, tolerance_s)
         skew[name] = np.maximum(skew.get(name, off), off)
         if limit and sync.beyond == "mask":
             near = off <= limit
@@ -212,11 +218,11 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
 
 
 def _moved(
-    signal: Signal, components: tuple[Component, ...], method: str, grid: Floats
+    signal: Signal, components: tuple[Component, ...], method: str, grid: Floats, tolerance_s: float
 ) -> tuple[NDArray[np.float32], Known, Floats]:
     """Return the values (T, A) of a signal on the grid, which of them are known (T,), and skew_ms (T,)."""
     if method != "interpolate":
-        index, skew = _INDEX[method](signal.timestamps, grid)
+        index, skew = matched(method, signal.timestamps, grid, tolerance_s)
         return signal.values[index], None if signal.known is None else signal.known[index], skew
     values, skew = interpolate(signal.timestamps, signal.values, grid)
     start = 0
@@ -241,14 +247,14 @@ def _grid(episode_id: str, frames: Floats, embodiment: Embodiment, timed: list[T
     may reach `max_skew_ms` (without one, half a period) beyond a stream's samples.
     """
     sync = embodiment.sync
-    close = rounding(*(times for _, times, _ in timed))
+    close = rounding(*(times for _, times, *_ in timed))
     start, stop = -np.inf, np.inf
-    for name, times, method in timed:
+    for name, times, method, tolerance_s in timed:
         if name == embodiment.primary_camera.name and not sync.rate_hz:
             continue
         period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         reach = sync.max_skew_ms / 1e3 if sync.max_skew_ms else period / 2
-        start = max(start, float(times[0]) - (reach if method == "nearest" else 0.0))
+        start = max(start, float(times[0]) - (reach if method == "nearest" else tolerance_s))
         if method == "nearest":
             stop = min(stop, float(times[-1]) + reach)
         elif method == "interpolate":
@@ -262,7 +268,7 @@ def _grid(episode_id: str, frames: Floats, embodiment: Embodiment, timed: list[T
     else:
         grid, total = frames[(frames >= start - close) & (frames <= stop + close)], len(frames)
     if not len(grid):
-        spans = ", ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times, _ in timed)
+        spans = ", ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times, *_ in timed)
         fault = f"its streams never run together: {spans}"
         raise AlignmentError(episode_id, fault, "check the topics, or try stamp: receive")
     return grid, total - len(grid)

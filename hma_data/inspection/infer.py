@@ -7,12 +7,15 @@ The YAML holds what the recording states. What the recording cannot know is writ
 
 import math
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
 import yaml
 
+from hma_data.episodes.offset import Offset
 from hma_data.errors import SourceError, UsageError
 from hma_data.inspection import infer_topics
 from hma_data.inspection.infer_choices import (
@@ -29,8 +32,9 @@ from hma_data.inspection.infer_choices import (
     states,
     vectors,
 )
+from hma_data.registry.catalog import entries
 from hma_data.registry.components import Space
-from hma_data.registry.embodiment import ID_PATTERN, TODO, find
+from hma_data.registry.embodiment import ID_PATTERN, TODO, Embodiment, find
 from hma_data.sources.base import Inspection, KeyInfo, detect, open_source
 from hma_data.storage.paths import StrPath
 
@@ -96,8 +100,60 @@ def from_inspection(found: Inspection, embodiment_id: str) -> str:
         values = find("hand_video").to_dict() | {"id": embodiment_id}
         head = "A copy of hand_video, which reads any video of two hands: use it as it is, or change this one"
         return f"# {head}\n{_yaml_text(values)}"
-    text = _yaml_text(_Draft(found).values(embodiment_id))
-    return f"# Inferred from source.uri; answer every {TODO}, then: hma registry validate FILE\n{text}"
+    values = _Draft(found).values(embodiment_id)
+    head = f"# Inferred from source.uri; answer every {TODO}, then: hma registry validate FILE\n"
+    known = _in_registry(found, values)
+    return head + (f"# {known}\n" if known else "") + _yaml_text(values)
+
+
+def commands(found: Inspection) -> dict[str, Offset]:
+    """Return by topic how commands lie between the pictures of the camera that `infer` takes as the clock."""
+    try:
+        return _Draft(found).offsets
+    except SourceError:
+        return {}
+
+
+def _in_registry(found: Inspection, values: dict[str, Any]) -> str:
+    """Return one line that names the embodiments which may be this robot; empty where there are none.
+
+    They have the recording's URI; or its format, its action keys with as many values, and cameras that are
+    all recorded. Where some of them name the values as the recording does, the others are left out.
+    """
+    components = [
+        (part["key"], part["dims"], part.get("names", ())) for part in values["action"]["components"]
+    ]
+    recorded, width = {key.key for key in found.keys}, sum(count for _, count, _ in components)
+    at, alike, named = [], [], []
+    for entry in entries():
+        if not entry.facts or entry.facts["format"] != found.format:
+            continue
+        if entry.facts["uri"] and _place(entry.facts["uri"]) == _place(found.uri):
+            at.append(entry.facts["id"])
+        elif entry.facts["action_dim"] == width:
+            robot = Embodiment.load(entry.path)
+            parts = [(part.key, part.dims, part.names or ()) for part in robot.action.components]
+            if _widths(parts) == _widths(components) and {one.key for one in robot.cameras} <= recorded:
+                alike.append(robot.id)
+                same = [name for *_, names in parts for name in names]
+                named += [robot.id] if same == [name for *_, names in components for name in names] else []
+    ids = at or named or alike
+    if not ids:
+        return ""
+    what = "for this recording:" if at else "with these keys and dims; is it this robot?"
+    return f"The registry has {shown(ids, 3)} {what} hma registry show {ids[0]}"
+
+
+def _place(uri: str) -> str:
+    return uri.rstrip("/") if "://" in uri else str(Path(uri).resolve())
+
+
+def _widths(parts: Iterable[tuple[str, int, Any]]) -> Counter[str]:
+    """Return the number of values by key: one key may be cut into several components."""
+    widths: Counter[str] = Counter()
+    for key, count, _ in parts:
+        widths[key] += count
+    return widths
 
 
 class _Draft:
@@ -133,6 +189,7 @@ class _Draft:
         hz = self.seen.keys[0].hz if self.bag else found.hz
         self.hz = hz if hz is not None and 0 < hz <= HIGHEST_HZ else None
         self.used = [*self.seen.keys, *self.action.keys, *self.states]
+        self.offsets = infer_topics.offsets(self.action.keys, self.seen.keys[0])
 
     def values(self, embodiment_id: str) -> dict[str, Any]:
         """Return the YAML's plain values, in the order of the registry's YAMLs."""
@@ -194,15 +251,23 @@ class _Draft:
                 "name": name,
                 "key": key.key,
                 "size": list(map(int, key.shape[:2])),
+                **_levels(key),
                 **(asked if doubtful else {}),
             }
             for name, key in zip(camera_names(self.seen.keys), self.seen.keys, strict=True)
         ]
 
     def _sync(self, primary: str) -> dict[str, Any]:
-        sync = {"primary": primary, "images": "nearest", "actions": "hold", "states": "interpolate"}
+        sync: dict[str, Any] = {
+            "primary": primary,
+            "images": "nearest",
+            "actions": "hold",
+            "states": "interpolate",
+        }
+        tolerance = infer_topics.tolerance_ms(self.offsets.values())
         skew = infer_topics.max_skew_ms(self.seen.keys[1:], self.action.keys, self.states)
         late = infer_topics.needs_receive_times(self.used)
+        sync |= {"tolerance_ms": tolerance} if tolerance else {}
         return sync | ({"max_skew_ms": skew} if skew else {}) | ({"stamp": "receive"} if late else {})
 
     def _instruction(self) -> str | None:
@@ -222,7 +287,11 @@ class _Draft:
             said["action"] = f"{TODO}: {self.action.question}"
         if self.seen.question:
             said["cameras"] = f"{TODO}: {self.seen.question}"
+        if levels := [key.key for key in self.seen.keys if key.encoding == "mono16"]:
+            said["levels"] = f"from 0 to the largest value of as many bits as {shown(levels)} uses"
         if self.bag:
+            if self.offsets:
+                said["sync"] = "; ".join(infer_topics.told(self.offsets))
             topics = infer_topics.about(self.used)
             gaps = shown(f"{topic.name} {topic.gap_ms:.0f} ms" for topic in topics if topic.gap_ms)
             if gaps:
@@ -242,6 +311,14 @@ class _Draft:
         rates = dict.fromkeys(f"{key.topic.name if key.topic else key.key} {_hz(key)}" for key in moved)
         beside = f"; beside it {shown(rates)}" if rates else ""
         return f"measured: {camera.key} {_hz(camera)}{beside}"
+
+
+def _levels(key: KeyInfo) -> dict[str, Any]:
+    """Return the levels of pictures in mono16: all values of 10, 12, 14 or 16 bits, whichever they need."""
+    if key.encoding != "mono16":
+        return {}
+    bits = next(bits for bits in (10, 12, 14, 16) if (key.high or 0) < 1 << bits)
+    return {"levels": [0, (1 << bits) - 1]}
 
 
 def _hz(key: KeyInfo) -> str:

@@ -199,6 +199,7 @@ def _by_names(key: KeyInfo) -> str | None:
 
 
 MIN_SIDE, MAX_RATIO = 8, 8  # of a camera's picture
+MONO = ("mono8", "mono16")  # encodings that say: a grey camera
 _NOT_CAMERA = re.compile(
     r"(^|_)(depth|disparity|masks?|seg|segmentation|semantic|instance|infra|infrared|ir|thermal|labels?|"
     r"normals?|flow|heatmap|features?|embedding|goal|tactile|gelsight)(_|$)"
@@ -229,13 +230,20 @@ class Choice:
 
 
 def cameras(keys: Iterable[KeyInfo]) -> Choice:
-    """Choose the colour cameras, third-person before wrist; grey ones, with a question, without colour."""
+    """Choose the cameras, third-person before wrist: those in colour, then those whose messages say mono.
+
+    Other grey ones are taken only where there are no such cameras, and with a question.
+    """
     usable = [key for key in keys if _is_camera(key)]
-    colour = _one_of_twins([key for key in usable if key.shape[2] == 3])
-    grey = _one_of_twins([key for key in usable if key.shape[2] == 1])
-    ordered = tuple(sorted(colour or grey, key=lambda key: (_rank(key.key), _natural(key.key))))
+    colour = _ordered(key for key in usable if key.shape[2] == 3)
+    mono = _ordered(key for key in usable if key.shape[2] == 1 and key.encoding in MONO)
+    grey = _ordered(key for key in usable if key.shape[2] == 1 and key.encoding not in MONO)
     asked = "only grey pictures are recorded; are these cameras, not depth or masks?"
-    return Choice(ordered, asked if grey and not colour else "")
+    return Choice(colour + mono or grey, asked if grey and not colour + mono else "")
+
+
+def _ordered(found: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
+    return tuple(sorted(_one_of_twins(list(found)), key=lambda key: (_rank(key.key), _natural(key.key))))
 
 
 def _is_camera(key: KeyInfo) -> bool:

@@ -4,6 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable
 
+from hma_data.episodes.offset import Offset
 from hma_data.inspection.infer_choices import (
     JOINT,
     MEASURED,
@@ -156,6 +157,25 @@ def needs_receive_times(keys: Iterable[KeyInfo]) -> str:
     if delays and max(delays) - min(delays) > CLOCKS_APART_MS:
         return f"header stamps are up to {(max(delays) - min(delays)) / 1e3:.3g} s apart between topics"
     return ""
+
+
+def offsets(actions: Iterable[KeyInfo], camera: KeyInfo) -> dict[str, Offset]:
+    """Return by topic how the actions lie between the pictures of that camera."""
+    name = camera.topic.name if camera.topic else ""
+    return {topic.name: one for topic in about(actions) for one in topic.offsets if one.camera == name}
+
+
+def told(found: dict[str, Offset]) -> list[str]:
+    """Return one line for each topic, or for all of them where they say the same."""
+    lines = {name: str(offset) for name, offset in found.items()}
+    if len(set(lines.values())) == 1:
+        return [*lines.values()][:1]
+    return [f"{name}: {line}" for name, line in lines.items()]
+
+
+def tolerance_ms(found: Iterable[Offset]) -> float | None:
+    """Return the tolerance with which `hold` gives pictures their commands; None where none is needed."""
+    return min((one.tolerance_ms for one in found if one.tolerance_ms), default=None)
 
 
 def max_skew_ms(

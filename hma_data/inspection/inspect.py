@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.errors import HMAError, SourceError
+from hma_data.inspection.infer import commands
+from hma_data.inspection.pairing import judged, proposed
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
 from hma_data.sources.common.checks import SEVERITIES, Finding, Severity
@@ -60,6 +62,10 @@ def inspect_recording(
     report = inspection.to_json()
     if robot:
         report["embodiment"] = _fit(uri, robot, source, inspection, found)
+    else:
+        offsets = commands(inspection)
+        report["facts"] |= {f"commands {name}": offset.measured for name, offset in offsets.items()}
+        found += proposed(offsets)
     report["findings"] = [finding.to_json() for finding in found]
     report["problems"] = [str(finding) for finding in found if finding.severity != "info"]
     report["checks"] = _results(inspection.checks, found)
@@ -107,6 +113,9 @@ def _fit(
     for stream, skew in clip.skew_ms.items():
         p50, p95, most = np.percentile(skew, [50, 95, 100])
         facts[f"skew of {stream}"] = f"p50 {p50:.1f} ms, p95 {p95:.1f} ms, max {most:.1f} ms"
+    for key, (offset, finding) in judged([clip], robot).items():
+        facts[f"commands {key}"] = offset.measured
+        found += [finding] if finding else []
     if hz and isinstance(robot.frequency_hz, float) and abs(hz / robot.rate_hz - 1) > 0.1:
         said = f"{robot.id} says {robot.rate_hz:g} Hz, the recording's grid ticks at {hz:.3g} Hz"
         found.append(Finding("rate", "warn", said, numbers={"hz": hz, "stated_hz": robot.rate_hz}))
@@ -177,6 +186,7 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
         yield Finding("episodes", "error", "the recording has no episodes")
     elif robot is None:
         yield from inspection.findings
+        yield from proposed(commands(inspection))
     else:
         yield from _for_robot(inspection, robot)
         yield from _episodes(uri, robot, source, sample, inspection)
@@ -235,6 +245,7 @@ def _episodes(
     if clips:
         told = any(one.check == "gaps" and one.key == robot.primary_camera.key for one in inspection.findings)
         yield from (one for one in _times(clips, robot) if not (told and one.check == "gaps"))
+        yield from (finding for _, finding in judged(clips, robot).values() if finding)
         yield from _numbers(np.concatenate([clip.actions for clip in clips]), robot)
 
 

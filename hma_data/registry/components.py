@@ -136,6 +136,15 @@ class Camera(SpecModel):
         None, description="[x, y, width, height] in source pixels"
     )
     stamp: Literal["header", "receive"] | None = None
+    levels: tuple[Number, Number] | None = Field(
+        None, description="[black, white] of a bag's 16-bit grey pictures: the values that become 0 and 255"
+    )
+
+    @model_validator(mode="after")
+    def _levels_rise(self) -> Self:
+        if self.levels and self.levels[0] >= self.levels[1]:
+            raise ValueError(f"levels {list(self.levels)} must be [black, white] with black < white")
+        return self
 
 
 class Sync(SpecModel):
@@ -153,6 +162,9 @@ class Sync(SpecModel):
     max_skew_ms: Number | None = Field(
         None, gt=0, description="the largest time by which a sample may be moved"
     )
+    tolerance_ms: Number | None = Field(
+        None, gt=0, description="a held action stamped at most so much after a frame is in force at it"
+    )
     beyond: Literal["refuse", "mask"] = Field(
         "refuse",
         description="beyond max_skew_ms, refuse the episode, or mask numbers; pictures always refuse it",
@@ -164,6 +176,12 @@ class Sync(SpecModel):
         description="in steps: the command of frame t is recorded at t + action_shift; not for bags",
     )
     stamp: Literal["header", "receive"] = "header"
+
+    @model_validator(mode="after")
+    def _held(self) -> Self:
+        if self.tolerance_ms and self.actions != "hold":
+            raise ValueError(f"tolerance_ms is for actions: hold, not for {self.actions}")
+        return self
 
 
 class Marker(SpecModel):

@@ -48,7 +48,7 @@ _DECIDES: Any = {
     "frequency_hz": True,
     "action": True,
     "state": True,
-    "cameras": {"__all__": {"name", "key", "color", "resize", "rotate", "flip", "crop", "stamp"}},
+    "cameras": {"__all__": {"name", "key", "color", "resize", "rotate", "flip", "crop", "stamp", "levels"}},
     "sync": True,
     "source": {"format", "instruction", "layout", "segments"},
 }

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode
+from hma_data.episodes.offset import Offset
 from hma_data.errors import EpisodeError, PluginError, SourceError
 from hma_data.plugins import SOURCE_GROUP, installed
 from hma_data.registry import FORMATS, MORE, known_formats
@@ -68,6 +69,7 @@ class TopicInfo:
         gap_ms: the longest interval between two of them; None for fewer than two.
         delay_ms: median from header stamp to receipt; None where messages carry no time.
         goes_back: whether header stamps go back in time.
+        offsets: how the messages lie between the pictures of each camera; of topics with numbers only.
     """
 
     name: str
@@ -75,6 +77,7 @@ class TopicInfo:
     gap_ms: float | None = None
     delay_ms: float | None = None
     goes_back: bool = False
+    offsets: tuple[Offset, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -94,9 +97,11 @@ class KeyInfo:
         topic: the topic that holds the key; of bags only.
         constant: whether a vector never changes in the sampled episodes.
         still: indices of the values of a vector that never change in the sampled episodes.
-        low, high: smallest and largest finite number in the sampled episodes.
+        low, high: smallest and largest finite number in the sampled episodes; of pictures in mono16, their
+            values before they are scaled.
         swapped: whether red and blue are swapped in the pictures: sure, hint, no; None where it is unknown.
         skew_ms: p50, p95 and max distance from the first camera's frames, for a stream with its own clock.
+        encoding: of a bag's pictures, as their messages state it: rgb8, mono8, mono16.
     """
 
     key: str
@@ -115,6 +120,7 @@ class KeyInfo:
     high: float | None = None
     skew_ms: tuple[float, float, float] | None = None
     swapped: str | None = None
+    encoding: str | None = None
 
 
 @dataclass(frozen=True)

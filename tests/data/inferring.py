@@ -87,6 +87,8 @@ def header(store: Any, ns: int) -> Any:
 def picture_of(encoding: str = "rgb8", shift_ns: int = 0) -> Message:
     def make(store: Any, ns: int) -> Any:
         shot = pictures(1, 1)[0] if encoding == "rgb8" else pictures(1, 1)[0, ..., 0]
+        if encoding == "mono16":
+            shot = (shot.astype("<u2") * 16).view(np.uint8)  # 12 bits
         about = (header(store, ns + shift_ns), H, W, encoding, 0, shot[0].nbytes, shot.reshape(-1))
         return store.types["sensor_msgs/msg/Image"](*about)
 

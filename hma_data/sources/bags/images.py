@@ -32,7 +32,9 @@ KINDS = {
     "foxglove/CompressedVideo": VIDEO,
     "ffmpeg_image_transport_msgs/FFMPEGPacket": VIDEO,
 }
-DEPTH = ("compresseddepth", "16uc1", "32fc1", "mono16")
+DEPTH = ("compresseddepth", "16uc1", "32fc1")
+MONO16 = "mono16"  # grey of 16 bits; `levels` of the camera say what becomes black and white
+Levels = tuple[float, float]
 ENCODINGS = {  # of raw pictures: bytes of a pixel, OpenCV's conversion to RGB
     "rgb8": (3, ""), "bgr8": (3, "BGR2RGB"), "8uc3": (3, "BGR2RGB"),
     "rgba8": (4, "RGBA2RGB"), "bgra8": (4, "BGRA2RGB"), "8uc4": (4, "BGRA2RGB"),
@@ -82,19 +84,39 @@ def video_codec(message: Any) -> str:
     return next((codec for name, codec in ENCODERS if name in stated), stated)
 
 
-def picture(message: Any, kind: str, where: str) -> Images:
+def encoding(message: Any, kind: str) -> str:
+    """Return the encoding of the pixels in lower case, such as mono8; empty where the message states none.
+
+    image_transport begins the format of compressed pictures with it: "mono8; jpeg compressed".
+    """
+    if kind == RAW:
+        return str(child(message, "encoding")).lower()
+    before, separator, _ = (
+        str(child(message, "format")).lower().partition(";") if kind == STILL else ("",) * 3
+    )
+    return before if separator else ""
+
+
+def picture(message: Any, kind: str, where: str, levels: Levels | None = None) -> Images:
     """Return a raw or still picture as (H, W, 3) RGB.
 
+    Args:
+        levels: the values of 16-bit grey that become 0 and 255.
+
     Raises:
-        EpisodeError: it is not colour or grey of 8 bits, its sizes do not fit, or its bytes are no picture.
+        EpisodeError: it is not colour or grey of 8 bits, its sizes do not fit, or its bytes are no picture;
+            or it is grey of 16 bits and there are no levels.
     """
     try:
-        if kind == RAW:
-            return _raw(message, where)
-        stated = str(child(message, "format"))
-        if any(name in stated.lower() for name in DEPTH):
+        if kind == STILL and any(name in str(child(message, "format")).lower() for name in DEPTH):
+            stated = str(child(message, "format"))
             raise EpisodeError(where, f"{stated!r} is depth, not colour", "name a colour topic as camera")
-        return decode_image(payload(message), where)
+        if encoding(message, kind) == MONO16 and (kind == RAW or _is_png(payload(message))):
+            if levels is None:
+                remedy = "state the values of black and white in the YAML, such as levels: [0, 4095]"
+                raise EpisodeError(where, "pictures in mono16 have 16 bits of grey", remedy)
+            return _grey(wide_grey(message, kind, where), levels)
+        return _raw(message, where) if kind == RAW else decode_image(payload(message), where)
     except (KeyError, TypeError, ValueError) as fault:
         raise EpisodeError(where, f"a message is not a picture: {fault!r}") from fault
 
@@ -102,8 +124,32 @@ def picture(message: Any, kind: str, where: str) -> Images:
 def is_grey(message: Any, kind: str) -> bool:
     """Check whether a raw or still picture has one channel."""
     if kind == RAW:
-        return str(child(message, "encoding")).lower() in ("mono8", "8uc1")
-    return kind == STILL and one_channel(payload(message))
+        return encoding(message, kind) in ("mono8", "8uc1", MONO16)
+    return kind == STILL and (encoding(message, kind) == MONO16 or one_channel(payload(message)))
+
+
+def wide_grey(message: Any, kind: str, where: str) -> NDArray[np.uint16]:
+    """Return the values (H, W) of a picture in mono16."""
+    if kind == RAW:
+        low_first = "is_bigendian" not in field_names(message) or not child(message, "is_bigendian")
+        pixels = _pixels(message, where, pixel=2)
+        return np.ascontiguousarray(pixels).view("<u2" if low_first else ">u2")[..., 0].astype(np.uint16)
+    cv2 = opencv()
+    found = cv2.imdecode(np.frombuffer(payload(message), np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None or found.ndim != 2:
+        raise EpisodeError(where, "a picture in mono16 cannot be decoded")
+    return found.astype(np.uint16)
+
+
+def _is_png(data: bytes) -> bool:
+    return data[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def _grey(values: NDArray[np.uint16], levels: Levels) -> Images:
+    """Return (H, W, 3): values from the lower level to the upper one become 0 to 255, others are clipped."""
+    low, high = levels
+    scaled = (values.astype(np.float32) - np.float32(low)) * np.float32(255 / (high - low))
+    return np.repeat(np.clip(np.rint(scaled), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def payload(message: Any) -> bytes:
@@ -115,18 +161,26 @@ def payload(message: Any) -> bytes:
 
 
 def _raw(message: Any, where: str) -> Images:
-    encoding = str(child(message, "encoding"))
-    height, width, step = (int(child(message, name)) for name in ("height", "width", "step"))
-    if encoding.lower() not in ENCODINGS:
+    stated = str(child(message, "encoding"))
+    if stated.lower() not in ENCODINGS:
         raise EpisodeError(
             where,
-            f"pictures in {encoding!r} are not 8-bit colour",
-            f"these can be read: {', '.join(ENCODINGS)}",
+            f"pictures in {stated!r} are not 8-bit colour",
+            f"these can be read: {', '.join([*ENCODINGS, MONO16])}",
         )
-    pixel, conversion = ENCODINGS[encoding.lower()]
+    pixel, conversion = ENCODINGS[stated.lower()]
+    pixels = _pixels(message, where, pixel)
+    cv2 = opencv()
+    return cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")) if conversion else pixels
+
+
+def _pixels(message: Any, where: str, pixel: int) -> Images:
+    """Return the bytes (H, W, pixel) of a raw picture without the padding of its rows."""
+    stated = str(child(message, "encoding"))
+    height, width, step = (int(child(message, name)) for name in ("height", "width", "step"))
     if min(height, width) < 1 or height * width > MAX_PIXELS:
         raise EpisodeError(where, f"a picture claims {width}×{height} pixels, the most is {MAX_PIXELS:,}")
-    planar = encoding.lower() in ("nv12", "nv21")  # rows of colour, half as many, follow those of luma
+    planar = stated.lower() in ("nv12", "nv21")  # rows of colour, half as many, follow those of luma
     rows, row = height * 3 // 2 if planar else height, width * pixel
     step = step or row
     data = child(message, "data")
@@ -134,14 +188,12 @@ def _raw(message: Any, where: str) -> Images:
     odd = planar and (height % 2 or width % 2)
     if odd or step < row or len(flat) < step * (rows - 1) + row:
         raise EpisodeError(
-            where, f"a picture of {width}×{height} in {encoding} has {len(flat):,} bytes, rows of {step}"
+            where, f"a picture of {width}×{height} in {stated} has {len(flat):,} bytes, rows of {step}"
         )
     if len(flat) < step * rows:  # the last row may end with its last pixel
         flat = np.concatenate([flat, np.zeros(step * rows - len(flat), np.uint8)])
     pixels = np.ascontiguousarray(flat[: step * rows].reshape(rows, step)[:, :row])
-    pixels = pixels.reshape(rows, width, pixel)
-    cv2 = opencv()
-    return cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")) if conversion else pixels
+    return pixels.reshape(rows, width, pixel)
 
 
 # -- video
@@ -339,9 +391,11 @@ class Messages:
 class StillStream:
     """A camera of raw or still pictures; see episode.Stream."""
 
-    def __init__(self, timestamps: Floats, messages: Messages, kind: str) -> None:
+    def __init__(
+        self, timestamps: Floats, messages: Messages, kind: str, levels: Levels | None = None
+    ) -> None:
         self.timestamps = timestamps
-        self._messages, self._kind = messages, kind
+        self._messages, self._kind, self._levels = messages, kind, levels
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
         """See episode.Stream."""
@@ -351,8 +405,8 @@ class StillStream:
 
     def each(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[Images]:
         """See episode.OneByOne."""
-        where = self._messages.where
-        return _of_one_size((picture(m, self._kind, where) for m in self._messages.read(indices)), where)
+        where, read = self._messages.where, self._messages.read(indices)
+        return _of_one_size((picture(m, self._kind, where, self._levels) for m in read), where)
 
 
 class VideoStream:

@@ -13,9 +13,19 @@ from typing import Any
 import numpy as np
 
 from hma_data.episodes.episode import Floats
+from hma_data.episodes.offset import measure as measure_offset
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
-from hma_data.sources.bags.images import VIDEO, codec, is_grey, picture_kind
+from hma_data.sources.bags.images import (
+    MONO16,
+    VIDEO,
+    Messages,
+    codec,
+    encoding,
+    is_grey,
+    picture_kind,
+    wide_grey,
+)
 from hma_data.sources.bags.messages import (
     child,
     decode,
@@ -39,6 +49,7 @@ MAX_WIDTH = 4096  # most values of an action or state; wider fields are maps or 
 LOGS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/diagnostics_agg")  # not streams
 PAIRS = 4  # runs of neighbouring pictures looked at, for a camera
 APART_S = 1.0  # header stamps further than this from receive times are reported
+WHOLE = (0.0, 65535.0)  # levels at which pictures in mono16 are looked at
 
 
 @dataclass
@@ -98,6 +109,22 @@ class _Topic:
 
 
 @dataclass
+class _Clock:
+    """The times (T,) of one topic of one bag, by both clocks, in order of receipt."""
+
+    header: Floats
+    receive: Floats
+
+    def beside(self, other: "_Clock") -> tuple[Floats, Floats]:
+        """Return the times of both topics; by receipt where their header stamps are not of one clock."""
+        delays = [float(np.median(one.receive - one.header)) for one in (self, other)]
+        back = any((np.diff(one.header) < 0).any() for one in (self, other))
+        if back or abs(delays[0] - delays[1]) > APART_S:
+            return self.receive, other.receive
+        return self.header, other.header
+
+
+@dataclass
 class _Budget:
     """The bytes and messages that may still be read."""
 
@@ -135,6 +162,7 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
         else:
             survey.note(Finding("readable", "info", f"{path}: holds no messages"))
     first: _BagInspection | None = None
+    clocks: list[dict[str, _Clock]] = []
     names = list(opened)
     for name in [names[i] for i in sampled(len(names), episodes)] if names else []:
         try:
@@ -144,12 +172,13 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
             continue
         survey.episode(name)
         first = first or looked
+        clocks.append(looked.clocks)
         if budget.spent:
             break
     if first is None:
         faults = [str(one) for one in survey.findings(()) if one.severity != "info"]
         raise SourceError(uri, f"nothing to inspect: {faults[0] if faults else 'no bag holds a message'}")
-    keys = tuple(survey.key(key) for key in first.keys)
+    keys = tuple(survey.key(key) for key in _with_offsets(first.keys, clocks, survey))
     camera = next((key for key in keys if key.kind == "camera"), None)
     frames = [counts[camera.key] for counts in lengths] if camera else []
     facts = {"keys and rates of": str(first.bag.path)}
@@ -171,8 +200,28 @@ def report(uri: str, root: Path, bags: dict[str, Path], episodes: int) -> Inspec
     )
 
 
+def _with_offsets(keys: list[KeyInfo], clocks: list[dict[str, _Clock]], survey: Survey) -> list[KeyInfo]:
+    """Add to topics with numbers how their messages lie between the pictures of each camera."""
+    cameras = [key.topic.name for key in keys if key.kind == "camera" and key.topic]
+    topics = {key.topic.name: key.topic for key in keys if key.kind == "vector" and key.topic}
+    for name, topic in topics.items():
+        found = [
+            measure_offset(
+                [bag[name].beside(bag[camera]) for bag in clocks if name in bag and camera in bag], camera
+            )
+            for camera in cameras
+            if name not in LOGS
+        ]
+        topics[name] = replace(topic, offsets=tuple(one for one in found if one))
+        survey.made |= {"offset"} if topics[name].offsets else set()
+    return [replace(key, topic=topics.get(key.topic.name, key.topic)) if key.topic else key for key in keys]
+
+
 class _BagInspection:
     """One bag, read once: its keys; its numbers, times, skew and some pictures go to the survey.
+
+    Attributes:
+        clocks: of its topics with messages.
 
     Raises:
         EpisodeError: the bag is damaged.
@@ -191,6 +240,12 @@ class _BagInspection:
             said = f"{', '.join(self._frozen[:8])}: header stamps never change; receive times are used"
             survey.note(Finding("stamps", "warn", said, numbers={"topics": self._frozen}))
         self._skew()
+        self.clocks: dict[str, _Clock] = {}
+        for name, topic in self._topics.items():
+            if len(topic.track):
+                order = topic.track.order()
+                times = [topic.track.seconds(clock)[order] for clock in ("header", "receive")]
+                self.clocks[name] = _Clock(*times)
 
     def _measure(self, budget: _Budget) -> None:
         where = str(self.bag.path)
@@ -254,20 +309,32 @@ class _BagInspection:
         return self._survey.times(self._name, track.topic, times, camera)
 
     def _camera(self, topic: _Topic, kind: str) -> KeyInfo:
-        name = topic.track.topic
-        stored = topic.track.codec if kind == VIDEO else codec(topic.sample, kind)
+        name, track = topic.track.topic, topic.track
+        stored = track.codec if kind == VIDEO else codec(topic.sample, kind)
+        high = None
         try:
-            stream = camera_stream(self.bag, topic.track, "receive")
-            keyframes = topic.track.keyframes() if kind == VIDEO else None
+            stream = camera_stream(self.bag, track, "receive", levels=WHOLE)
+            keyframes = track.keyframes() if kind == VIDEO else None
             indices = checks.choose(len(stream.timestamps), PAIRS, _starts(keyframes))
             for run in checks.runs(indices):
                 frames = stream.frames(run)
                 self._survey.pictures(self._name, name, frames, run, stored)
+            grey, stated = is_grey(topic.sample, kind), encoding(topic.sample, kind)
+            if grey and stated == MONO16:
+                messages = Messages(self.bag, track.channels, track.places()[track.order()], name)
+                high = float(max(wide_grey(one, kind, name).max() for one in messages.read(indices)))
         except EpisodeError as fault:
             self._survey.note(Finding("readable", "warn", f"{name}: {fault.fault}", key=name))
-            return KeyInfo(name, "other", (), topic.track.channels[0].type)
-        channels = 1 if is_grey(topic.sample, kind) else 3
-        return KeyInfo(name, "camera", (*frames.shape[1:3], channels), "uint8", codec=stored)
+            return KeyInfo(name, "other", (), track.channels[0].type)
+        return KeyInfo(
+            name,
+            "camera",
+            (*frames.shape[1:3], 1 if grey else 3),
+            "uint16" if high is not None else "uint8",
+            codec=stored,
+            encoding=stated or None,
+            high=high,
+        )
 
     def _skew(self) -> None:
         """Measure the skew of each camera and vector stream from the frames of the first camera."""

@@ -251,15 +251,15 @@ class _EpisodeReading:
         """Return a camera; for an episode in a bag, its own pictures, or those around the times `shown`."""
         track, clock = self._tracks[camera.key], camera.stamp or self._embodiment.sync.stamp
         if self._segment is None or self._table is None:
-            return camera_stream(self._bag, track, clock)
+            return camera_stream(self._bag, track, clock, levels=camera.levels)
         order = track.order()
         received = track.received()[order]
         if shown is not None:
-            return camera_stream(
-                self._bag, track, clock, self._around(received, track.seconds(clock)[order], shown)
-            )
+            around = self._around(received, track.seconds(clock)[order], shown)
+            return camera_stream(self._bag, track, clock, around, camera.levels)
         begin = int(np.searchsorted(received, self._segment.first_ns)) + self._segment.skip
-        return camera_stream(self._bag, track, self._table.clock, (begin, begin + len(self._segment)))
+        within = (begin, begin + len(self._segment))
+        return camera_stream(self._bag, track, self._table.clock, within, camera.levels)
 
     def _signal(self, column: Column, shown: Floats) -> Signal:
         track, rows = self._tracks[column.field.topic], column.rows()
@@ -274,9 +274,9 @@ class _EpisodeReading:
     def _around(self, received: Rows, times: Floats, shown: Floats) -> tuple[int, int]:
         """Return the range of samples, in order of receipt, that the pictures shown need.
 
-        It begins with the sample in force at the first picture, and ends with the first sample at or after
-        the last. Where a clock begins anew between two episodes, only the samples on this episode's side
-        count.
+        It begins with the sample in force at the first picture. It ends with the first sample at or after the
+        last picture, or, with `sync.tolerance_ms`, that much later. Where a clock begins anew between two
+        episodes, only the samples on this episode's side count.
         """
         assert self._segment
         inside = np.searchsorted(received, [self._segment.first_ns, self._segment.last_ns + 1])
@@ -287,7 +287,8 @@ class _EpisodeReading:
         if np.any(np.diff(times[low:high]) < 0):
             return low, high  # `align` reports where the times go back
         begin = low + max(0, int(np.searchsorted(times[low:high], shown[0], side="right")) - 1)
-        stop = low + int(np.searchsorted(times[low:high], shown[-1], side="left")) + 1
+        last = shown[-1] + (self._embodiment.sync.tolerance_ms or 0) / 1e3
+        stop = low + int(np.searchsorted(times[low:high], last, side="left")) + 1
         return begin, min(max(stop, begin + 1), high)
 
     def _about(self) -> dict[str, dict[str, int]]:

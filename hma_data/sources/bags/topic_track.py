@@ -318,13 +318,20 @@ class TopicTrack:
 # -- cameras
 
 
-def camera_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int] | None = None) -> Stream:
+def camera_stream(
+    bag: Bag,
+    track: TopicTrack,
+    clock: str,
+    shown: tuple[int, int] | None = None,
+    levels: tuple[float, float] | None = None,
+) -> Stream:
     """Return the stream of a camera whose topic was recorded.
 
     Args:
         clock: header or receive.
         shown: [from, to) of the pictures, in order of receipt; all by default. Video may need earlier
             messages too, to be decoded.
+        levels: of the camera, for pictures in mono16.
 
     Raises:
         EpisodeError: the topic holds no pictures, or video that never begins.
@@ -342,7 +349,7 @@ def camera_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int
     if kind != VIDEO:
         order = order[begin:stop]
         messages = Messages(bag, track.channels, track.places()[order], where)
-        return StillStream(track.seconds(clock)[order], messages, kind)
+        return StillStream(track.seconds(clock)[order], messages, kind, levels)
     first, keyframes = _decodable(track, order, begin, where)
     begin = max(begin, first)
     order, keyframes = order[first:stop], keyframes[first:stop]

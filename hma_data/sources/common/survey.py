@@ -34,6 +34,7 @@ CHECKS = {  # the checks of an inspection, in the order they are printed
     "gaps": "pauses",
     "rate": "rate as stated",
     "skew": "skew between streams",
+    "offset": "commands beside pictures",
     "finite": "NaN and infinity",
     "constant": "values that never change",
     "size": "pictures of one size",

@@ -60,6 +60,18 @@ def test_hold_is_the_last_at_or_before(source: np.ndarray, targets: np.ndarray) 
 
 
 @QUICK
+@given(source=times(), targets=times(), late=st.integers(0, 50))
+def test_hold_with_a_tolerance_is_the_last_at_most_so_late(
+    source: np.ndarray, targets: np.ndarray, late: int
+) -> None:
+    index, skew_ms = hold(source, targets, late * TICK)
+    np.testing.assert_array_equal(index, [one_held(source, t + late * TICK) for t in targets])
+    trimmed = targets + late * TICK < source[0]
+    assert ((skew_ms < 0) == trimmed).all()
+    np.testing.assert_array_equal(skew_ms[~trimmed], np.abs(targets - source[index])[~trimmed] * 1e3)
+
+
+@QUICK
 @given(source=times(), targets=times(), seed=st.integers(0, 99))
 def test_interpolate_is_linear_between_neighbours(source: np.ndarray, targets: np.ndarray, seed: int) -> None:
     assume((np.diff(source) > 0).all())
@@ -190,6 +202,18 @@ def test_a_command_sent_between_two_frames_acts_from_the_second_on() -> None:
     clip = to_clip(episode(STEADY, STEADY, np.array([0.0, 0.55]), STEADY, STEADY), embodiment())
     values = clip.episode.actions[0].values[:, 0]
     np.testing.assert_array_equal(clip.actions[:, 0], np.where(STEADY >= 0.55, values[1], values[0]))
+
+
+def test_a_command_within_the_tolerance_acts_at_the_frame_before_it_and_states_do_not_change() -> None:
+    late = STEADY + 0.03
+    run = episode(STEADY, STEADY, late, STEADY, late)
+    clip = to_clip(run, embodiment(tolerance_ms=30, states="hold"))
+    assert len(clip) == 19 and clip.trimmed == 1  # no state is known at the first frame
+    np.testing.assert_array_equal(clip.actions[:, 0], run.actions[0].values[1:, 0])
+    np.testing.assert_array_equal(clip.states, run.states[0].values[:-1])
+    assert clip.skew_ms["a"].max() == pytest.approx(30) and clip.skew_ms["s"].max() == pytest.approx(70)
+    with pytest.raises(RegistryError, match="tolerance_ms is for actions: hold, not for nearest"):
+        embodiment(tolerance_ms=30, actions="nearest")
 
 
 def test_frames_before_the_first_command_are_left_out_and_counted() -> None:

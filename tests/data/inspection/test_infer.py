@@ -17,6 +17,7 @@ from hma_data.inspection.infer import from_inspection, infer
 from hma_data.registry.embodiment import Embodiment, find, problems
 from hma_data.sources.base import Inspection, KeyInfo, open_source
 from hma_data.storage.yaml_io import parse_yaml
+from tests.command import hma
 from tests.data import rlds_files
 from tests.data.inferring import H, T, W, answered, first_clip, inferred, keys, numbers, pictures, questions
 from tests.data.rlds_files import TEXT, features_dict, image, png, tensor
@@ -423,6 +424,7 @@ def test_real_rendered_robomimic(real_data: Path) -> None:
 def test_real_g1(real_data: Path) -> None:
     path = real_data / "lerobot/g1_v21"
     values = inferred(path)
+    assert "# The registry has g1_inspire with these keys" in infer(str(path), "mine")
     robot = find("g1_inspire")
     assert values["action"]["components"][0]["names"] == robot.action.names()
     assert values["frequency_hz"] == 30 and values["source"]["episodes"] == 100
@@ -451,6 +453,36 @@ def test_real_recordings_of_no_use_say_what_is_there(
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 900
     for word in words:
         assert word in str(caught.value)
+
+
+# -- robots that the registry has
+
+
+def test_a_robot_of_the_registry_is_named_by_its_recording_or_its_keys(tmp_path: Path) -> None:
+    path = tmp_path / "run.hdf5"
+    with h5py.File(path, "w") as file:
+        demo = file.create_group("data/demo_0")
+        demo["actions"], demo["obs/front"] = numbers(T, 5), pictures()
+
+    def told() -> str:
+        done = hma("registry", "infer", path, "--id", "mine", "--out", tmp_path / "mine.yaml", cwd=tmp_path)
+        (tmp_path / "mine.yaml").unlink()
+        return done.stdout
+
+    assert "The registry" not in told()
+    values = answered(inferred(path)) | {"id": "ours"}
+    known = tmp_path / "registry" / "ours.yaml"
+    known.parent.mkdir()
+    known.write_text(yaml.safe_dump(values))
+    line = "The registry has ours for this recording: hma registry show ours"
+    assert line in told()
+    cut = [{"key": "actions", "dims": 2, "slice": [0, 2]}, {"key": "actions", "dims": 3, "slice": [2, 5]}]
+    values["action"]["components"], values["source"]["uri"] = cut, None
+    known.write_text(yaml.safe_dump(values))
+    assert line.replace("for this recording:", "with these keys and dims; is it this robot?") in told()
+    values["cameras"][0]["key"] = "obs/wrist"
+    known.write_text(yaml.safe_dump(values))
+    assert "The registry" not in told()
 
 
 # -- bad input

@@ -15,6 +15,7 @@ from tests.data.inferring import (
     joints_of,
     keys,
     picture_of,
+    pictures,
     pose,
     questions,
     trajectory,
@@ -157,3 +158,21 @@ def test_stamps_of_another_clock_make_it_receive_times(tmp_path: Path) -> None:
 def test_a_rate_is_whole_where_jitter_hides_the_difference(tmp_path: Path) -> None:
     path = bag(tmp_path / "run", {"/image": (picture_of(), 29.97), "/cmd_vel": (twist(), 10)}, seconds=2)
     assert inferred(path)["frequency_hz"] == 29.97
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "mono16"])
+def test_mono_cameras_are_pictures_without_a_question(tmp_path: Path, encoding: str) -> None:
+    path = bag(tmp_path / "run", {"/image": (picture_of(encoding), 10), "/cmd_vel": (twist(), 20)})
+    values = inferred(path)
+    assert keys(values, "cameras") == ["/image"] and "cameras" not in values["provenance"]
+    assert values["cameras"][0].get("levels") == ([0, 4095] if encoding == "mono16" else None)
+    shown = first_clip(path, values).frames_at("primary", np.arange(1))[0]
+    grey = pictures(1, 1)[0, ..., 0]
+    expected = np.rint(grey * 16.0 / 4095 * 255) if encoding == "mono16" else grey
+    np.testing.assert_array_equal(shown, np.repeat(expected[..., None], 3, -1))
+
+
+def test_mono_cameras_come_after_those_in_colour(tmp_path: Path) -> None:
+    topics = {"/a": (picture_of("mono8"), 10), "/b": (picture_of(), 10), "/c": (picture_of("8UC1"), 10)}
+    values = inferred(bag(tmp_path / "run", {**topics, "/cmd_vel": (twist(), 20)}))
+    assert keys(values, "cameras") == ["/b", "/a"]

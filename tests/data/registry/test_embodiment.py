@@ -227,6 +227,8 @@ def test_an_unknown_camera_names_the_known() -> None:
         ("action.components.0.unknown", 1, r"components\[0\]\.unknown: unknown key"),
         ("cameras.0.rotate", 45, r"cameras\[0\]\.rotate: .*0, 90, 180 or 270"),
         ("cameras.0.crop", [0, 0, 0, 4], r"cameras\[0\]\.crop\[2\]: .*greater than or equal to 1"),
+        ("cameras.0.levels", [9, 9], r"levels \[9.0, 9.0\] must be \[black, white\]"),
+        ("sync.tolerance_ms", 0, r"sync\.tolerance_ms: .*greater than 0"),
         ("cameras.0.name", "a/b", r"cameras\[0\]\.name: "),
         ("cameras.0.color", "hsv", r"cameras\[0\]\.color: .*'rgb' or 'bgr'"),
         ("sync.primary", "side", "sync.primary 'side' is not one of: front"),

@@ -70,10 +70,38 @@ def test_yuv_is_the_inverse_of_the_standard_conversion(encoding: str, luma: int)
     )
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "mono16", "rgb16", ""])
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "rgb16", ""])
 def test_what_is_no_8_bit_colour_is_refused(encoding: str) -> None:
     with pytest.raises(EpisodeError, match=r"not 8-bit colour.*rgb8"):
         picture(image(encoding, np.zeros(32, np.uint8), 4, 4, 8), "raw", "depth")
+
+
+def in_levels(values: np.ndarray, black: float, white: float) -> np.ndarray:
+    grey = [
+        [round(255 * min(max((v - black) / (white - black), 0), 1)) for v in row] for row in values.tolist()
+    ]
+    return np.repeat(np.array(grey, np.uint8)[..., None], 3, -1)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_16_bits_of_grey_are_scaled_by_the_levels_of_the_camera(order: str) -> None:
+    values = np.random.default_rng(0).integers(0, 5000, (6, 8), np.uint16)
+    expected = in_levels(values, 200, 4095)
+    rows = np.pad(values.astype(f"{order}u2").view(np.uint8).reshape(6, 16), ((0, 0), (0, 4)))
+    raw = image("mono16", rows, 8, 6, 20) | {"is_bigendian": int(order == ">")}
+    np.testing.assert_array_equal(picture(raw, "raw", "", (200, 4095)), expected)
+    png = cv2.imencode(".png", values)[1].reshape(-1)
+    still = {"format": "mono16; png compressed ", "data": png}
+    np.testing.assert_array_equal(picture(still, "still", "", (200, 4095)), expected)
+    for message, kind in ((raw, "raw"), (still, "still")):
+        with pytest.raises(EpisodeError, match=r"16 bits of grey.*levels: \[0, 4095\]"):
+            picture(message, kind, "cam")
+
+
+def test_mono16_that_its_driver_compressed_to_8_bits_needs_no_levels() -> None:
+    jpeg = cv2.imencode(".jpg", smooth()[..., 0])[1].reshape(-1)
+    found = picture({"format": "mono16; jpeg compressed mono8", "data": jpeg}, "still", "")
+    np.testing.assert_array_equal(found, cv2.imdecode(jpeg, cv2.IMREAD_COLOR))
 
 
 @pytest.mark.parametrize(
