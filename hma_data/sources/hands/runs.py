@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.sources.hands.layout import HandsLayout, Header
+from hma_data.registry.layouts import HandsLayout
+from hma_data.sources.hands.layout import Header
 
 Floats = NDArray[np.float64]
 Frames = NDArray[np.int64]

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError, OutputError
+from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint, local_path, unfollowed
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands, load_models
-from hma_data.sources.hands.layout import HandsLayout, Header, Video, header_of, videos_of
+from hma_data.sources.hands.layout import Header, Video, header_of, videos_of
 from hma_data.sources.hands.runs import POINTS, SIDES, HandLabels, labels_from_rows
 from hma_data.storage.files import atomic_path, cache_folder
 from hma_data.storage.paths import StrPath, as_path, as_text

@@ -17,11 +17,12 @@ from hma_data.errors import RegistryError, SourceError
 from hma_data.inspection.infer import infer
 from hma_data.loading.dataset import WindowDataset
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.layouts import HandsLayout
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import VideoFile
-from hma_data.sources.hands.layout import HandsLayout, Header
+from hma_data.sources.hands.layout import Header
 from hma_data.sources.hands.runs import cut_into_runs, labels_from_rows
 from tests.data import hands_files as made
 from tests.data.videos import encode, number_of
