@@ -33,6 +33,7 @@ from hma_data.registry.components import (
     Vector,
 )
 from hma_data.registry.layouts import LAYOUTS
+from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
 
@@ -379,6 +380,8 @@ def find(name_or_path: StrPath, beside: StrPath | None = None) -> Embodiment:
             raise RegistryError(paths[0], f"has id {embodiment.id!r}", "file name and id must be the same")
     from difflib import get_close_matches
 
+    if found := misplaced(as_path(name_or_path), "a YAML file"):
+        raise RegistryError(name_or_path, *found)
     near = get_close_matches(name_or_path, [file_id(path) for path in registry_files(folders)], n=3)
     hint = f"did you mean {', '.join(near)}? " if near else ""
     raise RegistryError(

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from hma_data.errors import TokenizerError
 from hma_data.storage.files import file_sha256, write_atomic
+from hma_data.storage.kinds import unreadable
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import Entry, find_entry
 
@@ -168,16 +169,15 @@ def read_tensors(path: Path) -> Tensors:
         # Only a zip archive can be memory-mapped; torch wrote others before version 1.6.
         values = torch.load(path, map_location="cpu", weights_only=True, mmap=start.startswith(b"PK"))
     except pickle.UnpicklingError as fault:
-        raise TokenizerError(
-            path,
-            "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled",
-            "save its state_dict as safetensors where it can be trusted",
-        ) from fault
+        text = "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled"
+        remedy = "save its state_dict as safetensors where it can be trusted"
+        raise TokenizerError(path, *unreadable(path, text, remedy)) from fault
     except TokenizerError:
         raise
     except Exception as fault:  # torch raises many kinds of errors on a damaged file
         text = f"is not a complete safetensors file or torch checkpoint: {type(fault).__name__}"
-        raise TokenizerError(path, f"{text}: {_one_line(fault)}", "download it again") from fault
+        reason = unreadable(path, f"{text}: {_one_line(fault)}", "download it again")
+        raise TokenizerError(path, *reason) from fault
     for key in NESTED:
         if isinstance(values, Mapping) and isinstance(values.get(key), Mapping):
             values = values[key]
@@ -194,9 +194,8 @@ def _read_safetensors(path: Path) -> tuple[Tensors, dict[str, str]]:
         with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (SafetensorError, OSError) as fault:
-        raise TokenizerError(
-            path, f"is not a complete safetensors file: {_one_line(fault)}", OTHER
-        ) from fault
+        reason = unreadable(path, f"is not a complete safetensors file: {_one_line(fault)}", OTHER)
+        raise TokenizerError(path, *reason) from fault
 
 
 def stated_scale(folder: Path, default: float) -> float:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import ID_PATTERN, Embodiment
 from hma_data.storage.files import file_sha256, read_json
+from hma_data.storage.kinds import misplaced, unreadable
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint import migrate
 from hma_model.checkpoint.weights import read_metadata
@@ -102,7 +103,7 @@ class Checkpoint:
         path = inside(self.folder, TRUNK)
         if self._measured_sha256 != self.trunk_sha256:
             remedy = "pull the checkpoint again, into a new folder"
-            raise CheckpointError(path, f"is another trunk than {CONFIG} names", remedy)
+            raise CheckpointError(path, *unreadable(path, f"is another trunk than {CONFIG} names", remedy))
         return path
 
     @cached_property
@@ -195,6 +196,8 @@ def resolve(folder: StrPath) -> Path:
     steps = training_checkpoints(folder)
     if steps:
         return steps[-1]
+    if found := misplaced(folder, "a checkpoint"):
+        raise CheckpointError(folder, *found)
     fault = f"has no {CONFIG} and no checkpoints/" if folder.is_dir() else "no such folder"
     raise CheckpointError(folder, fault, "give a checkpoint, or the folder of a training run")
 

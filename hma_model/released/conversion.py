@@ -24,6 +24,7 @@ from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.hub.repository import Repository
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.storage.files import new_folder, read_json, to_json
+from hma_data.storage.kinds import unreadable
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.catalog import find_entry
@@ -180,7 +181,7 @@ def _unpickled(path: Path) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as fault:
         text = "holds more than tensors, or is damaged; it is not opened"
-        raise CheckpointError(path, text, "convert it to safetensors") from fault
+        raise CheckpointError(path, *unreadable(path, text, "convert it to safetensors")) from fault
     except Exception as fault:  # torch raises errors of many kinds for a damaged file
         first = (str(fault).splitlines() or [type(fault).__name__])[0]
         raise CheckpointError(path, f"cannot be read: {first}", "download it again") from fault

@@ -153,7 +153,8 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     try:
         facts |= _hands_in(videos, chosen[:LOOKED_AT], survey)
     except HMAError as fault:
-        facts["hands"] = f"not looked for: {fault}"
+        said = f"hands were not looked for: {fault.where} {fault.fault}"
+        survey.note(Finding("hands", "warn", said, fault.remedy, "video"))
     first = next(iter(headers.values()), Header(0, 0.0, 0, 0, ""))
     hz, size = first.hz or None, (first.height, first.width, 3)
     keys = [KeyInfo("video", "camera", size, "uint8", hz, codec=first.codec or None)]

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError
 from hma_data.storage.fetch import attempt, fetch, info, is_local, mark, protocol
 from hma_data.storage.files import PART, cache_folder
+from hma_data.storage.kinds import LFS, unreadable
 
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
@@ -210,6 +211,8 @@ def scan_tfrecord(files: Any, path: str, size: int, known: Framing = EMPTY, limi
         header = read(position, min(size, position + HEADER.size))
         if not position and header[:2] == b"\x1f\x8b":
             raise SourceError(path, "is gzip-compressed", "decompress it: gunzip")
+        if not position and header == LFS[: HEADER.size]:
+            raise SourceError(path, *unreadable(Path(path), "is a Git LFS pointer", "run git lfs pull"))
         while position < size and len(offsets) != limit:
             end, fault = _data_end(header, position, size)
             if fault:
@@ -301,7 +304,8 @@ def scan_array_record(files: Any, path: str, size: int, known: Framing = EMPTY, 
     """
     reader = _open_array_record(path)
     if not reader.ok():
-        return replace(EMPTY, fault=_array_record_fault(reader), whole=True)
+        fault, remedy = unreadable(Path(path), _array_record_fault(reader), "")
+        return replace(EMPTY, fault=f"{fault} — {remedy}" if remedy else fault, whole=True)
     count = reader.num_records()
     lengths, checks = np.zeros(count, np.int64), np.zeros(count, np.uint32)
     for index in range(count):
