@@ -97,7 +97,7 @@ def test_a_video_with_too_few_hands_gives_no_masked_episode(folder: Path) -> Non
 
 
 def test_another_word_than_split_hold_and_mask_is_refused(folder: Path) -> None:
-    with pytest.raises(RegistryError, match="missing: is 'skip'.*'split', 'hold' or 'mask'"):
+    with pytest.raises(RegistryError, match="layout.missing: .*'skip'.*'split', 'hold' or 'mask'"):
         read(folder, made.hand_video("landmarks", missing="skip"))
 
 
