@@ -178,6 +178,13 @@ class Sync(SpecModel):
     )
     stamp: Literal["header", "receive"] = "header"
 
+    @field_validator("beyond")
+    @classmethod
+    def _mask_needs_a_limit(cls, value: str, info: ValidationInfo) -> str:
+        if value == "mask" and info.data.get("max_skew_ms", 0) is None:
+            raise ValueError("mask needs sync.max_skew_ms")
+        return value
+
 
 class Marker(SpecModel):
     """Messages of a bag that begin or end an episode.

@@ -106,8 +106,6 @@ class Embodiment(SpecModel):
         names = [camera.name for camera in info.data.get("cameras", ())]
         if value.primary and names and value.primary not in names:
             raise ValueError(f"primary {value.primary!r} is not one of: {', '.join(names)}")
-        if value.beyond == "mask" and value.max_skew_ms is None:
-            raise ValueError("beyond: mask needs max_skew_ms")
         return value
 
     @field_validator("source")

@@ -262,8 +262,8 @@ def detect(uri: StrPath) -> str:
     if broken:
         raise broken[0]
     known = [recognition.label for recognition in (*ours.values(), *theirs.values())]
-    if found := misplaced(path, "a recording"):
-        raise SourceError(uri, *found)
+    if other := misplaced(path, "a recording"):
+        raise SourceError(uri, *other)
     remedy = _unpack_first(files) or f"expected {', '.join(known[:-1])}, or {known[-1]}"
     if files:
         fault, remedy = unreadable(files[0], "is not a recording of a known format", remedy)

@@ -233,7 +233,8 @@ class Survey:
         for names, first in groups[:SHOWN]:
             said = f"{first.where}: {first.fault}"
             if len(names) > 1:
-                said = f"{len(names):,} of {looked:,} episodes looked at, such as {names[0]}: {said}"
+                named = said if said.startswith(names[0]) else f"{names[0]}: {said}"
+                said = f"{len(names):,} of {looked:,} episodes looked at, such as {named}"
             yield Finding("readable", severity, said, first.remedy, numbers={"episodes": len(names)})
         rest = sum(len(names) for names, _ in groups[SHOWN:])
         if rest:
