@@ -1,6 +1,6 @@
 """Run `hma inspect` (what is in a recording) and `hma doctor` (what in it will hurt training)."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 from typer import Argument, Option
@@ -9,6 +9,10 @@ from hma_data.console import human_number, print_json, print_lines, print_table
 
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
 Episodes = Annotated[int, Option("--episodes", min=1, help="Number of episodes to look into.")]
+FailOn = Annotated[
+    Literal["info", "warn", "error", "never"],
+    Option("--fail-on", help="Exit with 1 if there is a finding of this severity or worse."),
+]
 COLUMNS = ["key", "shape", "dtype", "Hz", "jitter ms", "skew ms", "count", "values"]
 NO_JITTER_MS = 0.001  # a smaller jitter comes from rounded stamps
 
@@ -19,9 +23,12 @@ def inspect(
         str | None, Option("--embodiment", "-e", help="Check against this embodiment.")
     ] = None,
     episodes: Episodes = 20,
+    fail_on: FailOn = "error",
     json: Json = False,
 ) -> None:
     """Show what is in a recording.
+
+    Exits with 1 as hma doctor does: if there is a finding of the severity of --fail-on or worse.
 
     Example: hma inspect ./demo.hdf5
     """
@@ -32,7 +39,15 @@ def inspect(
         print_json(report)
     else:
         _print_inspection(report)
-    raise typer.Exit(1 if report["problems"] else 0)
+    _exit([finding["severity"] for finding in report["findings"]], fail_on)
+
+
+def _exit(found: list[str], fail_on: str) -> NoReturn:
+    """Exit with 1 if one of the severities is `fail_on` or worse, else with 0."""
+    from hma_data.sources.common.checks import SEVERITIES
+
+    levels: list[str] = [*SEVERITIES, "never"]
+    raise typer.Exit(int(any(levels.index(one) >= levels.index(fail_on) for one in found)))
 
 
 def _print_inspection(report: dict[str, Any]) -> None:
@@ -96,10 +111,7 @@ def doctor(
         str | None, Option("--embodiment", "-e", help="Look into the episodes as this robot's.")
     ] = None,
     episodes: Episodes = 20,
-    fail_on: Annotated[
-        Literal["info", "warn", "error", "never"],
-        Option("--fail-on", help="Exit with 1 if there is a finding of this severity or worse."),
-    ] = "error",
+    fail_on: FailOn = "error",
     json: Json = False,
 ) -> None:
     """Check the health of a recording or shard set: report what in it will hurt training.
@@ -116,6 +128,4 @@ def doctor(
         print_lines((f"{finding.severity:5} {finding.check}", str(finding)) for finding in found)
         counts = [f"{sum(one.severity == level for one in found)} {level}" for level in reversed(SEVERITIES)]
         print(f"{target}: {', '.join(counts)}" if found else f"{target}: sound")
-    worst = max((SEVERITIES.index(finding.severity) for finding in found), default=-1)
-    failed = fail_on != "never" and worst >= SEVERITIES.index(fail_on)
-    raise typer.Exit(1 if failed else 0)
+    _exit([finding.severity for finding in found], fail_on)

@@ -219,7 +219,8 @@ class _Draft:
         source = {"format": found.format, "uri": found.uri, "episodes": max(found.episodes, 1)}
         said = self._instruction()
         source |= {"instruction": said} if said else {}
-        source |= {"layout": {"timestamps": facts["timestamps"]}} if facts.get("timestamps") else {}
+        layout = {key: facts[key] for key in ("timestamps", "pairing") if facts.get(key)}
+        source |= {"layout": layout} if layout else {}
         values |= {"source": source, "provenance": self._provenance()}
         taken = {key.key for key in self.used} | {said, ""}
         left = [key for key in found.keys if key.key not in taken and key.kind != "text"]
@@ -302,6 +303,8 @@ class _Draft:
         return said
 
     def _rate_from(self) -> str:
+        if self.found.facts.get("pairing"):
+            return "measured: the timestamps of the rows; meta/info.json states another rate, the film's"
         if self.found.format == "lerobot":
             return "fps of the recording's meta/info.json"
         if not self.bag:

@@ -22,13 +22,14 @@ from hma_data.inspection.pairing import judged, proposed
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
 from hma_data.sources.common.checks import SEVERITIES, Finding, Severity
-from hma_data.sources.common.survey import CHECKS, sampled
+from hma_data.sources.common.survey import CHECKS, alike, sampled
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
 
 TRIED = 20  # episodes tried until one can be read
 WINDOW = 12  # frames of the model's window, by default
 LOOKS = ("blank", "still", "colour", "size")  # checks of pictures; they count only for cameras that are used
+EMPTY = Finding("readable", "error", "the recording has no episodes")
 
 
 def _inspected(uri: str, robot: Embodiment | None, episodes: int) -> tuple[Source, Inspection]:
@@ -58,9 +59,11 @@ def inspect_recording(
     """
     uri, robot = as_text(uri), find(embodiment) if embodiment else None
     source, inspection = _inspected(uri, robot, episodes)
-    found = list(inspection.findings)
+    found = [one for one in inspection.findings if not (robot and _answered(one, robot))]
     report = inspection.to_json()
-    if robot:
+    if not inspection.episodes:
+        found.append(EMPTY)
+    elif robot:
         report["embodiment"] = _fit(uri, robot, source, inspection, found)
     else:
         offsets = commands(inspection)
@@ -118,7 +121,7 @@ def _fit(
         found += [finding] if finding else []
     if hz and isinstance(robot.frequency_hz, float) and abs(hz / robot.rate_hz - 1) > 0.1:
         said = f"{robot.id} says {robot.rate_hz:g} Hz, the recording's grid ticks at {hz:.3g} Hz"
-        found.append(Finding("rate", "warn", said, numbers={"hz": hz, "stated_hz": robot.rate_hz}))
+        found.append(Finding("rate", "error", said, numbers={"hz": hz, "stated_hz": robot.rate_hz}))
     constant = _constant(clip.actions.std(axis=0), robot)
     return facts | ({"constant in it": "action " + ", ".join(constant)} if constant else {})
 
@@ -183,13 +186,21 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
         yield Finding("readable", "error", str(fault))
         return
     if not inspection.episodes:
-        yield Finding("episodes", "error", "the recording has no episodes")
+        yield EMPTY
     elif robot is None:
         yield from inspection.findings
         yield from proposed(commands(inspection))
     else:
         yield from _for_robot(inspection, robot)
         yield from _episodes(uri, robot, source, sample, inspection)
+
+
+def _answered(finding: Finding, robot: Embodiment) -> bool:
+    """Check whether the YAML answers a finding: it pairs by index, has labels, or names the models."""
+    layout = robot.source.layout or {}
+    if finding.check == "hands":
+        return "models" in layout or layout.get("labels", "detector") != "detector"
+    return layout.get("pairing") == "index" and finding.check in ("skew", "rate")
 
 
 def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
@@ -199,7 +210,7 @@ def _for_robot(inspection: Inspection, robot: Embodiment) -> Iterator[Finding]:
     """
     cameras = {camera.key: camera for camera in robot.cameras}
     for finding in inspection.findings:
-        if finding.check == "constant":
+        if finding.check == "constant" or _answered(finding, robot):
             continue
         if finding.check in LOOKS:
             camera = cameras.get(finding.key)
@@ -227,7 +238,7 @@ def _episodes(
         yield Finding("usable", "error", f"none of its episodes: {fault.fault}", fault.remedy)
         return
     chosen = [names[i] for i in sampled(len(names), sample)]
-    refused: dict[tuple[str, str], list[str]] = {}
+    refused: list[tuple[str, HMAError]] = []
     clips: list[Clip] = []
     for name in chosen:
         try:
@@ -236,12 +247,12 @@ def _episodes(
                 clip.frames_at(camera.name, np.array([len(clip) - 1]))
             clips.append(clip)
         except HMAError as fault:
-            refused.setdefault((fault.fault, fault.remedy), []).append(name)
-    for (reason, remedy), which in sorted(refused.items(), key=lambda item: -len(item[1]))[:5]:
-        severity: Severity = "warn" if clips else "error"
-        said = f"{len(which)} of {len(chosen)} episodes looked at, such as {which[0]}: {reason}"
+            refused.append((name, fault))
+    severity: Severity = "warn" if clips else "error"
+    for which, first in alike(refused):
+        said = f"{len(which)} of {len(chosen)} episodes looked at, such as {which[0]}: {first.fault}"
         numbers = {"refused": len(which), "looked_at": len(chosen)}
-        yield Finding("usable", severity, said, remedy, numbers=numbers)
+        yield Finding("usable", severity, said, first.remedy, numbers=numbers)
     if clips:
         told = any(one.check == "gaps" and one.key == robot.primary_camera.key for one in inspection.findings)
         yield from (one for one in _times(clips, robot) if not (told and one.check == "gaps"))
@@ -299,21 +310,27 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
-    from hma_data.shards.manifest import Manifest
+    from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
+    from hma_data.shards.windows import WindowIndex
 
     wrong = verify(folder)
     for problem in wrong:
         yield Finding("integrity", "error", problem)
     if wrong:
         return
-    manifest = Manifest.load(folder)
+    shards = ShardSet(folder)
+    manifest = shards.manifest
     kept = sum(split["episodes"] for split in manifest.splits.values())
     if manifest.quarantined:
         said = f"{manifest.quarantined:,} episodes beside {kept:,} kept; reasons in quarantine.jsonl"
         yield Finding("quarantine", "warn", said)
     if not manifest.splits["train"]["episodes"]:
         yield Finding("split", "error", "no episode is in the train split")
+    elif not WindowIndex.of(shards, "train", WINDOW).count:
+        rows, longest = WINDOW * shards.row_stride, int(shards.index("train").length.max())
+        said = f"no window to train on: {WINDOW} frames need {rows} rows, the longest episode has {longest}"
+        yield Finding("windows", "error", said, "convert with a higher target_hz, or longer episodes")
     if not manifest.splits["val"]["episodes"]:
         yield Finding("split", "warn", "no episode is in the val split", "convert more than one episode")
     deviations = np.asarray(manifest.stats["action"]["std"], np.float64)

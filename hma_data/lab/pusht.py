@@ -64,7 +64,7 @@ class Arena:
     """
 
     def __init__(self, look: Look, start: str, rng: np.random.Generator) -> None:
-        with imported("gym-pusht", "pip install 'gym-pusht>=0.1.8'"):
+        with imported("gym-pusht", "uv sync"):
             from gym_pusht.envs.pusht import PushTEnv
             from pygame import Color
         self._env = PushTEnv(obs_type="state", observation_width=look.size, observation_height=look.size)

@@ -5,10 +5,19 @@ They are frozen and validated when made; `hma_data.registry.embodiment` puts the
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from hma_data.registry import FORMATS, MORE, known_formats
+from hma_data.registry.layouts import LAYOUTS, keys_schema
 
 Space = Literal[
     "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",
@@ -78,19 +87,23 @@ class Component(SpecModel):
     )
     stamp: Literal["header", "receive"] | None = None
 
-    @model_validator(mode="after")
-    def _widths(self) -> Self:
-        if self.slice and (width := self.slice[1] - self.slice[0]) != self.dims:
-            raise ValueError(f"slice {list(self.slice)} has {width} values, but dims is {self.dims}")
-        if self.names and len(self.names) != self.dims:
-            raise ValueError(f"there are {len(self.names)} names for {self.dims} dims")
-        for label in ("sign", "offset"):
-            value = getattr(self, label)
-            if isinstance(value, tuple) and len(value) != self.dims:
-                raise ValueError(f"{label} has {len(value)} values for {self.dims} dims")
-        if self.range and self.range[0] >= self.range[1]:
-            raise ValueError(f"range {list(self.range)} must be [low, high] with low < high")
-        return self
+    @field_validator("slice", "names", "sign", "offset")
+    @classmethod
+    def _as_many_as_dims(cls, value: Any, info: ValidationInfo) -> Any:
+        dims = info.data.get("dims")  # missing where it has a problem of its own
+        if not isinstance(value, tuple) or dims is None:
+            return value
+        width = value[1] - value[0] if info.field_name == "slice" else len(value)
+        if width != dims:
+            raise ValueError(f"has {width} values, but dims is {dims}")
+        return value
+
+    @field_validator("range")
+    @classmethod
+    def _rising(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value and value[0] >= value[1]:
+            raise ValueError("must be [low, high] with low < high")
+        return value
 
 
 class Vector(SpecModel):
@@ -177,6 +190,13 @@ class Sync(SpecModel):
     )
     stamp: Literal["header", "receive"] = "header"
 
+    @field_validator("beyond")
+    @classmethod
+    def _mask_needs_a_limit(cls, value: str, info: ValidationInfo) -> str:
+        if value == "mask" and info.data.get("max_skew_ms", 0) is None:
+            raise ValueError("mask needs sync.max_skew_ms")
+        return value
+
     @model_validator(mode="after")
     def _held(self) -> Self:
         if self.tolerance_ms and self.actions != "hold":
@@ -218,15 +238,44 @@ class Segments(SpecModel):
         return self
 
 
+def _as_text(value: Any) -> Any:
+    """Return numbers, true and false as text: a YAML may write them with or without quotes."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(value) if isinstance(value, int | float) else value
+
+
+def _by_format(schema: dict[str, Any]) -> None:
+    schema["allOf"] = keys_schema()
+    schema["properties"]["layout"] = {"description": schema["properties"]["layout"]["description"]}
+
+
 class SourceSpec(SpecModel):
     """The place and the layout of the recordings."""
+
+    model_config = ConfigDict(json_schema_extra=_by_format)
 
     format: Format
     uri: str | None = None
     split: str | None = Field(None, description="the source's own split to read")
     episodes: Count | None = Field(None, ge=1, description="the published number of episodes")
     instruction: str | None = Field(None, description="key of the language instruction")
-    layout: dict[str, str] | None = Field(
+    layout: dict[str, Annotated[str, BeforeValidator(_as_text)]] | None = Field(
         None, description="where a file has its data; the keys depend on the format"
     )
     segments: Segments | None = Field(None, description="how one bag is divided into episodes")
+
+    @field_validator("layout")
+    @classmethod
+    def _keys_of_the_format(cls, value: dict[str, str] | None, info: ValidationInfo) -> Any:
+        known = LAYOUTS.get(info.data.get("format", ""))
+        if known and value:
+            known.model_validate(value)
+        return value
+
+    @field_validator("segments")
+    @classmethod
+    def _of_bags(cls, value: Segments | None, info: ValidationInfo) -> Segments | None:
+        if value and info.data.get("format", "rosbag") != "rosbag":
+            raise ValueError(f"is for bags, not for {info.data['format']}")
+        return value

@@ -13,9 +13,9 @@ import os
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
 from hma_data.errors import RegistryError
 from hma_data.registry.catalog import file_id, registry_files, registry_folders
@@ -32,6 +32,8 @@ from hma_data.registry.components import (
     Sync,
     Vector,
 )
+from hma_data.registry.layouts import LAYOUTS
+from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
 
@@ -90,20 +92,29 @@ class Embodiment(SpecModel):
             raise ValueError("must lie between 0 and 100000 Hz")
         return value
 
-    @model_validator(mode="after")
-    def _names_agree(self) -> Self:
-        names = [camera.name for camera in self.cameras]
+    @field_validator("cameras")
+    @classmethod
+    def _names_differ(cls, value: tuple[Camera, ...]) -> tuple[Camera, ...]:
+        names = [camera.name for camera in value]
         if len(set(names)) != len(names):
             raise ValueError(f"two cameras have the same name: {', '.join(names)}")
-        if self.sync.primary and self.sync.primary not in names:
-            raise ValueError(f"sync.primary {self.sync.primary!r} is not one of: {', '.join(names)}")
-        if self.source.segments and self.source.format != "rosbag":
-            raise ValueError(f"source.segments is for bags, not for {self.source.format}")
-        if self.sync.beyond == "mask" and self.sync.max_skew_ms is None:
-            raise ValueError("sync.beyond: mask needs sync.max_skew_ms")
-        if self.sync.action_shift and self.source.format == "rosbag":
-            raise ValueError("sync.action_shift counts steps, but a bag has times instead of steps")
-        return self
+        return value
+
+    @field_validator("sync")
+    @classmethod
+    def _sync_fits(cls, value: Sync, info: ValidationInfo) -> Sync:
+        names = [camera.name for camera in info.data.get("cameras", ())]
+        if value.primary and names and value.primary not in names:
+            raise ValueError(f"primary {value.primary!r} is not one of: {', '.join(names)}")
+        return value
+
+    @field_validator("source")
+    @classmethod
+    def _source_fits(cls, value: SourceSpec, info: ValidationInfo) -> SourceSpec:
+        sync = info.data.get("sync")
+        if sync and sync.action_shift and value.format == "rosbag":
+            raise ValueError("a bag has times instead of steps, which sync.action_shift counts")
+        return value
 
     # -- derived facts
 
@@ -264,7 +275,7 @@ def find_problems(values: Any) -> list[Problem]:
             path = _yaml_path(item["loc"], values, missing=item["type"] == "missing")
             follows = item["type"] == "too_short" and item["input"]  # pydantic leaves out the wrong items
             if path not in asked and not follows:
-                found.append(_problem(path, item))
+                found.append(_problem(path, item, values))
     return list(dict.fromkeys(found))
 
 
@@ -293,11 +304,11 @@ def _yaml_path(location: tuple[int | str, ...], values: Any, missing: bool) -> s
     return path
 
 
-def _problem(path: str, item: Any) -> Problem:
+def _problem(path: str, item: Any, values: dict[str, Any]) -> Problem:
     if item["type"] == "missing":
         return Problem(path, "is missing")
     if item["type"] == "extra_forbidden":
-        return _unknown_key(path)
+        return _unknown_key(path, values)
     shown = None if isinstance(item["input"], dict) else repr(item["input"])
     if shown and len(shown) > 60:
         shown = shown[:57] + "..."
@@ -306,15 +317,17 @@ def _problem(path: str, item: Any) -> Problem:
     return Problem(path, item["msg"].removeprefix("Value error, "), shown)
 
 
-def _unknown_key(path: str) -> Problem:
+def _unknown_key(path: str, values: dict[str, Any]) -> Problem:
     from difflib import get_close_matches
 
-    parent, _, key = re.sub(r"\[\d+\]", "", path).rpartition(".")
-    known = _KEYS_AT.get(parent, Embodiment)
+    parent, of = re.sub(r"\[\d+\]", "", path).rpartition(".")[0], ""
+    known: type[BaseModel] = _KEYS_AT.get(parent, Embodiment)
+    if parent == "source.layout":
+        known, of = LAYOUTS[values["source"]["format"]], f" of format {values['source']['format']}"
     keys = [field.alias or name for name, field in known.model_fields.items()]
-    near = get_close_matches(key, keys, n=1)
+    near = get_close_matches(path.rpartition(".")[2], keys, n=1)
     hint = f", did you mean {near[0]!r}?" if near else ""
-    return Problem(path, f"unknown key{hint}", allowed=", ".join(keys))
+    return Problem(path, f"unknown key{of}{hint}", allowed=", ".join(keys) or "none")
 
 
 _KEYS_AT: dict[str, type[SpecModel]] = {
@@ -365,6 +378,8 @@ def find(name_or_path: StrPath, beside: StrPath | None = None) -> Embodiment:
             raise RegistryError(paths[0], f"has id {embodiment.id!r}", "file name and id must be the same")
     from difflib import get_close_matches
 
+    if found := misplaced(as_path(name_or_path), "a YAML file"):
+        raise RegistryError(name_or_path, *found)
     near = get_close_matches(name_or_path, [file_id(path) for path in registry_files(folders)], n=3)
     hint = f"did you mean {', '.join(near)}? " if near else ""
     raise RegistryError(

@@ -31,6 +31,7 @@ from hma_data.shards.schema import (
 )
 from hma_data.shards.stats import Stats
 from hma_data.storage.files import atomic_path, file_sha256, parse_json, write_atomic
+from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath, place
 from hma_data.storage.yaml_io import parse_yaml
@@ -163,6 +164,8 @@ class Manifest:
         path = folder / MANIFEST
         restat = f"hma shards restat {folder} writes it anew from the shards"
         if not path.is_file():
+            if not isinstance(folder, RemotePath) and (found := misplaced(folder, "a shard set")):
+                raise ShardError(folder, *found)
             remedy = f"run the same hma convert again to finish it; if the manifest was lost, {restat}"
             raise ShardError(folder, f"has no {MANIFEST}: its conversion has not finished", remedy)
         try:

@@ -242,7 +242,6 @@ def preview(
     picks = np.unique(np.linspace(0, len(shards.episodes) - 1, episodes).round().astype(int))
     rows = shards.episodes.take(picks).to_pylist()
     seen = [_Seen(shards, opened, row, number) for row in rows]
-    out.mkdir(parents=True, exist_ok=True)
     sheet, video = out / "sheet.png", out / "preview.mp4"
     write_png(sheet, np.concatenate([one.sheet(columns) for one in seen]))
     rate = shards.embodiment.rate_hz / shards.manifest.frame_stride

@@ -19,6 +19,7 @@ from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, S
 from hma_data.shards.schema import mask_columns, to_numpy, token_column
 from hma_data.storage.cache import kept_shard, limit_bytes
 from hma_data.storage.files import parse_json
+from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RangeFile, RemotePath, parquet_file, place
 
@@ -60,7 +61,9 @@ class ShardSet:
     def __init__(self, folder: StrPath, cache: bool = True) -> None:
         self.folder = place(folder)
         if not (self.folder / MANIFEST).is_file() and not self.folder.is_dir():
-            raise ShardError(self.folder, "is not a folder", "name the --out folder of an hma convert")
+            found = misplaced(self.folder, "a shard set")
+            remedy = "name the --out folder of an hma convert"
+            raise ShardError(self.folder, *(found or ("is not a folder", remedy)))
         self._cache = cache
         self.manifest = Manifest.load(self.folder)
         self.embodiment = self.manifest.embodiment

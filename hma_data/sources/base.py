@@ -28,6 +28,7 @@ from hma_data.registry import FORMATS, MORE, known_formats
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.common.checks import Finding
+from hma_data.storage.kinds import misplaced, unreadable
 from hma_data.storage.paths import StrPath, as_text
 
 SAMPLE = 20  # episodes that inspect looks into
@@ -267,12 +268,13 @@ def detect(uri: StrPath) -> str:
     if broken:
         raise broken[0]
     known = [recognition.label for recognition in (*ours.values(), *theirs.values())]
-    raise nothing_there(
-        uri,
-        path,
-        "is not a recording of a known format" if files else "holds no files",
-        _unpack_first(files) or f"expected {', '.join(known[:-1])}, or {known[-1]}",
-    )
+    if other := misplaced(path, "a recording"):
+        raise SourceError(uri, *other)
+    remedy = _unpack_first(files) or f"expected {', '.join(known[:-1])}, or {known[-1]}"
+    if files:
+        fault, remedy = unreadable(files[0], "is not a recording of a known format", remedy)
+        raise nothing_there(uri, path, fault, remedy)
+    raise nothing_there(uri, path, "holds no files", remedy)
 
 
 def _of_packages() -> tuple[Recognitions, list[PluginError]]:
@@ -332,6 +334,9 @@ def of_another_format(uri: str, name: str, fault: SourceError) -> SourceError:
         name: the format that was stated.
         fault: the error of reading it as that format; returned as it is where no other format is detected.
     """
+    here = Path(uri.removeprefix("file://")).expanduser()
+    if found := misplaced(here, "a recording"):
+        return SourceError(fault.where, *found)
     try:
         known = detect(uri) if Path(uri.removeprefix("file://")).expanduser().exists() else name
     except SourceError:
@@ -359,8 +364,11 @@ def local_path(uri: str) -> Path:
     """
     plain = uri.removeprefix("file://")
     path = Path(plain).expanduser()
-    if path.exists():
-        return path
+    try:
+        if path.exists():
+            return path
+    except PermissionError as fault:
+        raise SourceError(uri, *unreadable(path, str(fault), "")) from fault
     if "://" in plain:
         remedy = "copy it here: only RLDS and LeRobot are read elsewhere"
         raise SourceError(uri, "is not on this machine", remedy)
@@ -486,6 +494,7 @@ def unfollowed(root: Path, told: Collection[Path] = ()) -> list[Finding]:
 
 def nothing_there(uri: str, root: Path, fault: str, remedy: str) -> SourceError:
     """Return the error for a place without recordings; mention a link that was not followed, if any."""
+    fault, remedy = unreadable(root, fault, remedy)
     links = unfollowed(root)
     if links:
         fault, remedy = f"{fault}; {links[0].message}", links[0].remedy

@@ -22,6 +22,7 @@ PACKAGES = {
     "gs": "gcsfs", "gcs": "gcsfs", "s3": "s3fs", "s3a": "s3fs", "http": "aiohttp", "https": "aiohttp",
     "hf": "huggingface_hub", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
 }  # fmt: skip
+OF_EXTRA = ("gcsfs", "s3fs", "aiohttp")  # packages of the extra `remote`
 MARKS = ("etag", "ETag", "md5Hash", "crc32c", "mtime", "updated", "LastModified", "Last-Modified", "oid")
 NO_LISTING = ("http", "https")
 _ANSWERS_LATER = {
@@ -160,7 +161,8 @@ def file_system(uri: str) -> tuple[Any, str]:
         files, path = fsspec.core.url_to_fs(uri, **options)
     except ImportError as fault:
         package = PACKAGES.get(scheme)
-        remedy = f"pip install {package}" if package else said(fault)
+        remedy = f"uv pip install {package}" if package else said(fault)
+        remedy = "uv sync --extra remote" if package in OF_EXTRA else remedy
         raise MissingDependencyError(uri, f"needs the package of {scheme}://", remedy) from fault
     return files, path
 

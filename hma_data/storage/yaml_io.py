@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from hma_data.errors import HMAError, RegistryError
+from hma_data.storage.kinds import misplaced
 
 try:
     from yaml._yaml import CParser as _Events  # only its events: its own composer would build aliases
@@ -97,7 +98,8 @@ def read_bytes(path: Path, error: type[HMAError] = RegistryError) -> bytes:
     """
     try:
         if not path.is_file():
-            raise error(path, "is not a file" if path.exists() else "no such file")
+            found = misplaced(path, "a YAML file")
+            raise error(path, *(found or ("is not a file" if path.exists() else "no such file",)))
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as fault:
@@ -112,7 +114,8 @@ def decode_yaml(content: bytes, path: Path, error: type[HMAError] = RegistryErro
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as fault:
-        raise error(path, f"is not UTF-8 text: {fault}") from fault
+        found = misplaced(path, "a YAML file")
+        raise error(path, *(found or (f"is not UTF-8 text: {fault}",))) from fault
 
 
 def write_yaml(values: Any) -> str:

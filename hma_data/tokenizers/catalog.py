@@ -126,7 +126,7 @@ _ROWS = (
         "download", "hma_data.tokenizers.latents", licence="Stability AI Community License",
         repo="stabilityai/stable-video-diffusion-img2vid", bytes=391_000_000,
         file="vae/diffusion_pytorch_model.safetensors", revision="9cf024d5bfa8f56622af86c884f26a52f6676f2e",
-        imports=("torch", "diffusers"), extra="pip install diffusers",
+        imports=("torch", "diffusers"), extra="uv sync --extra svd",
     ),
     Entry(
         "taesd", "continuous", 256, (32, 32),

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 
 from hma_data.errors import HMAError, TokenizerError
 from hma_data.storage.files import file_sha256, read_json, write_atomic
+from hma_data.storage.kinds import unreadable
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import Entry, find_entry
 
@@ -162,12 +163,13 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
         values = torch.load(path, map_location="cpu", weights_only=True, mmap=start.startswith(b"PK"))
     except pickle.UnpicklingError as fault:
         text = "is not a torch checkpoint, or holds more than tensors and plain values; it was not unpickled"
-        raise error(path, text, "save its state_dict as safetensors where it can be trusted") from fault
+        remedy = "save its state_dict as safetensors where it can be trusted"
+        raise error(path, *unreadable(path, text, remedy)) from fault
     except HMAError:
         raise
     except Exception as fault:  # torch raises many kinds of errors on a damaged file
         text = f"is not a complete safetensors file or torch checkpoint: {type(fault).__name__}"
-        raise error(path, f"{text}: {_one_line(fault)}", "download it again") from fault
+        raise error(path, *unreadable(path, f"{text}: {_one_line(fault)}", "download it again")) from fault
     for key in NESTED:
         if isinstance(values, Mapping) and isinstance(values.get(key), Mapping):
             values = values[key]
@@ -185,7 +187,7 @@ def _read_safetensors(path: Path, error: type[HMAError]) -> tuple[Tensors, dict[
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except (SafetensorError, OSError) as fault:
         text = f"is not a complete safetensors file: {_one_line(fault)}"
-        raise error(path, text, "name another file, or download it again") from fault
+        raise error(path, *unreadable(path, text, "name another file, or download it again")) from fault
 
 
 def stated_scale(folder: Path, default: float) -> float:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import ID_PATTERN, Embodiment
 from hma_data.storage.files import file_sha256, read_json
+from hma_data.storage.kinds import misplaced, unreadable
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.config import HMAConfig
 
@@ -104,7 +105,7 @@ class Checkpoint:
         path = inside(self.folder, TRUNK)
         if file_sha256(path) != self.trunk_sha256:
             remedy = "pull the checkpoint again, into a new folder"
-            raise CheckpointError(path, f"is another trunk than {CONFIG} names", remedy)
+            raise CheckpointError(path, *unreadable(path, f"is another trunk than {CONFIG} names", remedy))
         return path
 
     def path(self, embodiment: str, part: str) -> Path:
@@ -213,6 +214,8 @@ def resolve(folder: StrPath) -> Path:
     steps = training_checkpoints(folder)
     if steps:
         return steps[-1]
+    if found := misplaced(folder, "a checkpoint"):
+        raise CheckpointError(folder, *found)
     fault = f"has no {CONFIG} and no checkpoints/" if folder.is_dir() else "no such folder"
     raise CheckpointError(folder, fault, "give a checkpoint, or the folder of a training run")
 
@@ -234,7 +237,8 @@ def read_metadata(path: Path) -> dict[str, str]:
         with safe_open(path, framework="np") as file:  # the header alone needs no torch
             return file.metadata() or {}
     except (SafetensorError, OSError) as fault:
-        raise CheckpointError(path, f"is not whole safetensors: {fault}", "pull or save it again") from fault
+        reason = unreadable(path, f"is not whole safetensors: {fault}", "pull or save it again")
+        raise CheckpointError(path, *reason) from fault
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hma_data.errors import CheckpointError
+from hma_data.storage.kinds import unreadable
 from hma_model.checkpoint.folder import FORMAT_VERSION, Checkpoint, converted, read_metadata
 
 if TYPE_CHECKING:
@@ -40,7 +41,8 @@ def read_tensors(path: Path) -> State:
     try:
         return load_file(path)
     except (SafetensorError, OSError) as fault:
-        raise CheckpointError(path, f"is not whole safetensors: {fault}", "pull or save it again") from fault
+        reason = unreadable(path, f"is not whole safetensors: {fault}", "pull or save it again")
+        raise CheckpointError(path, *reason) from fault
 
 
 def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: dict[str, str]) -> None:

@@ -62,7 +62,7 @@ class Remote:
     """A tracker for trackio or wandb, which have the same functions; the run has the name of its folder."""
 
     def __init__(self, name: str, recipe: Recipe, out: Path) -> None:
-        self._package = _package(name, name, f"pip install {name}")
+        self._package = _package(name, name, f"uv pip install {name}")
         run = out.absolute().name
         given = {"project": recipe.project, "name": run, "config": recipe.values(), "resume": "allow"}
         if name == "wandb":  # wandb resumes a run by its id, trackio by its name

@@ -69,7 +69,7 @@ def _ray() -> Any:
     try:
         import ray
     except ImportError as fault:
-        remedy = "pip install 'hma-toolkit[ray]'"
+        remedy = "uv sync --extra ray"
         raise MissingDependencyError("--engine ray", "Ray is not installed", remedy) from fault
     return ray
 

@@ -21,6 +21,7 @@ from typing import BinaryIO, NamedTuple
 from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
+from hma_data.storage.kinds import unreadable
 
 CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
 MAX_CHUNK = 512 << 20  # most bytes of an unpacked chunk, against decompression bombs and errors
@@ -101,9 +102,8 @@ def reading(path: Path) -> Iterator[None]:
 
 def damaged(path: Path, fault: str) -> EpisodeError:
     """Return the error of a file that cannot be read to its end."""
-    return EpisodeError(
-        path, fault, "copy it again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
-    )
+    remedy = "copy it again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
+    return EpisodeError(path, *unreadable(path, fault, remedy))
 
 
 class Piece(NamedTuple):

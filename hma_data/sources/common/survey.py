@@ -8,7 +8,7 @@ T samples of a key in an episode, A values a sample.
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -87,7 +87,7 @@ class Survey:
         self.looked: list[str] = []
         self.looks: dict[str, Look] = {}
         self.made: set[str] = {"readable"}
-        self._faults: dict[str, str] = {}
+        self._faults: dict[tuple[str, str], HMAError] = {}  # (episode, key or "") -> why
         self._numbers: dict[str, _Numbers] = {}
         self._times: dict[str, _Times] = {}
         self._absent: dict[str, list[str]] = {}
@@ -101,9 +101,9 @@ class Survey:
         """Note that an episode is sampled."""
         self.looked.append(name)
 
-    def fault(self, name: str, fault: HMAError | str) -> None:
+    def fault(self, name: str, fault: HMAError, key: str = "") -> None:
         """Note an episode, or a key of it, that cannot be read."""
-        self._faults.setdefault(name, str(fault))
+        self._faults.setdefault((name, key), fault)
 
     def note(self, finding: Finding) -> None:
         """Add a finding that only this format can make."""
@@ -215,7 +215,7 @@ class Survey:
     def findings(self, keys: Sequence[KeyInfo]) -> tuple[Finding, ...]:
         """Return all findings, check by check."""
         found = [
-            *self._readable(), *_merged(self._extra), *self._keys(), *self._rows(), *self._stamps(),
+            *self._readable(keys), *_merged(self._extra), *self._keys(), *self._rows(), *self._stamps(),
             *self._finite(), *self._constant(keys), *checks.picture_findings(self.looks),
         ]  # fmt: skip
         order = list(CHECKS)
@@ -225,17 +225,26 @@ class Survey:
         """Return the checks that could be made, in their order."""
         return tuple(check for check in CHECKS if check in self.made)
 
-    def _readable(self) -> Iterator[Finding]:
-        count = len(self._faults)
-        severity: Severity = "error" if count and count >= max(self.episodes, len(self.looked)) else "warn"
-        together = Counter(self._faults.values())
-        for fault, episodes in list(together.items())[:SHOWN]:
-            more = f" (and {episodes - 1:,} more episodes)" if episodes > 1 else ""
-            yield Finding("readable", severity, fault + more)
-        rest = sum(list(together.values())[SHOWN:])
+    def _readable(self, keys: Sequence[KeyInfo]) -> Iterator[Finding]:
+        faulty = dict.fromkeys(name for name, _ in self._faults)
+        looked = len(faulty | dict.fromkeys(self.looked))
+        whole = sum(not key for _, key in self._faults)
+        severity: Severity = "error" if whole and whole >= looked else "warn"
+        groups = alike((name, fault) for (name, _), fault in self._faults.items())
+        for names, first in groups[:SHOWN]:
+            said = f"{first.where}: {first.fault}"
+            if len(names) > 1:
+                named = said if said.startswith(names[0]) else f"{names[0]}: {said}"
+                said = f"{len(names):,} of {looked:,} episodes looked at, such as {named}"
+            yield Finding("readable", severity, said, first.remedy, numbers={"episodes": len(names)})
+        rest = sum(len(names) for names, _ in groups[SHOWN:])
         if rest:
-            said = f"{rest:,} more of {self.episodes:,} episodes cannot be read"
-            yield Finding("readable", severity, said, numbers={"episodes": count})
+            said = f"{rest:,} more of {looked:,} episodes looked at cannot be read"
+            yield Finding("readable", severity, said, numbers={"episodes": rest})
+        missing = any(one.check == "files" and one.severity == "warn" for one in self._extra)
+        shown = any(look.pictures for look in self.looks.values())
+        if (faulty or missing) and not shown and any(key.kind == "camera" for key in keys):
+            yield Finding("readable", "error", "not one picture of the episodes looked at can be read")
 
     def _keys(self) -> Iterator[Finding]:
         together: dict[tuple[str, ...], list[str]] = {}
@@ -310,6 +319,20 @@ def _finite(held: _Numbers) -> NDArray[Any]:
     """Return the smallest and largest finite number of each value."""
     ends = np.array([*held.low, *held.high])
     return ends[np.isfinite(ends)]
+
+
+def alike(faults: Iterable[tuple[str, HMAError]]) -> list[tuple[list[str], HMAError]]:
+    """Group (episode, fault) by what the faults say, whatever their numbers; the largest group first.
+
+    Returns:
+        For each group the names of its episodes, and the first fault.
+    """
+    groups: dict[tuple[str, str], tuple[dict[str, None], HMAError]] = {}
+    for name, fault in faults:
+        kind = re.sub(r"\d[\d.,]*", "0", fault.fault), re.sub(r"\d[\d.,]*", "0", fault.remedy)
+        groups.setdefault(kind, ({}, fault))[0][name] = None
+    found = [(list(names), first) for names, first in groups.values()]
+    return sorted(found, key=lambda group: -len(group[0]))
 
 
 def _merged(found: list[Finding]) -> Iterator[Finding]:

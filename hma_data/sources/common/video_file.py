@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import MAX_PIXELS, Images
 from hma_data.errors import EpisodeError
+from hma_data.storage.kinds import unreadable
 
 THREADS = 1  # of FFmpeg, for each decoder: the work is parallel over episodes, not within one
 # Allow plain files only: a playlist or list of files must not pass for a video and open other files.
@@ -74,7 +75,7 @@ def frame_table(path: Path) -> FrameTable:
     try:
         state = path.stat()
     except OSError as fault:
-        raise EpisodeError(path, "no such video file") from fault
+        raise EpisodeError(path, *unreadable(path, "no such video file", "")) from fault
     return _cached_table(str(path), state.st_size, state.st_mtime_ns)
 
 
@@ -320,4 +321,5 @@ def _explained(path: str) -> Iterator[None]:
     except (FFmpegError, MemoryError, OverflowError, UnicodeDecodeError) as fault:
         said = getattr(fault, "strerror", None) or fault
         remedy = "the file may be cut off or damaged"
-        raise EpisodeError(path, f"cannot be decoded as video: {said}", remedy) from fault
+        fault_and_remedy = unreadable(Path(path), f"cannot be decoded as video: {said}", remedy)
+        raise EpisodeError(path, *fault_and_remedy) from fault

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.images import Images, opencv
 from hma_data.errors import MissingDependencyError, SourceError
+from hma_data.storage.kinds import LFS, unreadable
 from hma_data.storage.paths import StrPath, as_text
 
 Floats = NDArray[np.float64]
@@ -45,7 +46,8 @@ _PALM = ("palm_detection_full.tflite", "palm_detection_lite.tflite", "hand_detec
 _HAND = ("hand_landmark_full.tflite", "hand_landmark_lite.tflite", "hand_landmarks_detector.tflite")
 _REMEDY = (
     "give source.layout.models (or the environment variable HMA_HAND_MODELS) a folder with MediaPipe's "
-    "palm_detection_full.tflite and hand_landmark_full.tflite, or the path of hand_landmarker.task"
+    "palm_detection_full.tflite and hand_landmark_full.tflite, or the path of hand_landmarker.task; "
+    "the README says where to get them"
 )
 
 # -- the models
@@ -91,7 +93,7 @@ def load_models(place: StrPath | None = None) -> HandModels:
                 raise SourceError(path, f"has none of {', '.join(names)}", _REMEDY)
             models.append(files[name].read_bytes())
     except (OSError, zipfile.BadZipFile) as fault:
-        raise SourceError(path, f"holds no hand models: {fault}", _REMEDY) from fault
+        raise SourceError(path, *unreadable(path, f"holds no hand models: {fault}", _REMEDY)) from fault
     palm, hand = models
     return HandModels(palm, hand, str(path))
 
@@ -113,12 +115,16 @@ class Network:
         try:
             interpreter = import_module("ai_edge_litert.interpreter").Interpreter
         except ImportError as fault:
-            remedy = "pip install 'hma-toolkit[hands]'"
+            remedy = "uv sync --extra hands"
             raise MissingDependencyError("ai-edge-litert", f"is not installed ({fault})", remedy) from fault
         try:
             self._interpreter = interpreter(model_content=content, num_threads=1)
             self._interpreter.allocate_tensors()
         except (ValueError, RuntimeError) as fault:
+            if content.startswith(LFS):
+                raise SourceError(
+                    where, "holds Git LFS pointers", "run git lfs pull in its folder"
+                ) from fault
             raise SourceError(where, f"cannot be run: {fault}", _REMEDY) from fault
         (given, *_) = self._interpreter.get_input_details()
         outputs: dict[int, list[int]] = defaultdict(list)

@@ -3,27 +3,7 @@
 A point is a side and a part of the hand: `left/center`, `right/wrist`, `left/landmarks`. A component's key is
 a point, with `/next` for its value at the next labelled frame of the run, or `/delta` for next minus current.
 
-`source.layout` of an embodiment with format `hands`; all values are text, as in every layout:
-
-| key | values | default |
-|---|---|---|
-| labels | detector, landmarks, epic_kitchens_hand_objects, ego4d_fho, egoexo4d_hand_pose | detector |
-| annotations | file or folder of the labels, absolute or below the videos' folder | that folder |
-| models | of the detector: folder of .tflite files or a .task bundle | $HMA_HAND_MODELS |
-| missing | what a frame without a needed hand does, see below: split, hold, mask | split |
-| max_hold | most labelled frames in a row for which the last position is held | no limit; with mask 0 |
-| min_frames | runs with fewer frames (with hands) are left out | 12 |
-| min_score | labels with a lower score are ignored | 0.5 |
-| max_gap_s | most seconds between labels of one run, where labels are irregular | 3 |
-| pictures | labelled: frames with a label; every: all from the first to the last of a run | labelled |
-| first_frame | number of a video's first frame in the labels | 1 for EPIC-KITCHENS, else 0 |
-| label_size | WIDTHxHEIGHT of the pictures on which pixel labels were made | the video's |
-| camera | Ego-Exo4D: which camera's labels and videos | cam01 |
-| mirrored | true for mirrored pictures (front cameras): swaps the detector's left and right | false |
-
-missing: `split` ends the run. `hold` keeps the hand's last position for at most `max_hold` frames, and then
-ends the run. `mask` continues the run: the values that need the hand are unknown; with `max_hold` they are
-held first, and unknown after that.
+`hma_data.registry.layouts.HandsLayout` lists the keys of `source.layout`.
 
 N labelled frames of a video, n of a run, w values of a point (2, or 42 for landmarks).
 """
@@ -34,14 +14,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
-from hma_data.errors import EpisodeError, RegistryError, SourceError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import local_path, nothing_there
 from hma_data.sources.common.video_file import opened
 from hma_data.sources.hands import VIDEO_SUFFIXES
@@ -57,63 +37,9 @@ BEYOND = 0.05  # share of the picture's side by which a label may lie outside; i
 LATE = 0.01  # share of a video's frames by which labels may continue after its end
 
 
-def _width_and_height(value: Any) -> Any:
-    if not isinstance(value, str):
-        return value
-    sides = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", value)
-    if not sides:
-        raise ValueError("give WIDTHxHEIGHT, such as 1920x1080")
-    return int(sides[1]), int(sides[2])
-
-
-Labels = Literal["detector", "landmarks", "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose"]
-
-
-class HandsLayout(BaseModel):
-    """The values of `source.layout`; see the module."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    labels: Labels = "detector"
-    annotations: str | None = None
-    models: str | None = None
-    missing: Literal["split", "hold", "mask"] = "split"
-    max_hold: int | None = Field(None, ge=0)
-    min_frames: int = Field(12, ge=0)
-    min_score: FiniteFloat = Field(0.5, ge=0)
-    max_gap_s: FiniteFloat = Field(3.0, ge=0)
-    pictures: Literal["labelled", "every"] = "labelled"
-    first_frame: int | None = Field(None, ge=0)
-    label_size: Annotated[tuple[int, int] | None, BeforeValidator(_width_and_height)] = None
-    camera: str = "cam01"
-    mirrored: bool = False
-
-    @property
-    def frame_offset(self) -> int:
-        """Return the number to subtract from a label's frame number to get the frame's index."""
-        if self.first_frame is not None:
-            return self.first_frame
-        return int(self.labels == "epic_kitchens_hand_objects")
-
-
 def layout_of(embodiment: Embodiment | None) -> HandsLayout:
-    """Return an embodiment's layout; all defaults without one.
-
-    Raises:
-        RegistryError: an unknown key, or a value that is not allowed.
-    """
-    if embodiment is None:
-        return HandsLayout()
-    try:
-        return HandsLayout.model_validate(embodiment.source.layout or {})
-    except ValidationError as fault:
-        first = fault.errors()[0]
-        where = f"embodiment {embodiment.id}: source.layout.{first['loc'][0]}"
-        if first["type"] == "extra_forbidden":
-            known = ", ".join(HandsLayout.model_fields)
-            raise RegistryError(where, "is not a key of hand videos", f"allowed: {known}") from fault
-        said = first["msg"].removeprefix("Value error, ")
-        raise RegistryError(where, f"is {first['input']!r}", said) from fault
+    """Return an embodiment's layout; all defaults without one."""
+    return HandsLayout.model_validate((embodiment.source.layout or {}) if embodiment else {})
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError, OutputError
+from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint, local_path, unfollowed
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
@@ -26,7 +27,6 @@ from hma_data.sources.hands.runs import (
     POINTS,
     SIDES,
     HandLabels,
-    HandsLayout,
     Header,
     Video,
     header_of,
@@ -155,7 +155,8 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     try:
         facts |= _hands_in(videos, chosen[:LOOKED_AT], survey)
     except HMAError as fault:
-        facts["hands"] = f"not looked for: {fault}"
+        said = f"hands were not looked for: {fault.where} {fault.fault}"
+        survey.note(Finding("hands", "warn", said, fault.remedy, "video"))
     first = next(iter(headers.values()), Header(0, 0.0, 0, 0, ""))
     hz, size = first.hz or None, (first.height, first.width, 3)
     keys = [KeyInfo("video", "camera", size, "uint8", hz, codec=first.codec or None)]

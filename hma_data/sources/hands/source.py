@@ -36,6 +36,7 @@ from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.common.survey import listed
 from hma_data.sources.common.video_file import VideoFile
@@ -44,7 +45,6 @@ from hma_data.sources.hands.labels import LabelSet, open_labels
 from hma_data.sources.hands.runs import (
     POINTS,
     HandLabels,
-    HandsLayout,
     Header,
     Runs,
     Video,

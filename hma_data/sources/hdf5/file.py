@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.base import local_path, nothing_there
+from hma_data.storage.kinds import unreadable
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
 WHOLE_FILE = "/"
@@ -127,7 +128,8 @@ def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[N
             remedy = (
                 "it is compressed in a way that HDF5 alone does not know; rewrite it with h5repack -f GZIP=4"
             )
-        raise error(where, f"cannot be read as HDF5: {said}", remedy) from fault
+        file = Path(str(getattr(where, "file", where)))
+        raise error(where, *unreadable(file, f"cannot be read as HDF5: {said}", remedy)) from fault
 
 
 # -- episodes

@@ -138,7 +138,7 @@ def _look(name: str, group: h5py.Group, first: _First, survey: Survey, pairs: in
                 elif info.kind == "vector" and item.size <= MAX_VALUES:
                     _values(name, key, numbers(group, key, name), info, survey, first)
         except HMAError as fault:
-            survey.fault(where, fault)
+            survey.fault(name, fault, key)
 
 
 def _values(name: str, key: str, values: Any, info: KeyInfo, survey: Survey, first: _First) -> None:

@@ -10,7 +10,6 @@ T frames, n of them asked for, H×W pixels, C channels.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import h5py
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images, decode_image
-from hma_data.errors import EpisodeError, SourceError
+from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.layouts import Hdf5Layout
 from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
     EpisodeFinder,
@@ -32,50 +32,18 @@ from hma_data.sources.hdf5.file import (
 )
 
 PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
-_ALLOWED = {"axes": ("THWC", "TCHW"), "pixels": tuple(PIXELS), "last_observation": ("drop",)}
 _CHANNELS = (1, 3, 4)
 _SLACK = 1e-3  # share of the range by which values may exceed it, as resizing can cause
 
 
-@dataclass(frozen=True)
-class Layout:
-    """The values of `source.layout` for HDF5.
-
-    Attributes:
-        episodes: pattern of the groups that are episodes, `/` for whole files; None: found from the file.
-        timestamps: key of the seconds; None: frames come at the embodiment's rate.
-        axes: of pictures; None: found from the shape.
-        pixels: range of pictures that are not uint8; None: such arrays are not pictures.
-        last_observation: `drop` where pictures and states have one row more than the actions, observed after
-            the last action.
-    """
-
-    episodes: str | None = None
-    timestamps: str | None = None
-    axes: str | None = None
-    pixels: str | None = None
-    last_observation: str | None = None
-
-
-def layout_of(embodiment: Embodiment | None) -> Layout:
+def layout_of(embodiment: Embodiment | None) -> Hdf5Layout:
     """Return the layout that the YAML states; all defaults without an embodiment.
 
-    Raises:
-        SourceError: a key or a value is not known for HDF5.
+    Its `episodes` is a pattern, WHOLE_FILE where every file is one episode, or None: found from the file.
     """
-    said = (embodiment.source.layout or {}) if embodiment else {}
-    where = f"embodiment {embodiment.id}" if embodiment else ""
-    known = [entry.name for entry in fields(Layout)]
-    for key, value in said.items():
-        if key not in known:
-            fault = f"source.layout.{key} is not known for hdf5"
-            raise SourceError(where, fault, f"known: {', '.join(known)}")
-        if key in _ALLOWED and value not in _ALLOWED[key]:
-            allowed = f"allowed: {', '.join(_ALLOWED[key])}"
-            raise SourceError(where, f"source.layout.{key} is {value!r}", allowed)
-    layout = Layout(**said)
+    layout = Hdf5Layout.model_validate((embodiment.source.layout or {}) if embodiment else {})
     pattern = layout.episodes
-    return replace(layout, episodes=pattern and (pattern.strip("/") or WHOLE_FILE))
+    return layout.model_copy(update={"episodes": pattern and (pattern.strip("/") or WHOLE_FILE)})
 
 
 class PictureRows:
@@ -97,7 +65,7 @@ class PictureRows:
         files: OpenFiles,
         place: EpisodeGroup,
         key: str,
-        layout: Layout,
+        layout: Hdf5Layout,
         times: Floats,
     ) -> None:
         self.timestamps = times
@@ -132,7 +100,7 @@ class PictureRows:
         return np.stack(pictures)
 
 
-def picture_kind(found: h5py.Dataset, layout: Layout | None = None) -> str | None:
+def picture_kind(found: h5py.Dataset, layout: Hdf5Layout | None = None) -> str | None:
     """Return `raw` or `encoded` by dtype and shape; None where the dataset cannot hold pictures."""
     shape: tuple[int, ...] = found.shape or ()
     if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
@@ -162,7 +130,7 @@ def encoded(row: Any) -> NDArray[np.uint8]:
     return np.frombuffer(row.tobytes() if isinstance(row, np.void) else row, np.uint8)
 
 
-def _axes(shape: tuple[int, ...], layout: Layout, where: str) -> str:
+def _axes(shape: tuple[int, ...], layout: Hdf5Layout, where: str) -> str:
     """Return THW, THWC or TCHW: from the YAML, else by the axis whose size is a number of channels."""
     if len(shape) == 3:
         return "THW"
@@ -178,7 +146,7 @@ def _axes(shape: tuple[int, ...], layout: Layout, where: str) -> str:
     return "THWC" if last else "TCHW"
 
 
-def _as_bytes(pictures: NDArray[Any], layout: Layout, where: str) -> NDArray[np.uint8]:
+def _as_bytes(pictures: NDArray[Any], layout: Hdf5Layout, where: str) -> NDArray[np.uint8]:
     """Convert pictures of another number type to uint8, by the range in `layout.pixels`."""
     if pictures.dtype == np.uint8:
         return pictures
@@ -199,7 +167,7 @@ def _is_bytes(dtype: np.dtype[Any]) -> bool:
     return np.dtype(inner).kind in "iu" and np.dtype(inner).itemsize == 1
 
 
-def _remedy(found: h5py.Dataset, layout: Layout) -> str:
+def _remedy(found: h5py.Dataset, layout: Hdf5Layout) -> str:
     shape: tuple[int, ...] = found.shape or ()
     numbers = found.dtype.kind in "fiu" and found.dtype != np.uint8
     if numbers and len(shape) == 4 and 3 in (shape[1], shape[3]) and not layout.pixels:

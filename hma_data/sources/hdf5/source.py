@@ -29,6 +29,7 @@ from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_time
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.layouts import Hdf5Layout
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
@@ -43,7 +44,7 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
-from hma_data.sources.hdf5.layout import Layout, PictureRows, layout_of, picture_kind
+from hma_data.sources.hdf5.layout import PictureRows, layout_of, picture_kind
 from hma_data.storage.paths import StrPath, as_text
 
 TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
@@ -137,7 +138,7 @@ class Hdf5Source:
             )
 
     def _pictures(
-        self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Layout, times: Floats
+        self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Hdf5Layout, times: Floats
     ) -> PictureRows:
         try:
             return PictureRows(self._finder, self._files, place, key, layout, times)
@@ -180,7 +181,7 @@ def _split_of(demo: str, masks: dict[str, set[str]]) -> str | None:
     return next((ours for mask, ours in _SPLITS.items() if demo in masks.get(mask, ())), None)
 
 
-def _check_length(layout: Layout, where: str, actions: int, key: str, length: int) -> None:
+def _check_length(layout: Hdf5Layout, where: str, actions: int, key: str, length: int) -> None:
     """Raise an EpisodeError where a series is not as long as the actions, or one row longer to be dropped."""
     one_more = length == actions + 1
     if length != actions and not (one_more and layout.last_observation == "drop"):
@@ -189,7 +190,7 @@ def _check_length(layout: Layout, where: str, actions: int, key: str, length: in
         raise EpisodeError(where, fault, remedy if one_more else "")
 
 
-def _times(group: h5py.Group, embodiment: Embodiment, layout: Layout, length: int, where: str) -> Floats:
+def _times(group: h5py.Group, embodiment: Embodiment, layout: Hdf5Layout, length: int, where: str) -> Floats:
     """Return the seconds of the frames: the episode's own where the YAML names their key."""
     key, hz = layout.timestamps, embodiment.frequency_hz
     if key is None and hz is None:

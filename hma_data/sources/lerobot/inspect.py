@@ -12,8 +12,8 @@ from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.survey import MAX_VALUES, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.sources.lerobot.metadata import Feature, Metadata, episode_name
-from hma_data.sources.lerobot.source import Rows, StillPictures, rows_of
+from hma_data.sources.lerobot.metadata import Feature, Metadata, Span, episode_name
+from hma_data.sources.lerobot.source import PAIRING, Rows, StillPictures, frames_of_rows, rows_of, times_of
 
 LENGTHS = 1_000  # most lengths in the inspection
 LOOKED_FOR = 20_000  # most episodes whose files are looked for, spread over all
@@ -25,9 +25,12 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
     lengths = [row["length"] for row in meta.episodes.values()]
     survey = Survey(len(lengths))
     _totals(meta, survey)
+    looking = _Looking(meta, survey, episodes)
     if not meta.folder.repo:
-        _Looking(meta, survey, episodes).look()
+        looking.look()
     keys = tuple(survey.key(info) for info in _keys(meta))
+    measured = next((key.hz for key in keys if key.key == "timestamp"), None)
+    facts = {"version": str(meta.info.codebase_version), "tasks": str(len(meta.tasks))}
     return Inspection(
         format="lerobot",
         uri=uri,
@@ -35,9 +38,9 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
         keys=keys,
         frames=sum(lengths),
         lengths=tuple(lengths[:LENGTHS]),
-        hz=meta.fps,
+        hz=measured if looking.drifts else meta.fps,
         robot=meta.info.robot_type or None,
-        facts={"version": str(meta.info.codebase_version), "tasks": str(len(meta.tasks))},
+        facts=facts | ({"pairing": "index"} if looking.drifts else {}),
         looked_at=len(survey.looked),
         findings=survey.findings(keys),
         checks=survey.checks(),
@@ -58,13 +61,18 @@ def _totals(meta: Metadata, survey: Survey) -> None:
 
 
 class _Looking:
-    """Check the files of a local dataset."""
+    """Check the files of a local dataset.
+
+    Attributes:
+        drifts: whether a video has a frame for each row, but not at the times of the rows.
+    """
 
     def __init__(self, meta: Metadata, survey: Survey, episodes: int) -> None:
         self._meta, self._survey, self._episodes = meta, survey, episodes
         self._videos = [name for name, item in meta.features.items() if item.dtype == "video"]
         indices = list(meta.episodes)
         self._indices = [indices[i] for i in sampled(len(indices), LOOKED_FOR)]
+        self.drifts = False
 
     def look(self) -> None:
         """Find which files are there; then sample the episodes that have all of their files."""
@@ -122,7 +130,7 @@ class _Looking:
                 elif _is_vector(feature) and np.prod(feature.shape, dtype=float) * len(rows) <= MAX_VALUES:
                     self._numbers(name, key, rows)
             except HMAError as fault:
-                self._survey.fault(f"{name} {key}", fault)
+                self._survey.fault(name, fault, key)
 
     def _numbers(self, name: str, key: str, rows: Rows) -> None:
         values = rows.numbers(key)
@@ -147,17 +155,37 @@ class _Looking:
             file = VideoFile(meta.folder.path(span.path))
             first, last = span.frames(file.timestamps, meta.fps)
             rows = meta.episodes[index]["length"]
-            if last - first != rows:
+            if last - first < rows or (last - first > rows and span.stop is None):
                 said = f"{span.path} has {last - first:,} frames{span} for {rows:,} rows"
                 numbers = {"frames": last - first, "rows": rows}
                 self._survey.note(Finding("frames", "warn", said, key=key, numbers=numbers))
+            else:
+                self._drift(file, span, key, index, last - first == rows)
+            last = min(last, first + rows)  # a shared video may go on with frames of no episode
             if last > first:
                 indices = first + checks.choose(last - first, pairs, file.table.keys[first:last] - first)
                 for run in checks.runs(indices):
                     self._survey.pictures(name, key, file.frames(run), run, file.table.codec)
             file.close()
         except HMAError as fault:
-            self._survey.fault(f"{name} {key}", fault)
+            self._survey.fault(name, fault, key)
+
+    def _drift(self, file: VideoFile, span: Span, key: str, index: int, as_many: bool) -> None:
+        """Note a video whose stamps are not the times of the rows; propose the pairing by index."""
+        try:
+            times = times_of(rows_of(self._meta, index), self._meta.fps)
+        except HMAError:
+            return  # `_rows` has noted it
+        self._survey.made.add("skew")
+        try:
+            frames_of_rows(file, span, times, self._meta.fps, by_index=False)
+        except EpisodeError as fault:
+            self.drifts |= as_many
+            said = f"{episode_name(index)} {key}: {fault.fault}"
+            remedy = (
+                f"both count {len(times):,}: if row i belongs to picture i, set {PAIRING}" if as_many else ""
+            )
+            self._survey.note(Finding("skew", "warn", said, remedy, key))
 
 
 def _is_vector(feature: Feature) -> bool:

@@ -8,8 +8,9 @@ the file of an episode and, within a video, its start and end.
 import json
 import math
 import re
+from bisect import bisect_right
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,6 +20,7 @@ from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveIn
 
 from hma_data.episodes.episode import Floats
 from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.storage.kinds import unreadable
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 _DATA_PATHS = {
@@ -97,17 +99,26 @@ class Info(BaseModel):
 
 @dataclass(frozen=True)
 class Span:
-    """The part of a video that holds an episode, in seconds of its clock; the whole file without `stop`."""
+    """The part of a video that holds an episode, in seconds of its clock.
+
+    Attributes:
+        path: of the file.
+        start: time of the episode's first frame.
+        stop: as the metadata state it; None for a whole file. Some writers state the end of the last frame,
+            others its time, so no frames are counted by it. lerobot does not read it either.
+        limit: start of the next episode in the file; infinity after the last one.
+    """
 
     path: str
     start: float = 0.0
     stop: float | None = None
+    limit: float = math.inf
 
     def frames(self, clock: Floats, fps: float) -> tuple[int, int]:
-        """Return the indices [first, last) of the episode's frames in a video with these times."""
+        """Return the indices [first, last) of the frames up to the next episode, of a video's times."""
         if self.stop is None:
             return 0, len(clock)
-        first, last = np.searchsorted(clock, [self.start - 0.5 / fps, self.stop - 0.5 / fps])
+        first, last = np.searchsorted(clock, [self.start - 0.5 / fps, self.limit - 0.5 / fps])
         return int(first), int(last)
 
     def __str__(self) -> str:
@@ -211,6 +222,7 @@ class Metadata:
         self.splits = _splits(self.info.splits)
         self.tasks = _tasks_v3(folder) if is_v3 else _tasks_v2(folder)
         self.episodes = _by_index(_episodes_v3(folder) if is_v3 else _lines(folder, "episodes.jsonl"))
+        self._starts: dict[str, dict[str, list[float]]] = {}  # camera -> video -> starts of its episodes
         if not self.episodes:
             raise SourceError(folder.uri, "has no episodes", "record some, or check meta/")
 
@@ -221,16 +233,34 @@ class Metadata:
 
     def video(self, index: int, key: str) -> Span:
         """Return the part of a video that holds an episode's frames of one camera."""
-        if not self.info.video_path:
-            raise SourceError(self._where, "names no video_path", "add it, as lerobot does")
-        path = self._filled(self.info.video_path, index, f"videos/{key}", {"video_key": key})
+        path = self._video_path(index, key)
         if not self._is_v3:
             return Span(path)
         row = self.episodes[index]
         start, stop = row.get(f"videos/{key}/from_timestamp"), row.get(f"videos/{key}/to_timestamp")
         if not (isinstance(start, float) and isinstance(stop, float) and 0 <= start <= stop < math.inf):
             raise EpisodeError(episode_name(index), f"meta/episodes does not say where {key} begins and ends")
-        return Span(path, start, stop)
+        return Span(path, start, stop, self._next_start(key, path, start))
+
+    def _next_start(self, key: str, path: str, start: float) -> float:
+        """Return where the episode after the one at `start` begins in a video; infinity after the last."""
+        if key not in self._starts:
+            found = self._starts[key] = {}
+            for index, row in self.episodes.items():
+                begin = row.get(f"videos/{key}/from_timestamp")
+                if isinstance(begin, float):
+                    with suppress(EpisodeError):
+                        found.setdefault(self._video_path(index, key), []).append(begin)
+            for starts in found.values():
+                starts.sort()
+        starts = self._starts[key][path]
+        after = bisect_right(starts, start)
+        return starts[after] if after < len(starts) else math.inf
+
+    def _video_path(self, index: int, key: str) -> str:
+        if not self.info.video_path:
+            raise SourceError(self._where, "names no video_path", "add it, as lerobot does")
+        return self._filled(self.info.video_path, index, f"videos/{key}", {"video_key": key})
 
     def _filled(self, template: str, index: int, prefix: str, values: dict[str, Any]) -> str:
         """Fill a path template of info.json with the episode's numbers."""
@@ -240,7 +270,9 @@ class Metadata:
                 if not isinstance(values[name], int):
                     raise EpisodeError(episode_name(index), f"meta/episodes has no {prefix}/{name} for it")
         else:
-            values |= {"episode_chunk": index // self.info.chunks_size, "episode_index": index}
+            chunk = index // self.info.chunks_size
+            values |= {"episode_chunk": chunk, "episode_index": index}
+            values |= {"chunk_index": chunk, "file_index": index}  # version 3's names, one file an episode
         return fill(template, values, self._where)
 
     def split_of(self, index: int) -> str | None:
@@ -283,7 +315,8 @@ def parquet_explained(where: object, error: type[HMAError]) -> Iterator[None]:
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError) as fault:
         said = (str(fault).splitlines() or [type(fault).__name__])[0]
         remedy = "the file may be cut off or damaged"
-        raise error(where, f"cannot be read as parquet: {said}", remedy) from fault
+        reason = unreadable(Path(str(where)), f"cannot be read as parquet: {said}", remedy)
+        raise error(where, *reason) from fault
 
 
 def _info(path: Path) -> Info:
@@ -293,7 +326,8 @@ def _info(path: Path) -> Info:
         first = fault.errors()[0]
         key = ".".join(map(str, first["loc"]))
         said = f"{key} is {first['input']!r}: {first['msg']}" if key else first["msg"]
-        raise SourceError(path, said, "the dataset is damaged or not complete") from fault
+        remedy = "the dataset is damaged or not complete"
+        raise SourceError(path, *unreadable(path, said, remedy)) from fault
     if info.codebase_version not in VERSIONS:
         said = f"is of version {info.codebase_version!r}; {', '.join(VERSIONS)} are read"
         raise SourceError(path, said, "convert it with lerobot's own scripts")
@@ -318,7 +352,8 @@ def _lines(folder: Folder, name: str) -> Iterator[Row]:
             try:
                 yield where, json.loads(line)
             except ValueError as fault:
-                raise SourceError(where, f"is not JSON: {fault}", "the dataset is damaged") from fault
+                reason = unreadable(path, f"is not JSON: {fault}", "the dataset is damaged")
+                raise SourceError(where, *reason) from fault
 
 
 def _splits(found: dict[str, Any]) -> dict[str, range]:

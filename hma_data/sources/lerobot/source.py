@@ -4,6 +4,9 @@ A uri is a folder, `hf://datasets/NAME/DATASET[@REVISION]`, or `NAME/DATASET` on
 the files of the episodes that are read are fetched. Keys are feature names (`action`,
 `observation.images.cam_high`). The rate is `fps` of info.json, and the embodiment's rate must agree with it.
 
+A row has the picture of its time. Where the film's stamps drift away from the rows' times, the embodiment may
+say `source: {layout: {pairing: index}}`: row i then has picture i, and the times and the rate are the rows'.
+
 T frames of an episode.
 """
 
@@ -34,6 +37,7 @@ from hma_data.storage.paths import StrPath, as_text
 
 RATE_TOLERANCE = 0.01  # of the rate
 TIME_TOLERANCE = 0.25  # of a frame's period, between the time of a row and the time of its picture
+PAIRING = "source: {layout: {pairing: index}}"
 MAX_BYTES = 1 << 30  # of one column of a row group, as stored
 MAX_VALUES = 1 << 26  # of such a column: a run of equal values may be stored as one value
 _SAMPLE = 4096  # bytes at each end of a video that its fingerprint covers
@@ -105,11 +109,14 @@ class LeRobotSource:
         length = meta.episodes[index]["length"]
         if len(rows) != length:
             raise EpisodeError(rows.path, f"has {len(rows)} rows of {episode_id}, its metadata says {length}")
-        times = _times(rows, meta.fps)
+        times = times_of(rows, meta.fps)
         tasks = _tasks(meta, index, rows)
         return Episode(
             id=episode_id,
-            streams={camera.name: _stream(meta, index, camera, rows, times) for camera in embodiment.cameras},
+            streams={
+                camera.name: _stream(meta, index, camera, rows, times, pairs_by_index(embodiment))
+                for camera in embodiment.cameras
+            },
             actions=(Signal(times, _vector(rows, embodiment.action)),),
             states=(Signal(times, _vector(rows, embodiment.state)),) if embodiment.state else (),
             instruction=_instruction(rows, embodiment.source.instruction, tasks),
@@ -124,7 +131,14 @@ class LeRobotSource:
         return self._opened[uri]
 
 
+def pairs_by_index(embodiment: Embodiment) -> bool:
+    """Check whether the embodiment says that row i has picture i."""
+    return (embodiment.source.layout or {}).get("pairing") == "index"
+
+
 def _check_rate(meta: Metadata, embodiment: Embodiment) -> None:
+    if pairs_by_index(embodiment):
+        return  # then fps is the film's rate, and the rows have another
     stated = embodiment.frequency_hz
     if isinstance(stated, float) and abs(stated - meta.fps) > RATE_TOLERANCE * meta.fps:
         raise SourceError(
@@ -310,7 +324,8 @@ def _vector(rows: Rows, vector: Vector) -> NDArray[np.float32]:
     return compose(vector, [pieces[part.key] for part in vector.components], str(rows.path))
 
 
-def _times(rows: Rows, fps: float) -> Floats:
+def times_of(rows: Rows, fps: float) -> Floats:
+    """Return the times (T,) of an episode's rows in seconds; at the rate where they state none."""
     if "timestamp" not in rows.columns:
         return rate_times(len(rows), fps)
     times = rows.numbers("timestamp").reshape(len(rows), -1)[:, 0].astype(np.float64)
@@ -341,27 +356,51 @@ def _success(rows: Rows) -> bool | None:
 # -- pictures
 
 
-def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Floats) -> Stream:
+def _stream(meta: Metadata, index: int, camera: Camera, rows: Rows, times: Floats, by_index: bool) -> Stream:
     if meta.features[camera.key].dtype == "image":
         return StillPictures(rows, camera.key, times, meta.folder)
     span = meta.video(index, camera.key)
-    return _Video(meta.folder.path(span.path), span, times, meta.fps)
+    file = VideoFile(meta.folder.path(span.path))
+    return _Video(file, times, frames_of_rows(file, span, times, meta.fps, by_index))
+
+
+def frames_of_rows(
+    file: VideoFile, span: Span, times: Floats, fps: float, by_index: bool
+) -> NDArray[np.int64]:
+    """Return the index of the frame that each row has.
+
+    Args:
+        file: the video; `span` is the episode's part of it.
+        times: (T,) seconds of the rows.
+        by_index: whether row i has frame i of the episode; otherwise it has the frame of its time.
+
+    Raises:
+        EpisodeError: the video has too few frames or too many, or none at the time of a row.
+    """
+    first, last = span.frames(file.timestamps, fps)
+    count, rows = last - first, len(times)
+    # A shared video may hold frames that no row asks for, such as those of a deleted episode.
+    if count < rows or (count > rows and (by_index or span.stop is None)):
+        raise EpisodeError(file.path, f"has {count} frames{span}, the episode has {rows} rows")
+    if by_index:
+        return np.arange(first, last)
+    indices, off_ms = nearest(file.timestamps[first:last], span.start + times)
+    worst = int(np.argmax(off_ms))
+    if off_ms[worst] > TIME_TOLERANCE * 1e3 / fps:
+        fault = f"its picture nearest to row {worst} is {off_ms[worst]:.1f} ms away"
+        remedy = f"rows and video disagree on time; a frame is {1e3 / fps:.1f} ms"
+        if count == rows:
+            remedy += f", and both count {rows}: if row i belongs to picture i, set {PAIRING}"
+        raise EpisodeError(file.path, fault, remedy)
+    return indices + first
 
 
 class _Video:
-    """A camera's Stream: the part of a video file that holds an episode with rows at `times` (T,) seconds."""
+    """A camera's Stream: the frames of a video file with the indices (T,), at the times (T,) of the rows."""
 
-    def __init__(self, path: Path, span: Span, times: Floats, fps: float) -> None:
+    def __init__(self, file: VideoFile, times: Floats, indices: NDArray[np.int64]) -> None:
         self.timestamps = times
-        self._file = VideoFile(path)
-        first, last = span.frames(self._file.timestamps, fps)
-        if last - first != len(times):
-            raise EpisodeError(path, f"has {last - first} frames{span}, the episode has {len(times)} rows")
-        self._indices, off_ms = nearest(self._file.timestamps, span.start + times)
-        worst = int(np.argmax(off_ms))
-        if off_ms[worst] > TIME_TOLERANCE * 1e3 / fps:
-            fault = f"its picture nearest to row {worst} is {off_ms[worst]:.1f} ms away"
-            raise EpisodeError(path, fault, f"rows and video disagree on time; a frame is {1e3 / fps:.1f} ms")
+        self._file, self._indices = file, indices
 
     def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
         """See Stream."""

@@ -90,7 +90,7 @@ def _look(steps: Steps, survey: Survey, pairs: int) -> None:
                 if seconds is not None:
                     survey.times(steps.name, key, seconds)
         except EpisodeError as fault:
-            survey.fault(f"{steps.name} {key}", fault)
+            survey.fault(steps.name, fault, key)
 
 
 def _facts(folder: Folder) -> dict[str, str]:
@@ -120,7 +120,7 @@ def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
         if feature.kind == "number" and feature.width is None:  # may have any length: not a fault
             survey.note(Finding("rows", "info", str(fault), key=key))
         else:
-            survey.fault(f"{steps.name} {key}", fault)
+            survey.fault(steps.name, fault, key)
     return KeyInfo(key, kind, shape, feature.dtype, codec=codec, count=steps.count)
 
 

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from hma_data.errors import EpisodeError, MissingDependencyError, OutputError, SourceError
 from hma_data.storage.fetch import attempt, fetch, info, is_local, mark, protocol
 from hma_data.storage.files import atomic_path, cache_folder
+from hma_data.storage.kinds import LFS, unreadable
 
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
@@ -180,6 +181,8 @@ def scan_tfrecord(files: Any, path: str, size: int, known: Framing = EMPTY, limi
         header = read(position, min(size, position + HEADER.size))
         if not position and header[:2] == b"\x1f\x8b":
             raise SourceError(path, "is gzip-compressed", "decompress it: gunzip")
+        if not position and header == LFS[: HEADER.size]:
+            raise SourceError(path, *unreadable(Path(path), "is a Git LFS pointer", "run git lfs pull"))
         while position < size and len(offsets) != limit:
             end, fault = _data_end(header, position, size)
             if fault:
@@ -258,11 +261,13 @@ def scan_array_record(files: Any, path: str, size: int, known: Framing = EMPTY, 
     """
     reader = _open_array_record(path)
     if not reader.ok():
+        why = "is no ArrayRecord file"
         try:
             reader.read([0])  # its error says why
-        except RuntimeError as fault:
-            return replace(EMPTY, fault=str(fault), whole=True)
-        return replace(EMPTY, fault="is no ArrayRecord file", whole=True)
+        except RuntimeError as error:
+            why = str(error)
+        fault, remedy = unreadable(Path(path), why, "")
+        return replace(EMPTY, fault=f"{fault} — {remedy}" if remedy else fault, whole=True)
     count = reader.num_records()
     lengths, checks = np.zeros(count, np.int64), np.zeros(count, np.uint32)
     for index in range(count):

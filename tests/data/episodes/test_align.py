@@ -266,7 +266,7 @@ def test_a_shifted_action_stands_beside_the_frame_it_was_issued_at(shift: int) -
 
 
 def test_a_shift_in_steps_of_a_bag_is_refused() -> None:
-    with pytest.raises(RegistryError, match="action_shift counts steps"):
+    with pytest.raises(RegistryError, match="steps, which sync.action_shift counts"):
         Embodiment.from_values(
             {**embodiment().to_dict(), "sync": {"action_shift": 1}, "source": {"format": "rosbag"}}, "bag"
         )

@@ -70,7 +70,10 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
 def test_every_format_answers_the_same_checks(name: str, tmp_path: Path) -> None:
     report = inspect_recording(str(FORMATS[name](tmp_path)))
     assert report["format"] == name and list(report["checks"]) == list(CHECKS)
-    assert report["problems"] == [] and report["looked_at"] >= 1
+    assert report["looked_at"] >= 1
+    said = " ".join(report["problems"])
+    assert said.startswith("hands were not looked for: hand models are not given" if name == "hands" else "")
+    assert name == "hands" or not said
     assert {"readable", "size", "blank", "colour"} <= {
         check for check, result in report["checks"].items() if result != "not looked at"
     }

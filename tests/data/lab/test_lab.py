@@ -292,7 +292,7 @@ def test_no_episodes_is_refused(tmp_path: Path) -> None:
 
 def test_missing_gym_pusht_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gym_pusht.envs.pusht", None)
-    with pytest.raises(MissingDependencyError, match="pip install 'gym-pusht"):
+    with pytest.raises(MissingDependencyError, match="gym-pusht.*uv sync"):
         record("pusht_fast", tmp_path, 1)
     assert list(tmp_path.iterdir()) == []
 

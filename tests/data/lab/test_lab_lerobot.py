@@ -90,6 +90,6 @@ def test_without_lerobot_one_line_says_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "lerobot.datasets.lerobot_dataset", None)
-    with pytest.raises(MissingDependencyError, match=r"lerobot: .*pip install 'lerobot\[dataset\]'") as found:
+    with pytest.raises(MissingDependencyError, match=r"lerobot: .*uv sync") as found:
         record("planar_arm_lerobot", tmp_path, 1)
     assert "\n" not in str(found.value) and list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ import copy
 import datetime
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from hma_data.errors import RegistryError
 from hma_data.registry.embodiment import Embodiment, find, problems, registry_files, schema, todos
+from hma_data.registry.layouts import LAYOUTS
 from hma_data.storage.yaml_io import MAX_BYTES, parse_yaml, read_yaml, write_yaml
 
 BASE: dict[str, Any] = {
@@ -213,17 +215,21 @@ def test_an_unknown_camera_names_the_known() -> None:
         ("action.components", [], "action.components: .*at least 1"),
         ("action.components.0.dims", -3, r"action\.components\[0\]\.dims: .*\(is -3\)"),
         ("action.components.0.dims", 10**9, r"action\.components\[0\]\.dims: "),
-        ("action.components.0.slice", [0, 2], r"components\[0\]: slice \[0, 2\] has 2 values, but dims is 3"),
+        (
+            "action.components.0.slice",
+            [0, 2],
+            r"components\[0\]\.slice: has 2 values, but dims is 3 \(is \[0, 2\]\)",
+        ),
         (
             "action.components.0.slice",
             [3, 0],
-            r"components\[0\]: slice \[3, 0\] has -3 values, but dims is 3",
+            r"components\[0\]\.slice: has -3 values, but dims is 3",
         ),
         ("action.components.0.slice", [0], r"components\[0\]\.slice\[1\]: is missing"),
-        ("action.components.0.names", ["x"], r"components\[0\]: there are 1 names for 3 dims"),
-        ("action.components.0.sign", [1, 1], r"components\[0\]: sign has 2 values for 3 dims"),
+        ("action.components.0.names", ["x"], r"components\[0\]\.names: has 1 values, but dims is 3"),
+        ("action.components.0.sign", [1, 1], r"components\[0\]\.sign: has 2 values, but dims is 3"),
         ("action.components.0.offset", math.nan, r"components\[0\]\.offset: "),
-        ("action.components.0.range", [1, -1], r"components\[0\]: range \[1.0, -1.0\] must be \[low, high\]"),
+        ("action.components.0.range", [1, -1], r"components\[0\]\.range: must be \[low, high\]"),
         ("action.components.0.unknown", 1, r"components\[0\]\.unknown: unknown key"),
         ("cameras.0.rotate", 45, r"cameras\[0\]\.rotate: .*0, 90, 180 or 270"),
         ("cameras.0.crop", [0, 0, 0, 4], r"cameras\[0\]\.crop\[2\]: .*greater than or equal to 1"),
@@ -231,9 +237,14 @@ def test_an_unknown_camera_names_the_known() -> None:
         ("sync.tolerance_ms", 0, r"sync\.tolerance_ms: .*greater than 0"),
         ("cameras.0.name", "a/b", r"cameras\[0\]\.name: "),
         ("cameras.0.color", "hsv", r"cameras\[0\]\.color: .*'rgb' or 'bgr'"),
-        ("sync.primary", "side", "sync.primary 'side' is not one of: front"),
+        ("sync.primary", "side", "sync: primary 'side' is not one of: front"),
         ("sync.max_skew_ms", -1, r"sync\.max_skew_ms: "),
         ("source.format", "zarr", r"source\.format: .*'zarr'.*allowed: 'rlds'"),
+        (
+            "source.layout",
+            {"axes": "THWC"},
+            r"source\.layout\.axes: unknown key of format rlds; allowed: none",
+        ),
         ("provenance.float", 3, r"provenance\.float: .*string"),
     ],
 )
@@ -255,6 +266,53 @@ def test_all_problems_are_told_at_once() -> None:
     said = problems(values)
     assert len(said) == 4
     assert {line.split(":")[0] for line in said} == {"kind", "stride", "wheels", "action"}
+
+
+def test_a_problem_of_one_part_hides_none_of_another() -> None:
+    values = changed("action.components.0.names", ["x"]) | {"sync": {"primary": "side"}}
+    values["action"]["components"][0] |= {"range": [1, -1], "slice": [0, 2]}
+    values["source"] = {"format": "hdf5", "layout": {"episode": "data/*", "axes": "x", "pixels": 3}, "of": 1}
+    part, layout = "action.components[0]", "source.layout"
+    places = {f"{part}.{key}" for key in ("names", "range", "slice")} | {"sync", "source.of"}
+    said = dict(line.split(": ", 1) for line in problems(values))
+    assert said.keys() == places | {f"{layout}.{key}" for key in ("episode", "axes", "pixels")}
+    assert said[f"{layout}.episode"].startswith("unknown key of format hdf5, did you mean 'episodes'?")
+
+
+def test_the_page_on_adding_a_robot_lists_every_layout_key() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "adding-a-robot.md").read_text()
+    table = page[page.index("| format | key of `layout` |") :].split("\n\n")[0]
+    listed = re.findall(r"^\| (\w+) \| `(\w+)` \|", table, re.MULTILINE)
+    assert listed == [(name, key) for name, layout in LAYOUTS.items() for key in layout.model_fields]
+
+
+LAYOUT_VALUES = [
+    ("hdf5", {"axes": "TCHW", "pixels": "0-1", "episodes": "/"}, True),
+    ("hdf5", {"last_observation": "keep"}, False),
+    ("hdf5", {"pairing": "index"}, False),
+    ("lerobot", {"pairing": "index"}, True),
+    ("lerobot", {"pairing": "order"}, False),
+    ("hands", {"labels": "landmarks", "max_hold": 3, "mirrored": True, "label_size": "64x48"}, True),
+    ("hands", {"min_frames": "12", "models": "m.task"}, True),
+    ("hands", {"camera": "cam02", "colour": "red"}, False),
+    ("rosbag", {}, True),
+    ("rosbag", {"episodes": "x"}, False),
+]
+
+
+@pytest.mark.parametrize(("name", "layout", "valid"), LAYOUT_VALUES)
+def test_the_schema_and_the_registry_judge_a_layout_alike(
+    name: str, layout: dict[str, Any], valid: bool
+) -> None:
+    values = BASE | {"source": {"format": name, "layout": layout}}
+    told = pytest.importorskip("jsonschema").Draft202012Validator(schema()).is_valid(values)
+    assert (not problems(values), told) == (valid, valid)
+
+
+def test_values_of_a_layout_are_kept_as_text() -> None:
+    layout = {"max_hold": 3, "mirrored": True, "min_score": 0.25}
+    made = Embodiment.from_values(BASE | {"source": {"format": "hands", "layout": layout}}, "arm.yaml")
+    assert made.source.layout == {"max_hold": "3", "mirrored": "true", "min_score": "0.25"}
 
 
 def test_open_questions_are_the_problem_not_what_pydantic_says_of_them() -> None:

@@ -13,11 +13,11 @@ from hma_data.conversion.job import convert
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
 from hma_data.registry.embodiment import find
+from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import detect, open_source
 from hma_data.sources.hands.runs import (
     KEYS,
     POINTS,
-    HandsLayout,
     Header,
     cut_into_runs,
     find_spans,
@@ -363,7 +363,7 @@ def test_a_folder_of_videos_is_recognised_and_inspected(folder: Path, monkeypatc
     assert (
         found.episodes == 2 and found.frames == LENGTH and {key.key for key in found.keys[1:]} == set(POINTS)
     )
-    assert "not looked for" in found.facts["hands"] and "broken.mp4" in found.problems[0]
+    assert "broken.mp4" in found.problems[0] and "hands were not looked for" in found.problems[-1]
 
 
 def test_a_rate_that_nothing_states_is_called_measured(folder: Path, monkeypatch) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, HMAError, RegistryError, SourceError
 from hma_data.sources.base import open_source
-from hma_data.sources.hands.runs import layout_of, videos_of
+from hma_data.sources.hands.runs import videos_of
 from tests.data import hands_files as made
 from tests.data.videos import HEIGHT, WIDTH, encode
 
@@ -35,19 +35,18 @@ def folder(tmp_path: Path, clip: Path) -> Path:
 @pytest.mark.parametrize(
     ("layout", "fault"),
     [
-        ({"missing": "skip"}, "is 'skip' — .*'split', 'hold' or 'mask'"),
+        ({"missing": "skip"}, r"\(is 'skip'\); allowed: 'split', 'hold' or 'mask'"),
         ({"min_frames": "few"}, "valid integer"),
         ({"min_frames": "-1"}, "greater than or equal to 0"),
         ({"min_score": "nan"}, "finite number"),
         ({"label_size": "1920"}, "WIDTHxHEIGHT"),
-        ({"colour": "red"}, "is not a key of hand videos"),
+        ({"colour": "red"}, "unknown key of format hands.*allowed: labels, annotations"),
     ],
 )
 def test_a_wrong_layout_says_where_and_what_is_allowed(layout: dict[str, str], fault: str) -> None:
     key = next(iter(layout))
-    with pytest.raises(RegistryError, match=fault) as caught:
-        layout_of(made.hand_video("landmarks", **layout))
-    assert caught.value.where == f"embodiment test_hands: source.layout.{key}"
+    with pytest.raises(RegistryError, match=rf"source\.layout\.{key}: .*{fault}"):
+        made.hand_video("landmarks", **layout)
 
 
 class Touch:

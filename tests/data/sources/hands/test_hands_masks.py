@@ -17,11 +17,12 @@ from hma_data.errors import RegistryError, SourceError
 from hma_data.inspection.infer import infer
 from hma_data.loading.dataset import WindowDataset
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.layouts import HandsLayout
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import VideoFile
-from hma_data.sources.hands.runs import HandsLayout, Header, cut_into_runs, labels_from_rows
+from hma_data.sources.hands.runs import Header, cut_into_runs, labels_from_rows
 from tests.data import hands_files as made
 from tests.data.videos import encode, number_of
 
@@ -95,7 +96,7 @@ def test_a_video_with_too_few_hands_gives_no_masked_episode(folder: Path) -> Non
 
 
 def test_another_word_than_split_hold_and_mask_is_refused(folder: Path) -> None:
-    with pytest.raises(RegistryError, match="missing: is 'skip'.*'split', 'hold' or 'mask'"):
+    with pytest.raises(RegistryError, match="layout.missing: .*'skip'.*'split', 'hold' or 'mask'"):
         read(folder, made.hand_video("landmarks", missing="skip"))
 
 

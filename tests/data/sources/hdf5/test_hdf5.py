@@ -194,11 +194,6 @@ def test_an_unknown_rate_can_still_be_looked_at(demos: Path) -> None:
     assert len(episode.streams["front"].timestamps) == T
 
 
-def test_a_layout_key_of_another_format_is_refused(demos: Path) -> None:
-    with pytest.raises(SourceError, match=r"source\.layout\.episode is not known.*episodes, timestamps"):
-        open_source("hdf5").index(str(demos), embodiment(source__layout={"episode": "data/*"}))
-
-
 @pytest.mark.parametrize("shape", [(T, H, W), (T, H, W, 1), (T, H, W, 4), (T, 3, H, W)])
 def test_pictures_of_other_shapes_become_rgb(tmp_path: Path, shape: tuple[int, ...]) -> None:
     stored = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hma_data.episodes.align import to_clip
-from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.errors import EpisodeError, HMAError
 from hma_data.sources.base import open_source
 from tests.data.hdf5_files import H, T, W, embodiment, fill, pictures
 
@@ -145,13 +145,6 @@ def test_axes_that_could_be_either_are_refused_until_said(tmp_path: Path) -> Non
 def test_axes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(EpisodeError, match=r"pictures \(12, 16, 3\), source\.layout\.axes says TCHW"):
         shown(one(tmp_path, data=pictures()), axes="TCHW")
-
-
-def test_a_value_the_layout_does_not_know_is_refused(tmp_path: Path) -> None:
-    path = one(tmp_path, data=pictures())
-    for key, allowed in (("axes", "THWC, TCHW"), ("pixels", "0-1, 0-255"), ("last_observation", "drop")):
-        with pytest.raises(SourceError, match=rf"source\.layout\.{key} is 'x'.*{allowed}"):
-            shown(path, **{key: "x"})
 
 
 # -- other recorders

@@ -3,18 +3,25 @@
 Numbers, texts and times are equal; pictures are equal to those of lerobot's PyAV backend, byte for byte.
 """
 
+import json
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.errors import SourceError
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.inspection.infer import infer
+from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import frame_table
+from hma_data.storage.yaml_io import parse_yaml
 
 FPS, HEIGHT, WIDTH = 10, 64, 96
 LENGTHS = (12, 9, 15, 2, 11)
@@ -250,3 +257,113 @@ def test_metadata_spread_over_many_row_groups_is_whole(tmp_path: Path) -> None:
     for item, episode, row in rows_of(list(theirs(root)), robot, root):
         np.testing.assert_array_equal(episode.streams["still"].frames([row])[0], as_picture(item[STILL]))
         np.testing.assert_array_equal(episode.actions[0].values[row], item["action"].numpy())
+
+
+# -- sets as other writers leave them: lerobot's own, altered
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of one camera whose episodes share one video."""
+    features = {key: FEATURES[key] for key in ("action", CAM)}
+    return write(tmp_path_factory.mktemp("plain") / "set", features, **encoder("h264"))
+
+
+@pytest.fixture
+def altered(plain: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(plain, tmp_path / "set"))
+
+
+def change_spans(root: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Change `to_timestamp` of every episode."""
+    (path,) = (root / "meta/episodes").rglob("*.parquet")
+    table = pq.read_table(path)
+    name = f"videos/{CAM}/to_timestamp"
+    column = pa.array([change(row) for row in table.to_pylist()], pa.float64())
+    pq.write_table(table.set_column(table.column_names.index(name), name, column), path)
+
+
+@pytest.mark.parametrize("frames", [-1, 2])
+def test_where_an_episode_ends_in_a_video_is_judged_as_lerobot_does(altered: Path, frames: int) -> None:
+    change_spans(altered, lambda row: row[f"videos/{CAM}/to_timestamp"] + frames / FPS)
+    robot = arm(cameras=[{"name": "cam", "key": CAM}], state=None)
+    for item, episode, row in rows_of(list(theirs(altered)), robot, altered):
+        np.testing.assert_array_equal(episode.streams["cam"].frames([row])[0], as_picture(item[CAM]))
+    assert open_source("lerobot").inspect(str(altered)).problems == ()
+
+
+def test_no_row_takes_a_picture_of_the_next_episode(altered: Path) -> None:
+    (path,) = (altered / "meta/episodes").rglob("*.parquet")
+    table = pq.read_table(path)
+    starts = table[f"videos/{CAM}/from_timestamp"].to_pylist()
+    starts[2] -= 1 / FPS  # the third episode begins with the last picture of the second
+    name = f"videos/{CAM}/from_timestamp"
+    pq.write_table(table.set_column(table.column_names.index(name), name, pa.array(starts)), path)
+    robot, source = arm(cameras=[{"name": "cam", "key": CAM}], state=None), open_source("lerobot")
+    with pytest.raises(EpisodeError, match=r"has 8 frames from 1\.200 to 2\.100 s, the episode has 9 rows"):
+        source.read(str(altered), "episode_000001", robot)
+
+
+def as_v21(root: Path, out: Path, row_hz: float = FPS) -> Path:
+    """Bring a set to version 2.1 with the names of version 3 in its templates, and rows at another rate."""
+    files = sorted(root.rglob("*.mp4"))
+    whole = pa.concat_tables([pq.read_table(path) for path in sorted((root / "data").rglob("*.parquet"))])
+    info = json.loads((root / "meta/info.json").read_text())
+    info |= {"codebase_version": "v2.1", "chunks_size": 1000}
+    info["data_path"] = "data/chunk-{chunk_index:03d}/episode_{episode_index:06d}.parquet"
+    info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+    (out / "meta").mkdir(parents=True)
+    (out / "meta/info.json").write_text(json.dumps(info))
+    listed = [{"episode_index": i, "tasks": [], "length": n} for i, n in enumerate(LENGTHS)]
+    (out / "meta/episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in listed))
+    (out / "meta/tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": TASKS[0]}))
+    for i, length in enumerate(LENGTHS):
+        data, film = (
+            out / f"data/chunk-000/episode_{i:06d}.parquet",
+            out / f"videos/{CAM}/chunk-000/file-{i:03d}.mp4",
+        )
+        data.parent.mkdir(parents=True, exist_ok=True)
+        film.parent.mkdir(parents=True, exist_ok=True)
+        rows = whole.filter(pc.equal(whole["episode_index"], i))
+        times = pa.array((np.arange(length) / row_hz).astype(np.float32))
+        pq.write_table(rows.set_column(rows.column_names.index("timestamp"), "timestamp", times), data)
+        shutil.copy(files[i], film)
+    return out
+
+
+@pytest.fixture(scope="module")
+def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of one camera with a video for each episode."""
+    features = {key: FEATURES[key] for key in ("action", CAM)}
+    root = tmp_path_factory.mktemp("apart") / "set"
+    return write(root, features, many_files, **encoder("h264"))
+
+
+def test_templates_of_version_3_are_filled_in_version_2(apart: Path, tmp_path: Path) -> None:
+    robot, old = arm(cameras=[{"name": "cam", "key": CAM}], state=None), as_v21(apart, tmp_path / "old")
+    for item, episode, row in rows_of(list(theirs(apart)), robot, old):
+        np.testing.assert_array_equal(episode.streams["cam"].frames([row])[0], as_picture(item[CAM]))
+        np.testing.assert_array_equal(episode.actions[0].values[row], item["action"].numpy())
+
+
+def test_stamps_that_drift_are_found_and_pairing_by_index_reads_them(apart: Path, tmp_path: Path) -> None:
+    drifting = as_v21(apart, tmp_path / "cloth", row_hz=9.15)
+    source = open_source("lerobot")
+    cameras = [{"name": "cam", "key": CAM}]
+    with pytest.raises(EpisodeError, match=r"both count 12: if row i belongs to picture i.*pairing: index"):
+        source.read(str(drifting), "episode_000000", arm(cameras=cameras, state=None))
+    (told,) = (one for one in examine(str(drifting)) if one.check == "skew")
+    assert "pairing: index" in told.remedy and told.severity == "warn"
+
+    yaml = infer(str(drifting), "cloth")
+    values = parse_yaml(yaml, "cloth.yaml")
+    assert values["source"]["layout"] == {"pairing": "index"} and values["frequency_hz"] == 9.15
+    values |= {"kind": "real", "robot": "testbot", "action": values["action"] | {"space": "joint_position"}}
+    robot = Embodiment.from_values(values, "cloth.yaml")
+    (tmp_path / "cloth.yaml").write_text(robot.to_yaml())
+    told_again = examine(str(drifting), str(tmp_path / "cloth.yaml"))
+    assert not {"skew", "rate", "usable"} & {one.check for one in told_again}
+    for item, episode, row in rows_of(list(theirs(apart)), robot, drifting):
+        (camera,) = episode.streams.values()
+        np.testing.assert_array_equal(camera.frames([row])[0], as_picture(item[CAM]))
+        assert camera.timestamps[row] == pytest.approx(row / 9.15)

@@ -281,14 +281,20 @@ def test_a_remote_file_cut_short_is_an_episode_error(memory):
 
 
 @pytest.mark.parametrize(
-    ("protocol", "package"), [("gs", "gcsfs"), ("s3", "s3fs"), ("http", "aiohttp"), ("abfs", "adlfs")]
+    ("protocol", "package", "install"),
+    [
+        ("gs", "gcsfs", "uv sync --extra remote"),
+        ("s3", "s3fs", "uv sync --extra remote"),
+        ("http", "aiohttp", "uv sync --extra remote"),
+        ("abfs", "adlfs", "uv pip install adlfs"),
+    ],
 )
-def test_a_driver_that_is_missing_is_named_with_its_install_line(monkeypatch, protocol, package):
+def test_a_driver_that_is_missing_is_named_with_its_install_line(monkeypatch, protocol, package, install):
     def missing(*args, **options):
         raise ImportError(f"Install {package} to access {protocol}")
 
     monkeypatch.setattr(fsspec.core, "url_to_fs", missing)
-    with pytest.raises(MissingDependencyError, match=f"pip install {package}"):
+    with pytest.raises(MissingDependencyError, match=install):
         RLDS.index(f"{protocol}://bucket/{package}/x")
 
 

@@ -1,0 +1,63 @@
+"""Tell what a path holds, for errors: a recording where shards are wanted, a Git LFS pointer, no permission.
+
+Only names and first bytes are looked at, and only after something else has failed.
+"""
+
+import os
+from itertools import islice
+from pathlib import Path
+
+LFS = b"version https://git-lfs.github.com/spec/"
+_RECORDED = (".hdf5", ".h5", ".bag", ".mcap", ".db3", ".mp4", ".mkv", ".avi", ".mov", ".webm")
+_DESCRIBED = ("meta/info.json", "features.json", "dataset_info.json", "metadata.yaml")
+_USE = {
+    "a recording": "hma inspect shows it, hma convert makes shards of it",
+    "a shard set": "hma shards info shows it, hma train takes it as data",
+    "a checkpoint": "hma evaluate and hma generate take it",
+    "a YAML file": "give the YAML of an embodiment by --embodiment (-e)",
+}
+
+
+def kind_of(path: Path) -> str:
+    """Return what is at a path of this machine, one of `_USE`; empty where it is nothing of these."""
+    try:
+        if path.suffix.lower() in (".yaml", ".yml") and path.is_file():
+            return "" if path.name == "metadata.yaml" else "a YAML file"
+        if (path / "trunk.safetensors").is_file() or any(path.glob("checkpoints/step-*")):
+            return "a checkpoint"
+        if any(path.glob("train/shard-*.parquet")) or any(path.glob("val/shard-*.parquet")):
+            return "a shard set"
+        files = [path] if path.is_file() else islice(path.rglob("*"), 2000)
+        described = any((path / name).is_file() for name in _DESCRIBED)
+        if described or any(file.suffix.lower() in _RECORDED or ".tfrecord" in file.name for file in files):
+            return "a recording"
+    except OSError:
+        pass
+    return ""
+
+
+def misplaced(path: Path, wanted: str) -> tuple[str, str] | None:
+    """Return fault and remedy where a path holds something else of the toolkit than what is wanted."""
+    kind = kind_of(path)
+    return (f"is {kind}, not {wanted}", _USE[kind]) if kind and kind != wanted else None
+
+
+def unreadable(path: Path, fault: str, remedy: str) -> tuple[str, str]:
+    """Return fault and remedy of a file or folder that could not be read.
+
+    They are those given, unless it is a Git LFS pointer or there is no permission: then that is the reason.
+    """
+    mode = os.R_OK | os.X_OK if path.is_dir() else os.R_OK
+    try:
+        path.stat()
+        if not os.access(path, mode, effective_ids=os.access in os.supports_effective_ids):
+            return "may not be read: permission denied", f"ask its owner, or run chmod u+rX {path}"
+        if path.is_file():
+            with path.open("rb") as file:
+                if file.read(len(LFS)) == LFS:
+                    return "is a Git LFS pointer instead of the file", "run git lfs pull in its folder"
+    except PermissionError:
+        return "may not be read: permission denied", f"ask the owner of {path.parent}"
+    except OSError:
+        pass
+    return fault, remedy
