@@ -104,7 +104,7 @@ def _write_shard(
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
-    schema = arrow_schema(spec, robot.action_dim, 0, 1)
+    schema = arrow_schema(spec, robot.action_dim, 0)
     stats = Stats.empty(robot.action_dim)
     rows = []
     with ShardWriter(path, schema, spec) as writer:
@@ -114,7 +114,7 @@ def _write_shard(
             stats.merge(Stats.of(actions))
             where = (str(i), "train", _name(0), writer.rows, length, length)
             rows.append(EpisodeRow(i, *where, "", None, "", 0.0, 0.0, 0.0, "{}", 0, ""))
-            writer.add(EpisodeRows(i, np.arange(length) / robot.rate_hz, tokens, actions, None, "main"))
+            writer.add(EpisodeRows(i, np.arange(length) / robot.rate_hz, tokens, actions, None))
         writer.close(Footer(plan, _name(0), "train", tuple(rows), (), {"action": stats}))
 
 

@@ -60,13 +60,13 @@ def _write(folder: Path, settings: dict[str, int]) -> dict[str, float]:
     clock = np.arange(length) / 10
     for unit in plan.units:
         rows, stats = [], {"action": Stats.empty(7)}
-        with ShardWriter(folder / unit.name, arrow_schema(spec, 7, 0, 1), spec) as writer:
+        with ShardWriter(folder / unit.name, arrow_schema(spec, 7, 0), spec) as writer:
             for index, ref in unit.episodes:
                 tokens = rng.integers(0, 2**18, (length, 16, 16), dtype=np.uint32)
                 actions = _teleoperated(rng, length)
                 begun = time.perf_counter()
                 place = (ref.id, unit.split, unit.name, writer.rows, length, length)
-                writer.add(EpisodeRows(index, clock, tokens, actions, None, "main"))
+                writer.add(EpisodeRows(index, clock, tokens, actions, None))
                 stats["action"].merge(Stats.of(actions))
                 rows.append(EpisodeRow(index, *place, "", None, "", 0.0, 0.0, 0.0, "{}", 0, ""))
                 seconds += time.perf_counter() - begun

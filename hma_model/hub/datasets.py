@@ -195,6 +195,7 @@ def _facts(manifest: Manifest) -> str:
         "frames per second of the model": "unknown" if unknown else number(robot.effective_hz),
         "tokenizer": f"{line(tokenizer.name)}, {'×'.join(map(str, tokenizer.grid))} of "
         f"{tokenizer.image_size} pixels, {line(tokenizer.kind)}",
+        "cameras": line(manifest.cameras_line) if len(robot.cameras) > 1 else "",
         "licence": line(robot.license) or "not stated",
         "quarantined episodes": str(manifest.quarantined),
     }

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hma_data.errors import CheckpointError, RecipeError, TrainingError
+from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
 from hma_data.loading.dataset import Batch, WindowDataset, open_sets
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import remove_partial, to_json, write_atomic
@@ -93,7 +93,10 @@ class Run:
         if recipe.self_forward and recipe.parallel == "fsdp" and self.world.size > 1:
             fault = "does not work with parallel=fsdp on several ranks"
             raise RecipeError("recipe: self_forward", fault, "use parallel=ddp")
-        self.sets = open_sets(recipe.data)
+        try:
+            self.sets = open_sets(recipe.data, recipe.cameras)
+        except UsageError as fault:
+            raise RecipeError(f"recipe: {fault.where}", fault.fault, fault.remedy) from fault
         self.start: Start | None = None
         if recipe.start is not None:
             self.world.once(lambda: Start.bring(recipe, self.sets, self.out))
@@ -115,7 +118,10 @@ class Run:
             self.stats = {name: self.start.stats(shards) for name, shards in self.sets.items()}
         torch.manual_seed(seed_for(recipe.seed, "init"))
         self.model = self._fresh_model()
-        held_out = ((name, s, WindowDataset(s, "val", recipe.frames)) for name, s in self.sets.items())
+        held_out = (
+            (name, s, WindowDataset(s, "val", recipe.frames, cameras=recipe.cameras))
+            for name, s in self.sets.items()
+        )
         self.held_out = {name: shards for name, shards, dataset in held_out if len(dataset)}
         self.step, self.skipped, self.seconds = 0, 0, 0.0
         self.spike_detector = GradientSpikeDetector(recipe.spike)
@@ -171,7 +177,8 @@ class Run:
         if plain or self.start:
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
-        shares = [[p * digit for digit in digit_frequencies(shards)] for p, shards in drawn]
+        cameras = self.recipe.cameras
+        shares = [[p * digit for digit in digit_frequencies(s, cameras=cameras)] for p, s in drawn]
         bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
@@ -306,7 +313,8 @@ class Run:
             }
             if video and model.config.kind == "discrete":
                 if self._baseline is None:
-                    self._baseline = unconditional_baseline(self.sets, self._held_out_batches())
+                    batches = self._held_out_batches()
+                    self._baseline = unconditional_baseline(self.sets, batches, recipe.cameras)
                 facts["perplexity"] = perplexity(facts["loss"])
                 facts["accuracy"] = accuracy.mean()
                 facts["accuracy_by_embodiment"] = accuracy.by_embodiment()
@@ -319,7 +327,9 @@ class Run:
     def _held_out_batches(self) -> Iterator[Batch]:
         recipe = self.recipe
         for shards in self.held_out.values():
-            yield from windows(shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size)
+            yield from windows(
+                shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size, recipe.cameras
+            )
 
     def _write_sheets(self, model: HMA) -> None:
         """Write pictures of rollouts: after the last step always, after others if the time allows."""
@@ -329,7 +339,7 @@ class Run:
             return
         fault = write_sheets(
             model, self.held_out, self.out, self.step,
-            frames=recipe.frames, count=recipe.pictures, seed=recipe.seed,
+            frames=recipe.frames, count=recipe.pictures, seed=recipe.seed, cameras=recipe.cameras,
         )  # fmt: skip
         if fault and len(self._sheet_seconds) == 1:  # noted once
             self.notes.append(fault)
@@ -376,6 +386,8 @@ class Run:
         metrics = {ours: values.get(name) for ours, values in found if values is not None}
         train = shards.manifest.splits.get("train", {})
         data: dict[str, Any] = {key: train.get(key) for key in ("episodes", "frames")}
+        if self.recipe.cameras != "first":
+            data["cameras"] = self.recipe.cameras
         if "://" in shards.manifest.source:  # a path is of no use on another machine
             data["source"] = shards.manifest.source
         training: dict[str, Any] = {"steps": self.step, "seed": self.recipe.seed}
