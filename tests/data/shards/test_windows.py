@@ -100,7 +100,7 @@ def test_a_split_without_shards_has_no_windows() -> None:
     nothing = fake([5])
     nothing.row_groups, nothing.index = (
         lambda split: [],
-        lambda split: EpisodeIndex(empty, empty, empty, empty),
+        lambda split: EpisodeIndex(empty, empty, empty, empty, empty),
     )
     index = WindowIndex.of(nothing, "val", 4)
     assert index.count == 0 and len(index.units()) == 0
