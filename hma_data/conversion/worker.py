@@ -232,18 +232,18 @@ def _episode(
     yield _Episode(index, ref, clip, content)
     for name in layout.cameras:
         camera, stream = job.embodiment.camera(name), clip.episode.streams[name]
-        if report:
-            report(Seen(name, *clip.frames_at(name, kept[:1]).shape[1:3]))
-        for start in range(0, len(kept), BATCH):
-            indices = clip.frame_indices[name][kept[start : start + BATCH]]
-            try:
+        try:
+            if report:
+                report(Seen(name, *clip.frames_at(name, kept[:1]).shape[1:3]))
+            for start in range(0, len(kept), BATCH):
+                indices = clip.frame_indices[name][kept[start : start + BATCH]]
                 frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
-            except EpisodeError as fault:
-                if len(layout.cameras) == 1:
-                    raise
-                raise camera_fault(ref.id, name, layout.cameras, fault) from fault
-            content.add(start, frames)
-            yield name, frames
+                content.add(start, frames)
+                yield name, frames
+        except EpisodeError as fault:
+            if len(layout.cameras) == 1:
+                raise
+            raise camera_fault(ref.id, name, layout.cameras, fault) from fault
     yield None
 
 

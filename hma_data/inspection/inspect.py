@@ -106,8 +106,9 @@ def _fit(
     facts["first episode"] = f"{name}: {len(clip)} frames on the grid, {clip.trimmed} trimmed at its ends"
     facts["pictures"] = "×".join(map(str, pictures.shape[1:]))
     for camera in robot.cameras:
-        said = describe_resize(camera, *sizes[camera.name], SQUARE).removeprefix(f"{camera.name}: ")
-        facts[f"camera {camera.name}"] = said
+        height, width = sizes[camera.name]
+        said = describe_resize(camera, height, width, SQUARE)
+        facts[f"camera {camera.name}"] = said.removeprefix(f"{camera.name}: ")
     hz = _median_hz(np.diff(clip.timestamps))
     facts["rate on the grid"] = f"{hz:.3g} Hz" if hz else "unknown"
     for stream, skew in clip.skew_ms.items():

@@ -136,8 +136,8 @@ class WindowDataset(Dataset[Batch]):
         order = np.concatenate(samples)
         joined["camera"] = camera[order]
         name = self.shards.embodiment.id
-        windows = {name: (order, joined)}
-        return assemble({name: self.shards}, [name] * len(numbers), windows, self._short, self._views)
+        cut = {name: (order, joined)}
+        return assemble({name: self.shards}, [name] * len(numbers), cut, self._short, self._views)
 
 
 class MixtureDataset(IterableDataset[Batch]):
