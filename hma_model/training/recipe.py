@@ -368,7 +368,7 @@ def _unknown(path: str) -> str:
     if home == "model" and key in _DERIVED:
         return f"{path}: follows from the shards and the recipe, and cannot be given"
     near = _meant(key, list(known[home]))
-    for name in ("mixture", "model") if not home and not near else ():
+    for name in ("mixture", "model") if not home else ():
         if key in known[name]:
             near = f", did you mean {f'{name}.{key}'!r}?"
     return f"{path}: unknown key{near}"
