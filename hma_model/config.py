@@ -88,7 +88,7 @@ _CHOICES = {
 }
 _AT_LEAST_ONE = (
     *("layers", "width", "heads", "mlp_ratio", "frames", "channels", "patch", "action_tokens", "base_width"),
-    *("history_frames", "diffusion_depth", "diffusion_width", "diffusion_train_steps"),
+    *("history_frames", "diffusion_depth", "diffusion_width", "diffusion_train_steps", "views"),
     *("diffusion_sample_steps", "diffusion_repeats"),
 )
 _SHARES = ("label_smoothing", "corrupt_max", "history_probability", "mask_ratio_min", "dropout")
@@ -109,6 +109,7 @@ class HMAConfig:
     mlp_ratio: float = 4.0
     frames: int = 12  # T, the window; in a longer rollout, temporal attention sees this many frames
     grid: tuple[int, int] = (16, 16)  # the tokenizer's (h, w); a continuous model's tokens are patches of it
+    views: int = 1  # cameras in a frame, stacked along the height: a frame has views · h rows of tokens
     dropout: float = 0.0  # in the MLPs
 
     factored: tuple[int, ...] = (512, 512)  # discrete: values a digit, low digit first
@@ -176,14 +177,15 @@ class HMAConfig:
 
     @property
     def token_grid(self) -> tuple[int, int]:
-        """Return (h, w), the grid of the tokens that the trunk sees in a frame."""
+        """Return (views · h, w), the grid of the tokens that the trunk sees in a frame."""
         side = self.patch if self.kind == "continuous" else 1
-        return self.grid[0] // side, self.grid[1] // side
+        return self.views * self.grid[0] // side, self.grid[1] // side
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
-        """Return the shape of a stored frame: (h, w) of tokens, or (c, H, W) of latents."""
-        return self.grid if self.kind == "discrete" else (self.channels, *self.grid)
+        """Return the shape of a frame: (views · h, w) of tokens, or (c, views · H, W) of latents."""
+        grid = (self.views * self.grid[0], self.grid[1])
+        return grid if self.kind == "discrete" else (self.channels, *grid)
 
     @property
     def tokens_per_frame(self) -> int:
@@ -222,10 +224,11 @@ class HMAConfig:
         return dataclasses.replace(self, **changes)
 
     def to_json(self) -> dict[str, Any]:
-        """Return a dictionary that `json.dumps` accepts and `from_json` reads back."""
+        """Return a dictionary that `json.dumps` accepts and `from_json` reads back; one view is left out."""
         return {
             f.name: list(value) if isinstance(value := getattr(self, f.name), tuple) else value
             for f in dataclasses.fields(self)
+            if f.name != "views" or self.views > 1
         }
 
     @classmethod

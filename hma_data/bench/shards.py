@@ -46,13 +46,13 @@ def _write_shard(
     path.parent.mkdir(parents=True, exist_ok=True)
     clock = np.arange(length) / robot.rate_hz
     rows, stats = [], Stats.empty(robot.action_dim)
-    with ShardWriter(path, arrow_schema(spec, robot.action_dim, 0, 1), spec) as writer:
+    with ShardWriter(path, arrow_schema(spec, robot.action_dim, 0), spec) as writer:
         for index, episode in episodes:
             tokens = rng.integers(0, spec.vocab_size, (length, *spec.grid), dtype=np.uint32)
             actions = draw(rng, length)
             begun = time.perf_counter()
             place = (episode, split, name, writer.rows, length, length)
-            writer.add(EpisodeRows(index, clock, tokens, actions, None, "main"))
+            writer.add(EpisodeRows(index, clock, tokens, actions, None))
             stats.merge(Stats.of(actions))
             rows.append(EpisodeRow(index, *place, "", None, "", 0.0, 0.0, 0.0, "{}", 0, ""))
             seconds += time.perf_counter() - begun

@@ -38,7 +38,15 @@ def convert(
     frequency_hz: Annotated[
         float | None, Option(help="Rate of the recording, where the YAML does not know it.")
     ] = None,
-    camera: Annotated[list[str] | None, Option(help="Camera to keep; repeat it for more.")] = None,
+    cameras: Annotated[
+        list[str] | None,
+        Option(
+            "--cameras",
+            "--camera",
+            metavar="all|NAME[,NAME…]",
+            help="Cameras to store; default: the YAML's first.",
+        ),
+    ] = None,
     shard_frames: Annotated[int | None, Option(min=1, help="Frames in a shard, about.")] = None,
     val_fraction: Annotated[float, Option(help="Share of episodes for validation.")] = 0.05,
     seed: Annotated[int, Option(help="Seed of the split.")] = 0,
@@ -89,7 +97,7 @@ def convert(
             limit=limit,
             frames=frames,
             frequency_hz=frequency_hz,
-            cameras=tuple(camera or ()),
+            cameras=tuple(cameras or ()),
             shard_frames=shard_frames,
             val_fraction=val_fraction,
             seed=seed,
@@ -161,6 +169,7 @@ def _convert(job: "ConversionJob", json: bool, extend: bool, overwrite: bool, sh
 def _plan(job: "ConversionJob", json: bool) -> bool:
     from hma_data.conversion.job import plan_conversion
     from hma_data.conversion.plan import estimate
+    from hma_data.shards.manifest import cameras_line
     from hma_data.storage.remote import place
     from hma_data.tokenizers.base import get_tokenizer
 
@@ -181,6 +190,8 @@ def _plan(job: "ConversionJob", json: bool) -> bool:
                 "bytes": cost.bytes,
                 "frames_per_second": cost.frames_per_second,
                 "seconds": cost.seconds,
+                "cameras": plan.facts["cameras"],
+                "pictures": cost.pictures,
                 "shards": units,
             }
         )
@@ -190,6 +201,7 @@ def _plan(job: "ConversionJob", json: bool) -> bool:
         f"{uri}: {plan.episodes:,} episodes, about {plan.frames:,} frames into {len(units)} shards, "
         f"about {human_bytes(cost.bytes)}"
     )
+    _print_cameras(cameras_line(plan.facts["cameras"], robot), cost.pictures, robot, opened.spec.image_size)
     if cost.seconds is None:
         print(f"time unknown, no episode could be read: {cost.fault}")
     else:
@@ -198,6 +210,15 @@ def _plan(job: "ConversionJob", json: bool) -> bool:
             f"{cost.frames_per_second:,.0f} frames/s, measured on one episode"
         )
     return True
+
+
+def _print_cameras(line: str, pictures: dict[str, tuple[int, int]], robot: Any, size: int) -> None:
+    """Print which cameras are stored, and what becomes of their pictures."""
+    from hma_data.episodes.images import describe_resize
+
+    print(f"cameras: {line}")
+    for name, (height, width) in pictures.items():
+        print(describe_resize(robot.camera(name), height, width, size))
 
 
 def _robot(job: "ConversionJob") -> Any:
@@ -254,6 +275,8 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
                 "shards_made": summary.made_shards,
                 "shards_kept": summary.kept_shards,
                 "seconds": summary.seconds,
+                "cameras": manifest.cameras,
+                "pictures": summary.pictures,
                 "flags": summary.flags,
                 "reasons": summary.reasons,
                 "too_many_quarantined": summary.too_many,
@@ -262,6 +285,8 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
     else:
         kept = f" ({summary.kept_shards} were there already)" if summary.kept_shards else ""
         print(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
+        robot, size = manifest.embodiment, manifest.tokenizer.image_size
+        _print_cameras(manifest.cameras_line, summary.pictures, robot, size)
         if summary.flags:
             counts = [f"{count:,} {name.replace('_', ' ')}" for name, count in summary.flags.items()]
             print(f"flags: {', '.join(counts)}")

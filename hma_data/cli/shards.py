@@ -51,9 +51,10 @@ def _print_info(facts: dict[str, Any]) -> None:
         f"({totals['hours']:.2f} h), {human_bytes(totals['bytes'])} in {facts['shards']:,} shards "
         f"({facts['bytes_per_frame']:.0f} bytes a frame)"
     )
+    print(f"cameras: {robot['cameras_line']}")
     print(
-        f"cameras {', '.join(robot['cameras'])}; {robot['action_dim']} action and {robot['state_dim']} state "
-        f"values; stride {robot['stride']}, so the model sees {robot['effective_hz']:g} Hz"
+        f"{robot['action_dim']} action and {robot['state_dim']} state values; stride {robot['stride']}, "
+        f"so the model sees {robot['effective_hz']:g} Hz"
     )
     print(
         f"episodes of {episodes['shortest']:,} to {episodes['longest']:,} frames, median "
@@ -115,7 +116,7 @@ def shards_preview(
     folder: Folder,
     out: Annotated[Path | None, Option(help="Folder for sheet.png and preview.mp4.")] = None,
     episodes: Annotated[int, Option(min=1, help="Number of episodes to show.")] = 4,
-    camera: Camera = None,
+    camera: Annotated[str | None, Option(help="Camera to show; default: all of the set.")] = None,
     weights: Annotated[str | None, Option(help="The tokenizer's weights, if not the usual ones.")] = None,
 ) -> None:
     """Write a contact sheet and a video decoded from the tokens, with the actions drawn.
@@ -127,6 +128,8 @@ def shards_preview(
     place = out or Path(f"{folder.resolve().name}-preview")
     shown = preview(folder, place, episodes=episodes, weights=weights, camera=camera)
     print(f"wrote {shown.sheet} and {shown.video} ({len(shown.episodes)} episodes)")
+    for line in shown.resized:
+        print(line)
 
 
 def totals_line(out: Path, manifest: "Manifest") -> str:

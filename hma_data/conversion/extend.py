@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.conversion.cameras import read_clip
 from hma_data.conversion.plan import Plan, ShardUnit, differences, pack, shard_size
-from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
 from hma_data.errors import EpisodeError, OutputError
@@ -205,7 +205,7 @@ def content_of(
     """
     layout = RowLayout.of_plan(facts, embodiment)
     spec = layout.tokenizer
-    clip = to_clip(source.read(uri, episode_id, embodiment), embodiment)
+    clip = read_clip(source, uri, episode_id, embodiment, layout.cameras)
     kept = kept_frames(clip, layout)
     content = Content(clip, kept)
     for name in layout.cameras:

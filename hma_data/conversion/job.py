@@ -31,7 +31,7 @@ from hma_data.conversion.output import (
 )
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
 from hma_data.conversion.publish import HubOutput
-from hma_data.conversion.worker import Job, MakeWork, Tick
+from hma_data.conversion.worker import Job, MakeWork, Seen, Tick
 from hma_data.errors import OutputError, RegistryError, SourceError, StorageAwayError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
@@ -56,6 +56,7 @@ class Progress:
     total_episodes: int = 0
     total_frames: int = 0
     retries: list[str] = field(default_factory=list)
+    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
     started: float = field(default_factory=time.monotonic)
 
 
@@ -67,6 +68,7 @@ class Summary:
         reasons: error type and message (without the ids where there are several) -> number of episodes
             refused for it.
         flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
+        pictures: camera -> (height, width) of its recorded pictures; empty if no shard was made.
         too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
     """
 
@@ -78,6 +80,7 @@ class Summary:
     reasons: dict[str, int]
     flags: dict[str, int]
     too_many: bool
+    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -189,7 +192,7 @@ def convert(
     episodes = sum(split["episodes"] for split in manifest.splits.values())
     too_many = manifest.quarantined > max_quarantine * (episodes + manifest.quarantined)
     seconds = time.monotonic() - begun
-    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many)
+    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many, conversion.pictures)
 
 
 def convert_share(
@@ -250,6 +253,7 @@ class _Conversion:
         if self._opened is self.tokenizer or str(self.out).startswith("memory:"):
             self.workers = 0  # no other process sees them
         self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._opened, self.settings)
+        self.pictures: dict[str, tuple[int, int]] = {}
 
     def plan(self, extend: bool) -> tuple[Plan, Manifest | None]:
         """Return the plan, and the manifest it extends or None.
@@ -278,12 +282,14 @@ class _Conversion:
         there = finished_shards(self.out, plan, base, share is not None)
         todo = [unit for unit in mine if unit.name not in there]
         kept = [unit for unit in mine if unit.name in there]
+        cameras = len(plan.facts["cameras"])
         progress = Progress(
             episodes=sum(len(unit.episodes) for unit in kept),
-            frames=sum(unit.frames for unit in kept),
+            frames=cameras * sum(unit.frames for unit in kept),
             kept_shards=len(kept) + (len(base.shards) if base else 0),
             total_episodes=sum(len(unit.episodes) for unit in mine),
-            total_frames=sum(unit.frames for unit in mine),
+            total_frames=cameras * sum(unit.frames for unit in mine),
+            pictures=self.pictures,
         )
         on_progress(progress)
         if todo:
@@ -353,7 +359,10 @@ class _Counter:
         self._progress, self._on_progress = progress, on_progress
         self._by_unit: dict[int, dict[str, int]] = {}
 
-    def __call__(self, unit: int, event: Tick | Retry) -> None:
+    def __call__(self, unit: int, event: Tick | Seen | Retry) -> None:
+        if isinstance(event, Seen):
+            self._progress.pictures.setdefault(event.camera, (event.height, event.width))
+            return
         counts = self._by_unit.setdefault(unit, dict.fromkeys(vars(Tick()), 0))
         if isinstance(event, Retry):
             self._progress.retries.append(event.reason)

@@ -11,19 +11,19 @@ import math
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
-from hma_data.episodes.align import to_clip
+from hma_data.conversion.cameras import chosen, read_clip
 from hma_data.episodes.images import prepare
 from hma_data.errors import HMAError, SourceError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import digest, plan_hash
 from hma_data.shards.schema import RowLayout
 from hma_data.sources.base import EpisodeRef, open_source
-from hma_data.storage.paths import StrPath
+from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
 FRAMES, TRIED = 64, 5  # of an estimate: pictures tokenized, episodes tried
@@ -36,7 +36,7 @@ class Settings:
 
     Attributes:
         frames: all rows at the recording's rate, or only the model's grid with whole action chunks.
-        cameras: names; the primary camera by default.
+        cameras: names; ("all",) takes all of the YAML; the primary camera by default.
         val_fraction: fraction of episodes for validation, chosen by hash of their id.
         seed: of that hash.
         limit: take only so many episodes, from the first on; None takes all.
@@ -124,8 +124,7 @@ def make_plan(
     ((name, count),) = Counter(ref.id for ref in refs).most_common(1)
     if count > 1:
         raise SourceError(source, f"has two episodes with id {name!r}")
-    cameras = [embodiment.camera(name).name for name in settings.cameras] or [embodiment.primary_camera.name]
-
+    cameras = chosen(embodiment, settings.cameras)
     splits = choose_splits(refs, settings.val_fraction, settings.seed)
     target = settings.shard_frames or shard_size(sum(ref.frames for ref in refs))
     units = [
@@ -138,6 +137,7 @@ def make_plan(
         "embodiment_hash": embodiment.digest,
         "tokenizer": tokenizer.to_json(),
         "cameras": cameras,
+        **({"camera_columns": True} if len(cameras) > 1 else {}),
         "frames": settings.frames,
         "frame_stride": settings.frame_stride(embodiment),
         "settings": {**asdict(settings), "cameras": cameras},
@@ -196,6 +196,7 @@ def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
         "embodiment_hash": "content of the embodiment's YAML",
         "tokenizer": "tokenizer",
         "cameras": "cameras",
+        "camera_columns": "columns of the cameras",
         "frames": "--frames",
         "recording": "recordings",
         "settings": "settings",
@@ -226,12 +227,14 @@ class Estimate:
         frames_per_second: of one worker, decoding included; None when no episode could be read.
         seconds: in all, with the requested number of workers; None when no episode could be read.
         fault: why no episode could be read.
+        pictures: camera -> [height, width] of its recorded pictures.
     """
 
     bytes: int
     frames_per_second: float | None
     seconds: float | None
     fault: str = ""
+    pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
 def estimate(
@@ -239,20 +242,21 @@ def estimate(
 ) -> Estimate:
     """Estimate a conversion: tokenize some frames of the first readable episode, and scale up."""
     layout = RowLayout.of_plan(plan.facts, embodiment)
-    rows = plan.frames // layout.frame_stride * len(layout.cameras)
+    rows = plan.frames // layout.frame_stride
     size = int(rows * bytes_a_row(layout))
     source = open_source(embodiment.source.format)
     fault = ""
     for _, ref in [item for unit in plan.units for item in unit.episodes][:TRIED]:
         try:
             begun = time.monotonic()
-            clip = to_clip(source.read(uri, ref.id, embodiment), embodiment)
-            camera = embodiment.camera(layout.cameras[0])
-            kept = layout.kept(len(clip))[:FRAMES]
-            raw = clip.frames_at(camera.name, kept)
-            tokenizer.encode(prepare(raw, camera, tokenizer.spec.image_size, tokenizer.spec.resize_filter))
+            clip = read_clip(source, as_text(uri), ref.id, embodiment, layout.cameras)
+            kept, pictures = layout.kept(len(clip))[:FRAMES], {}
+            for name in layout.cameras:
+                raw, spec = clip.frames_at(name, kept), tokenizer.spec
+                tokenizer.encode(prepare(raw, embodiment.camera(name), spec.image_size, spec.resize_filter))
+                pictures[name] = (raw.shape[1], raw.shape[2])
             rate = len(kept) / (time.monotonic() - begun)
-            return Estimate(size, rate, rows / rate / max(workers, 1))
+            return Estimate(size, rate, rows / rate / max(workers, 1), pictures=pictures)
         except HMAError as refused:
             fault = str(refused)
     return Estimate(size, None, None, fault)
@@ -270,4 +274,5 @@ def bytes_a_row(layout: RowLayout) -> float:
         picture = h * w * math.ceil(math.log2(spec.vocab_size or 2)) / 8
     else:
         picture = h * w * (spec.channels or 1) * np.dtype(spec.dtype).itemsize
+    picture *= len(layout.cameras)
     return picture + 4 * (layout.frame_stride * layout.widths["action"] + layout.widths.get("state", 0))

@@ -3,21 +3,29 @@
     defaults: {tokenizer: fsq-16, workers: 4}     # optional; any key of a job
     jobs:
       - {embodiment: bridge_dataset, source: "gs://…", out: shards/bridge}
-      - {embodiment: ./my_arm.yaml, source: ./demos, out: shards/my_arm, frames: strided}
+      - {embodiment: ./my_arm.yaml, source: ./demos, out: shards/my_arm, frames: strided, cameras: all}
 
 The keys are the options of `hma convert`, with `_` for `-`.
 """
 
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hma_data.conversion.plan import Settings
 from hma_data.errors import RecipeError, UsageError
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.storage.yaml_io import read_yaml
+
+
+def _names(value: Any) -> Any:
+    """Split `a,b` and `[a, "b,c"]` into names."""
+    texts = [value] if isinstance(value, str) else value
+    if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
+        return value
+    return tuple(name for text in texts for word in text.split(",") if (name := word.strip()))
 
 
 class ConversionJob(BaseModel):
@@ -36,7 +44,7 @@ class ConversionJob(BaseModel):
     limit: int | None = Field(None, ge=1)
     frames: Literal["all", "strided"] = "all"
     frequency_hz: float | None = Field(None, gt=0, allow_inf_nan=False)
-    cameras: tuple[str, ...] = ()
+    cameras: Annotated[tuple[str, ...], BeforeValidator(_names)] = ()
     shard_frames: int | None = Field(None, ge=1)
     val_fraction: float = Field(0.05, ge=0, lt=1)
     seed: int = 0

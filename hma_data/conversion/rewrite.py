@@ -132,20 +132,21 @@ class _Job:
 def _make_shard(job: _Job, plan: Plan, out: Path, unit: ShardUnit, refused: Sequence[Refused]) -> None:
     layout = job.sets[0].manifest.layout
     readers = [EpisodeReader(shards, shards.columns()) for shards in job.sets]
+    layout = replace(layout, camera_rows=False)
     stats = layout.empty_stats()
     rows: list[EpisodeRow] = []
     with ShardWriter(out / unit.name, layout.schema, layout.tokenizer) as writer:
         for index, _ in unit.episodes:
             item, start = job.episodes[index], writer.rows
             row, old = item.row, item.old
-            columns = readers[item.number].rows(old.shard, old.row_start, old.rows)
-            if (columns.pop("episode_index") != old.episode_index).any():
+            place = {"shard": old.shard, "row_start": old.row_start, "length": old.length}
+            views = {camera: readers[item.number].episode(place, camera) for camera in layout.cameras}
+            if any((view["episode_index"] != old.episode_index).any() for view in views.values()):
                 fault = f"its rows from {old.row_start} on are not episode {old.episode_index}"
                 remedy = "hma shards verify tells what is damaged"
                 raise ShardError(job.sets[item.number].folder / old.shard, fault, remedy)
-            for piece in _pieces(index, columns, old.length, layout):
-                writer.add(piece)
-            for name, own in layout.stats(columns, slice(old.length)).items():
+            writer.add(_rows_of(index, views, layout))
+            for name, own in layout.stats(views[layout.cameras[0]], slice(old.length)).items():
                 stats[name].merge(own)
             source = "" if row.source == job.source else row.source
             rows.append(
@@ -155,27 +156,28 @@ def _make_shard(job: _Job, plan: Plan, out: Path, unit: ShardUnit, refused: Sequ
                     split=unit.split,
                     shard=unit.name,
                     row_start=start,
+                    rows=row.length,
                     source=source,
                 )
             )
         writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
 
 
-def _pieces(
-    index: int, columns: dict[str, NDArray[Any]], length: int, layout: RowLayout
-) -> Iterator[EpisodeRows]:
-    for number, camera in enumerate(layout.cameras):
-        own = {name: values[number * length : (number + 1) * length] for name, values in columns.items()}
-        yield EpisodeRows(
-            episode_index=index,
-            timestamps=own["timestamp"],
-            tokens=own[token_column(layout.tokenizer)[0]],
-            actions=own["action"],
-            states=own.get("state"),
-            camera=camera,
-            action_known=own.get("action_known"),
-            state_known=own.get("state_known"),
-        )
+def _rows_of(index: int, views: Mapping[str, dict[str, NDArray[Any]]], layout: RowLayout) -> EpisodeRows:
+    """Return the rows of an episode from its columns by camera."""
+    tokens = token_column(layout.tokenizer)[0]
+    first, *further = layout.token_columns.items()
+    own = views[first[0]]
+    return EpisodeRows(
+        episode_index=index,
+        timestamps=own["timestamp"],
+        tokens=own[tokens],
+        actions=own["action"],
+        states=own.get("state"),
+        further={column: views[camera][tokens] for camera, column in further},
+        action_known=own.get("action_known"),
+        state_known=own.get("state_known"),
+    )
 
 
 # -- from shard sets

@@ -21,15 +21,16 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.conversion.cameras import camera_fault, read_clip
 from hma_data.conversion.engines import FIRST, Attempt, Report, Step, Work
 from hma_data.conversion.extend import Content, kept_frames
 from hma_data.conversion.output import Made
 from hma_data.conversion.plan import ShardUnit
 from hma_data.cpu import usable_cores
-from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
 from hma_data.errors import (
+    EpisodeError,
     HMAError,
     MissingDependencyError,
     OutputError,
@@ -82,6 +83,15 @@ class Tick:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """The size of a camera's recorded pictures in pixels, reported in the first episode of a shard."""
+
+    camera: str
+    height: int
+    width: int
+
+
+@dataclass(frozen=True)
 class MakeWork:
     """A maker of a worker's function; it can be pickled, so that any engine can send it."""
 
@@ -125,12 +135,11 @@ def make_shard(
                 report(Tick(episodes=1, quarantined=1))
                 continue
             start = writer.rows
-            for piece in _cut(item, layout):
-                writer.add(piece)
+            writer.add(_cut(item, layout))
             stats["action"].merge(Stats.of(item.clip.known_actions))
             if item.clip.known_states is not None:
                 stats["state"].merge(Stats.of(item.clip.known_states))
-            rows.append(_row(item, unit, start, writer.rows - start, len(layout.cameras)))
+            rows.append(_row(item, unit, start, writer.rows - start))
             report(Tick(episodes=1))
         writer.close(Footer(job.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
         with _signs_of_life(report):  # an upload may take longer than the limit for a hanging worker
@@ -185,6 +194,7 @@ def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Ite
     earlier items are then void.
     """
     source = open_source(job.embodiment.source.format)
+    first = unit.episodes[0][1] if unit.episodes else None
     for index, ref in unit.episodes:
         if ref.id in attempt.refused:
             yield Refused(ref.id, "Fatal", f"{ref.id}: reading it {attempt.refused[ref.id]}")
@@ -192,7 +202,7 @@ def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Ite
         report(Step(ref.id))
         for wait_s in (*WAITS_S, None):
             try:
-                yield from _episode(job, source, index, ref)
+                yield from _episode(job, source, index, ref, report if ref is first else None)
                 break
             except (*FATAL, MemoryError):
                 raise
@@ -211,20 +221,29 @@ def _decoded(job: Job, unit: ShardUnit, report: Report, attempt: Attempt) -> Ite
                 break
 
 
-def _episode(job: Job, source: Source, index: int, ref: EpisodeRef) -> Iterator[Decoded]:
+def _episode(
+    job: Job, source: Source, index: int, ref: EpisodeRef, report: Report | None = None
+) -> Iterator[Decoded]:
     layout = job.layout
     spec = layout.tokenizer
-    clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
+    clip = read_clip(source, job.source, ref.id, job.embodiment, layout.cameras)
     kept = kept_frames(clip, layout)
     content = Content(clip, kept)
     yield _Episode(index, ref, clip, content)
     for name in layout.cameras:
         camera, stream = job.embodiment.camera(name), clip.episode.streams[name]
-        for start in range(0, len(kept), BATCH):
-            indices = clip.frame_indices[name][kept[start : start + BATCH]]
-            frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
-            content.add(start, frames)
-            yield name, frames
+        try:
+            if report:
+                report(Seen(name, *clip.frames_at(name, kept[:1]).shape[1:3]))
+            for start in range(0, len(kept), BATCH):
+                indices = clip.frame_indices[name][kept[start : start + BATCH]]
+                frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
+                content.add(start, frames)
+                yield name, frames
+        except EpisodeError as fault:
+            if len(layout.cameras) == 1:
+                raise
+            raise camera_fault(ref.id, name, layout.cameras, fault) from fault
     yield None
 
 
@@ -261,8 +280,8 @@ def _tokenized(
     yield from ready()
 
 
-def _cut(item: _Episode, layout: RowLayout) -> Iterator[EpisodeRows]:
-    """Yield the episode's rows, camera after camera; strided rows hold the whole chunk of actions."""
+def _cut(item: _Episode, layout: RowLayout) -> EpisodeRows:
+    """Return the episode's rows; strided rows hold the whole chunk of actions."""
     clip, kept = item.clip, layout.kept(len(item.clip))
     steps = len(kept) * layout.frame_stride
     actions: NDArray[np.float32] = clip.actions[:steps].reshape(len(kept), -1)
@@ -270,20 +289,20 @@ def _cut(item: _Episode, layout: RowLayout) -> Iterator[EpisodeRows]:
     if known is not None:
         known = np.all(known[:steps].reshape(len(kept), -1), axis=1)
         actions = np.where(known[:, None], actions, np.float32(0))
-    for camera in layout.cameras:
-        yield EpisodeRows(
-            episode_index=item.index,
-            timestamps=clip.timestamps[kept],
-            tokens=np.concatenate(item.tokens[camera]),
-            actions=actions,
-            states=None if clip.states is None else clip.states[kept],
-            camera=camera,
-            action_known=known,
-            state_known=None if clip.state_known is None else clip.state_known[kept],
-        )
+    first, *further = layout.token_columns.items()
+    return EpisodeRows(
+        episode_index=item.index,
+        timestamps=clip.timestamps[kept],
+        tokens=np.concatenate(item.tokens[first[0]]),
+        actions=actions,
+        states=None if clip.states is None else clip.states[kept],
+        further={column: np.concatenate(item.tokens[camera]) for camera, column in further},
+        action_known=known,
+        state_known=None if clip.state_known is None else clip.state_known[kept],
+    )
 
 
-def _row(item: _Episode, unit: ShardUnit, start: int, rows: int, cameras: int) -> EpisodeRow:
+def _row(item: _Episode, unit: ShardUnit, start: int, rows: int) -> EpisodeRow:
     clip = item.clip
     skew = {name: [float(v) for v in np.percentile(ms, [50, 95, 100])] for name, ms in clip.skew_ms.items()}
     worst = max(skew.values(), key=lambda values: values[2], default=[0.0, 0.0, 0.0])
@@ -294,7 +313,7 @@ def _row(item: _Episode, unit: ShardUnit, start: int, rows: int, cameras: int) -
         shard=unit.name,
         row_start=start,
         rows=rows,
-        length=rows // cameras,
+        length=rows,
         instruction=clip.episode.instruction,
         success=clip.episode.success,
         fingerprint=item.ref.fingerprint,

@@ -148,6 +148,32 @@ def resize(
     return out
 
 
+def describe_resize(camera: Camera, height: int, width: int, size: int) -> str:
+    """Return what becomes of a camera's pictures, in one line.
+
+    Args:
+        height, width: of a recorded picture in pixels.
+        size: side of the tokenizer's square.
+    """
+    text = f"{camera.name}: {width}×{height}"
+    if camera.rotate in (90, 270):
+        height, width = width, height
+    if camera.crop:
+        _, _, width, height = camera.crop
+        text += f", crop {width}×{height}"
+    text += f" → {size}×{size}"
+    short, long = sorted((height, width))
+    if short == long:
+        return text
+    side, share = "width" if width > height else "height", f"{100 * (1 - short / long):.0f} %"
+    if camera.resize == "stretch":
+        return f"{text}, stretched by {long / short:.2f}"
+    if camera.resize == "letterbox":
+        other = "height" if side == "width" else "width"
+        return f"{text}, letterbox: {share} of the {other} is black"
+    return f"{text}, {share} of the {side} cropped; resize: letterbox keeps it"
+
+
 def _packed(frame: Images) -> Images:
     """Return the picture in a memory layout that OpenCV takes: gaps between rows, but not between pixels."""
     rows, *pixel = frame.strides

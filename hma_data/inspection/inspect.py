@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
+from hma_data.episodes.images import describe_resize
 from hma_data.errors import HMAError, SourceError
 from hma_data.inspection.infer import commands
 from hma_data.inspection.pairing import judged, proposed
@@ -27,6 +28,7 @@ from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
 
 TRIED = 20  # episodes tried until one can be read
+SQUARE = 256  # pixels: the side of most tokenizers' pictures
 WINDOW = 12  # frames of the model's window, by default
 LOOKS = ("blank", "still", "colour", "size")  # checks of pictures; they count only for cameras that are used
 EMPTY = Finding("readable", "error", "the recording has no episodes")
@@ -98,6 +100,7 @@ def _fit(
         try:
             clip = to_clip(source.read(uri, name, robot), robot)
             pictures = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))
+            sizes = {name: clip.frames_at(name, np.arange(1)).shape[1:3] for name in clip.frame_indices}
             break
         except HMAError as fault:
             faults.append(fault)
@@ -111,6 +114,10 @@ def _fit(
         found.append(Finding("usable", "warn", said, numbers={"refused": len(faults)}))
     facts["first episode"] = f"{name}: {len(clip)} frames on the grid, {clip.trimmed} trimmed at its ends"
     facts["pictures"] = "×".join(map(str, pictures.shape[1:]))
+    for camera in robot.cameras:
+        height, width = sizes[camera.name]
+        said = describe_resize(camera, height, width, SQUARE)
+        facts[f"camera {camera.name}"] = said.removeprefix(f"{camera.name}: ")
     hz = _median_hz(np.diff(clip.timestamps))
     facts["rate on the grid"] = f"{hz:.3g} Hz" if hz else "unknown"
     for stream, skew in clip.skew_ms.items():

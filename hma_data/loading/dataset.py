@@ -21,6 +21,7 @@ from hma_data.errors import HMAError, ShardError, UsageError
 from hma_data.loading.mixture import TEMPERATURES, Draw, Mixture
 from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
 from hma_data.loading.rows import MIB, Batch, Decoder, as_batch, assemble
+from hma_data.loading.views import FIRST, Cameras, Views, by_number, view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints, Short
 from hma_data.storage.paths import StrPath
@@ -28,14 +29,16 @@ from hma_data.storage.paths import StrPath
 __all__ = ["Batch", "MixtureDataset", "WindowDataset", "as_batch", "open_sets"]
 
 
-def open_sets(data: Sequence[StrPath | ShardSet]) -> dict[str, ShardSet]:
+def open_sets(data: Sequence[StrPath | ShardSet], cameras: Cameras = FIRST) -> dict[str, ShardSet]:
     """Open shard sets; return embodiment id -> shard set.
 
     Args:
         data: for each set, the str or path of its folder, its URI, or the set itself.
+        cameras: the cameras that windows will take, see `hma_data.loading.views`.
 
     Raises:
         ShardError: there are none, two are of one embodiment, or their tokenizers differ.
+        UsageError: a set lacks a camera.
     """
     sets: dict[str, ShardSet] = {}
     for item in data:
@@ -44,6 +47,7 @@ def open_sets(data: Sequence[StrPath | ShardSet]) -> dict[str, ShardSet]:
         if name in sets:
             fault = f"has embodiment {name}, and so has {sets[name].folder}"
             raise ShardError(shards.folder, fault, "give each embodiment once")
+        Views.of(shards, cameras)
         sets[name] = shards
     if not sets:
         raise ShardError("data", "names no shard sets", "give the --out of at least one hma convert")
@@ -70,9 +74,12 @@ class WindowDataset(Dataset[Batch]):
         stride: rows between frames; None takes the embodiment's.
         short: "drop" or "pad": what happens to episodes shorter than a window.
         cache_mib: memory for decoded row groups that are kept, in MiB.
+        cameras: `first`, `drawn`, a name, or the names of several cameras, whose views are stacked along the
+            height of the token grid. With `drawn`, a window's camera follows from its number.
 
     Raises:
         ShardError: the set is damaged or contradicts itself.
+        UsageError: the set lacks a camera.
     """
 
     def __init__(
@@ -83,10 +90,12 @@ class WindowDataset(Dataset[Batch]):
         stride: int | None = None,
         short: Short = "drop",
         cache_mib: int = 256,
+        cameras: Cameras = FIRST,
     ) -> None:
         self.shards = data if isinstance(data, ShardSet) else ShardSet(data)
-        self._decoder = Decoder(self.shards, split, frames, stride, short, cache_mib * MIB)
+        self._decoder = Decoder(self.shards, split, frames, stride, short, cache_mib * MIB, cameras)
         self._short: Short = short
+        self._views = view_count(cameras)
         self.index = self._decoder.index
 
     def __len__(self) -> int:
@@ -113,19 +122,22 @@ class WindowDataset(Dataset[Batch]):
         last = index.last_rows(numbers) if index.padded_episodes else None
         group = np.searchsorted(index.edges, first, side="right") - 1
         over = np.minimum(first + index.span - 1, index.last_rows(numbers)) >= index.edges[group + 1]
+        camera, view = self._decoder.views.taken(by_number(numbers), index.cameras(numbers))
         samples, cuts = [], []  # a window may continue in the next row group
         for key in np.unique(2 * group + over):
             chosen = np.flatnonzero(2 * group + over == key)
             rows = self._decoder.rows(int(key // 2), whole=bool(key % 2))
             edge = index.edges[key // 2]
             end = None if last is None else last[chosen] - edge
-            cuts.append(rows.cut(first[chosen] - edge, end, index))
+            views = None if view is None else view[chosen]
+            cuts.append(rows.cut(first[chosen] - edge, end, index, views))
             samples.append(chosen)
         joined = {name: np.concatenate([cut[name] for cut in cuts]) for name in cuts[0]}
         order = np.concatenate(samples)
-        joined["camera"] = index.cameras(numbers)[order]
+        joined["camera"] = camera[order]
         name = self.shards.embodiment.id
-        return assemble({name: self.shards}, [name] * len(numbers), {name: (order, joined)}, self._short)
+        cut = {name: (order, joined)}
+        return assemble({name: self.shards}, [name] * len(numbers), cut, self._short, self._views)
 
 
 class MixtureDataset(IterableDataset[Batch]):
@@ -152,10 +164,12 @@ class MixtureDataset(IterableDataset[Batch]):
         pool: row groups decoded together for an embodiment and lane; None: as `memory_mib` allows, at most 8.
         lanes: independent streams per rank; at least the number of workers for full speed.
         memory_mib: memory for decoded rows in all lanes together, in MiB, about.
+        cameras: `first`, `drawn` (a camera for each window), a name, or the names of several cameras, whose
+            views are stacked along the height of the token grid.
 
     Raises:
         ShardError: the sets do not fit together, or one has no window.
-        UsageError: a value is out of range.
+        UsageError: a value is out of range, or a set lacks a camera.
     """
 
     def __init__(
@@ -179,18 +193,20 @@ class MixtureDataset(IterableDataset[Batch]):
         pool: int | None = None,
         lanes: int = 4,
         memory_mib: int = 1024,
+        cameras: Cameras = FIRST,
     ) -> None:
         if not 0 <= rank < world:
             raise UsageError("rank", f"{rank} is not one of 0 to {world - 1}")
         for name, value in (("batch_size", batch_size), ("lanes", lanes), ("pool", pool)):
             if value is not None and value < 1:
                 raise UsageError(name, f"must be at least 1, not {value}")
-        self.sets = open_sets(data)
+        self.sets = open_sets(data, cameras)
+        self._cameras = cameras if isinstance(cameras, str) else list(cameras)
         self.batch_size, self.rank, self.world, self.lanes = batch_size, rank, world, lanes
         self.seed, self._short = seed, short
         share = memory_mib * MIB / len(self.sets)
         self._decoders = {
-            name: Decoder(shards, split, frames, None, short, int(share / 5))
+            name: Decoder(shards, split, frames, None, short, int(share / 5), cameras)
             for name, shards in self.sets.items()
         }
         for decoder in self._decoders.values():
@@ -273,7 +289,8 @@ class MixtureDataset(IterableDataset[Batch]):
             which = int(draws[samples[0]])
             sequence = self._sequence(lane, which)
             windows_of[names[which]] = (samples, sequence.take(int(taken[which]), len(samples)))
-        return assemble(self.sets, [names[i] for i in draws], windows_of, self._short)
+        views = view_count(self._cameras)
+        return assemble(self.sets, [names[i] for i in draws], windows_of, self._short, views)
 
     def _sequence(self, lane: int, which: int) -> WindowSequence:
         if (lane, which) not in self._sequences:
@@ -314,6 +331,7 @@ class MixtureDataset(IterableDataset[Batch]):
             "lanes": self.lanes,
             "pools": self._pools,
             "seed": self.seed,
+            **({} if self._cameras == FIRST else {"cameras": self._cameras}),  # older states lack the key
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -325,7 +343,7 @@ class MixtureDataset(IterableDataset[Batch]):
         Raises:
             UsageError: the state is of another mixture.
         """
-        for key, mine in self._identity().items():
+        for key, mine in ({"cameras": None} | self._identity()).items():
             if state.get(key) != mine:
                 raise UsageError(
                     "sampler state",

@@ -119,6 +119,7 @@ class WindowSequence:
         self._epoch: tuple[int, Ints, Ints] | None = None
         self._at: tuple[int, int] | None = None
         self._rows: Rows | None = None
+        self._view: Ints | None = None
 
     def take(self, start: int, count: int) -> dict[str, NDArray[Any]]:
         """Return windows start to start + count of the sequence: those of `Rows.cut`, and camera (n,)."""
@@ -132,7 +133,8 @@ class WindowSequence:
             some = min(count, int(ends[number]) - offset)
             chosen = slice(inside, inside + some)
             last = None if self._last is None else self._last[chosen]
-            cut = rows.cut(self._first[chosen], last, self._decoder.index)
+            view = None if self._view is None else self._view[chosen]
+            cut = rows.cut(self._first[chosen], last, self._decoder.index, view)
             cuts.append(cut | {"camera": self._camera[chosen]})
             start, count = start + some, count - some
         if len(cuts) == 1:
@@ -170,6 +172,7 @@ class WindowSequence:
         mixed, _ = spread(first, index.span, np.random.default_rng([*self._entropy, epoch, number]))
         self._first = first[mixed]
         self._last = np.concatenate(lasts)[mixed] if index.padded_episodes else None
-        self._camera = np.concatenate(cameras)[mixed]
+        draws = np.random.default_rng([*self._entropy, epoch, number, 1]).integers(0, 2**31, len(first))
+        self._camera, self._view = self._decoder.views.taken(draws, np.concatenate(cameras)[mixed])
         self._at, self._rows = (epoch, number), Rows.join(loaded)
         return self._rows

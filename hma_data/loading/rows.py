@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hma_data.errors import ShardError, UsageError
+from hma_data.loading.views import FIRST, Cameras, Views, stacked
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns, token_column
 from hma_data.shards.windows import Ints, Short, WindowIndex
@@ -25,7 +26,7 @@ MIB = 2**20
 class Rows:
     """Decoded rows, from which windows are cut."""
 
-    tokens: NDArray[Any]
+    tokens: NDArray[Any]  # (N, S), or (N, V, S) of several cameras
     actions: NDArray[np.float32]
     episode: NDArray[np.int32]
     frame: NDArray[np.int32]
@@ -49,28 +50,37 @@ class Rows:
         kept: list[Any] = [None if column is None else column[:count] for column in columns]
         return Rows(*kept)
 
-    def cut(self, first: Ints, last: Ints | None, index: WindowIndex) -> dict[str, NDArray[Any]]:
+    def cut(
+        self, first: Ints, last: Ints | None, index: WindowIndex, view: Ints | None = None
+    ) -> dict[str, NDArray[Any]]:
         """Return the windows that start at rows `first` (n,).
 
         Args:
             last: (n,) last rows of their episodes, beyond which windows are padded; None pads no window.
+            view: (n,) which of the V cameras each window takes; None takes all.
 
         Returns:
-            tokens (n, T, S), actions (n, T, K), episode (n,) and frame (n,). Where the set has marks or
-            windows may be padded, also known (n, T) bool. Where windows may be padded, also inside (n, T)
-            bool, True for frames of the episode.
+            tokens (n, T, S) or (n, T, V, S), actions (n, T, K), episode (n,) and frame (n,). Where the set
+            has marks or windows may be padded, also known (n, T) bool. Where windows may be padded, also
+            inside (n, T) bool, True for frames of the episode.
         """
         found = {"episode": self.episode[first], "frame": self.frame[first]}
         if last is not None:
-            return found | self._padded(first, last, index)
-        found["tokens"] = self.tokens[first[:, None] + np.arange(0, index.span, index.row_stride)]
+            return found | self._padded(first, last, index, view)
+        rows = first[:, None] + np.arange(0, index.span, index.row_stride)
+        found["tokens"] = self._frames(rows, view)
         found["actions"] = _spans(self.actions, index.span)[first].reshape(len(first), index.frames, -1)
         if self.known is not None:
             known = _spans(self.known[:, None], index.span)[first]
             found["known"] = np.all(known.reshape(len(first), index.frames, -1), axis=2)
         return found
 
-    def _padded(self, first: Ints, last: Ints, index: WindowIndex) -> dict[str, NDArray[Any]]:
+    def _frames(self, rows: Ints, view: Ints | None) -> NDArray[Any]:
+        return self.tokens[rows] if view is None else self.tokens[rows, view[:, None]]
+
+    def _padded(
+        self, first: Ints, last: Ints, index: WindowIndex, view: Ints | None
+    ) -> dict[str, NDArray[Any]]:
         every = first[:, None] + np.arange(index.span)
         inside = every <= last[:, None]
         every = np.minimum(every, last[:, None])
@@ -78,7 +88,7 @@ class Rows:
         actions[~inside] = 0
         known = inside if self.known is None else inside & self.known[every]
         return {
-            "tokens": self.tokens[every[:, :: index.row_stride]],
+            "tokens": self._frames(every[:, :: index.row_stride], view),
             "actions": actions.reshape(len(first), index.frames, -1),
             "known": np.all(known.reshape(len(first), index.frames, -1), axis=2),
             "inside": inside[:, :: index.row_stride],
@@ -104,9 +114,10 @@ class Decoder:
         shards, split: the shard set and its split.
         frames, stride, short: see `WindowIndex.of`.
         cache_bytes: memory for decoded rows that are kept; at least two row groups are kept.
+        cameras: see `hma_data.loading.views`.
 
     Raises:
-        UsageError: `frames` is below 1.
+        UsageError: `frames` is below 1, or the set lacks a camera.
         ShardError: the set contradicts itself.
     """
 
@@ -118,17 +129,19 @@ class Decoder:
         stride: int | None = None,
         short: Short = "drop",
         cache_bytes: int = 256 * MIB,
+        cameras: Cameras = FIRST,
     ) -> None:
         if frames < 1:
             raise UsageError("frames", f"a window must have at least 1, not {frames}")
         self.shards, self.split = shards, split
+        self.views = Views.of(shards, cameras)
         _check_stride(shards)
-        self.index = WindowIndex.of(shards, split, frames, stride, short)
-        tokens, width = token_column(shards.spec)
+        self.index = WindowIndex.of(shards, split, frames, stride, short, self.views.numbers)
+        width = token_column(shards.spec)[1] * len(self.views.columns)
         robot = shards.embodiment
         action_width = robot.action_dim * shards.manifest.frame_stride
         self._row_bytes = width * np.dtype(shards.spec.dtype).itemsize + action_width * 4 + 9
-        self._columns = [tokens, "action", "episode_index", "frame_index"]
+        self._columns = ["action", "episode_index", "frame_index"]
         self._columns += [mask for mask in mask_columns(robot) if mask == "action_known"]
         self._names = shards.shards(split)
         self._kept: OrderedDict[int, Rows] = OrderedDict()
@@ -158,9 +171,11 @@ class Decoder:
     def _group(self, group: int) -> Rows:
         if group not in self._kept:
             shard, number = (int(v) for v in self.index.groups[group])
-            values = self.shards.read(self._names[shard], [number], self._columns)
+            values = self.shards.read(self._names[shard], [number], [*self.views.columns, *self._columns])
             self._check(self._names[shard], values)
-            tokens, actions, episode, frame, *known = (values[name] for name in self._columns)
+            pictures = [values[name] for name in self.views.columns]
+            tokens = pictures[0] if len(pictures) == 1 else np.stack(pictures, axis=1)
+            actions, episode, frame, *known = (values[name] for name in self._columns)
             self._kept[group] = Rows(tokens, actions, episode, frame, known[0] if known else None)
             while len(self._kept) > self._keep:
                 self._kept.popitem(last=False)
@@ -169,15 +184,17 @@ class Decoder:
 
     def _check(self, shard: str, values: dict[str, NDArray[Any]]) -> None:
         """Raise ShardError for tokens or actions that would spoil the training without an error."""
-        tokens, actions, episode, frame = (values[name] for name in self._columns[:4])
+        actions, episode, frame = (values[name] for name in self._columns[:3])
         size, fault = self.shards.spec.vocab_size, ""
+        pictures = [values[name] for name in self.views.columns]
+        highest = max(int(tokens.max(initial=0)) for tokens in pictures) if size else 0
         bad = np.flatnonzero(~np.isfinite(actions).all(axis=1))
         if len(bad):
             first = f"episode {episode[bad[0]]} frame {frame[bad[0]]}"
             fault = f"{len(bad):,} rows have actions that are not finite; the first is {first}"
-        elif size and int(tokens.max(initial=0)) >= size:
-            fault = f"token {tokens.max()} is outside the vocabulary, 0 to {size - 1}"
-        elif tokens.dtype.kind == "f" and not np.isfinite(tokens).all():
+        elif size and highest >= size:
+            fault = f"token {highest} is outside the vocabulary, 0 to {size - 1}"
+        elif any(tokens.dtype.kind == "f" and not np.isfinite(tokens).all() for tokens in pictures):
             fault = "latents are not finite"
         if fault:
             folder = self.shards.folder
@@ -205,10 +222,10 @@ class Batch:
         embodiment: B ids; may mix.
         actions: (B, T, Kmax) float32 raw; rows of narrower embodiments are zero at the end.
         action_mask: (B, T) bool, True where all steps of the chunk are known.
-        tokens: (B, T, h, w) int64, or None.
-        latents: (B, T, c, H, W) float32 as stored, or None.
+        tokens: (B, T, h, w) int64, or None. V views are stacked along the height: (B, T, V·h, w).
+        latents: (B, T, c, H, W) float32 as stored, or None; V views as (B, T, c, V·H, W).
         episode, frame: (B,) int64, the episode of the window and the frame it starts at.
-        camera: (B,) int64, index of the camera among those of the shard set.
+        camera: (B,) int64, index of the camera among those of the shard set; of stacked views, the first's.
         frame_mask: (B, T) bool, False where a short episode was padded; such frames give no loss. None where
             episodes are not padded.
     """
@@ -244,26 +261,29 @@ def assemble(
     names: list[str],
     windows_of: Mapping[str, tuple[Ints, dict[str, NDArray[Any]]]],
     short: Short,
+    views: int = 1,
 ) -> Batch:
     """Assemble one batch.
 
     Args:
         names: (B,) the embodiment of each sample.
         windows_of: embodiment -> the indices (n,) of its samples in the batch, and its windows.
+        views: V, the cameras in each frame.
     """
     size = len(names)
     width = max(windows["actions"].shape[2] for _, windows in windows_of.values())
     frames = next(iter(windows_of.values()))[1]["actions"].shape[1]
     spec = next(iter(sets.values())).spec
     discrete = spec.kind == "discrete"
-    shape = spec.grid if discrete else (spec.channels or 1, *spec.grid)
+    grid = (views * spec.grid[0], spec.grid[1])
+    shape = grid if discrete else (spec.channels or 1, *grid)
     actions = np.zeros((size, frames, width), np.float32)
     pictures = np.empty((size, frames, *shape), np.int64 if discrete else np.float32)
     known, inside = np.ones((size, frames), np.bool_), np.ones((size, frames), np.bool_)
     where = {key: np.empty(size, np.int64) for key in ("episode", "frame", "camera")}
-    for samples, windows in windows_of.values():
+    for name, (samples, windows) in windows_of.items():
         actions[samples, :, : windows["actions"].shape[2]] = windows["actions"]
-        pictures[samples] = windows["tokens"].reshape(len(samples), frames, *shape)
+        pictures[samples] = stacked(windows["tokens"], sets[name], views)
         if "known" in windows:
             known[samples] = windows["known"]
         if "inside" in windows:

@@ -11,9 +11,10 @@ import json
 import math
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
@@ -187,6 +188,14 @@ class Embodiment(SpecModel):
                 return camera
         known = ", ".join(camera.name for camera in self.cameras)
         raise RegistryError(f"embodiment {self.id}", f"has no camera {name!r}", f"its cameras: {known}")
+
+    def with_cameras(self, names: Sequence[str]) -> Self:
+        """Return a copy with these cameras alone, and with the one whose frames are the grid."""
+        needed = {*names, self.sync.primary}
+        if self.source.format == "rosbag":
+            needed.add(self.primary_camera.name)
+        kept = tuple(camera for camera in self.cameras if camera.name in needed)
+        return self if kept == self.cameras else self.model_copy(update={"cameras": kept})
 
     @property
     def normalize_mask(self) -> "NDArray[np.bool_]":

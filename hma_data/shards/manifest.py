@@ -118,15 +118,22 @@ class Manifest:
 
     @property
     def cameras(self) -> list[str]:
-        """Return the cameras in the shards, in row order within an episode."""
+        """Return the cameras in the shards, in order."""
         return list(self.layout.cameras)
+
+    @property
+    def cameras_line(self) -> str:
+        """Return which cameras of the YAML are stored and which are not, in one line."""
+        return cameras_line(self.cameras, self.embodiment)
 
     def to_json(self) -> dict[str, Any]:
         """Return the plain values of manifest.json."""
+        several = len(self.embodiment.cameras) > 1
         return {
             "schema_version": SCHEMA_VERSION,
             "plan": self.plan,
             "source": self.source,
+            **({"cameras": self.cameras_line} if several else {}),
             "embodiment": self.embodiment.to_dict(),
             "tokenizer": self.tokenizer.to_json(),
             "splits": self.splits,
@@ -189,6 +196,13 @@ class Manifest:
         except MALFORMED as fault:
             said = f"it lacks {fault}" if isinstance(fault, KeyError) else str(fault)
             raise ShardError(path, f"is damaged: {said}", restat) from fault
+
+
+def cameras_line(stored: Sequence[str], embodiment: Embodiment) -> str:
+    """Return such a line: `top; not stored: wrist (use --cameras all)`."""
+    left = [camera.name for camera in embodiment.cameras if camera.name not in stored]
+    text = ", ".join(stored)
+    return f"{text}; not stored: {', '.join(left)} (use --cameras all)" if left else text
 
 
 def damaged_files(folder: Path, manifest: Manifest) -> list[Path]:

@@ -87,25 +87,28 @@ def _export_split(shards: ShardSet, split: str, place: Path, camera: int) -> Ite
 
 
 def _write_rows(shards: ShardSet, split: str, part: Path, camera: int) -> Iterator[int]:
-    spec, columns = shards.spec, [name for name in shards.columns() if name != "episode_index"]
+    spec = shards.spec
+    name = shards.manifest.cameras[camera]
+    columns = [column for column in shards.columns([name]) if column != "episode_index"]
     tokens = token_column(spec)[0]
     table = shards.episodes.filter(pc.equal(shards.episodes["split"], split))
     reader = EpisodeReader(shards, columns)
+    written = [tokens, *(column for column in columns if column in {"action", *EXTRA_DTYPES})]
     dtypes = {tokens: video_dtype(spec), "action": "<f4", **EXTRA_DTYPES}
     paths = {tokens: VIDEO, "action": ACTIONS} | {name: f"{EXTRA}/{name}.bin" for name in EXTRA_DTYPES}
     segments: list[int] = []
     (part / "actions").mkdir()
     (part / EXTRA).mkdir()
     with ExitStack() as opened:
-        files = {name: opened.enter_context((part / paths[name]).open("wb")) for name in columns}
+        files = {column: opened.enter_context((part / paths[column]).open("wb")) for column in written}
         for row in table.to_pylist():
             length = row["length"]
-            values = reader.rows(row["shard"], row["row_start"] + camera * length, length)
+            values = reader.episode(row, name)
             values[tokens] = shards.tokens(values[tokens])
             if spec.dtype == "uint8":
                 values[tokens] = values[tokens].transpose(0, 2, 3, 1)  # pixels are (N, H, W, 3) there
-            for name in columns:
-                files[name].write(np.ascontiguousarray(values[name], dtypes[name]).tobytes())
+            for column, file in files.items():
+                file.write(np.ascontiguousarray(values[column], dtypes[column]).tobytes())
             segments.append(length)
             yield length
     ids = np.repeat(np.arange(len(segments)), segments).astype("<i4")

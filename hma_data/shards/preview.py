@@ -4,7 +4,7 @@
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,11 +14,11 @@ import numpy as np
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from hma_data.episodes.images import opencv
+from hma_data.episodes.images import describe_resize, opencv
 from hma_data.episodes.sheets import INK, PAPER, Images, write_mp4, write_png, write_text
 from hma_data.errors import ShardError, TokenizerError
-from hma_data.shards.reader import ShardSet
-from hma_data.shards.schema import flag_totals, mask_columns, token_column
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.shards.schema import flag_totals, token_column
 from hma_data.shards.windows import WindowIndex
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
@@ -60,6 +60,7 @@ def describe(folder: StrPath) -> dict[str, Any]:
             "rows_hz": row_hz,
             "effective_hz": robot.effective_hz,
             "cameras": manifest.cameras,
+            "cameras_line": manifest.cameras_line,
         },
         "tokenizer": values["tokenizer"],
         "source": manifest.source,
@@ -183,11 +184,16 @@ class Curves:
 
 @dataclass(frozen=True)
 class Preview:
-    """The files that were written, and the ids of the episodes in them."""
+    """The files that were written, the ids of the episodes in them, and what became of the pictures.
+
+    Attributes:
+        resized: a line for each camera whose YAML states its size, see `describe_resize`.
+    """
 
     sheet: Path
     video: Path
     episodes: tuple[str, ...]
+    resized: tuple[str, ...] = ()
 
 
 def tokenizer_of(shards: ShardSet, weights: StrPath | None = None, device: str = "cpu") -> Tokenizer:
@@ -226,7 +232,7 @@ def preview(
         weights: str or path, as `get_tokenizer` takes them.
         episodes: number of episodes, evenly spaced from the first to the last.
         columns: number of pictures of each episode in the sheet.
-        camera: name of the camera; None takes the first.
+        camera: name of the camera; None shows all cameras of the set.
         frames: largest number of frames of each episode in the video.
         tokenizer: tokenizer that decodes; None takes the set's own.
 
@@ -235,40 +241,51 @@ def preview(
         UsageError: there is no such camera.
     """
     shards, out = ShardSet(folder), as_path(out)
-    number = shards.camera_index(camera)
+    cameras = [shards.manifest.cameras[shards.camera_index(camera)]] if camera else shards.manifest.cameras
     if not len(shards.episodes):
         raise ShardError(shards.folder, "holds no episodes", "its quarantine.jsonl says why")
     opened = tokenizer or tokenizer_of(shards, weights)
     picks = np.unique(np.linspace(0, len(shards.episodes) - 1, episodes).round().astype(int))
     rows = shards.episodes.take(picks).to_pylist()
-    seen = [_Seen(shards, opened, row, number) for row in rows]
+    seen = [_Seen(shards, opened, row, cameras) for row in rows]
     sheet, video = out / "sheet.png", out / "preview.mp4"
     write_png(sheet, np.concatenate([one.sheet(columns) for one in seen]))
     rate = shards.embodiment.rate_hz / shards.manifest.frame_stride
     write_mp4(video, (frame for one in seen for frame in one.film(frames)), rate)
-    return Preview(sheet, video, tuple(row["id"] for row in rows))
+    resized = [
+        describe_resize(one, *one.size, shards.spec.image_size)
+        for one in map(shards.embodiment.camera, cameras)
+        if one.size
+    ]
+    return Preview(sheet, video, tuple(row["id"] for row in rows), tuple(resized))
 
 
 class _Seen:
-    """One episode as one camera recorded it; tokens are decoded when they are drawn."""
+    """One episode as some cameras recorded it; tokens are decoded when they are drawn."""
 
-    def __init__(self, shards: ShardSet, tokenizer: Tokenizer, row: dict[str, Any], camera: int) -> None:
+    def __init__(
+        self, shards: ShardSet, tokenizer: Tokenizer, row: dict[str, Any], cameras: Sequence[str]
+    ) -> None:
         self._shards, self._tokenizer = shards, tokenizer
-        own = slice(camera * row["length"], (camera + 1) * row["length"])
-        masks = [name for name in mask_columns(shards.embodiment) if name == "action_known"]
-        names = [token_column(shards.spec)[0], "action", "timestamp", *masks]
-        values = shards.episode_rows(row["episode_index"], names)
-        self._tokens = values[names[0]][own]
-        self._actions = values["action"][own, : shards.embodiment.action_dim]  # the first command of a chunk
-        self._known = values["action_known"][own] if masks else None
-        self._seconds = float(values["timestamp"][own][-1])
+        reader = EpisodeReader(shards, shards.columns(cameras))
+        views = {camera: reader.episode(row, camera) for camera in cameras}
+        self._tokens = {camera: view[token_column(shards.spec)[0]] for camera, view in views.items()}
+        values = views[cameras[0]]
+        self._actions = values["action"][:, : shards.embodiment.action_dim]  # the first command of a chunk
+        self._known = values.get("action_known")
+        self._seconds = float(values["timestamp"][-1])
+        self._length = row["length"]
         success = {True: "success", False: "failure", None: ""}[row["success"]]
         length = f"{row['length']} frames, {self._seconds:.1f} s"
         words = [row["id"], row["split"], length, row["instruction"], success]
         self.label = "   ".join(word for word in words if word)
 
-    def _pictures(self, rows: NDArray[np.int64]) -> Images:
-        return self._tokenizer.decode(self._shards.tokens(self._tokens[rows]))
+    def _pictures(self, rows: NDArray[np.int64]) -> dict[str, Images]:
+        """Return camera -> pictures (n, S, S, 3) of some rows."""
+        return {
+            camera: self._tokenizer.decode(self._shards.tokens(tokens[rows]))
+            for camera, tokens in self._tokens.items()
+        }
 
     def _curves(self, width: int, height: int) -> Curves:
         stats = self._shards.manifest.stats["action"]
@@ -278,29 +295,34 @@ class _Seen:
         return Curves(self._actions, known, low, high, names, self._seconds, width, height)
 
     def sheet(self, columns: int) -> Images:
-        """Return (H, W, 3): the label, pictures in a row, and below them the actions of the whole episode."""
-        picks = np.unique(np.linspace(0, len(self._tokens) - 1, columns).astype(int))
+        """Return (H, W, 3): the label, a row of pictures a camera, and the actions of the whole episode."""
+        picks = np.unique(np.linspace(0, self._length - 1, columns).astype(int))
         width = columns * (THUMB + GAP) + GAP
         shown = min(self._actions.shape[1], 16)
         curves = self._curves(width, 16 + max(shown * STRIPS, 40))
-        strip = np.full((LABEL + THUMB + GAP, width, 3), PAPER, np.uint8)
-        write_text(strip, self.label[:110], (GAP, LABEL - 5))
-        for place, picture in enumerate(self._pictures(picks)):
-            left = GAP + place * (THUMB + GAP)
-            strip[LABEL : LABEL + THUMB, left : left + THUMB] = _resized(picture, THUMB)
-        return np.concatenate([strip, curves.marked(picks), np.full((2, width, 3), INK, np.uint8)])
+        strips = []
+        for number, (camera, pictures) in enumerate(self._pictures(picks).items()):
+            strip = np.full((LABEL + THUMB + GAP, width, 3), PAPER, np.uint8)
+            named = [camera] if len(self._tokens) > 1 else []
+            words = "   ".join([*named, *([] if number else [self.label])])
+            write_text(strip, words[:110], (GAP, LABEL - 5))
+            for place, picture in enumerate(pictures):
+                left = GAP + place * (THUMB + GAP)
+                strip[LABEL : LABEL + THUMB, left : left + THUMB] = _resized(picture, THUMB)
+            strips.append(strip)
+        return np.concatenate([*strips, curves.marked(picks), np.full((2, width, 3), INK, np.uint8)])
 
     def film(self, most: int) -> Iterator[Images]:
-        """Yield (H, W, 3) for each frame: the picture, and the actions with a cursor at its time."""
+        """Yield (H, W, 3) for each frame: the pictures, and the actions with a cursor at its time."""
         curves = self._curves(FILM + 128, FILM)
-        for start in range(0, min(len(self._tokens), most), DECODED):
-            rows = np.arange(start, min(start + DECODED, len(self._tokens), most))
-            for row, picture in zip(rows, self._pictures(rows)):
-                bar = np.full((LABEL, 2 * FILM + 128, 3), PAPER, np.uint8)
-                write_text(bar, self.label[:80], (GAP, LABEL - 5))
-                yield np.concatenate(
-                    [bar, np.concatenate([_resized(picture, FILM), curves.at(int(row))], axis=1)]
-                )
+        cameras = len(self._tokens)
+        for start in range(0, min(self._length, most), DECODED):
+            rows = np.arange(start, min(start + DECODED, self._length, most))
+            for row, *pictures in zip(rows, *self._pictures(rows).values()):
+                bar = np.full((LABEL, (cameras + 1) * FILM + 128, 3), PAPER, np.uint8)
+                write_text(bar, self.label[: 40 * (cameras + 1)], (GAP, LABEL - 5))
+                parts = [*(_resized(picture, FILM) for picture in pictures), curves.at(int(row))]
+                yield np.concatenate([bar, np.concatenate(parts, axis=1)])
 
 
 def _resized(picture: Images, side: int) -> Images:

@@ -3,7 +3,7 @@
 N rows, S tokens a frame, A values of an action.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -28,19 +28,23 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class EpisodeIndex:
-    """The places of a split's episodes; one entry for each episode and camera, in arrays of one length.
+    """The places of a split's episodes, in arrays of one length.
+
+    A set whose cameras have rows of their own has an entry for each episode and camera.
 
     Attributes:
         episode_index: number of the episode in the plan.
         shard: index into `ShardSet.shards(split)`.
         start: first row in the shard.
         length: number of rows.
+        camera: index of the camera whose rows these are; 0 where the rows hold all cameras.
     """
 
     episode_index: Ints
     shard: Ints
     start: Ints
     length: Ints
+    camera: Ints
 
 
 class ShardSet:
@@ -116,9 +120,14 @@ class ShardSet:
             raise UsageError("--camera", f"{camera!r} is not a camera of {self.folder}", remedy)
         return cameras.index(camera) if camera else 0
 
-    def columns(self) -> list[str]:
-        """Return the columns to `read`, without `camera` and `frame_index`, which follow from the others."""
-        names = [token_column(self.spec)[0], "episode_index", "timestamp", "action"]
+    def columns(self, cameras: Sequence[str] | None = None) -> list[str]:
+        """Return the columns to `read` for some cameras, None for all.
+
+        `camera` and `frame_index` are left out; they follow from the others.
+        """
+        tokens = self.manifest.layout.token_columns
+        names = dict.fromkeys(tokens[name] for name in (cameras or tokens))
+        names |= dict.fromkeys(("episode_index", "timestamp", "action"))
         return [*names, *(["state"] if self.embodiment.state else []), *mask_columns(self.embodiment)]
 
     def shards(self, split: str) -> list[str]:
@@ -130,8 +139,8 @@ class ShardSet:
         return [shard.row_groups for shard in self.manifest.shards if shard.split == split]
 
     def index(self, split: str) -> EpisodeIndex:
-        """Return the split's episodes, in row order; an episode with several cameras counts once for each."""
-        cameras = len(self.manifest.cameras)
+        """Return the split's episodes, in row order."""
+        cameras = self.manifest.layout.rows_a_frame
         columns = ["episode_index", "split", "shard", "row_start", "length"]
         table = self._episodes(columns, read_dictionary=["split", "shard"])
         splits, names = _words(table["split"]), _words(table["shard"])
@@ -142,8 +151,9 @@ class ShardSet:
             to_numpy(table[name]).astype(np.int64)[mine] for name in ("row_start", "length", "episode_index")
         )
         starts = (start[:, None] + np.arange(cameras) * length[:, None]).ravel()
+        number = np.tile(np.arange(cameras), len(index))
         index, shard, length = (np.repeat(values, cameras) for values in (index, shard, length))
-        return EpisodeIndex(index, shard, starts, length)
+        return EpisodeIndex(index, shard, starts, length, number)
 
     def read(self, shard: str, row_groups: Sequence[int], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Read columns of some row groups of a shard, (N,) or (N, width) each.
@@ -178,7 +188,7 @@ class ShardSet:
     def episode_rows(
         self, episode_index: int, columns: Sequence[str] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Read all rows of one episode, cameras one after the other.
+        """Read all rows of one episode; in sets of older releases, cameras one after the other.
 
         Raises:
             ShardError: there is no such episode.
@@ -217,6 +227,23 @@ class EpisodeReader:
         self._edges = {
             shard.path: np.cumsum([0, *shard.row_groups], dtype=np.int64) for shard in shards.manifest.shards
         }
+
+    def episode(self, row: Mapping[str, Any], camera: str) -> dict[str, NDArray[Any]]:
+        """Read the columns of an episode, (T,) or (T, width) each, as one camera recorded it.
+
+        Args:
+            row: of episodes.parquet.
+            camera: name of a camera of the set.
+
+        Returns:
+            the columns; the frames of the camera are in the first token column.
+        """
+        layout, length = self._set.manifest.layout, row["length"]
+        start = row["row_start"] + (layout.cameras.index(camera) * length if layout.camera_rows else 0)
+        values = self.rows(row["shard"], start, length)
+        columns = {*layout.token_columns.values()}
+        kept = {name: column for name, column in values.items() if name not in columns}
+        return {token_column(layout.tokenizer)[0]: values[layout.token_columns[camera]], **kept}
 
     def rows(self, shard: str, row_start: int, rows: int) -> dict[str, NDArray[Any]]:
         """Read columns of `rows` rows of a shard from `row_start` on, (rows,) or (rows, width) each.

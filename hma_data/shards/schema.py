@@ -39,7 +39,7 @@ class EpisodeRow:
         split: train or val.
         shard: path of its shard below the shard set.
         row_start: number of its first row in the shard.
-        rows: its rows in the shard: frames times cameras.
+        rows: its rows in the shard: its frames; in sets of older releases, frames times cameras.
         length: frames.
         skew_p50_ms, skew_p95_ms, skew_max_ms: skew of the stream that was moved furthest.
         skew: stream -> [p50, p95, max] in ms, as JSON.
@@ -176,7 +176,10 @@ def flag_totals(flags: pa.ChunkedArray) -> dict[str, int]:
 
 
 def token_column(spec: TokenizerSpec) -> tuple[str, int]:
-    """Return the name of the column that holds a frame, and its number of values a row."""
+    """Return the name of the column that holds a frame of the first camera, and its number of values a row.
+
+    Each further camera has a column of its own, see `RowLayout.token_columns`.
+    """
     if spec.kind == "discrete":
         return "tokens", spec.grid[0] * spec.grid[1]
     return "latents", (spec.channels or 1) * spec.grid[0] * spec.grid[1]
@@ -202,16 +205,27 @@ def mask_columns(embodiment: Embodiment) -> tuple[str, ...]:
 
 
 def arrow_schema(
-    spec: TokenizerSpec, action_width: int, state_width: int, cameras: int, masks: Sequence[str] = ()
+    spec: TokenizerSpec,
+    action_width: int,
+    state_width: int,
+    further: Sequence[str] = (),
+    masks: Sequence[str] = (),
+    camera_rows: bool = False,
 ) -> pa.Schema:
-    """Return the columns of a shard; no value is ever null. `masks`: see `mask_columns`."""
+    """Return the columns of a shard; no value is ever null.
+
+    Args:
+        further: names of the columns of the cameras after the first.
+        masks: see `mask_columns`.
+        camera_rows: whether each camera has rows of its own, as in sets of older releases.
+    """
     name, width = token_column(spec)
     columns = {
         "episode_index": pa.int32(),
         "frame_index": pa.int32(),
         "timestamp": pa.float64(),
-        "camera": pa.string() if cameras > 1 else None,
-        name: _vector(_STORED[spec.dtype], width),
+        "camera": pa.string() if camera_rows else None,
+        **{column: _vector(_STORED[spec.dtype], width) for column in (name, *further)},
         "action": _vector(pa.float32(), action_width),
         "state": _vector(pa.float32(), state_width) if state_width else None,
         **{mask: pa.bool_() for mask in masks},
@@ -225,20 +239,37 @@ class RowLayout:
 
     Attributes:
         embodiment, tokenizer: what the set was made with.
-        cameras: names, in row order within an episode.
+        cameras: names, the first one's frames in the first token column.
         frame_stride: recorded steps a row: 1, or the embodiment's stride where only the model's grid is kept.
+        camera_rows: whether each camera has rows of its own, one camera after the other within an episode;
+            older releases wrote several cameras so. Now each camera has a column.
     """
 
     embodiment: Embodiment
     tokenizer: TokenizerSpec
     cameras: tuple[str, ...]
     frame_stride: int
+    camera_rows: bool = False
 
     @classmethod
     def of_plan(cls, plan: dict[str, Any], embodiment: Embodiment) -> "RowLayout":
         """Return the layout that the facts of a plan state."""
-        tokenizer = TokenizerSpec.from_json(plan["tokenizer"])
-        return cls(embodiment, tokenizer, tuple(plan["cameras"]), int(plan["frame_stride"]))
+        tokenizer, cameras = TokenizerSpec.from_json(plan["tokenizer"]), tuple(plan["cameras"])
+        rows = len(cameras) > 1 and not plan.get("camera_columns")
+        return cls(embodiment, tokenizer, cameras, int(plan["frame_stride"]), rows)
+
+    @property
+    def token_columns(self) -> dict[str, str]:
+        """Return camera -> the column of its frames."""
+        first = token_column(self.tokenizer)[0]
+        if self.camera_rows:
+            return dict.fromkeys(self.cameras, first)
+        return {name: f"{first}_{name}" if i else first for i, name in enumerate(self.cameras)}
+
+    @property
+    def rows_a_frame(self) -> int:
+        """Return the number of rows for each frame: 1, or the number of cameras in sets of older releases."""
+        return len(self.cameras) if self.camera_rows else 1
 
     @property
     def strided(self) -> bool:
@@ -258,12 +289,13 @@ class RowLayout:
             self.tokenizer,
             self.widths["action"] * self.frame_stride,
             self.widths.get("state", 0),
-            len(self.cameras),
+            () if self.camera_rows else [*self.token_columns.values()][1:],
             mask_columns(self.embodiment),
+            self.camera_rows,
         )
 
     def kept(self, length: int) -> NDArray[np.int64]:
-        """Return the frames (N,) of a clip of `length` frames that become rows of a camera."""
+        """Return the frames (N,) of a clip of `length` frames that become rows."""
         return np.arange(0, length // self.frame_stride * self.frame_stride, self.frame_stride)
 
     def empty_stats(self) -> dict[str, Stats]:

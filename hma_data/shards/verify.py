@@ -37,7 +37,7 @@ from hma_data.shards.manifest import (
     split_totals,
     stored_embodiment,
 )
-from hma_data.shards.schema import Footer, read_footer, to_numpy, token_column
+from hma_data.shards.schema import Footer, read_footer, to_numpy
 from hma_data.shards.stats import Stats
 from hma_data.storage.files import PART, file_sha256
 from hma_data.storage.paths import StrPath
@@ -177,9 +177,9 @@ def _footer_problems(
     starts = np.cumsum([0, *(row.rows for row in footer.episodes)])
     if any(row.row_start != start for row, start in zip(footer.episodes, starts)) or starts[-1] != shard.rows:
         found.append("its episodes do not follow one another row by row")
-    cameras = len(manifest.cameras)
-    if any(row.rows != row.length * cameras or row.length < 1 for row in footer.episodes):
-        found.append("an episode does not have one row for each frame and camera")
+    each = manifest.layout.rows_a_frame
+    if any(row.rows != row.length * each or row.length < 1 for row in footer.episodes):
+        found.append(f"an episode does not have {each} rows for each frame")
     expected, actual = manifest.layout.schema, pq.read_schema(parquet_input(path))
     if not actual.equals(expected, check_metadata=False):
         wrong = [f"{column.name} {column.type}" for column in actual if column not in list(expected)]
@@ -191,20 +191,22 @@ def _footer_problems(
 
 def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """Return all columns except the tokens, and what is wrong with the tokens and numbers."""
-    name, size = token_column(manifest.tokenizer)[0], manifest.tokenizer.vocab_size
+    names, size = sorted({*manifest.layout.token_columns.values()}), manifest.tokenizer.vocab_size
     found: list[str] = []
     with parquet_file(path, page_checksum_verification=True) as file:
-        tables = [file.schema_arrow.empty_table().drop_columns(name)]
+        tables = [file.schema_arrow.empty_table().drop_columns(names)]
         for group in range(file.metadata.num_row_groups):
             table = file.read_row_group(group, use_threads=False)
             if any(column.null_count for column in table.columns):
                 found.append(f"row group {group} has nulls")
-            tokens = to_numpy(table[name])
-            if size and tokens.size and tokens.max() >= size:
-                found.append(f"row group {group} has token {tokens.max()}, the vocabulary ends at {size - 1}")
-            if tokens.dtype.kind == "f" and not np.isfinite(tokens).all():
-                found.append(f"row group {group} has {name} that are not finite")
-            tables.append(table.drop_columns(name))
+            for name in names:
+                tokens = to_numpy(table[name])
+                if size and tokens.size and tokens.max() >= size:
+                    said = f"has token {tokens.max()} in {name}, the vocabulary ends at {size - 1}"
+                    found.append(f"row group {group} {said}")
+                if tokens.dtype.kind == "f" and not np.isfinite(tokens).all():
+                    found.append(f"row group {group} has {name} that are not finite")
+            tables.append(table.drop_columns(names))
     rows = pa.concat_tables(tables)
     columns = {column: to_numpy(rows[column]) for column in rows.column_names}
     found += [
@@ -218,15 +220,15 @@ def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, NDArray[Any]],
 def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> list[str]:
     """Check rows against the footer: whole episodes, frames that count up, zeros where nothing is known."""
     found: list[str] = []
-    cameras = len(manifest.cameras)
+    each = manifest.layout.rows_a_frame
     length = np.array([row.length for row in footer.episodes], np.int64)
-    episodes = np.repeat([row.episode_index for row in footer.episodes], length * cameras)
-    counting = [np.tile(np.arange(n), cameras) for n in length] or [np.zeros(0)]
+    episodes = np.repeat([row.episode_index for row in footer.episodes], length * each)
+    counting = [np.tile(np.arange(n), each) for n in length] or [np.zeros(0)]
     if not np.array_equal(columns["episode_index"], episodes):
         found.append("column episode_index is not what its footer says")
     if not np.array_equal(columns["frame_index"], np.concatenate(counting)):
         found.append("column frame_index does not count up from 0 in every episode")
-    if cameras > 1:
+    if manifest.layout.camera_rows:
         names = [camera for n in length for camera in np.repeat(manifest.cameras, n)]
         if columns["camera"].tolist() != names:
             found.append(f"column camera is not {', '.join(manifest.cameras)} in turn")
@@ -239,7 +241,7 @@ def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Ma
 
 
 def _row_stats(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> dict[str, Stats]:
-    """Return statistics of the rows of the first camera, computed as a conversion computes them."""
+    """Return statistics of the rows, each frame once, computed as a conversion computes them."""
     merged = manifest.layout.empty_stats()
     for row in footer.episodes:
         own = manifest.layout.stats(columns, slice(row.row_start, row.row_start + row.length))

@@ -9,6 +9,7 @@ the missing frames repeat its last row and are masked. Attention is causal in ti
 real frame change no prediction before them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -49,12 +50,18 @@ class WindowIndex:
     groups: Ints
     _starts: Ints  # (N,) first row of each episode that has windows
     _lengths: Ints  # (N,) rows of each episode
-    _cameras: NDArray[np.int16]  # (N,) index of each episode's camera
+    _cameras: NDArray[np.int16]  # (N,) index of the camera whose rows these are; 0 where rows hold them all
     _before: Ints  # (N+1,) number of windows before each episode
 
     @classmethod
     def of(
-        cls, shards: ShardSet, split: str, frames: int, row_stride: int | None = None, short: Short = "drop"
+        cls,
+        shards: ShardSet,
+        split: str,
+        frames: int,
+        row_stride: int | None = None,
+        short: Short = "drop",
+        cameras: Sequence[int] = (0,),
     ) -> "WindowIndex":
         """Return the index of a split.
 
@@ -63,15 +70,17 @@ class WindowIndex:
             row_stride: rows between frames; None takes the embodiment's.
             short: "drop" or "pad" for episodes shorter than a window; an episode of a single frame is always
                 dropped.
+            cameras: indices of the cameras whose rows have windows, in a set whose cameras have rows of
+                their own. In other sets a window has all cameras.
         """
         stride = row_stride or shards.row_stride
         span = frames * stride
         edges, groups = _row_groups(shards.row_groups(split))
         episodes = shards.index(split)
         starts = _first_rows(shards, split, episodes)
-        cameras = len(shards.manifest.cameras)
-        windows = np.maximum(0, episodes.length - span + 1)
-        padded = (windows == 0) & (episodes.length > stride) & (short == "pad")
+        wanted = np.isin(episodes.camera, cameras) | (not shards.manifest.layout.camera_rows)
+        windows = np.where(wanted, np.maximum(0, episodes.length - span + 1), 0)
+        padded = wanted & (windows == 0) & (episodes.length > stride) & (short == "pad")
         windows[padded] = 1
         order = np.argsort(starts, kind="stable")
         keep = order[windows[order] > 0]
@@ -81,14 +90,14 @@ class WindowIndex:
             row_stride=stride,
             span=span,
             count=int(before[-1]),
-            short_episodes=int((windows == 0).sum()),
+            short_episodes=int((wanted & (windows == 0)).sum()),
             padded_episodes=int(padded.sum()),
             unit_first=np.zeros(0, np.int64),
             edges=edges,
             groups=groups,
             _starts=starts[keep],
             _lengths=episodes.length[keep],
-            _cameras=(np.arange(len(starts)) % cameras)[keep].astype(np.int16),
+            _cameras=episodes.camera[keep].astype(np.int16),
             _before=before,
         )
         object.__setattr__(index, "unit_first", index._windows_before(edges))
@@ -116,7 +125,7 @@ class WindowIndex:
         return self._starts[at] + self._lengths[at] - 1
 
     def cameras(self, windows: Ints) -> Ints:
-        """Return the index of each window's camera among those of the set."""
+        """Return the index of the camera whose rows each window has; 0 where rows hold all cameras."""
         return self._cameras[self._episodes(windows)].astype(np.int64)
 
     def units(self) -> Ints:

@@ -63,12 +63,13 @@ def render(
 def _about(config: Mapping[str, Any]) -> str:
     model, tokenizer = config["model"], config["tokenizer"]
     grid = "×".join(str(side) for side in model.get("grid", ()))
+    views = f" of {line(model['views'])} cameras" if model.get("views", 1) != 1 else ""
     return (
         "An action-conditioned video model of robots (Heterogeneous Masked Autoregression): one trunk, "
         "and a stem and head for each embodiment, which are published and pulled one at a time.\n\n"
         f"- network: {line(model.get('kind'))}, {line(model.get('layers'))} layers, "
         f"width {line(model.get('width'))}, {line(model.get('heads'))} heads, "
-        f"window of {line(model.get('frames'))} frames\n"
+        f"window of {line(model.get('frames'))} frames{views}\n"
         f"- tokenizer: {line(tokenizer.get('name'))}, {grid} tokens of a "
         f"{line(tokenizer.get('image_size'))}-pixel picture\n"
         f"- trunk SHA-256: `{line(config.get('trunk_sha256'))}`"

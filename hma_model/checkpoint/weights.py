@@ -22,7 +22,7 @@ State = dict[str, "Tensor"]
 MOST = 1_000_000  # upper limit of every count in a configuration
 _COUNTS = ("layers", "width", "heads", "frames", "channels", "patch", "action_tokens", "history_frames",
            "diffusion_depth", "diffusion_width", "diffusion_train_steps", "diffusion_sample_steps",
-           "grid", "factored")  # fmt: skip
+           "grid", "views", "factored")  # fmt: skip
 _REMEDY = "pull the checkpoint again; if it stays so, do not use it"
 
 

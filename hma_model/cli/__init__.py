@@ -87,6 +87,14 @@ SampleSteps = Annotated[
 ]
 
 
+Cameras = Annotated[
+    str | None,
+    typer.Option(
+        "--cameras", metavar="NAME[,NAME…]", help="Cameras to show the model; default: those of its training."
+    ),
+]
+
+
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for everything the demo makes.")] = Path(
@@ -123,6 +131,7 @@ def evaluate(
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
+    cameras: Cameras = None,
     json: Json = False,
 ) -> None:
     """Measure the loss and its baseline, and rollouts with true and shuffled actions.
@@ -133,7 +142,7 @@ def evaluate(
 
     found = run(
         *_opened(checkpoint, data), split=split, count=windows, frames=frames, prompt=prompt, seed=seed,
-        unmask_steps=unmask_steps, sample_steps=sample_steps,
+        unmask_steps=unmask_steps, sample_steps=sample_steps, cameras=_names(cameras),
     )  # fmt: skip
     if json:
         print_json(found)
@@ -163,6 +172,7 @@ def generate(
         float, typer.Option("--temperature", min=0, help="0 takes the likeliest token.")
     ] = 0.0,
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    cameras: Cameras = None,
 ) -> None:
     """Write a video of a rollout beside the truth.
 
@@ -173,10 +183,16 @@ def generate(
     film = rollout_video(
         *_opened(checkpoint, data), split=split, window=window, frames=frames, prompt=prompt, seed=seed,
         unmask_steps=unmask_steps, sample_steps=sample_steps, temperature=temperature,
+        cameras=_names(cameras),
     )  # fmt: skip
     write_video(out, film)
     about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
     print(f"wrote {out}: {about}")
+
+
+def _names(cameras: str | None) -> str | list[str] | None:
+    names = [name.strip() for name in cameras.split(",")] if cameras else []
+    return names if len(names) > 1 else cameras
 
 
 def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:

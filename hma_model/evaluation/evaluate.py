@@ -6,7 +6,7 @@ frequencies of the training tokens: a model that ignores its input would reach i
 its own predictions. Rollouts are made with the true actions and with the actions of another window; the
 difference shows how much the model uses the actions.
 
-B batch, T frames, P frames of the prompt, h,w grid, F digits, V values a digit, S pixels a side.
+B batch, T frames, P frames of the prompt, h,w grid, F digits, V values a digit, S pixels a side, C cameras.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,10 +21,10 @@ from torch import Tensor
 
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
+from hma_data.loading.views import FIRST, Cameras, Views, view_count
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.schema import token_column
 from hma_data.storage.paths import StrPath
-from hma_model.checkpoint.folder import require_tokenizer
+from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.config import OBJECTIVES
 from hma_model.evaluation.metrics import perplexity, psnr, ssim, teacher_forced
 
@@ -67,10 +67,15 @@ class Means:
 
 
 def windows(
-    data: StrPath | ShardSet, split: str, frames: int, count: int, batch_size: int = 8
+    data: StrPath | ShardSet,
+    split: str,
+    frames: int,
+    count: int,
+    batch_size: int = 8,
+    cameras: Cameras = FIRST,
 ) -> Iterator[Batch]:
     """Yield up to `count` windows of a split in batches; they are evenly spaced and always the same."""
-    dataset = WindowDataset(data, split, frames)
+    dataset = WindowDataset(data, split, frames, cameras=cameras)
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(np.int64))
     for start in range(0, len(chosen) if len(dataset) else 0, batch_size):
         yield dataset.batch(chosen[start : start + batch_size])
@@ -107,7 +112,9 @@ def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
     return validation_losses(model, batches)[0].mean()
 
 
-def digit_frequencies(shards: ShardSet, max_frames: int = BASELINE_FRAMES) -> list[NDArray[np.float64]]:
+def digit_frequencies(
+    shards: ShardSet, max_frames: int = BASELINE_FRAMES, cameras: Cameras = FIRST
+) -> list[NDArray[np.float64]]:
     """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
 
     Of more than `max_frames` frames, only row groups spread evenly over them are counted, about `max_frames`
@@ -118,9 +125,10 @@ def digit_frequencies(shards: ShardSet, max_frames: int = BASELINE_FRAMES) -> li
     files = list(zip(shards.shards("train"), shards.row_groups("train")))
     groups = [(name, group) for name, rows in files for group in range(len(rows))]
     stride = max(1, -(-sum(sum(rows) for _, rows in files) // max_frames))
-    column = token_column(shards.spec)[0]
+    columns = Views.of(shards, cameras).columns
     for name, group in groups[::stride]:
-        tokens = shards.read(name, [group], [column])[column].astype(np.int64).ravel()
+        read = shards.read(name, [group], columns)
+        tokens = np.concatenate([read[column].astype(np.int64).ravel() for column in columns])
         for digit, values in enumerate(factored):
             counts[digit] += np.bincount(tokens % values, minlength=values)
             tokens //= values
@@ -128,7 +136,9 @@ def digit_frequencies(shards: ShardSet, max_frames: int = BASELINE_FRAMES) -> li
 
 
 def unconditional_baseline(
-    train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet], batches: Iterable[Batch]
+    train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet],
+    batches: Iterable[Batch],
+    cameras: Cameras = FIRST,
 ) -> Means:
     """Return the cross-entropy of each embodiment's training frequencies, which ignores all input.
 
@@ -140,7 +150,7 @@ def unconditional_baseline(
         Nats a token by embodiment, over the frames from the second on, as in `masked_val_loss`.
     """
     sets = train.values() if isinstance(train, Mapping) else [_opened(item) for item in train]
-    scores = {s.embodiment.id: [np.log(p) for p in digit_frequencies(s)] for s in sets}
+    scores = {s.embodiment.id: [np.log(p) for p in digit_frequencies(s, cameras=cameras)] for s in sets}
     means = Means()
     for batch in batches:
         assert batch.tokens is not None
@@ -155,7 +165,7 @@ def unconditional_baseline(
 
 @dataclass(frozen=True)
 class Pictures:
-    """A rollout and the truth, both uint8 (B, T, S, S, 3); the first P frames are the prompt."""
+    """A rollout and the truth, both uint8 (B, T, S, C·S, 3); the first P frames are the prompt."""
 
     prompt: int
     predicted: NDArray[np.uint8]
@@ -213,11 +223,30 @@ def default_prompt(length: int) -> int:
 
 
 def decode(tokenizer: "Tokenizer", stored: Tensor) -> NDArray[np.uint8]:
-    """Decode ids (B, T, h, w) or latents (B, T, c, H, W) to pictures (B, T, S, S, 3) uint8."""
-    values = stored.flatten(0, 1).cpu().numpy()
+    """Decode ids (B, T, C·h, w) or latents (B, T, c, C·H, W) to pictures (B, T, S, C·S, 3), side by side."""
+    views = stored.flatten(0, 1).cpu().numpy()
     dtype = np.uint32 if tokenizer.spec.kind == "discrete" else np.dtype(tokenizer.spec.dtype)
-    pictures = tokenizer.decode(values.astype(dtype))
+    cameras = np.split(views.astype(dtype), views.shape[-2] // tokenizer.spec.grid[0], axis=-2)
+    pictures = np.concatenate([tokenizer.decode(view) for view in cameras], axis=2)
     return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
+
+
+def cameras_for(model: "HMA", shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
+    """Return the cameras that a model sees: those given, or those that it was trained on.
+
+    Raises:
+        UsageError: these are more or fewer than the views of the model.
+    """
+    if cameras is None and "origin" in vars(model):
+        card = Checkpoint.open(vars(model)["origin"]).card(shards.embodiment.id)
+        cameras = card.get("data", {}).get("cameras")
+    cameras = FIRST if cameras is None else cameras
+    if (count := view_count(cameras)) != model.config.views:
+        fault = f"are {count} in a frame, but the model takes {model.config.views}"
+        raise UsageError(
+            "cameras", fault, f"name {model.config.views} of {', '.join(shards.manifest.cameras)}"
+        )
+    return cameras
 
 
 def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0) -> Tensor:
@@ -248,6 +277,7 @@ def evaluate(
     prompt: int | None = None,
     batch_size: int = 16,
     seed: int = 0,
+    cameras: Cameras | None = None,
     **sampling: Unpack[Sampling],
 ) -> dict[str, Any]:
     """Compute a model's figures on one shard set; rollouts are compared with the decoded true tokens.
@@ -261,6 +291,7 @@ def evaluate(
         frames: T of a window; by default the model's.
         prompt: true frames a rollout starts from.
         seed: of the rollouts.
+        cameras: as `WindowDataset` takes them; None takes those that the model was trained on.
         sampling: options of `HMA.generate` for the rollouts.
 
     Returns:
@@ -278,13 +309,14 @@ def evaluate(
     require_tokenizer(model.config, shards.spec, shards.folder)
     length = frames or model.config.frames
     first = default_prompt(length) if prompt is None else prompt
-    if not len(WindowDataset(shards, split, length)):
+    cameras = cameras_for(model, shards, cameras)
+    if not len(WindowDataset(shards, split, length, cameras=cameras)):
         raise UsageError(shards.folder, f"has no window of {length} frames in {split}", "use another split")
 
     def chosen() -> Iterator[Batch]:
-        return windows(shards, split, length, count, batch_size)
+        return windows(shards, split, length, count, batch_size, cameras)
 
-    table = _losses(model, shards, chosen)
+    table = _losses(model, shards, chosen, cameras)
     rollouts: dict[str, list[Pictures]] = {"true": [], "shuffled": [], "copy": []}
     for number, batch in enumerate(chosen()):
         roll = partial(rollout, model, tokenizer, batch, prompt=first, seed=seed + number, **sampling)
@@ -302,13 +334,16 @@ def evaluate(
         "frames": length,
         "prompt": first,
         "against": "decoded tokens",
+        "cameras": cameras if isinstance(cameras, str) else ", ".join(cameras),
         **table,
         **scores,
         "psnr_action_gain_last": scores["true"]["psnr_last"] - scores["shuffled"]["psnr_last"],
     }
 
 
-def _losses(model: "HMA", shards: ShardSet, chosen: Callable[[], Iterator[Batch]]) -> dict[str, Any]:
+def _losses(
+    model: "HMA", shards: ShardSet, chosen: Callable[[], Iterator[Batch]], cameras: Cameras
+) -> dict[str, Any]:
     losses, accuracy = validation_losses(model, chosen())
     if model.config.kind == "continuous":
         return {"loss": losses.mean()}
@@ -316,7 +351,7 @@ def _losses(model: "HMA", shards: ShardSet, chosen: Callable[[], Iterator[Batch]
     return {
         "loss": losses.mean(),
         "shuffled_loss": masked_val_loss(model, shuffled),
-        "baseline_loss": unconditional_baseline([shards], chosen()).mean(),
+        "baseline_loss": unconditional_baseline([shards], chosen(), cameras).mean(),
         "perplexity": perplexity(losses.mean()),
         "accuracy": accuracy.mean(),
     }

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from hma_data.episodes.sheets import grid, png_bytes, webp_bytes, with_actions, write_mp4, write_text
 from hma_data.errors import HMAError, UsageError
 from hma_data.loading.dataset import WindowDataset
+from hma_data.loading.views import FIRST, Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.evaluation.evaluate import Sampling, rollout, shuffled_actions, windows
+from hma_model.evaluation.evaluate import Sampling, cameras_for, rollout, shuffled_actions, windows
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -46,6 +47,7 @@ def rollout_video(
     frames: int | None = None,
     prompt: int = 2,
     seed: int = 0,
+    cameras: Cameras | None = None,
     **sampling: Unpack[Sampling],
 ) -> RolloutVideo:
     """Roll out from one window of a shard set, with its own actions and with those of another window.
@@ -56,15 +58,16 @@ def rollout_video(
         frames: how many to predict; None fills the model's window.
         prompt: how many true frames to start from.
         seed: of the rollouts.
+        cameras: as `WindowDataset` takes them; None takes those that the model was trained on.
         sampling: options of `HMA.generate`.
 
     Raises:
         CheckpointError: the model was trained on another tokenizer.
-        UsageError: the split has no such window.
+        UsageError: the split has no such window, or the cameras are not as many as the model takes.
     """
     require_tokenizer(model.config, shards.spec, shards.folder)
     length = prompt + frames if frames else max(model.config.frames, prompt + 1)
-    dataset = WindowDataset(shards, split, length)
+    dataset = WindowDataset(shards, split, length, cameras=cameras_for(model, shards, cameras))
     count = len(dataset)
     if window >= count:
         fault = f"has {count} windows of {length} frames in {split}, none with number {window}"
@@ -116,7 +119,15 @@ def write_video(path: StrPath, film: RolloutVideo) -> None:
 
 
 def write_sheets(
-    model: "HMA", sets: Mapping[str, ShardSet], out: Path, step: int, *, frames: int, count: int, seed: int
+    model: "HMA",
+    sets: Mapping[str, ShardSet],
+    out: Path,
+    step: int,
+    *,
+    frames: int,
+    count: int,
+    seed: int,
+    cameras: Cameras = FIRST,
 ) -> str:
     """Write `pictures/step-N-ID.png` for each robot.
 
@@ -126,6 +137,7 @@ def write_sheets(
         out: the run's folder, and the number of its finished steps.
         frames, count: the frames of a window, and how many windows of each robot are shown.
         seed: of the rollouts.
+        cameras: as `WindowDataset` takes them.
 
     Returns:
         The reason for no pictures if the tokenizer is not available here; else an empty string.
@@ -142,7 +154,7 @@ def write_sheets(
     model.eval()
     columns = np.unique(np.linspace(0, frames - 1, COLUMNS).astype(int))
     for name, shards in sets.items():
-        (batch,) = windows(shards, "val", frames, count, count)
+        (batch,) = windows(shards, "val", frames, count, count, cameras)
         true = rollout(model, tokenizer, batch, seed=seed)
         swapped = shuffled_actions(batch, true.prompt - 1, seed)
         other = rollout(model, tokenizer, batch, actions=swapped, seed=seed, truth=true.truth)

@@ -199,6 +199,7 @@ def _facts(manifest: Manifest) -> str:
         "frames per second of the model": rate,
         "tokenizer": f"{line(tokenizer.name)}, {'×'.join(map(str, tokenizer.grid))} of "
         f"{tokenizer.image_size} pixels, {line(tokenizer.kind)}",
+        "cameras": line(manifest.cameras_line) if len(robot.cameras) > 1 else "",
         "licence": line(robot.license) or "not stated",
         "quarantined episodes": str(manifest.quarantined),
     }

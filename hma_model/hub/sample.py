@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hma_data.loading.dataset import Batch
+    from hma_data.loading.views import Cameras
     from hma_data.shards.reader import ShardSet
 
 COLUMNS, SIDE = 6, 128  # pictures in a row, and pixels of a side
@@ -55,11 +56,11 @@ def _picture(checkpoint: Path, shards: "ShardSet") -> bytes:
     """Return a PNG of one window: truth, prediction, and prediction with other actions, over time."""
     from hma_data.episodes.sheets import grid, png_bytes
     from hma_data.shards.preview import tokenizer_of
-    from hma_model.evaluation.evaluate import rollout
+    from hma_model.evaluation.evaluate import cameras_for, rollout
 
     model = checkpoints.load(checkpoint, [shards.embodiment.id])
     require_tokenizer(model.config, shards.spec, shards.folder)
-    batch = _window(shards, model.config.frames)
+    batch = _window(shards, model.config.frames, cameras_for(model, shards))
     tokenizer = tokenizer_of(shards)
     true = rollout(model, tokenizer, batch)
     other = rollout(model, tokenizer, batch, actions=batch.actions.flip(1), truth=true.truth)
@@ -73,12 +74,12 @@ def _picture(checkpoint: Path, shards: "ShardSet") -> bytes:
     return png_bytes(grid(shown, list(rows)))
 
 
-def _window(shards: "ShardSet", frames: int) -> "Batch":
+def _window(shards: "ShardSet", frames: int, cameras: "Cameras") -> "Batch":
     """Return the middle window of the validation split, or of training if that has none."""
     from hma_data.loading.dataset import WindowDataset
 
     for split in ("val", "train"):
-        windows = WindowDataset(shards, split, frames)
+        windows = WindowDataset(shards, split, frames, cameras=cameras)
         if len(windows):
             return windows.batch([len(windows) // 2])
     raise UsageError(shards.folder, f"has no window of {frames} frames", "give shards with longer episodes")

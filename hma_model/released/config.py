@@ -219,6 +219,8 @@ def _inexpressible(config: HMAConfig) -> list[str]:
         faults.append(f"objectives {', '.join(trained)} with absent_action {config.absent_action!r}")
     if config.qk_norm != (config.norms == "qk"):
         faults.append(f"qk_norm {config.qk_norm} with norms {config.norms!r}")
+    if config.views > 1:
+        faults.append(f"frames of {config.views} cameras")
     if math.isqrt(tokens) ** 2 != tokens:
         faults.append(f"a frame of {tokens} tokens, which is no square")
     if continuous and config.mup and config.width != 256:

@@ -83,6 +83,7 @@ class TrainData:
                 rank=number,
                 world=self.passes,
                 memory_mib=max(MEMORY_MIB // self.passes, 1),
+                cameras=recipe.cameras,
             )
         except UsageError as fault:
             remedy = fault.remedy or f"the data has {', '.join(sets)}"

@@ -26,6 +26,7 @@ from pydantic import (
 )  # fmt: skip
 
 from hma_data.errors import RecipeError, UsageError
+from hma_data.loading.views import view_count
 from hma_data.storage.paths import StrPath, as_text, shipped
 from hma_data.storage.yaml_io import parse_yaml, read_yaml
 from hma_model.config import HMAConfig
@@ -39,7 +40,9 @@ _FREE = {
     *("eval_every", "eval_windows", "pictures", "pictures_share", "checkpoint_every", "keep_last"),
     *("report", "track", "project"),
 }
-_DERIVED = {"kind", "grid", "factored", "channels", "latent_scale", "frames", "objectives", "tokenizer"}
+_DERIVED = {
+    *("kind", "grid", "views", "factored", "channels", "latent_scale", "frames", "objectives", "tokenizer"),
+}
 _PLAIN = {  # pydantic's error types, or their first words, in plain English
     "int": "must be a whole number (an integer)",
     "float": "must be a number",
@@ -75,6 +78,14 @@ def _words(value: Any) -> Any:
     raise ValueError("must be a word or a list of words")
 
 
+def _cameras(value: Any) -> str | tuple[str, ...]:
+    if isinstance(value, str) and value:
+        return value
+    if isinstance(value, list | tuple) and value and all(isinstance(v, str) and v for v in value):
+        return tuple(value)
+    raise ValueError("must be first, drawn, a camera's name, or a list of names")
+
+
 Count = Annotated[int, BeforeValidator(_no_bool)]
 Number = Annotated[float, BeforeValidator(_no_bool), Field(allow_inf_nan=False)]
 Steps = Annotated[Count, Field(ge=0)]
@@ -84,6 +95,9 @@ Cap = Annotated[Number, Field(gt=0, le=1)]
 Place = Annotated[str, AfterValidator(_named)]
 Places = Annotated[tuple[Place, ...], BeforeValidator(_listed)]
 Trackers = Annotated[tuple[Literal["tensorboard", "trackio", "wandb"], ...], BeforeValidator(_listed)]
+
+
+CameraChoice = Annotated[Any, AfterValidator(_cameras)]
 
 
 class _Settings(BaseModel):
@@ -113,6 +127,7 @@ class Recipe(_Settings):
     """The settings of a training run. `load_recipe` makes it and explains its errors."""
 
     data: Places = Field((), description="folders of shards, one an embodiment")
+    cameras: CameraChoice = Field("first", description="first, drawn, a name, or a list of stacked views")
     mixture: MixtureSettings = MixtureSettings()
     frames: Count = Field(12, ge=2, le=4096, description="T of a window")
     short: Literal["drop", "pad"] = Field("drop", description="episodes shorter than a window")
@@ -186,7 +201,7 @@ class Recipe(_Settings):
             derived["factored"] = spec.factored or (spec.vocab_size,)
         else:
             derived.update(channels=spec.channels, latent_scale=spec.latent_scale)
-        derived.update(frames=self.frames, objectives=self.objectives)
+        derived.update(frames=self.frames, objectives=self.objectives, views=view_count(self.cameras))
         return HMAConfig(**{**self.model, **derived})
 
 
@@ -345,7 +360,7 @@ def _unknown(path: str) -> str:
     if home == "model" and key in _DERIVED:
         return f"{path}: follows from the shards and the recipe, and cannot be given"
     near = _meant(key, list(known[home]))
-    for name in ("mixture", "model") if not home and not near else ():
+    for name in ("mixture", "model") if not home else ():
         if key in known[name]:
             near = f", did you mean {f'{name}.{key}'!r}?"
     return f"{path}: unknown key{near}"

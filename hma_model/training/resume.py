@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hma_data.errors import CheckpointError, HubError, RecipeError
+from hma_data.loading.views import view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import file_sha256, finite, read_json, to_json
 from hma_model.checkpoint import io as checkpoints
@@ -129,6 +130,9 @@ class Start:
                 fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"
                 remedy = "leave it out: the network is the checkpoint's"
                 raise RecipeError(f"recipe: model.{key}", fault, remedy)
+        if (views := view_count(recipe.cameras)) != config.views:
+            fault = f"are {views} in a frame, the checkpoint that the run starts from has {config.views}"
+            raise RecipeError("recipe: cameras", fault, "name as many, or train from scratch")
         if config.time_position == "learned" and recipe.frames > config.frames:
             fault = f"{recipe.frames} are more than the checkpoint's {config.frames}"
             raise RecipeError("recipe: frames", fault, "use fewer")

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hma_data.errors import CheckpointError, RecipeError, TrainingError
+from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
 from hma_data.loading.dataset import Batch, WindowDataset, open_sets
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import remove_partial, to_json, write_atomic
@@ -55,7 +55,10 @@ class Run:
         if recipe.self_forward and recipe.parallel == "fsdp" and self.world.size > 1:
             fault = "does not work with parallel=fsdp on several ranks"
             raise RecipeError("recipe: self_forward", fault, "use parallel=ddp")
-        self.sets = open_sets(recipe.data)
+        try:
+            self.sets = open_sets(recipe.data, recipe.cameras)
+        except UsageError as wrong:
+            raise RecipeError(f"recipe: {wrong.where}", wrong.fault, wrong.remedy) from wrong
         self.start: Start | None = None
         if recipe.start is not None:
             self.world.once(lambda: Start.bring(recipe, self.sets, self.out))
@@ -76,7 +79,10 @@ class Run:
             self.stats = {name: self.start.stats(shards) for name, shards in self.sets.items()}
         torch.manual_seed(seed_for(recipe.seed, "init"))
         self.model = self._fresh_model()
-        held_out = ((name, s, WindowDataset(s, "val", recipe.frames)) for name, s in self.sets.items())
+        held_out = (
+            (name, s, WindowDataset(s, "val", recipe.frames, cameras=recipe.cameras))
+            for name, s in self.sets.items()
+        )
         self.held_out = {name: shards for name, shards, dataset in held_out if len(dataset)}
         self.step, self.skipped, self.seconds = 0, 0, 0.0  # finished steps, and the time they took
         self.spike_detector = guards.GradientSpikeDetector(recipe.spike)
@@ -131,7 +137,8 @@ class Run:
         if plain or self.start:
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
-        shares = [[p * digit for digit in evaluate.digit_frequencies(shards)] for p, shards in drawn]
+        cameras = self.recipe.cameras
+        shares = [[p * d for d in evaluate.digit_frequencies(s, cameras=cameras)] for p, s in drawn]
         bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
@@ -264,7 +271,8 @@ class Run:
             }
             if video and model.config.kind == "discrete":
                 if self._baseline is None:
-                    self._baseline = evaluate.unconditional_baseline(self.sets, self._held_out_batches())
+                    batches = self._held_out_batches()
+                    self._baseline = evaluate.unconditional_baseline(self.sets, batches, recipe.cameras)
                 facts["perplexity"] = perplexity(facts["loss"])
                 facts["accuracy"] = accuracy.mean()
                 facts["accuracy_by_embodiment"] = accuracy.by_embodiment()
@@ -277,7 +285,9 @@ class Run:
     def _held_out_batches(self) -> Iterator[Batch]:
         recipe = self.recipe
         for shards in self.held_out.values():
-            yield from evaluate.windows(shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size)
+            yield from evaluate.windows(
+                shards, "val", recipe.frames, recipe.eval_windows, recipe.batch_size, recipe.cameras
+            )
 
     def _write_sheets(self, model: HMA) -> None:
         """Write pictures of rollouts: after the last step always, after others if the time allows."""
@@ -286,7 +296,7 @@ class Run:
         if not recipe.pictures or (self.step < recipe.steps and spare <= 0):
             return
         facts = {"frames": recipe.frames, "count": recipe.pictures, "seed": recipe.seed}
-        fault = write_sheets(model, self.held_out, self.out, self.step, **facts)
+        fault = write_sheets(model, self.held_out, self.out, self.step, cameras=recipe.cameras, **facts)
         if fault and len(self._sheet_seconds) == 1:  # noted once
             self.notes.append(fault)
         self._sheet_seconds.append(time.monotonic() - begun)
@@ -331,6 +341,8 @@ class Run:
         metrics = {ours: values.get(name) for ours, values in found if values is not None}
         train = shards.manifest.splits.get("train", {})
         data: dict[str, Any] = {key: train.get(key) for key in ("episodes", "frames")}
+        if self.recipe.cameras != "first":
+            data["cameras"] = self.recipe.cameras
         if "://" in shards.manifest.source:  # a path is of no use on another machine
             data["source"] = shards.manifest.source
         training: dict[str, Any] = {"steps": self.step, "seed": self.recipe.seed}

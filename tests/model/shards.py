@@ -44,7 +44,7 @@ def make_shards(
     parts = {split: numbers for split, numbers in parts.items() if numbers}
     for split, numbers in parts.items():
         path = f"{split}/shard-00000.parquet"
-        with ShardWriter(folder / path, arrow_schema(spec, dims, 0, 1), spec) as writer:
+        with ShardWriter(folder / path, arrow_schema(spec, dims, 0), spec) as writer:
             rows = []
             for number in numbers:
                 tokens, actions = whole[number]
@@ -52,7 +52,7 @@ def make_shards(
                 if spec.kind == "continuous":
                     frames = rng.normal(size=(length, spec.channels, *spec.grid)).astype(np.float16)
                 start, clock = writer.rows, np.arange(length) / 10
-                writer.add(EpisodeRows(number, clock, frames, actions, None, "top"))
+                writer.add(EpisodeRows(number, clock, frames, actions, None))
                 place = (split, path, start, length, length)
                 rows.append(EpisodeRow(number, f"e{number}", *place, "", None, "", 0, 0, 0, "{}", 0, ""))
             stats = Stats.of(np.concatenate([whole[number][1] for number in numbers]))

@@ -59,7 +59,7 @@ def test_rows_are_the_recording(toy_arm, toy_recording, tmp_path, block_tokenize
 def test_shards_open_with_plain_pyarrow(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
     run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
     table = pq.read_table(tmp_path / "out" / "train")
-    assert table.column_names[:4] == ["episode_index", "frame_index", "timestamp", "tokens"]
+    assert table.column_names == ["episode_index", "frame_index", "timestamp", "tokens", "action"]
     metadata = pq.read_metadata(tmp_path / "out" / "train" / "shard-00000.parquet").metadata
     assert metadata[b"hma.embodiment"] == b"toy_arm"
     assert metadata[b"hma.tokenizer"] == b"block"
@@ -175,19 +175,6 @@ def test_strided_rows_carry_the_whole_chunk(toy_arm, toy_recording, tmp_path, bl
         recorded = file["data/demo_0/actions"][()]
     np.testing.assert_array_equal(values["action"], recorded.reshape(10, 6))
     assert shards.row_stride == 1
-
-
-def test_two_cameras_are_rows_of_their_own(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, Settings(cameras=("top", "side")))
-    assert verify(tmp_path / "out") == []
-    shards = ShardSet(tmp_path / "out")
-    values = shards.episode_rows(5, ["tokens", "camera", "frame_index"])
-    assert list(np.unique(values["camera"])) == ["side", "top"]
-    top, side = (
-        block_tokenizer.decode(shards.tokens(values["tokens"][values["camera"] == c]))
-        for c in ("top", "side")
-    )
-    np.testing.assert_array_equal(top, side[..., ::-1])
 
 
 def test_statistics_are_over_train_only(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:

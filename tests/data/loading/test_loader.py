@@ -163,28 +163,6 @@ def test_strided_rows_give_the_windows_of_all_rows(tmp_path: Path) -> None:
     assert mixed.actions.shape == (5, FRAMES, 6)
 
 
-def test_every_camera_gives_its_own_windows(tmp_path: Path) -> None:
-    write_toy(tmp_path / "toy.hdf5", [12, 9])
-    settings = Settings(cameras=("side", "top"), val_fraction=0)
-    convert(
-        Embodiment.from_yaml(ARM_YAML), str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / "out",
-        settings=settings,
-    )  # fmt: skip
-    windows = WindowDataset(tmp_path / "out", "train", FRAMES)
-    batch = windows.batch(range(len(windows)))
-    assert len(windows) == 2 * (5 + 2)
-    by_camera = [batch.tokens[batch.camera == camera] for camera in (0, 1)]
-    order = {0: "side", 1: "top"}
-    colour = {"top": batch.frame[batch.camera == 1] % 16, "side": batch.frame[batch.camera == 0] % 16}
-    for camera, tokens in enumerate(by_camera):
-        digits = [tokens // 256, tokens // 16 % 16, tokens % 16]  # blue, green, red
-        assert torch.equal(digits[1][:, 0, 0, 0], colour[order[camera]])  # green counts frames in both
-        other = digits[0] if order[camera] == "top" else digits[2]
-        assert (other == 0).all()  # top has no blue, side (its mirror) no red
-    mixed = next(iter(MixtureDataset([tmp_path / "out"], 14, FRAMES, lanes=1)))
-    assert set(mixed.camera.tolist()) == {0, 1}
-
-
 def test_short_episodes_are_padded_with_their_last_frame_and_masked(tmp_path: Path) -> None:
     write_toy(tmp_path / "toy.hdf5", [2, 3, 5, 20])
     settings = Settings(val_fraction=0)

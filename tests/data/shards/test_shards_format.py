@@ -16,7 +16,7 @@ import pytest
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.reader import ShardSet
+from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import Footer, arrow_schema
 from hma_data.shards.stats import Stats
 from hma_data.shards.windows import WindowIndex
@@ -89,16 +89,18 @@ class Reader:
 
     def episode(self, row: dict[str, Any], camera: int = 0) -> dict[str, np.ndarray]:
         table = pq.read_table(self.folder / row["shard"])
-        mine = table.slice(row["row_start"] + camera * row["length"], row["length"])
+        mine = table.slice(row["row_start"], row["length"])
         assert set(mine["episode_index"].to_pylist()) == {row["episode_index"]}
         assert mine["frame_index"].to_pylist() == list(range(row["length"]))
-        return {name: np.array(mine[name].to_pylist()) for name in mine.column_names}
+        values = {name: np.array(mine[name].to_pylist()) for name in mine.column_names}
+        name = self.manifest["plan"]["cameras"][camera]
+        return values | {"tokens": values[f"tokens_{name}" if camera else "tokens"]}
 
-    def windows(self, split: str, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def windows(self, split: str, frames: int, camera: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """(T, h, w) tokens and (T, s·A) chunks."""
         s, (h, w) = self.stride, self.manifest["tokenizer"]["grid"]
         for row in self.episodes:
-            for camera in range(len(self.manifest["plan"]["cameras"])) if row["split"] == split else ():
+            if row["split"] == split:
                 values = self.episode(row, camera)
                 for start in range(max(0, row["length"] - frames * s + 1)):
                     rows = slice(start, start + frames * s)
@@ -124,13 +126,11 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def test_a_reader_from_the_page_gives_the_rows(made: Path) -> None:
     reader, shards = Reader(made), ShardSet(made)
     for row in reader.episodes:
-        ours = shards.episode_rows(row["episode_index"], ["tokens", "action", "timestamp", "state"])
-        for camera in (0, 1):
+        columns = EpisodeReader(shards, shards.columns())
+        for camera, name in enumerate(("top", "side")):
             theirs = reader.episode(row, camera)
-            own = slice(camera * row["length"], (camera + 1) * row["length"])
-            assert set(theirs["camera"]) == {("top", "side")[camera]}
-            for name, values in ours.items():
-                np.testing.assert_array_equal(theirs[name], values[own])
+            for column, values in columns.episode(row, name).items():
+                np.testing.assert_array_equal(theirs[column], values)
 
 
 def test_a_reader_from_the_page_finds_the_same_windows(made: Path) -> None:
@@ -202,9 +202,7 @@ def test_duckdb_reads_it(made: Path) -> None:
     found = duckdb.sql(f"SELECT count(*), count(DISTINCT episode_index) FROM {shards}").fetchall()[0]
     assert found == (rows, episodes)
     index, tokens = first_tokens(made)
-    query = (
-        f"SELECT tokens FROM {shards} WHERE episode_index = {index} AND frame_index = 0 AND camera = 'top'"
-    )
+    query = f"SELECT tokens FROM {shards} WHERE episode_index = {index} AND frame_index = 0"
     assert list(duckdb.sql(query).fetchall()[0][0]) == tokens
     joined = duckdb.sql(
         f"SELECT e.id, count(*) FROM {shards} s JOIN '{made}/episodes.parquet' e USING (episode_index) "
@@ -219,7 +217,7 @@ def test_polars_reads_it(made: Path) -> None:
     table = polars.read_parquet(f"{made}/train/*.parquet")
     assert (len(table), table["episode_index"].n_unique()) == counts(made)
     index, tokens = first_tokens(made)
-    mine = table.filter((polars.col("episode_index") == index) & (polars.col("camera") == "top"))
+    mine = table.filter(polars.col("episode_index") == index)
     assert mine["tokens"][0].to_list() == tokens
 
 
@@ -243,11 +241,11 @@ def test_random_tokens_of_18_bits_cost_less_than_600_bytes_a_frame(tmp_path: Pat
     path = tmp_path / "train" / "shard-00000.parquet"
     plan = {"embodiment": "a", "embodiment_hash": "", "tokenizer": spec.to_json(), "hash": "0"}
     actions = rng.normal(size=(frames, 7)).astype(np.float32)
-    with ShardWriter(path, arrow_schema(spec, 7, 0, 1), spec) as writer:
+    with ShardWriter(path, arrow_schema(spec, 7, 0), spec) as writer:
         for start in range(0, frames, 128):
             tokens = rng.integers(0, 2**18, (128, 16, 16), dtype=np.uint32)
             own = actions[start : start + 128]
-            writer.add(EpisodeRows(start // 128, np.arange(128) / 5, tokens, own, None, ""))
+            writer.add(EpisodeRows(start // 128, np.arange(128) / 5, tokens, own, None))
         stats = {"action": Stats.of(actions)}
         writer.close(Footer(plan, "train/shard-00000.parquet", "train", (), (), stats))
     metadata = pq.read_metadata(path)
@@ -267,11 +265,11 @@ def test_row_groups_of_large_frames_hold_fewer_of_them(tmp_path: Path) -> None:
     path = tmp_path / "shard.parquet"
     plan = {"embodiment": "a", "embodiment_hash": "", "tokenizer": spec.to_json(), "hash": "0"}
     pictures = np.arange(100, dtype=np.uint8)[:, None, None, None] + np.zeros((3, 256, 256), np.uint8)
-    with ShardWriter(path, arrow_schema(spec, 1, 0, 1), spec) as writer:
+    with ShardWriter(path, arrow_schema(spec, 1, 0), spec) as writer:
         for episode, length in enumerate((30, 50, 10, 100)):
             actions = np.zeros((length, 1), np.float32)
             time = np.arange(length) / 10
-            writer.add(EpisodeRows(episode, time, pictures[:length], actions, None, ""))
+            writer.add(EpisodeRows(episode, time, pictures[:length], actions, None))
         stats = {"action": Stats.of(np.zeros((190, 1), np.float32))}
         writer.close(Footer(plan, "train/shard-00000.parquet", "train", (), (), stats))
     file = pq.ParquetFile(path)

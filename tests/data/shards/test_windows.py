@@ -23,12 +23,13 @@ def fake(lengths: list[int], stride: int = 1, cameras: int = 1, group: int = 7, 
         np.repeat(shard, cameras).astype(np.int64),
         (starts[:, None] + offsets).ravel().astype(np.int64),
         np.repeat(np.array(lengths, np.int64), cameras),
+        np.tile(np.arange(cameras), len(lengths)),
     )
     groups = [tuple(min(group, rows - at) for at in range(0, rows, group)) for rows in sums]
     return SimpleNamespace(
         folder="a set",
         row_stride=stride,
-        manifest=SimpleNamespace(cameras=["top", "side", "wrist"][:cameras]),
+        manifest=SimpleNamespace(layout=SimpleNamespace(camera_rows=cameras > 1)),
         row_groups=lambda split: groups,
         index=lambda split: index,
     )
@@ -42,11 +43,17 @@ LENGTHS = st.lists(st.integers(1, 30), min_size=1, max_size=20)
 def test_window_arithmetic_equals_counting(
     lengths: list[int], frames: int, stride: int, cameras: int, shards: int
 ) -> None:
-    index = WindowIndex.of(fake(lengths, stride, cameras, shards=shards), "train", frames)
+    last = range(cameras - 1, cameras)  # of a set whose cameras have rows of their own
+    for wanted in (range(cameras), last):
+        made = fake(lengths, stride, cameras, shards=shards)
+        check_index(WindowIndex.of(made, "train", frames, cameras=wanted), lengths, cameras, wanted)
+
+
+def check_index(index: WindowIndex, lengths: list[int], cameras: int, wanted: range) -> None:
     starts, seen, row = [], [], 0
     for length in lengths:
         for camera in range(cameras):
-            found = range(row, row + max(0, length - frames * stride + 1))
+            found = range(row, row + max(0, length - index.span + 1) * (camera in wanted))
             starts += list(found)
             seen += [camera] * len(found)
             row += length
@@ -93,7 +100,7 @@ def test_a_split_without_shards_has_no_windows() -> None:
     nothing = fake([5])
     nothing.row_groups, nothing.index = (
         lambda split: [],
-        lambda split: EpisodeIndex(empty, empty, empty, empty),
+        lambda split: EpisodeIndex(empty, empty, empty, empty, empty),
     )
     index = WindowIndex.of(nothing, "val", 4)
     assert index.count == 0 and len(index.units()) == 0

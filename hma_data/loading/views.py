@@ -1,0 +1,105 @@
+"""Choose the cameras of windows: one for all windows, one drawn for each, or several stacked.
+
+    cameras: first          # the first camera of each set
+    cameras: drawn          # one camera for each window, drawn
+    cameras: wrist          # a camera by its name
+    cameras: [top, wrist]   # several views, stacked along the height of the token grid
+
+n windows, T frames, V views, h·w grid, c channels.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import ShardError, UsageError
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.windows import Ints
+
+Cameras = str | Sequence[str]
+FIRST, DRAWN = "first", "drawn"
+
+
+def view_count(cameras: Cameras) -> int:
+    """Return V, the number of views in a frame of a window."""
+    return 1 if isinstance(cameras, str) else len(cameras)
+
+
+@dataclass(frozen=True)
+class Views:
+    """The cameras of a shard set that its windows take.
+
+    Attributes:
+        numbers: their indices among the cameras of the set.
+        drawn: whether a window takes one of them, drawn; otherwise it takes all, stacked.
+        columns: the columns that hold their frames; one column where cameras have rows of their own.
+        rows: whether cameras have rows of their own, as in sets of older releases.
+    """
+
+    numbers: tuple[int, ...]
+    drawn: bool
+    columns: tuple[str, ...]
+    rows: bool
+
+    @classmethod
+    def of(cls, shards: ShardSet, cameras: Cameras) -> "Views":
+        """Return the cameras of a set.
+
+        Raises:
+            UsageError: the set lacks one of them, or none or one twice is named.
+            ShardError: several are to be stacked, and the set has a row for each camera.
+        """
+        layout, robot = shards.manifest.layout, shards.embodiment.id
+        names: Sequence[str] = [cameras] if isinstance(cameras, str) else cameras
+        if cameras == FIRST:
+            names = layout.cameras[:1]
+        elif cameras == DRAWN:
+            names = layout.cameras
+        lacking = [name for name in names if name not in layout.cameras]
+        if lacking:
+            has = f"{robot} has the cameras {', '.join(layout.cameras)} in {shards.folder}"
+            recorded = {camera.name for camera in shards.embodiment.cameras}.issuperset(lacking)
+            remedy = "hma convert --cameras all stores every camera" if recorded else "name cameras it has"
+            raise UsageError("cameras", f"{has}, not {', '.join(lacking)}", remedy)
+        if not names or len(set(names)) < len(names):
+            raise UsageError("cameras", f"{list(names)!r} names no camera, or one twice", "name each once")
+        drawn = cameras == DRAWN and len(names) > 1
+        if layout.camera_rows and len(names) > 1 and not drawn:
+            fault = "has a row for each camera, as older releases wrote it, so its views cannot be stacked"
+            raise ShardError(shards.folder, fault, "convert the recordings again, or use hma shards merge")
+        columns = tuple(dict.fromkeys(layout.token_columns[name] for name in names))
+        numbers = tuple(layout.cameras.index(name) for name in names)
+        return cls(numbers, drawn, columns, layout.camera_rows)
+
+    def taken(self, draws: Ints, of_rows: Ints) -> tuple[Ints, Ints | None]:
+        """Return the camera (n,) of each window, and which of the columns (n,) it takes; None for all.
+
+        Args:
+            draws: (n,) a random number of at least 0 for each window.
+            of_rows: (n,) the camera whose rows each window has, see `WindowIndex.cameras`.
+        """
+        if self.rows:
+            return of_rows, None
+        if not self.drawn:
+            return np.full(len(draws), self.numbers[0]), None
+        view = draws % len(self.numbers)
+        return np.asarray(self.numbers)[view], view
+
+
+def by_number(windows: Ints) -> Ints:
+    """Return a number (n,) for each window's number, that looks random and is always the same."""
+    mixed = windows.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    return (mixed >> np.uint64(33)).astype(np.int64)
+
+
+def stacked(tokens: NDArray[Any], shards: ShardSet, views: int) -> NDArray[Any]:
+    """Stack the views of frames (n, T, …) along the height: (n, T, V·h, w) or (n, T, c, V·h, w)."""
+    spec = shards.spec
+    (h, w), (samples, frames) = spec.grid, tokens.shape[:2]
+    if spec.kind == "discrete":
+        return tokens.reshape(samples, frames, views * h, w)
+    split = tokens.reshape(samples, frames, views, spec.channels or 1, h, w)
+    return split.swapaxes(2, 3).reshape(samples, frames, spec.channels or 1, views * h, w)

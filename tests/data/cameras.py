@@ -1,0 +1,64 @@
+"""Recordings of a robot with three cameras of three sizes; colours tell camera, episode and frame."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from hma_data.lab.writers import LeRobotEpisode, write_lerobot
+from hma_data.registry.embodiment import Embodiment
+
+SIZES = {"top": (64, 64), "wrist": (32, 32), "side": (64, 96)}
+LENGTHS = (9, 8, 10)
+ACTION = "{space: joint_delta, components: [{key: %s, dims: 2, names: [a, b]}]}"
+
+
+def arm(source: str = "hdf5") -> Embodiment:
+    """The robot, as HDF5 or as a LeRobotDataset."""
+    keys = {"hdf5": ("actions", "obs/%s"), "lerobot": ("action", "observation.images.%s")}[source]
+    cameras = [
+        f"  - {{name: {name}, key: {keys[1] % name}, size: [{height}, {width}]}}\n"
+        for name, (height, width) in SIZES.items()
+    ]
+    return Embodiment.from_yaml(
+        f"id: three_{source}\nkind: simulation\nfrequency_hz: 10\ntarget_hz: 5\naction: {ACTION % keys[0]}\n"
+        f"cameras:\n{''.join(cameras)}source: {{format: {source}}}\n"
+        + ("state: {components: [{key: observation.state, dims: 1}]}\n" if source == "lerobot" else "")
+    )
+
+
+def pictures(camera: str, episode: int, length: int) -> np.ndarray:
+    """Flat pictures (T, H, W, 3): red is the camera, green the episode, blue the frame."""
+    made = np.empty((length, *SIZES[camera], 3), np.uint8)
+    made[..., 0], made[..., 1] = 17 * (1 + 4 * list(SIZES).index(camera)), 17 * (1 + episode)
+    made[..., 2] = 17 * np.arange(length)[:, None, None]
+    return made
+
+
+def actions(episode: int, length: int) -> np.ndarray:
+    return np.stack([np.full(length, episode), np.sin(np.arange(length))], axis=1).astype(np.float32)
+
+
+def write_hdf5(path: Path) -> Path:
+    with h5py.File(path, "w") as file:
+        for episode, length in enumerate(LENGTHS):
+            group = file.create_group(f"data/demo_{episode}")
+            group["actions"] = actions(episode, length)
+            for camera in SIZES:
+                group[f"obs/{camera}"] = pictures(camera, episode, length)
+    return path
+
+
+def write_dataset(folder: Path) -> Path:
+    """The same as a LeRobotDataset, with videos."""
+    episodes = [
+        LeRobotEpisode(
+            pictures={f"observation.images.{camera}": pictures(camera, i, length) for camera in SIZES},
+            action=actions(i, length),
+            state=np.zeros((length, 1), np.float32),
+            task="look",
+        )
+        for i, length in enumerate(LENGTHS)
+    ]
+    write_lerobot(folder, arm("lerobot"), episodes)
+    return folder
