@@ -29,6 +29,7 @@ from hma_data.cpu import usable_cores
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
+from hma_data.episodes.quality import PictureCheck, picture_flags
 from hma_data.errors import (
     HMAError,
     MissingDependencyError,
@@ -164,6 +165,7 @@ class _Episode:
         read: whether all its pictures are in the queue, or encoded.
         waiting: frames that are in the queue.
         tokens: camera -> tokens of the frames that are encoded.
+        flags: of its pictures, see `picture_flags`.
     """
 
     index: int
@@ -173,6 +175,7 @@ class _Episode:
     read: bool = False
     waiting: int = 0
     tokens: defaultdict[str, list[NDArray[Any]]] = field(default_factory=lambda: defaultdict(list))
+    flags: dict[str, int] = field(default_factory=dict)
 
 
 Decoded = _Episode | tuple[str, Frames] | Refused | None  # None ends the episode that was begun
@@ -217,14 +220,18 @@ def _episode(job: Job, source: Source, index: int, ref: EpisodeRef) -> Iterator[
     clip = to_clip(source.read(job.source, ref.id, job.embodiment), job.embodiment)
     kept = kept_frames(clip, layout)
     content = Content(clip, kept)
-    yield _Episode(index, ref, clip, content)
+    episode = _Episode(index, ref, clip, content)
+    yield episode
     for name in layout.cameras:
         camera, stream = job.embodiment.camera(name), clip.episode.streams[name]
+        seen = PictureCheck()
         for start in range(0, len(kept), BATCH):
             indices = clip.frame_indices[name][kept[start : start + BATCH]]
             frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
             content.add(start, frames)
+            seen.add(frames)
             yield name, frames
+        episode.flags |= picture_flags(seen, job.embodiment.quality, ref.id, name)
     yield None
 
 
@@ -303,7 +310,7 @@ def _row(item: _Episode, unit: ShardUnit, start: int, rows: int, cameras: int) -
         skew_max_ms=worst[2],
         skew=json.dumps(skew),
         trimmed=clip.trimmed,
-        flags=flags_text(clip.trimmed, clip.flags),
+        flags=flags_text(clip.trimmed, clip.flags | item.flags),
         group=item.ref.group,
         content=item.content.text(),
     )

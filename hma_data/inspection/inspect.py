@@ -20,6 +20,7 @@ from hma_data.errors import HMAError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
 from hma_data.sources.common.checks import SEVERITIES, Finding, Severity
+from hma_data.sources.common.choice import ids_for_robot
 from hma_data.sources.common.survey import CHECKS, sampled
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
@@ -82,7 +83,7 @@ def _fit(
     faults: list[HMAError] = []
     names: list[str] = []
     try:
-        names = [ref.id for ref in source.index(uri, robot)]
+        names = ids_for_robot([ref.id for ref in source.index(uri, robot)], robot)
     except HMAError as fault:
         faults.append(fault)
     for name in names[:TRIED]:
@@ -212,7 +213,7 @@ def _episodes(
     uri: str, robot: Embodiment, source: Source, sample: int, inspection: Inspection
 ) -> Iterator[Finding]:
     try:
-        names = [ref.id for ref in source.index(uri, robot)]
+        names = ids_for_robot([ref.id for ref in source.index(uri, robot)], robot)
     except HMAError as fault:
         yield Finding("usable", "error", f"none of its episodes: {fault.fault}", fault.remedy)
         return
@@ -288,7 +289,9 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
+    from hma_data.inspection.shard_pictures import shard_picture_findings
     from hma_data.shards.manifest import Manifest
+    from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
 
     wrong = verify(folder)
@@ -308,3 +311,4 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
     deviations = np.asarray(manifest.stats["action"]["std"], np.float64)
     if constant := _constant(deviations, manifest.embodiment):
         yield Finding("constant", "warn", f"never change: {', '.join(constant)}")
+    yield from shard_picture_findings(ShardSet(folder))

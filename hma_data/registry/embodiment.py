@@ -26,6 +26,7 @@ from hma_data.registry.components import (
     Count,
     Marker,
     Number,
+    Quality,
     Segments,
     SourceSpec,
     SpecModel,
@@ -51,6 +52,7 @@ _DECIDES: Any = {
     "cameras": {"__all__": {"name", "key", "color", "resize", "rotate", "flip", "crop", "stamp"}},
     "sync": True,
     "source": {"format", "instruction", "layout", "segments"},
+    "quality": True,
 }
 
 
@@ -71,6 +73,7 @@ class Embodiment(SpecModel):
     cameras: tuple[Camera, ...] = Field(min_length=1)
     sync: Sync = Sync()
     source: SourceSpec
+    quality: Quality = Quality()
     stats_key: str | None = None
     license: str | None = None
     provenance: dict[str, str] = Field(default_factory=dict)
@@ -325,6 +328,7 @@ _KEYS_AT: dict[str, type[SpecModel]] = {
     "cameras": Camera,
     "sync": Sync,
     "source": SourceSpec,
+    "quality": Quality,
     "source.segments": Segments,
     "source.segments.start": Marker,
     "source.segments.stop": Marker,
