@@ -216,13 +216,17 @@ def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
         "cameras": "cameras",
         "frames": "--frames",
         "recording": "recordings",
-        "settings": "settings",
     }
     found = []
     for key, word in words.items():
         if mine.get(key) != theirs.get(key):
             ours, other = _short(mine.get(key)), _short(theirs.get(key))
             found.append(f"{word} ({other} there, {ours} now)" if ours != other else word)
+    ours, others = mine.get("settings", {}), theirs.get("settings", {})
+    for name in sorted((ours.keys() | others.keys()) - words.keys()):
+        if ours.get(name) != others.get(name):
+            there, now = (_short(one.get(name, "none")) for one in (others, ours))
+            found.append(f"--{name.replace('_', '-')} ({there} there, {now} now)")
     return ", ".join(found) or "the cut into shards"
 
 

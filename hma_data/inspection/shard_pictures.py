@@ -53,7 +53,7 @@ def shard_picture_findings(shards: ShardSet) -> Iterator[Finding]:
         still = [one.episode for one in own if one.still and one not in blank]
         if black:
             meant = shards.embodiment.quality.blank == "flag"
-            remedy = "convert again with --overwrite, which refuses them now, or with --exclude"
+            remedy = "hma convert --overwrite refuses them now, and --exclude leaves them out"
             if meant:
                 remedy = "the YAML keeps them: quality.blank is flag"
             said = _said(shards, black, f"camera {name} shows one colour")
