@@ -291,6 +291,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
     if summary.too_many:
         typer.echo(
             f"error: {summary.out}: {totals['quarantined']:,} episodes are in quarantine, more than "
-            f"--max-quarantine {max_quarantine:g} allows — see quarantine.jsonl; --exclude leaves them out; what was converted is kept",
+            f"--max-quarantine {max_quarantine:g} allows; what was converted is kept "
+            "— see quarantine.jsonl; --exclude leaves them out",
             err=True,
         )

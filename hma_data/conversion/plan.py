@@ -223,10 +223,13 @@ def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
             ours, other = _short(mine.get(key)), _short(theirs.get(key))
             found.append(f"{word} ({other} there, {ours} now)" if ours != other else word)
     ours, others = mine.get("settings", {}), theirs.get("settings", {})
-    for name in sorted((ours.keys() | others.keys()) - words.keys()):
-        if ours.get(name) != others.get(name):
-            there, now = (_short(one.get(name, "none")) for one in (others, ours))
-            found.append(f"--{name.replace('_', '-')} ({there} there, {now} now)")
+    options = [
+        f"--{name.replace('_', '-')} {_short(others.get(name))} there, {_short(ours.get(name))} now"
+        for name in sorted((ours.keys() | others.keys()) - words.keys())
+        if ours.get(name) != others.get(name)
+    ]
+    if options:
+        found.append(f"settings ({'; '.join(options)})")
     return ", ".join(found) or "the cut into shards"
 
 
