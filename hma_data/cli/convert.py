@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SHOWN = 20  # reasons of quarantine that are printed
 
 Text = str | None
+CHOICE = "ID|GLOB|@FILE"
 
 
 def convert(
@@ -32,6 +33,14 @@ def convert(
     workers: Annotated[int, Option(min=0, help="Processes; 0 works in this one and survives no crash.")] = 1,
     engine: Annotated[Literal["local", "ray"], Option(help="What runs the workers.")] = "local",
     limit: Annotated[int | None, Option(min=1, help="Convert only the first episodes.")] = None,
+    only: Annotated[
+        list[str] | None,
+        Option(help="Episode to take: id, glob or @FILE of ids; repeat it for more.", metavar=CHOICE),
+    ] = None,
+    exclude: Annotated[
+        list[str] | None,
+        Option(help="Episode to leave out: id, glob or @FILE of ids; repeat it for more.", metavar=CHOICE),
+    ] = None,
     frames: Annotated[
         Literal["all", "strided"], Option(help="Keep all rows, or only those of the model's grid.")
     ] = "all",
@@ -95,6 +104,8 @@ def convert(
             workers=workers,
             engine=engine,
             limit=limit,
+            only=tuple(only or ()),
+            exclude=tuple(exclude or ()),
             frames=frames,
             frequency_hz=frequency_hz,
             cameras=tuple(cameras or ()),
@@ -186,6 +197,7 @@ def _plan(job: "ConversionJob", json: bool) -> bool:
                 "source": uri,
                 "out": str(place(job.out)),
                 "episodes": plan.episodes,
+                "left_out": plan.left_out,
                 "frames": plan.frames,
                 "bytes": cost.bytes,
                 "frames_per_second": cost.frames_per_second,
@@ -202,6 +214,7 @@ def _plan(job: "ConversionJob", json: bool) -> bool:
         f"about {human_bytes(cost.bytes)}"
     )
     _print_cameras(cameras_line(plan.facts["cameras"], robot), cost.pictures, robot, opened.spec.image_size)
+    _print_left_out(plan.left_out)
     if cost.seconds is None:
         print(f"time unknown, no episode could be read: {cost.fault}")
     else:
@@ -261,8 +274,14 @@ def _report_share(done: "Shared", share: "Share", json: bool) -> None:
     )
 
 
+def _print_left_out(count: int) -> None:
+    if count:
+        print(f"left out by only and exclude: {count:,} episode{'s' if count > 1 else ''}")
+
+
 def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
     from hma_data.cli.shards import totals_line
+    from hma_data.shards.schema import flag_words
 
     manifest = summary.manifest
     totals = manifest.to_json()["totals"]
@@ -278,6 +297,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
                 "cameras": manifest.cameras,
                 "pictures": summary.pictures,
                 "flags": summary.flags,
+                "left_out": summary.left_out,
                 "reasons": summary.reasons,
                 "too_many_quarantined": summary.too_many,
             }
@@ -287,14 +307,16 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
         print(f"{totals_line(summary.out, manifest)}{kept}, {human_seconds(summary.seconds)}")
         robot, size = manifest.embodiment, manifest.tokenizer.image_size
         _print_cameras(manifest.cameras_line, summary.pictures, robot, size)
+        _print_left_out(summary.left_out)
         if summary.flags:
-            counts = [f"{count:,} {name.replace('_', ' ')}" for name, count in summary.flags.items()]
+            counts = [f"{count:,} {flag_words(name)}" for name, count in summary.flags.items()]
             print(f"flags: {', '.join(counts)}")
     for reason, count in sorted(summary.reasons.items(), key=lambda item: -item[1])[:SHOWN]:
         typer.echo(f"quarantine: {count:,} × {reason}", err=True)
     if summary.too_many:
         typer.echo(
             f"error: {summary.out}: {totals['quarantined']:,} episodes are in quarantine, more than "
-            f"--max-quarantine {max_quarantine:g} allows — see quarantine.jsonl; what was converted is kept",
+            f"--max-quarantine {max_quarantine:g} allows; what was converted is kept "
+            "— see quarantine.jsonl; --exclude leaves them out",
             err=True,
         )

@@ -44,6 +44,8 @@ def shards_info(folder: Folder, json: Json = False) -> None:
 
 
 def _print_info(facts: dict[str, Any]) -> None:
+    from hma_data.shards.schema import flag_words
+
     robot, totals, episodes = facts["embodiment"], facts["totals"], facts["episodes"]
     print(f"{facts['folder']}: {robot['id']} × {facts['tokenizer']['name']}, from {facts['source']}")
     print(
@@ -64,7 +66,7 @@ def _print_info(facts: dict[str, Any]) -> None:
     )
     for label in ("flags", "quarantine"):
         for name, count in episodes[label].items():
-            print(f"{label}: {count:,} × {name}")
+            print(f"{label}: {count:,} × {flag_words(name) if label == 'flags' else name}")
     print_table(
         ["split", "episodes", "frames", "rows", "shards", "windows of 12", "episodes too short"],
         [
@@ -118,6 +120,12 @@ def shards_preview(
     episodes: Annotated[int, Option(min=1, help="Number of episodes to show.")] = 4,
     camera: Annotated[str | None, Option(help="Camera to show; default: all of the set.")] = None,
     weights: Annotated[str | None, Option(help="The tokenizer's weights, if not the usual ones.")] = None,
+    only: Annotated[
+        list[str] | None, Option(help="Episode to show: id, glob or @FILE of ids; repeat it for more.")
+    ] = None,
+    exclude: Annotated[
+        list[str] | None, Option(help="Episode not to show: id, glob or @FILE of ids; repeat it for more.")
+    ] = None,
 ) -> None:
     """Write a contact sheet and a video decoded from the tokens, with the actions drawn.
 
@@ -126,7 +134,15 @@ def shards_preview(
     from hma_data.shards.preview import preview
 
     place = out or Path(f"{folder.resolve().name}-preview")
-    shown = preview(folder, place, episodes=episodes, weights=weights, camera=camera)
+    shown = preview(
+        folder,
+        place,
+        episodes=episodes,
+        weights=weights,
+        camera=camera,
+        only=only or (),
+        exclude=exclude or (),
+    )
     print(f"wrote {shown.sheet} and {shown.video} ({len(shown.episodes)} episodes)")
     for line in shown.resized:
         print(line)

@@ -48,9 +48,9 @@ def hashes(facts: dict[str, Any]) -> set[str]:
 
 
 def ways(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the facts that a set and its extension must share; --limit and --shard-frames may differ."""
+    """Return the facts that a set and its extension share; the episodes and --shard-frames may differ."""
     ways = {key: value for key, value in facts.items() if key not in _OF_THE_CUT}
-    free = ("limit", "shard_frames")
+    free = ("limit", "shard_frames", "only", "exclude")
     return ways | {"settings": {key: value for key, value in ways["settings"].items() if key not in free}}
 
 

@@ -10,7 +10,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -38,6 +38,7 @@ from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_totals
 from hma_data.sources.base import EpisodeRef, of_another_format, open_source
+from hma_data.sources.common.choice import chosen_ids, ids_for_robot
 from hma_data.storage.files import remove_parts
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import parquet_file, place
@@ -69,6 +70,7 @@ class Summary:
             refused for it.
         flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
         pictures: camera -> (height, width) of its recorded pictures; empty if no shard was made.
+        left_out: number of the recording's episodes that `only` and `exclude` leave out.
         too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
     """
 
@@ -81,6 +83,7 @@ class Summary:
     flags: dict[str, int]
     too_many: bool
     pictures: dict[str, tuple[int, int]] = field(default_factory=dict)
+    left_out: int = 0
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,12 @@ def plan_conversion(
         raise
     except SourceError as fault:
         raise of_another_format(uri, form, fault) from fault
-    return make_plan(refs, embodiment, tokenizer.spec, settings, uri), uri
+    kept = set(
+        chosen_ids(ids_for_robot([ref.id for ref in refs], embodiment), settings.only, settings.exclude)
+    )
+    chosen = [ref for ref in refs if ref.id in kept]
+    plan = make_plan(chosen, embodiment, tokenizer.spec, settings, uri)
+    return replace(plan, left_out=len(refs) - len(chosen)), uri
 
 
 def convert(
@@ -192,7 +200,8 @@ def convert(
     episodes = sum(split["episodes"] for split in manifest.splits.values())
     too_many = manifest.quarantined > max_quarantine * (episodes + manifest.quarantined)
     seconds = time.monotonic() - begun
-    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many, conversion.pictures)
+    shown, left_out = conversion.pictures, conversion.left_out
+    return Summary(out, manifest, done, made, seconds, reasons, flags, too_many, shown, left_out)
 
 
 def convert_share(
@@ -254,6 +263,11 @@ class _Conversion:
             self.workers = 0  # no other process sees them
         self._whole, self.uri = plan_conversion(self.embodiment, self.source, self._opened, self.settings)
         self.pictures: dict[str, tuple[int, int]] = {}
+
+    @property
+    def left_out(self) -> int:
+        """Return the number of episodes that `only` and `exclude` leave out."""
+        return self._whole.left_out
 
     def plan(self, extend: bool) -> tuple[Plan, Manifest | None]:
         """Return the plan, and the manifest it extends or None.

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import PurePath
 from typing import Any, Literal
 
 import numpy as np
@@ -41,6 +42,7 @@ class Settings:
         seed: of that hash.
         limit: take only so many episodes, from the first on; None takes all.
         shard_frames: frames a shard, about; None lets the size of the recording decide.
+        only, exclude: episodes to take and to leave out: ids, globs, or @FILE; see `chosen_ids`.
     """
 
     frames: Literal["all", "strided"] = "all"
@@ -49,6 +51,8 @@ class Settings:
     seed: int = 0
     limit: int | None = None
     shard_frames: int | None = None
+    only: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 <= self.val_fraction < 1:
@@ -57,6 +61,15 @@ class Settings:
             raise UsageError("--limit", f"must be at least 1, is {self.limit}")
         if self.shard_frames is not None and self.shard_frames < 1:
             raise UsageError("--shard-frames", f"must be at least 1, is {self.shard_frames}")
+
+    def facts(self, cameras: list[str]) -> dict[str, Any]:
+        """Return the settings as the plan states them, without a choice of episodes that was not made."""
+        values = asdict(self) | {"cameras": cameras}
+        for name in ("only", "exclude"):
+            words = values.pop(name)
+            if words:  # the plan's digest of the recording covers the ids in a file
+                values[name] = [f"@{PurePath(word).name}" if word.startswith("@") else word for word in words]
+        return values
 
     def frame_stride(self, embodiment: Embodiment) -> int:
         """Return the recorded steps a row; the plan, and with it every shard, states this number."""
@@ -79,10 +92,15 @@ class ShardUnit:
 
 @dataclass(frozen=True)
 class Plan:
-    """All shards of a conversion, and the facts that distinguish it from others."""
+    """All shards of a conversion, and the facts that distinguish it from others.
+
+    Attributes:
+        left_out: number of the recording's episodes that `only` and `exclude` leave out.
+    """
 
     units: tuple[ShardUnit, ...]
     facts: dict[str, Any]
+    left_out: int = 0
 
     @classmethod
     def of(cls, units: Sequence[ShardUnit], facts: dict[str, Any]) -> "Plan":
@@ -140,7 +158,7 @@ def make_plan(
         **({"camera_columns": True} if len(cameras) > 1 else {}),
         "frames": settings.frames,
         "frame_stride": settings.frame_stride(embodiment),
-        "settings": {**asdict(settings), "cameras": cameras},
+        "settings": settings.facts(cameras),
         "recording": digest([(ref.id, ref.fingerprint) for ref in refs]),
         "shards": digest([(unit.name, [i for i, _ in unit.episodes]) for unit in units]),
     }
@@ -199,13 +217,20 @@ def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
         "camera_columns": "columns of the cameras",
         "frames": "--frames",
         "recording": "recordings",
-        "settings": "settings",
     }
     found = []
     for key, word in words.items():
         if mine.get(key) != theirs.get(key):
             ours, other = _short(mine.get(key)), _short(theirs.get(key))
             found.append(f"{word} ({other} there, {ours} now)" if ours != other else word)
+    ours, others = mine.get("settings", {}), theirs.get("settings", {})
+    options = [
+        f"--{name.replace('_', '-')} {_short(others.get(name))} there, {_short(ours.get(name))} now"
+        for name in sorted((ours.keys() | others.keys()) - words.keys())
+        if ours.get(name) != others.get(name)
+    ]
+    if options:
+        found.append(f"settings ({'; '.join(options)})")
     return ", ".join(found) or "the cut into shards"
 
 

@@ -50,12 +50,21 @@ class ConversionJob(BaseModel):
     seed: int = 0
     max_quarantine: float = Field(0.01, ge=0, le=1)
     episode_timeout: float = Field(300.0, ge=0)
+    only: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
 
     @property
     def settings(self) -> Settings:
         """Return the settings that decide the plan."""
         return Settings(
-            self.frames, self.cameras, self.val_fraction, self.seed, self.limit, self.shard_frames
+            self.frames,
+            self.cameras,
+            self.val_fraction,
+            self.seed,
+            self.limit,
+            self.shard_frames,
+            self.only,
+            self.exclude,
         )
 
 

@@ -224,7 +224,7 @@ def merge(
     made_by = {"merge": [shards.manifest.plan["hash"] for shards in sets]}
     sources = list(dict.fromkeys(shards.manifest.source for shards in sets))
     source = sources[0] if len(sources) == 1 else f"merged of {len(sources)} recordings, first {sources[0]}"
-    settings = replace(_settings(first), limit=None)
+    settings = replace(_settings(first), limit=None, only=(), exclude=())
     job = _Job(sets, settings, episodes, source, refused, made_by)
     return job.run(out, workers, on_progress)
 
@@ -308,7 +308,8 @@ def _check_alike(first: ShardSet, other: ShardSet) -> None:
 def _settings(shards: ShardSet) -> Settings:
     """Return the settings that the set was made with."""
     said = shards.manifest.plan.get("settings", {})
-    return Settings(**{**said, "cameras": tuple(shards.manifest.cameras)})
+    choice = {name: tuple(said.get(name, ())) for name in ("only", "exclude")}
+    return Settings(**{**said, **choice, "cameras": tuple(shards.manifest.cameras)})
 
 
 def _rows(shards: ShardSet) -> list[EpisodeRow]:

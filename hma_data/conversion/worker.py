@@ -29,6 +29,7 @@ from hma_data.conversion.plan import ShardUnit
 from hma_data.cpu import usable_cores
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
+from hma_data.episodes.quality import PictureCheck, picture_flags
 from hma_data.errors import (
     EpisodeError,
     HMAError,
@@ -173,6 +174,7 @@ class _Episode:
         read: whether all its pictures are in the queue, or encoded.
         waiting: frames that are in the queue.
         tokens: camera -> tokens of the frames that are encoded.
+        flags: of its pictures, see `picture_flags`.
     """
 
     index: int
@@ -182,6 +184,7 @@ class _Episode:
     read: bool = False
     waiting: int = 0
     tokens: defaultdict[str, list[NDArray[Any]]] = field(default_factory=lambda: defaultdict(list))
+    flags: dict[str, int] = field(default_factory=dict)
 
 
 Decoded = _Episode | tuple[str, Frames] | Refused | None  # None ends the episode that was begun
@@ -229,9 +232,11 @@ def _episode(
     clip = read_clip(source, job.source, ref.id, job.embodiment, layout.cameras)
     kept = kept_frames(clip, layout)
     content = Content(clip, kept)
-    yield _Episode(index, ref, clip, content)
+    episode = _Episode(index, ref, clip, content)
+    yield episode
     for name in layout.cameras:
         camera, stream = job.embodiment.camera(name), clip.episode.streams[name]
+        seen = PictureCheck()
         try:
             if report:
                 report(Seen(name, *clip.frames_at(name, kept[:1]).shape[1:3]))
@@ -239,11 +244,13 @@ def _episode(
                 indices = clip.frame_indices[name][kept[start : start + BATCH]]
                 frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
                 content.add(start, frames)
+                seen.add(frames)
                 yield name, frames
         except EpisodeError as fault:
             if len(layout.cameras) == 1:
                 raise
             raise camera_fault(ref.id, name, layout.cameras, fault) from fault
+        episode.flags |= picture_flags(seen, job.embodiment.quality, ref.id, name)
     yield None
 
 
@@ -322,7 +329,7 @@ def _row(item: _Episode, unit: ShardUnit, start: int, rows: int) -> EpisodeRow:
         skew_max_ms=worst[2],
         skew=json.dumps(skew),
         trimmed=clip.trimmed,
-        flags=flags_text(clip.trimmed, clip.flags),
+        flags=flags_text(clip.trimmed, clip.flags | item.flags),
         group=item.ref.group,
         content=item.content.text(),
     )

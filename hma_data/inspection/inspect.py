@@ -23,6 +23,7 @@ from hma_data.inspection.pairing import judged, proposed
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, Source, detect, of_another_format, open_source
 from hma_data.sources.common.checks import SEVERITIES, Finding, Severity
+from hma_data.sources.common.choice import ids_for_robot
 from hma_data.sources.common.survey import CHECKS, alike, sampled
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.storage.remote import is_remote, place
@@ -93,7 +94,7 @@ def _fit(
     faults: list[HMAError] = []
     names: list[str] = []
     try:
-        names = [ref.id for ref in source.index(uri, robot)]
+        names = ids_for_robot([ref.id for ref in source.index(uri, robot)], robot)
     except HMAError as fault:
         faults.append(fault)
     for name in names[:TRIED]:
@@ -240,7 +241,7 @@ def _episodes(
     uri: str, robot: Embodiment, source: Source, sample: int, inspection: Inspection
 ) -> Iterator[Finding]:
     try:
-        names = [ref.id for ref in source.index(uri, robot)]
+        names = ids_for_robot([ref.id for ref in source.index(uri, robot)], robot)
     except HMAError as fault:
         yield Finding("usable", "error", f"none of its episodes: {fault.fault}", fault.remedy)
         return
@@ -317,6 +318,7 @@ def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Findin
 
 
 def _shard_set(folder: Path) -> Iterator[Finding]:
+    from hma_data.inspection.shard_pictures import shard_picture_findings
     from hma_data.shards.reader import ShardSet
     from hma_data.shards.verify import verify
     from hma_data.shards.windows import WindowIndex
@@ -343,3 +345,4 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
     deviations = np.asarray(manifest.stats["action"]["std"], np.float64)
     if constant := _constant(deviations, manifest.embodiment):
         yield Finding("constant", "warn", f"never change: {', '.join(constant)}")
+    yield from shard_picture_findings(ShardSet(folder))

@@ -28,6 +28,8 @@ Representation = Literal[
 ]
 Gripper = Literal["open_is_high", "open_is_low", "opening_is_high", "closing_is_high"]
 Method = Literal["nearest", "hold", "interpolate"]
+Verdict = Literal["refuse", "flag"]
+Pattern = Annotated[str, Field(min_length=1)]
 
 
 def _no_bool(value: Any) -> Any:
@@ -264,6 +266,12 @@ class SourceSpec(SpecModel):
         None, description="where a file has its data; the keys depend on the format"
     )
     segments: Segments | None = Field(None, description="how one bag is divided into episodes")
+    only: tuple[Pattern, ...] = Field(
+        (), description="take only these episodes: ids, globs, or @FILE, a file with one of them a line"
+    )
+    exclude: tuple[Pattern, ...] = Field(
+        (), description="leave these episodes out: ids, globs, or @FILE, a file with one of them a line"
+    )
 
     @field_validator("layout")
     @classmethod
@@ -279,3 +287,14 @@ class SourceSpec(SpecModel):
         if value and info.data.get("format", "rosbag") != "rosbag":
             raise ValueError(f"is for bags, not for {info.data['format']}")
         return value
+
+
+class Quality(SpecModel):
+    """What happens to an episode whose camera shows nothing that a model could learn."""
+
+    blank: Verdict = Field("refuse", description="a camera shows one colour throughout, such as black")
+    still: Verdict = Field("flag", description="a camera shows one picture throughout")
+    repeated: Verdict = Field(
+        "flag", description="more than repeated_share of a camera's pictures repeat the picture before"
+    )
+    repeated_share: Number = Field(0.5, ge=0, le=1)

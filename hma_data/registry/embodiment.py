@@ -27,6 +27,7 @@ from hma_data.registry.components import (
     Count,
     Marker,
     Number,
+    Quality,
     Segments,
     SourceSpec,
     SpecModel,
@@ -54,6 +55,7 @@ _DECIDES: Any = {
     "cameras": {"__all__": {"name", "key", "color", "resize", "rotate", "flip", "crop", "stamp", "levels"}},
     "sync": True,
     "source": {"format", "instruction", "layout", "segments"},
+    "quality": True,
 }
 
 
@@ -74,6 +76,7 @@ class Embodiment(SpecModel):
     cameras: tuple[Camera, ...] = Field(min_length=1)
     sync: Sync = Sync()
     source: SourceSpec
+    quality: Quality = Quality()
     stats_key: str | None = None
     license: str | None = None
     provenance: dict[str, str] = Field(default_factory=dict)
@@ -347,6 +350,7 @@ _KEYS_AT: dict[str, type[SpecModel]] = {
     "cameras": Camera,
     "sync": Sync,
     "source": SourceSpec,
+    "quality": Quality,
     "source.segments": Segments,
     "source.segments.start": Marker,
     "source.segments.stop": Marker,

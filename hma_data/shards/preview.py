@@ -20,6 +20,7 @@ from hma_data.errors import ShardError, TokenizerError
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_totals, token_column
 from hma_data.shards.windows import WindowIndex
+from hma_data.sources.common.choice import chosen_ids
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
@@ -223,6 +224,8 @@ def preview(
     camera: str | None = None,
     frames: int = 300,
     tokenizer: Tokenizer | None = None,
+    only: Sequence[str] = (),
+    exclude: Sequence[str] = (),
 ) -> Preview:
     """Write `sheet.png` and `preview.mp4` for episodes spread evenly over a shard set.
 
@@ -235,18 +238,22 @@ def preview(
         camera: name of the camera; None shows all cameras of the set.
         frames: largest number of frames of each episode in the video.
         tokenizer: tokenizer that decodes; None takes the set's own.
+        only, exclude: episodes to choose from: ids, globs, or @FILE; see `chosen_ids`.
 
     Raises:
         ShardError: the set holds no episodes.
-        UsageError: there is no such camera.
+        UsageError: there is no such camera or no such episode.
     """
     shards, out = ShardSet(folder), as_path(out)
     cameras = [shards.manifest.cameras[shards.camera_index(camera)]] if camera else shards.manifest.cameras
     if not len(shards.episodes):
         raise ShardError(shards.folder, "holds no episodes", "its quarantine.jsonl says why")
     opened = tokenizer or tokenizer_of(shards, weights)
-    picks = np.unique(np.linspace(0, len(shards.episodes) - 1, episodes).round().astype(int))
-    rows = shards.episodes.take(picks).to_pylist()
+    ids = shards.episodes["id"].to_pylist()
+    kept = set(chosen_ids(ids, only, exclude))
+    places = np.flatnonzero([name in kept for name in ids])
+    picks = np.unique(np.linspace(0, len(places) - 1, episodes).round().astype(int))
+    rows = shards.episodes.take(places[picks]).to_pylist()
     seen = [_Seen(shards, opened, row, cameras) for row in rows]
     sheet, video = out / "sheet.png", out / "preview.mp4"
     write_png(sheet, np.concatenate([one.sheet(columns) for one in seen]))

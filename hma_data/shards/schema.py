@@ -166,6 +166,12 @@ def flag_counts(flags: str) -> dict[str, int]:
     return {name.strip(): int(count) for name, _, count in pairs if count.strip().isdecimal()}
 
 
+def flag_words(name: str) -> str:
+    """Return the name of a flag in words: `blank_pictures:top` is blank pictures of top."""
+    kind, _, camera = name.partition(":")
+    return kind.replace("_", " ") + (f" of {camera}" if camera else "")
+
+
 def flag_totals(flags: pa.ChunkedArray) -> dict[str, int]:
     """Return name -> count over all episodes, from the column `flags`."""
     totals: Counter[str] = Counter()

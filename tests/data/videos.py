@@ -1,7 +1,7 @@
 """Videos and LeRobotDatasets made for tests: each frame shows its number as a shade of grey."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,13 @@ def number_of(frame: np.ndarray) -> int:
 
 
 def encode(
-    path: Path, numbers: Sequence[int], codec: str = "h264", fps: int = 10, gop: int = 8, b_frames: int = 2
+    path: Path,
+    numbers: Sequence[int],
+    codec: str = "h264",
+    fps: int = 10,
+    gop: int = 8,
+    b_frames: int = 2,
+    draw: Callable[[int], np.ndarray] = picture,
 ) -> Path:
     """A video of those pictures at `path`."""
     name, options = CODECS[codec]
@@ -43,7 +49,7 @@ def encode(
             stream.codec_context.max_b_frames = b_frames
         stream.codec_context.time_base = Fraction(1, fps)
         for number in numbers:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(number), format="rgb24")))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(draw(number), format="rgb24")))
         container.mux(stream.encode(None))
     return path
 

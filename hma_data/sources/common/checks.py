@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from hma_data.episodes.align import nearest
 from hma_data.episodes.episode import Floats
 from hma_data.episodes.images import Images
+from hma_data.episodes.quality import BLANK, PictureCheck
 
 Severity = Literal["error", "warn", "info"]
 SEVERITIES: tuple[Severity, ...] = ("info", "warn", "error")
@@ -40,7 +41,7 @@ PIXELS = 4096  # pixels of a picture whose colours are checked
 DISTINCT = 1_000  # least number of distinct colours for the YCbCr sign
 SURE, CHANCE = 0.98, 0.6  # share of colours that YCbCr gives: least in the right order, most in the other
 COLD = 0.15  # share of cold pixels (saturated, blue > green > red) above which a hint is given
-STILL, BLANK = 0.5, 2.0  # limits: share of equal neighbours; standard deviation of all values
+STILL = 0.5  # least share of equal neighbours that is reported
 
 
 @dataclass(frozen=True)
@@ -277,7 +278,7 @@ class Look:
     warm: float = 0.0
     cold: float = 0.0
     colours: list[NDArray[np.uint8]] = field(default_factory=list)
-    _blank: bool = False
+    _check: PictureCheck | None = None
     _size: tuple[int, int] = (0, 0)
 
     def add(self, frames: Images, indices: NDArray[np.int64], again: bool = False) -> None:
@@ -286,7 +287,7 @@ class Look:
         `again` says that they are of the same episode as the pictures before.
         """
         if not again:
-            self.episodes, self.blank, self._blank = self.episodes + 1, self.blank + 1, True
+            self.episodes, self.blank, self._check = self.episodes + 1, self.blank + 1, PictureCheck()
         self.pictures += len(frames)
         size = (int(frames.shape[1]), int(frames.shape[2]))
         self.changes += again and size != self._size
@@ -295,8 +296,10 @@ class Look:
         pairs = np.flatnonzero(np.diff(indices) == 1)
         self.neighbours += len(pairs)
         self.same += sum(np.array_equal(frames[i], frames[i + 1]) for i in pairs)
-        if self._blank and float(frames.std()) >= BLANK:
-            self.blank, self._blank = self.blank - 1, False
+        if self._check:
+            self._check.add(frames)
+            if self._check.contrast > BLANK:
+                self.blank, self._check = self.blank - 1, None
         step = max(1, int(np.sqrt(size[0] * size[1] / PIXELS)))
         for frame in frames:
             pixels = frame[::step, ::step].reshape(-1, 3)  # on a grid over the picture

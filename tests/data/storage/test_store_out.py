@@ -240,7 +240,7 @@ def test_another_plan_is_refused_while_a_job_runs(toy_arm, toy_recording, out, w
     def differ() -> None:
         assert not [name for name in out.listing() if "shard-" in name]
         said = (
-            rf"{out}: another conversion is being written there; different: settings — .* delete {out}/\.plan"
+            rf"{out}: another conversion is being written there; different: settings .* delete {out}/\.plan"
         )
         with pytest.raises(OutputError, match=said):
             run(toy_arm, toy_recording, out, settings=replace(SMALL, seed=3))
