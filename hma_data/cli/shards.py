@@ -102,9 +102,13 @@ def shards_verify(
 
     Example: hma shards verify shards/my_arm
     """
+    from hma_data.errors import ShardError
     from hma_data.shards.verify import verify
-    from hma_data.storage.remote import place
+    from hma_data.storage.remote import is_remote, place
 
+    for folder in map(place, folders):
+        if not is_remote(folder) and not folder.is_dir():
+            raise ShardError(folder, "is not a folder", "name the --out folder of an hma convert")
     found = {}
     with progress("verify", unit="bytes") as update:
         for folder in folders:

@@ -74,7 +74,7 @@ def several(folder: StrPath) -> list[Found]:
     folder = as_path(folder)
     found = list(_found(folder, recognitions(), False))
     apart = [one for one in found if not one.beside]
-    alone = len(apart) == 1 and (apart[0].path == folder or apart[0].format not in WHOLE)
+    alone = len(apart) == 1 and (apart[0].path == folder or apart[0].format not in ("lerobot", SHARDS))
     return [] if not apart or alone else found
 
 
