@@ -75,7 +75,7 @@ def several(folder: StrPath) -> list[Found]:
     found = list(_found(folder, recognitions(), False))
     apart = [one for one in found if not one.beside]
     alone = len(apart) == 1 and (apart[0].path == folder or apart[0].format not in ("lerobot", SHARDS))
-    return [] if not apart or alone else found
+    return [] if not apart or alone else sorted(found, key=lambda one: one.path)
 
 
 def _found(folder: Path, known: Mapping[str, Recognition], below: bool) -> Iterator[Found]:
@@ -93,11 +93,13 @@ def _found(folder: Path, known: Mapping[str, Recognition], below: bool) -> Itera
     for path in shown:
         if path.is_dir() and not path.is_symlink():
             inside += _found(path, known, below)
-    formats = {one.format for one in inside}
-    if len(inside) > 1 and len(formats) == 1 and not formats & {*WHOLE}:
-        yield Found(folder, inside[0].format, all(one.beside for one in inside))
-    else:
-        yield from inside
+    films = [one for one in inside if one.beside]
+    apart = [one for one in inside if not one.beside]
+    formats = {one.format for one in apart}
+    if len(apart) > 1 and len(formats) == 1 and not formats & {*WHOLE}:
+        apart = [Found(folder, apart[0].format)]
+    yield from apart
+    yield from films
 
 
 def _whole(folder: Path, files: Sequence[Path], known: Mapping[str, Recognition]) -> str | None:
