@@ -171,7 +171,7 @@ def _bar(description: str, total: float, unit: str) -> Iterator[Update]:
 
     class Times(ProgressColumn):
         def render(self, task: Task) -> Text:
-            return Text(_times(task.elapsed or 0.0, task.time_remaining if task.total else None))
+            return Text(human_times(task.elapsed or 0.0, task.time_remaining if task.total else None))
 
     bar = Progress(
         TextColumn("{task.description}", markup=False),
@@ -202,7 +202,7 @@ def _amount(done: float, total: float, rate: float, unit: str) -> str:
     return text + (f", {rate:,.{1 if rate < 10 else 0}f}/s" if rate > 0 else "")
 
 
-def _times(elapsed: float, left: float | None) -> str:
+def human_times(elapsed: float, left: float | None) -> str:
     """Return the elapsed and the remaining time as text; a remaining time that is unknown is left out."""
     rest = f", {_whole_seconds(left)} left" if left is not None else ""
     return f"{_whole_seconds(elapsed)} so far{rest}"
@@ -240,4 +240,4 @@ class _Lines:
         left = missing / rate if rate > 0 and missing > 0 else None
         amount = _amount(self._done, self._total, rate, self._unit)
         words = f", {self._extra}" if self._extra else ""
-        print(f"{self._text}: {amount}, {_times(elapsed, left)}{words}", file=sys.stderr, flush=True)
+        print(f"{self._text}: {amount}, {human_times(elapsed, left)}{words}", file=sys.stderr, flush=True)

@@ -37,8 +37,8 @@ THUMB, GAP, LABEL, STRIPS, FILM = 144, 4, 18, 22, 256  # pixels; STRIPS is the h
 DECODED = 16  # frames decoded at a time
 LINE, CURSOR, ZERO, UNKNOWN = (0, 114, 178), (213, 94, 0), (200, 200, 200), (225, 225, 225)
 MOST = 16  # strips; of further values only the number is shown
-LABELS, NAMES, FOOT = 216, 110, 16  # pixels left of the strips, of the names in them, and below the strips
-BESIDE = 208  # pixels by which the curves of the video are wider than its picture
+LABELS, NAMES, FOOT = 240, 120, 16  # pixels left of the strips, of the names in them, and below the strips
+BESIDE = 232  # pixels by which the curves of the video are wider than its picture
 SMALL = 0.36  # scale of the text beside the strips
 WINDOW = 12  # frames of the model's window
 

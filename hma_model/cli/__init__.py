@@ -117,6 +117,14 @@ def _fail(text: str, code: int) -> int:
     return code
 
 
+FIGURES = {  # figures of `hma evaluate` as its table names them; the others have their names in the JSON
+    "against": "compared with",
+    "loss": "loss, nats a token",
+    "shuffled_loss": "loss with shuffled actions",
+    "baseline_loss": "loss of token frequencies alone",
+    "accuracy": "accuracy, share of tokens",
+    "psnr_action_gain_last": "last frame, true less shuffled, dB",
+}
 Checkpoint = Annotated[
     str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
@@ -191,8 +199,8 @@ def evaluate(
     if json:
         print_json(found)
         return
-    plain = {key: value for key, value in found.items() if not isinstance(value, dict)}
-    print_table(["figure", "value"], list(plain.items()))
+    plain = [[FIGURES.get(key, key), value] for key, value in found.items() if not isinstance(value, dict)]
+    print_table(["figure", "value"], plain)
     columns = ["psnr", "psnr_last", "ssim"]
     rows = [[name, *(found[name][column] for column in columns)] for name in ("true", "shuffled", "copy")]
     print_table(["rollout", "PSNR dB", "last frame dB", "SSIM"], rows)
