@@ -8,9 +8,11 @@ import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
+
+from hma_data.errors import Interrupted
 
 
 class Update(Protocol):
@@ -39,7 +41,8 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], title: st
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(*columns, title=title or None, title_justify="left", box=SIMPLE, pad_edge=False)
+    heads = [escape(column) for column in columns]
+    table = Table(*heads, title=escape(title) or None, title_justify="left", box=SIMPLE, pad_edge=False)
     table.columns[0].overflow = "fold"  # users type it into the next command, so it is never cut short
     for i, column in enumerate(table.columns):
         values = [row[i] for row in rows]
@@ -101,6 +104,11 @@ def human_number(value: float | None) -> str | None:
     return f"{value:.0f}" if float(value).is_integer() and abs(value) < 1e6 else f"{value:.3g}"
 
 
+def human_count(count: int, noun: str) -> str:
+    """Return a number with its noun, in the plural where it is not one: 1 shard, 2,000 shards."""
+    return f"{count:,} {noun}" + ("s" if count != 1 else "")
+
+
 def human_bytes(count: float) -> str:
     """Return a number of bytes as text: 1234567 -> 1.2 MB."""
     if count < 1000:
@@ -122,8 +130,30 @@ def human_seconds(seconds: float) -> str:
 
 
 @contextmanager
+def interruptible(words: Callable[[], str]) -> Iterator[None]:
+    """Convert a Ctrl-C in the block to an error that says what is kept and how to go on.
+
+    Args:
+        words: returns that text; it is called after the Ctrl-C.
+
+    Raises:
+        Interrupted: the user pressed Ctrl-C.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as stopped:
+        raise Interrupted("", f"interrupted: {words()}") from stopped
+
+
+@contextmanager
 def progress(description: str, total: float = 0, unit: str = "frames") -> Iterator[Update]:
-    """Show progress on standard error: a bar with rate and time left, or a line every 10 s off a terminal."""
+    """Show progress on standard error: a bar with rate and time left, or a line every 10 s off a terminal.
+
+    Args:
+        description: what is done.
+        total: the amount in all; 0 where it is not known yet.
+        unit: the unit of the amounts; "bytes" are shown in kB, MB or GB.
+    """
     if sys.stderr.isatty():
         with _bar(description, total, unit) as update:
             yield update
@@ -136,29 +166,50 @@ def progress(description: str, total: float = 0, unit: str = "frames") -> Iterat
 @contextmanager
 def _bar(description: str, total: float, unit: str) -> Iterator[Update]:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+    from rich.text import Text
+
+    class Times(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text(human_times(task.elapsed or 0.0, task.time_remaining if task.total else None))
 
     bar = Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
-        TextColumn("{task.completed:,.0f}/{task.total:,.0f} " + unit),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[extra]}"),
+        TextColumn("{task.fields[amount]}"),
+        Times(),
+        TextColumn("{task.fields[extra]}", markup=False),
         console=Console(stderr=True),
         refresh_per_second=5,
     )
     with bar:
-        task = bar.add_task(description, total=total or 1, rate="", extra="")
+        task = bar.add_task(description, total=total or None, amount="", extra="")
 
         def update(done: float, extra: str = "", total: float | None = None) -> None:
-            speed = bar.tasks[0].speed
-            rate = f"{speed:,.0f}/s" if speed else ""
-            bar.update(task, completed=done, total=total or bar.tasks[0].total, extra=extra, rate=rate)
+            whole = total or bar.tasks[0].total
+            amount = _amount(done, whole or 0, bar.tasks[0].speed or 0, unit)
+            bar.update(task, completed=done, total=whole, extra=extra, amount=amount)
 
         yield update
+
+
+def _amount(done: float, total: float, rate: float, unit: str) -> str:
+    """Return the amount done, the total and the rate as text; an unknown total or rate is left out."""
+    if unit == "bytes":
+        text = human_bytes(done) + (f" of {human_bytes(total)}" if total else "")
+        return text + (f", {human_bytes(rate)}/s" if rate > 0 else "")
+    text = f"{done:,.0f}" + (f"/{total:,.0f}" if total else "") + f" {unit}"
+    return text + (f", {rate:,.{1 if rate < 10 else 0}f}/s" if rate > 0 else "")
+
+
+def human_times(elapsed: float, left: float | None) -> str:
+    """Return the elapsed and the remaining time as text; a remaining time that is unknown is left out."""
+    rest = f", {_whole_seconds(left)} left" if left is not None else ""
+    return f"{_whole_seconds(elapsed)} so far{rest}"
+
+
+def _whole_seconds(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 60 else human_seconds(seconds)
 
 
 class _Lines:
@@ -183,9 +234,10 @@ class _Lines:
 
     def _show(self) -> None:
         self._shown = time.monotonic()
-        rate = (self._done - (self._first or 0)) / max(self._shown - self._start, 1e-9)
+        elapsed = self._shown - self._start
+        rate = (self._done - (self._first or 0)) / max(elapsed, 1e-9)
         missing = self._total - self._done
-        left = f", {human_seconds(missing / rate)} left" if rate > 0 and missing > 0 else ""
+        left = missing / rate if rate > 0 and missing > 0 else None
+        amount = _amount(self._done, self._total, rate, self._unit)
         words = f", {self._extra}" if self._extra else ""
-        text = f"{self._text}: {self._done:,.0f}/{self._total:,.0f} {self._unit}, {rate:,.0f}/s{left}{words}"
-        print(text, file=sys.stderr, flush=True)
+        print(f"{self._text}: {amount}, {human_times(elapsed, left)}{words}", file=sys.stderr, flush=True)

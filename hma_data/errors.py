@@ -34,6 +34,12 @@ class UsageError(HMAError):
     exit_code = 2
 
 
+class Interrupted(HMAError):
+    """The user stopped the command with Ctrl-C; the text says what is kept and how to go on."""
+
+    exit_code = 130
+
+
 class RegistryError(HMAError):
     """An embodiment's YAML cannot be used as it stands."""
 

@@ -62,7 +62,7 @@ hma registry validate my_arm.yaml
 hma convert -e my_arm.yaml --source DATA --out shards/my_arm
 hma shards verify shards/my_arm
 hma shards preview shards/my_arm                          # sheet.png and preview.mp4 from the tokens
-hma train discrete_tiny data=[shards/my_arm] --out runs/my_arm
+hma train discrete_tiny "data=[shards/my_arm]" --out runs/my_arm
 hma evaluate runs/my_arm shards/my_arm
 hma generate runs/my_arm shards/my_arm --out rollout.mp4
 hma hub push runs/my_arm ./my-hub/team/model --embodiment my_arm
@@ -361,14 +361,15 @@ def _rollouts(page: Page, made: Demo) -> None:
         "Rollouts on held-out episodes",
         "The model, pulled from the hub for one robot alone, sees the first frames and the actions. It "
         "continues from its own predictions. With another window's actions it should do worse. The loss "
-        "shows this; PSNR hardly shows it after so short a training, because the disc covers few pixels.",
+        "shows this; PSNR hardly shows it after so short a training, because the disc covers few pixels. "
+        "Copy is the baseline that repeats the last frame of the prompt.",
     )
     rows = []
     for robot, shards in made.sets.items():
         film, found = made.films[robot], made.figures[robot]
         caption = f"{robot}: truth, prediction with the true actions, with another window's; actions as bars"
         page.picture(webp_bytes(film.frames, film.fps), "webp", caption)
-        names = {"true": "true actions", "shuffled": "shuffled actions", "copy": "last seen frame repeated"}
+        names = {"true": "true actions", "shuffled": "shuffled actions", "copy": "copy"}
         curves = {name: found[key]["psnr_by_frame"] for key, name in names.items()}
         about = f"mean of {found['windows']} held-out windows, against {found['against']}"
         plot = psnr_over_horizon(curves, 1 / shards.embodiment.effective_hz)

@@ -50,6 +50,54 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
         assert "Example: hma" in " ".join(hma(*verb, "--help").stdout.replace("│", " ").split())
 
 
+def test_help_shows_brackets_and_the_version() -> None:
+    def shown(*verb: str) -> str:
+        return " ".join(hma(*verb, "--help").stdout.replace("│", " ").split())
+
+    assert 'Example: hma train discrete_tiny "data=[shards/my_arm]" --out' in shown("train")
+    assert "org/name[@revision]" in shown("evaluate")
+    assert hma("--version").stdout.startswith("hma 0.")
+
+
+def test_what_the_command_line_shows_to_be_wrong_is_refused_before_torch_is_imported() -> None:
+    code = """
+import sys
+from hma_model.cli import main
+for words in (
+    "convert -e pusht_fast --source nowhere.hdf5 --out o",
+    "convert -e pusht_fast --source tests --tokenizer none --out o",
+    "convert -e pusht_fast --source tests --val-fraction 7 --out o",
+    "inspect nowhere",
+    "train discrete_tiny data=[nowhere] --out o",
+    "train nowhere --out o",
+    "finetune --from nowhere --data nowhere --out o",
+    "evaluate nowhere nowhere",
+    "generate nowhere nowhere --out film.avi",
+    "mixture nowhere",
+    "shards preview nowhere",
+    "tokenizer eval none nowhere",
+    "tokenizer train nowhere.yaml",
+):
+    assert main(words.split()), words
+    assert "torch" not in sys.modules, words
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("error: ") == len(done.stderr.splitlines()) == 13
+
+
+def test_a_ctrl_c_says_what_is_kept(arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(*arguments: object, **options: object) -> None:
+        (tmp_path / "o" / "train").mkdir(parents=True)
+        (tmp_path / "o" / "train" / "shard-00000.parquet").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hma_data.conversion.job.convert", stopped)
+    source, out = str(tmp_path / "toy.hdf5"), str(tmp_path / "o")
+    done = hma("convert", "-e", str(arm), "--source", source, "--out", out)
+    fails(done, 130, "interrupted: 1 finished shard", "run the same command again to continue")
+
+
 def test_light_verbs_import_nothing_heavy() -> None:
     code = """
 import sys

@@ -16,24 +16,23 @@ from hma_data.cli.shards import shards_app
 from hma_data.cli.tokenizer import tokenizer_app
 from hma_data.console import print_json, print_table
 
+DATA = "Recordings and shards"  # the panel of `hma --help`
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
 
 
 def mount(app: typer.Typer) -> None:
     """Add every data verb to the command."""
-    app.add_typer(registry_app, name="registry")
-    app.command("inspect")(inspect)
-    app.command("doctor")(doctor)
-    app.command("convert")(convert)
-    app.add_typer(shards_app, name="shards")
-    app.command("mixture")(mixture)
-    app.add_typer(tokenizer_app, name="tokenizer")
-    app.command("bench")(bench)
+    for verb in (inspect, doctor, convert, mixture):
+        app.command(rich_help_panel=DATA)(verb)
+    app.add_typer(registry_app, name="registry", rich_help_panel=DATA)
+    app.add_typer(shards_app, name="shards", rich_help_panel=DATA)
+    app.add_typer(tokenizer_app, name="tokenizer", rich_help_panel=DATA)
+    app.command()(bench)
 
 
 def bench(
     name: Annotated[str | None, Argument(help="Which one; all are listed without it.")] = None,
-    settings: Annotated[list[str] | None, Argument(metavar="[KEY=VALUE]...", help="Its settings.")] = None,
+    settings: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Its settings.")] = None,
     json: Json = False,
 ) -> None:
     """Run a benchmark on generated data; nothing is downloaded.

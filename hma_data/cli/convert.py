@@ -8,8 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Option
 
-from hma_data.console import human_bytes, human_seconds, print_json, print_table, progress
-from hma_data.errors import HMAError, UsageError
+from hma_data.console import (
+    human_bytes,
+    human_count,
+    human_seconds,
+    interruptible,
+    print_json,
+    print_table,
+    progress,
+)
+from hma_data.errors import HMAError, Interrupted, UsageError
 
 if TYPE_CHECKING:
     from hma_data.conversion.job import Progress, Shared, Summary
@@ -17,35 +25,59 @@ if TYPE_CHECKING:
     from hma_data.conversion.recipe import ConversionJob
 
 SHOWN = 20  # reasons of quarantine that are printed
+DATA, BAD, OLD = "What is kept, and the split", "Episodes that cannot be used", "If --out holds a shard set"
+JOBS, RARE = "Several conversions, several machines", "Rarely needed"
 
 Text = str | None
 CHOICE = "ID|GLOB|@FILE"
 
 
 def convert(
-    embodiment: Annotated[Text, Option("--embodiment", "-e", help="Registry id, or a YAML file.")] = None,
+    embodiment: Annotated[
+        Text, Option("--embodiment", "-e", help="The robot: an id of the registry, or a YAML file.")
+    ] = None,
     out: Annotated[Path | None, Option(help="Folder of the shard set.")] = None,
-    source: Annotated[Text, Option(help="Recording; default: source.uri of the YAML.")] = None,
-    recipe: Annotated[Path | None, Option(help="Several conversions: a YAML as in recipes/convert.")] = None,
+    source: Annotated[
+        Text, Option(help="Recording: file, folder or URI; default: source.uri of the YAML.")
+    ] = None,
+    recipe: Annotated[
+        Path | None, Option(help="Several conversions: a YAML as in recipes/convert.", rich_help_panel=JOBS)
+    ] = None,
     tokenizer: Annotated[str, Option(help="Name of the tokenizer; see hma tokenizer list.")] = "fsq-16",
-    weights: Annotated[Text, Option(help="The tokenizer's weights, if not the usual ones.")] = None,
+    weights: Annotated[
+        Text, Option(help="The tokenizer's weights, if not the usual ones.", rich_help_panel=RARE)
+    ] = None,
     device: Annotated[str, Option(help="Where the tokenizer runs: cpu, cuda, mps.")] = "cpu",
     workers: Annotated[int, Option(min=0, help="Processes; 0 works in this one and survives no crash.")] = 1,
-    engine: Annotated[Literal["local", "ray"], Option(help="What runs the workers.")] = "local",
-    limit: Annotated[int | None, Option(min=1, help="Convert only the first episodes.")] = None,
+    engine: Annotated[
+        Literal["local", "ray"], Option(help="What runs the workers.", rich_help_panel=JOBS)
+    ] = "local",
+    limit: Annotated[
+        int | None, Option(min=1, help="Convert only so many episodes, from the first on.")
+    ] = None,
     only: Annotated[
         list[str] | None,
-        Option(help="Episode to take: id, glob or @FILE of ids; repeat it for more.", metavar=CHOICE),
+        Option(
+            help="Episode to take: id, glob or @FILE of ids; repeat it for more.",
+            metavar=CHOICE,
+            rich_help_panel=DATA,
+        ),
     ] = None,
     exclude: Annotated[
         list[str] | None,
-        Option(help="Episode to leave out: id, glob or @FILE of ids; repeat it for more.", metavar=CHOICE),
+        Option(
+            help="Episode to leave out: id, glob or @FILE of ids; repeat it for more.",
+            metavar=CHOICE,
+            rich_help_panel=DATA,
+        ),
     ] = None,
     frames: Annotated[
-        Literal["all", "strided"], Option(help="Keep all rows, or only those of the model's grid.")
+        Literal["all", "strided"],
+        Option(help="Keep all rows, or only those of the model's grid.", rich_help_panel=DATA),
     ] = "all",
     frequency_hz: Annotated[
-        float | None, Option(help="Rate of the recording, where the YAML does not know it.")
+        float | None,
+        Option(help="Rate of the recording, where the YAML does not know it.", rich_help_panel=DATA),
     ] = None,
     cameras: Annotated[
         list[str] | None,
@@ -56,26 +88,47 @@ def convert(
             help="Cameras to store; default: the YAML's first.",
         ),
     ] = None,
-    shard_frames: Annotated[int | None, Option(min=1, help="Frames in a shard, about.")] = None,
-    val_fraction: Annotated[float, Option(help="Share of episodes for validation.")] = 0.05,
-    seed: Annotated[int, Option(help="Seed of the split.")] = 0,
+    shard_frames: Annotated[
+        int | None, Option(min=1, help="Frames in a shard, about.", rich_help_panel=RARE)
+    ] = None,
+    val_fraction: Annotated[
+        float, Option(help="Share of episodes for validation.", rich_help_panel=DATA)
+    ] = 0.05,
+    seed: Annotated[int, Option(help="Seed of the split.", rich_help_panel=DATA)] = 0,
     max_quarantine: Annotated[
-        float, Option(min=0, max=1, help="Share of episodes that may be refused.")
+        float,
+        Option(min=0, max=1, help="Fail if a larger share of episodes is refused.", rich_help_panel=BAD),
     ] = 0.01,
     episode_timeout: Annotated[
-        float, Option(min=0, help="Refuse an episode after this many seconds without progress; 0: never.")
+        float,
+        Option(
+            min=0,
+            help="Refuse an episode after this many seconds without progress; 0: never.",
+            rich_help_panel=BAD,
+        ),
     ] = 300.0,
     extend: Annotated[
-        bool, Option("--extend", help="Add the episodes that the set in --out does not have yet.")
+        bool,
+        Option(
+            "--extend", help="Add the episodes that the set in --out does not have yet.", rich_help_panel=OLD
+        ),
     ] = False,
-    overwrite: Annotated[bool, Option("--overwrite", help="Delete the shard set in --out first.")] = False,
+    overwrite: Annotated[
+        bool, Option("--overwrite", help="Delete the shard set in --out first.", rich_help_panel=OLD)
+    ] = False,
     shard_index: Annotated[
-        int | None, Option(min=0, help="Which share of the shards this job makes, of --shard-count.")
+        int | None,
+        Option(
+            min=0, help="Which share of the shards this job makes, of --shard-count.", rich_help_panel=JOBS
+        ),
     ] = None,
     shard_count: Annotated[
-        int | None, Option(min=1, help="Number of jobs that share the work, for example a Slurm array.")
+        int | None,
+        Option(min=1, help="Jobs that share the work, for example a Slurm array.", rich_help_panel=JOBS),
     ] = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="Only print the plan, its size and time.")] = False,
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Only print the plan, its size and its time; write nothing.")
+    ] = False,
     json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Convert recordings to tokenized shards; run it again to continue.
@@ -140,6 +193,8 @@ def _run_all(jobs: "list[ConversionJob]", run: "Callable[[ConversionJob], bool]"
     for job in jobs:
         try:
             failed += not run(job)
+        except Interrupted:
+            raise
         except HMAError as fault:
             failed += 1
             typer.echo(f"error: {job.embodiment}: {fault}", err=True)
@@ -150,12 +205,13 @@ def _run_all(jobs: "list[ConversionJob]", run: "Callable[[ConversionJob], bool]"
 
 def _convert(job: "ConversionJob", json: bool, extend: bool, overwrite: bool, share: "Share | None") -> bool:
     """Run a conversion, or a share of it; return False if too many episodes are in quarantine."""
+    robot = _ready(job)
     from hma_data.conversion.engines import Limits
     from hma_data.conversion.job import convert as run
     from hma_data.conversion.job import convert_share
 
-    what = (_robot(job), job.source, job.tokenizer, job.out)
-    with _shown(job) as on_progress:
+    what = (robot, job.source, job.tokenizer, job.out)
+    with interruptible(lambda: _kept(job, overwrite)), _shown(job) as on_progress:
         options: dict[str, Any] = {
             "settings": job.settings,
             "workers": job.workers,
@@ -177,14 +233,26 @@ def _convert(job: "ConversionJob", json: bool, extend: bool, overwrite: bool, sh
     return not summary.too_many
 
 
+def _kept(job: "ConversionJob", overwrite: bool) -> str:
+    """Return what a Ctrl-C leaves, and how to go on."""
+    from hma_data.storage.remote import is_remote, place
+
+    out = place(job.out)
+    again = "run the same command again" + (", without --overwrite," if overwrite else "") + " to continue"
+    if is_remote(out):
+        return f"finished shards in {job.out} kept; {again}"
+    shards = sum(1 for _ in out.glob("*/shard-*.parquet"))
+    return f"{human_count(shards, 'finished shard')} in {job.out} kept; {again}"
+
+
 def _plan(job: "ConversionJob", json: bool) -> bool:
+    robot = _ready(job)
     from hma_data.conversion.job import plan_conversion
     from hma_data.conversion.plan import estimate
     from hma_data.shards.manifest import cameras_line
     from hma_data.storage.remote import place
     from hma_data.tokenizers.base import get_tokenizer
 
-    robot = _robot(job)
     opened = get_tokenizer(job.tokenizer, weights=job.weights, device=job.device)
     plan, uri = plan_conversion(robot, job.source, opened, job.settings)
     cost = estimate(plan, uri, robot, opened, job.workers)
@@ -208,10 +276,12 @@ def _plan(job: "ConversionJob", json: bool) -> bool:
             }
         )
         return True
-    print_table(["shard", "episodes", "frames, about"], [list(unit.values()) for unit in units])
+    print_table(["shard", "episodes", "recorded frames, about"], [list(unit.values()) for unit in units])
+    stride = plan.facts["frame_stride"]
+    kept = f" (1 of {stride} is kept)" if stride > 1 else ""
     print(
-        f"{uri}: {plan.episodes:,} episodes, about {plan.frames:,} frames into {len(units)} shards, "
-        f"about {human_bytes(cost.bytes)}"
+        f"{uri}: {human_count(plan.episodes, 'episode')}, about {plan.frames:,} recorded frames{kept} into "
+        f"{human_count(len(units), 'shard')}, about {human_bytes(cost.bytes)}"
     )
     _print_cameras(cameras_line(plan.facts["cameras"], robot), cost.pictures, robot, opened.spec.image_size)
     _print_left_out(plan.left_out)
@@ -234,10 +304,15 @@ def _print_cameras(line: str, pictures: dict[str, tuple[int, int]], robot: Any, 
         print(describe_resize(robot.camera(name), height, width, size))
 
 
-def _robot(job: "ConversionJob") -> Any:
+def _ready(job: "ConversionJob") -> Any:
+    """Return the robot; refuse what can be seen from the command line before torch is imported."""
     from hma_data.registry.embodiment import find
+    from hma_data.sources.base import require_there
+    from hma_data.tokenizers.catalog import find_entry
 
     robot = find(job.embodiment)
+    find_entry(job.tokenizer)
+    require_there(job.source or robot.source.uri or "")
     return robot if job.frequency_hz is None else robot.with_rate(job.frequency_hz)
 
 
@@ -267,9 +342,10 @@ def _report_share(done: "Shared", share: "Share", json: bool) -> None:
         return
     said = "all shards are there, the manifest is written"
     if done.missing:
-        said = f"{done.missing} shards are left to the other shares; the last of them writes the manifest"
+        missing = human_count(done.missing, "shard")
+        said = f"{missing} left to the other shares; the last of them writes the manifest"
     print(
-        f"{done.out}: share {share.name} made {done.made_shards} shards "
+        f"{done.out}: share {share.name} made {human_count(done.made_shards, 'shard')} "
         f"({done.kept_shards} were there already), {human_seconds(done.seconds)}; {said}"
     )
 

@@ -1,11 +1,15 @@
 """Run `hma inspect` (what is in a recording) and `hma doctor` (what in it will hurt training)."""
 
-from typing import Annotated, Any, Literal, NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 from typer import Argument, Option
 
-from hma_data.console import human_number, print_json, print_lines, print_table
+from hma_data.console import human_count, human_number, print_json, print_lines, print_table
+
+if TYPE_CHECKING:
+    from hma_data.inspection.folder import Found
 
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
 Episodes = Annotated[int, Option("--episodes", min=1, help="Number of episodes to look into.")]
@@ -18,20 +22,27 @@ NO_JITTER_MS = 0.001  # a smaller jitter comes from rounded stamps
 
 
 def inspect(
-    uri: Annotated[str, Argument(help="A recording: file, folder or URI.")],
+    uri: Annotated[str, Argument(help="A recording (file, folder or URI), or a folder of several.")],
     embodiment: Annotated[
-        str | None, Option("--embodiment", "-e", help="Check against this embodiment.")
+        str | None,
+        Option("--embodiment", "-e", help="Check whether this robot fits: a registry id, or a YAML file."),
     ] = None,
     episodes: Episodes = 20,
     fail_on: FailOn = "error",
     json: Json = False,
 ) -> None:
-    """Show what is in a recording.
+    """Show what is in a recording, or list the recordings in a folder.
 
     Exits with 1 as hma doctor does: if there is a finding of the severity of --fail-on or worse.
 
     Example: hma inspect ./demo.hdf5
     """
+    if embodiment is None and Path(uri).expanduser().is_dir():
+        from hma_data.inspection.folder import several
+
+        if recordings := several(uri):
+            _list(uri, [found.counted() for found in recordings], json)
+            return
     from hma_data.inspection.inspect import inspect_recording
 
     report = inspect_recording(uri, embodiment, episodes)
@@ -48,6 +59,19 @@ def _exit(found: list[str], fail_on: str) -> NoReturn:
 
     levels: list[str] = [*SEVERITIES, "never"]
     raise typer.Exit(int(any(levels.index(one) >= levels.index(fail_on) for one in found)))
+
+
+def _list(folder: str, found: "list[Found]", json: bool) -> None:
+    """Print the recordings of a folder, each with the command that looks at it."""
+    if json:
+        print_json({"folder": folder, "recordings": [one.to_json() for one in found]})
+        return
+    print(f"{folder}: {human_count(len(found), 'recording')}; look at them one by one:")
+    rows = [[one.command, one.format, one.episodes] for one in found]
+    print_table(["command", "format", "episodes"], rows)
+    for one in found:
+        if one.problem:
+            print(f"cannot be counted: {one.problem}")
 
 
 def _print_inspection(report: dict[str, Any]) -> None:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
+from hma_data.cli.shards import refuse_early
 from hma_data.console import print_json, print_table
 from hma_data.errors import UsageError
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
 
 Pairs = list[str] | None
+SHARES = "Other shares than the temperature's"
 
 
 def mixture(
@@ -24,26 +26,46 @@ def mixture(
     frames: Annotated[int, Option(min=1, help="Frames T of a window.")] = 12,
     split: Annotated[Literal["train", "val"], Option(help="Split to draw from.")] = "train",
     short: Annotated[Literal["drop", "pad"], Option(help="What to do with short episodes.")] = "drop",
-    weight: Annotated[Pairs, Option(metavar="NAME=FACTOR", help="Of an embodiment or group.")] = None,
-    group: Annotated[Pairs, Option(metavar="ID=GROUP", help="Groups get equal shares.")] = None,
-    cap: Annotated[Pairs, Option(metavar="ID=SHARE", help="Largest probability.")] = None,
-    max_epochs: Annotated[float | None, Option(help="Largest number of passes over one set.")] = None,
+    weight: Annotated[
+        Pairs,
+        Option(
+            metavar="NAME=FACTOR",
+            help="Multiply the probability of an embodiment or group; repeat it for more.",
+            rich_help_panel=SHARES,
+        ),
+    ] = None,
+    group: Annotated[
+        Pairs,
+        Option(
+            metavar="ID=GROUP",
+            help="Put an embodiment into a group; groups get equal shares.",
+            rich_help_panel=SHARES,
+        ),
+    ] = None,
+    cap: Annotated[
+        Pairs,
+        Option(metavar="ID=SHARE", help="Largest probability of an embodiment.", rich_help_panel=SHARES),
+    ] = None,
+    max_epochs: Annotated[
+        float | None, Option(help="Largest number of passes over one set.", rich_help_panel=SHARES)
+    ] = None,
     samples: Annotated[
         int | None, Option(min=1, help="Planned draws; default: the number of windows.")
     ] = None,
     plot: Annotated[Path | None, Option(help="PNG, SVG or PDF to draw.")] = None,
     json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show how often each embodiment is drawn.
+    """Show how often each embodiment is drawn when a model trains on several shard sets.
 
     Example: hma mixture shards/a shards/b --temperature 3 --plot mixture.png
     """
+    if plot and plot.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise UsageError("--plot", f"must end in .png, .svg or .pdf, is {plot}")
+    refuse_early(folders)
     from hma_data.loading.dataset import open_sets
     from hma_data.loading.mixture import TEMPERATURES, Mixture, plot_mixture
     from hma_data.shards.windows import WindowIndex
 
-    if plot and plot.suffix.lower() not in (".png", ".svg", ".pdf"):
-        raise UsageError("--plot", f"must end in .png, .svg or .pdf, is {plot}")
     tau = TEMPERATURES[split] if temperature is None else temperature
     sets = open_sets(folders)
     indexes = {name: WindowIndex.of(shards, split, frames, short=short) for name, shards in sets.items()}

@@ -1,5 +1,6 @@
 """Run `hma registry`: list and show embodiments, check their YAML, write a new robot's YAML, export it."""
 
+import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from hma_data.console import print_json, print_table
+from hma_data.console import human_count, print_json, print_table
 from hma_data.registry import FORMATS
 
 registry_app = typer.Typer(no_args_is_help=True, help="Look at embodiments, check and write their YAML.")
@@ -74,7 +75,7 @@ def registry_list(
             shown = {**row, "rate_hz": rate, "cameras": ", ".join(row["cameras"])}
             cells.append([shown[fact] for fact in LISTED.values()])
         print_table(list(LISTED), cells)
-        print(f"{len(rows):,} embodiment{'s' if len(rows) != 1 else ''}")
+        print(human_count(len(rows), "embodiment"))
     for line in broken:
         print(f"not listed: {line}", file=sys.stderr)
     raise typer.Exit(1 if broken else 0)
@@ -146,7 +147,7 @@ def registry_validate(
     else:
         for entry, problem in found:
             print(f"{entry.path}: {_line(problem)}")
-        print(f"{len(judged)} files, {len(found)} problems")
+        print(f"{human_count(len(judged), 'file')}, {human_count(len(found), 'problem')}")
     raise typer.Exit(1 if found else 0)
 
 
@@ -236,6 +237,7 @@ def registry_infer(
         print(pairing)
     for path, question in todos(values):
         print(f"answer {path}: {question}")
+    print(f"then: hma registry validate {shlex.quote(str(out))}")
 
 
 def _schema_for(out: Path) -> str:

@@ -1,13 +1,13 @@
 """Run `hma shards`: look at shard sets, verify them, and make new sets from them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer import Argument, Option
 
-from hma_data.console import Update, human_bytes, print_json, print_table, progress
+from hma_data.console import Update, human_bytes, human_count, print_json, print_table, progress
 
 if TYPE_CHECKING:
     from hma_data.shards.manifest import Manifest
@@ -23,9 +23,19 @@ Camera = Annotated[str | None, Option(help="Camera to take; default: the first."
 Json = Annotated[bool, Option("--json", help="Print JSON.")]
 
 
-def _in(update: Update, unit: float = 1) -> Callable[[int, int], None]:
-    """Return a progress callback that counts in `unit`."""
-    return lambda done, total: update(done / unit, total=total / unit)
+def _in(update: Update) -> Callable[[int, int], None]:
+    """Return a callback of (done, total) that updates a progress display."""
+    return lambda done, total: update(done, total=total)
+
+
+def refuse_early(folders: Iterable[str]) -> None:
+    """Refuse folders of this machine without shards, before torch is imported for the rest of a verb."""
+    from hma_data.shards.reader import ShardSet
+    from hma_data.storage.remote import is_remote, place
+
+    for folder in map(place, folders):
+        if not is_remote(folder):
+            ShardSet(folder)
 
 
 @shards_app.command("info")
@@ -49,9 +59,9 @@ def _print_info(facts: dict[str, Any]) -> None:
     robot, totals, episodes = facts["embodiment"], facts["totals"], facts["episodes"]
     print(f"{facts['folder']}: {robot['id']} × {facts['tokenizer']['name']}, from {facts['source']}")
     print(
-        f"{totals['episodes']:,} episodes, {totals['frames']:,} frames at {robot['rows_hz']:g} Hz "
-        f"({totals['hours']:.2f} h), {human_bytes(totals['bytes'])} in {facts['shards']:,} shards "
-        f"({facts['bytes_per_frame']:.0f} bytes a frame)"
+        f"{human_count(totals['episodes'], 'episode')}, {totals['frames']:,} frames at "
+        f"{robot['rows_hz']:g} Hz ({totals['hours']:.2f} h), {human_bytes(totals['bytes'])} in "
+        f"{human_count(facts['shards'], 'shard')} ({facts['bytes_per_frame']:.0f} bytes a frame)"
     )
     print(f"cameras: {robot['cameras_line']}")
     print(
@@ -95,13 +105,17 @@ def shards_verify(
 
     Example: hma shards verify shards/my_arm
     """
+    from hma_data.errors import ShardError
     from hma_data.shards.verify import verify
-    from hma_data.storage.remote import place
+    from hma_data.storage.remote import is_remote, place
 
+    for folder in map(place, folders):
+        if not is_remote(folder) and not folder.is_dir():
+            raise ShardError(folder, "is not a folder", "name the --out folder of an hma convert")
     found = {}
-    with progress("verify", unit="MB") as update:
+    with progress("verify", unit="bytes") as update:
         for folder in folders:
-            problems = verify(folder, workers=workers, quick=quick, on_progress=_in(update, 1e6))
+            problems = verify(folder, workers=workers, quick=quick, on_progress=_in(update))
             found[str(place(folder))] = problems
     if json:
         print_json(found)
@@ -109,7 +123,7 @@ def shards_verify(
         for folder_name, problems in found.items():
             for problem in problems:
                 print(problem)
-            print(f"{folder_name}: {f'{len(problems)} problems' if problems else 'sound'}")
+            print(f"{folder_name}: {human_count(len(problems), 'problem') if problems else 'sound'}")
     raise typer.Exit(1 if any(found.values()) else 0)
 
 
@@ -134,15 +148,17 @@ def shards_preview(
     from hma_data.shards.preview import preview
 
     place = out or Path(f"{folder.resolve().name}-preview")
-    shown = preview(
-        folder,
-        place,
-        episodes=episodes,
-        weights=weights,
-        camera=camera,
-        only=only or (),
-        exclude=exclude or (),
-    )
+    with progress("preview") as update:
+        shown = preview(
+            folder,
+            place,
+            episodes=episodes,
+            weights=weights,
+            camera=camera,
+            only=only or (),
+            exclude=exclude or (),
+            on_progress=_in(update),
+        )
     print(f"wrote {shown.sheet} and {shown.video} ({len(shown.episodes)} episodes)")
     for line in shown.resized:
         print(line)
@@ -153,8 +169,8 @@ def totals_line(out: Path, manifest: "Manifest") -> str:
     totals = manifest.to_json()["totals"]
     splits = ", ".join(f"{name} {split['episodes']:,}" for name, split in manifest.splits.items())
     return (
-        f"{out}: {totals['episodes']:,} episodes ({splits}), {totals['frames']:,} frames, "
-        f"{human_bytes(totals['bytes'])} in {len(manifest.shards)} shards"
+        f"{out}: {human_count(totals['episodes'], 'episode')} ({splits}), {totals['frames']:,} frames, "
+        f"{human_bytes(totals['bytes'])} in {human_count(len(manifest.shards), 'shard')}"
     )
 
 
@@ -217,8 +233,8 @@ def shards_restat(folder: Folder, workers: Workers = None, json: Json = False) -
     """
     from hma_data.conversion.rewrite import restat
 
-    with progress("restat", unit="MB") as update:
-        manifest = restat(folder, workers=workers, on_progress=_in(update, 1e6))
+    with progress("restat", unit="bytes") as update:
+        manifest = restat(folder, workers=workers, on_progress=_in(update))
     _report(folder, manifest, json)
 
 

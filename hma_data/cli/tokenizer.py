@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from hma_data.console import human_bytes, print_json, print_table
+from hma_data.console import human_bytes, interruptible, print_json, print_table
 from hma_data.errors import MissingDependencyError, RecipeError, UsageError
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
@@ -52,9 +52,7 @@ def _print_list(entries: list[Any]) -> None:
 @tokenizer_app.command("train")
 def tokenizer_train(
     recipe: Annotated[Path, Argument(help="A YAML of recipes/tokenizer.")],
-    overrides: Annotated[
-        list[str] | None, Argument(metavar="[KEY=VALUE]...", help="Dotted overrides.")
-    ] = None,
+    overrides: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Dotted overrides.")] = None,
     out: Annotated[Path, Option(help="The weights' file.")] = Path("tokenizer.safetensors"),
     device: Device = "cpu",
     workers: Annotated[int, Option(min=0, help="Threads that draw crops ahead.")] = 0,
@@ -63,8 +61,7 @@ def tokenizer_train(
 
     Example: hma tokenizer train recipes/tokenizer/fsq.yaml --out fsq.safetensors
     """
-    from hma_data.storage.yaml_io import parse_yaml
-    from hma_data.tokenizers.training.train import train
+    from hma_data.storage.yaml_io import parse_yaml, read_yaml
 
     changes = {}
     for text in overrides or []:
@@ -76,7 +73,17 @@ def tokenizer_train(
     def report(line: str) -> None:
         typer.echo(line, err=True)
 
-    facts = train(recipe, out, changes, device=device, workers=workers, report=report)
+    def kept() -> str:
+        state = out.with_name(out.name + ".state")
+        if not state.is_file():
+            return "nothing is saved before step 100"
+        return f"{state} holds the run up to its last report; the same command continues from there"
+
+    read_yaml(recipe, RecipeError)  # a missing recipe is refused before torch is imported
+    with interruptible(kept):
+        from hma_data.tokenizers.training.train import train
+
+        facts = train(recipe, out, changes, device=device, workers=workers, report=report)
     print(f"wrote {out}: " + ", ".join(f"{key} {value}" for key, value in facts.items()))
 
 
@@ -103,11 +110,12 @@ def tokenizer_eval(
     """
     from hma_data.registry.embodiment import find
     from hma_data.tokenizers.base import get_tokenizer
-    from hma_data.tokenizers.training.eval import evaluate, to_markdown, without_frames, write_report
-    from hma_data.tokenizers.training.frames import frames_of
 
     robot = find(embodiment) if embodiment else None
     opened = get_tokenizer(tokenizer, weights=weights, device=device)
+    from hma_data.tokenizers.training.eval import evaluate, to_markdown, without_frames, write_report
+    from hma_data.tokenizers.training.frames import frames_of
+
     perceptual, missing = _perceptual(lpips, device)
     found, skipped = {}, list[str]()
     for place in data:

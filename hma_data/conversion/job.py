@@ -8,7 +8,7 @@ the job goes on.
 
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,7 +36,7 @@ from hma_data.errors import OutputError, RegistryError, SourceError, StorageAway
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import EPISODES, MANIFEST, Manifest, damaged_files, finish, shard_sizes
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.schema import flag_totals
+from hma_data.shards.schema import RowLayout, flag_totals
 from hma_data.sources.base import EpisodeRef, of_another_format, open_source
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
 from hma_data.storage.files import remove_parts
@@ -296,13 +296,13 @@ class _Conversion:
         there = finished_shards(self.out, plan, base, share is not None)
         todo = [unit for unit in mine if unit.name not in there]
         kept = [unit for unit in mine if unit.name in there]
-        cameras = len(plan.facts["cameras"])
+        layout = RowLayout.of_plan(plan.facts, self.embodiment)
         progress = Progress(
             episodes=sum(len(unit.episodes) for unit in kept),
-            frames=cameras * sum(unit.frames for unit in kept),
+            frames=_encoded(kept, layout),
             kept_shards=len(kept) + (len(base.shards) if base else 0),
             total_episodes=sum(len(unit.episodes) for unit in mine),
-            total_frames=cameras * sum(unit.frames for unit in mine),
+            total_frames=_encoded(mine, layout),
             pictures=self.pictures,
         )
         on_progress(progress)
@@ -353,6 +353,12 @@ class _Conversion:
         )
         remove_notes(out)
         return manifest
+
+
+def _encoded(units: Sequence[ShardUnit], layout: RowLayout) -> int:
+    """Return the number of frames to encode: of every camera, and with --frames strided only the grid's."""
+    rows = sum(ref.frames // layout.frame_stride for unit in units for _, ref in unit.episodes)
+    return rows * len(layout.cameras)
 
 
 def _reasons(out: Path) -> dict[str, int]:

@@ -87,7 +87,7 @@ def job_of_options(**values: Any) -> ConversionJob:
     except ValidationError as fault:
         first = fault.errors()[0]
         name = "--" + "-".join(map(str, first["loc"])).replace("_", "-")
-        raise UsageError(name, f"is {first['input']!r}: {first['msg'].lower()}") from fault
+        raise UsageError(name, f"is {first['input']!r}, {_rule(first['msg'])}") from fault
 
 
 def load_jobs(path: StrPath) -> list[ConversionJob]:
@@ -123,4 +123,9 @@ def _valid[T: BaseModel](model: type[T], values: Any, where: str) -> T:
             raise RecipeError(where, f"has the unknown key {key!r}{hint}", remedy) from fault
         if first["type"] == "missing":
             raise RecipeError(where, f"lacks {key}", remedy) from fault
-        raise RecipeError(where, f"{key} is {first['input']!r}: {first['msg'].lower()}", remedy) from fault
+        raise RecipeError(where, f"{key} is {first['input']!r}, {_rule(first['msg'])}", remedy) from fault
+
+
+def _rule(message: str) -> str:
+    """Return pydantic's message in our words: must be less than 1."""
+    return message.lower().replace("input should be", "must be")

@@ -4,6 +4,7 @@ N pictures, H×W pixels, A action dims; pictures are uint8 RGB.
 """
 
 import io
+import re
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from itertools import chain
@@ -32,7 +33,7 @@ def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = ()
     for i, row in enumerate(rows):
         top = gap + i * (height + gap + label_height)
         if labels:
-            write_text(sheet, labels[i], (gap, top + 13))
+            write_text(sheet, fitted(labels[i], sheet.shape[1] - 2 * gap), (gap, top + 13))
         for j, picture in enumerate(row):
             left = gap + j * (width + gap)
             sheet[top + label_height : top + label_height + height, left : left + width] = picture
@@ -42,8 +43,46 @@ def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = ()
 def write_text(picture: Images, text: str, at: tuple[int, int], scale: float = 0.42) -> None:
     """Write text into a picture in place, with its lower left corner at (x, y)."""
     cv2 = opencv()
-    plain = text.encode("ascii", "replace").decode()
-    cv2.putText(picture, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, INK, 1, cv2.LINE_AA)
+    cv2.putText(picture, _ascii(text), at, cv2.FONT_HERSHEY_SIMPLEX, scale, INK, 1, cv2.LINE_AA)
+
+
+def text_width(text: str, scale: float = 0.42) -> int:
+    """Return the width in pixels that `write_text` needs."""
+    cv2 = opencv()
+    return int(cv2.getTextSize(_ascii(text), cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
+
+
+def fitted(text: str, width: int, scale: float = 0.42) -> str:
+    """Return a text that fits `width` pixels: where it is too long, its middle becomes two dots."""
+    short, kept = text, len(text)
+    while kept and text_width(short, scale) > width:
+        kept -= 1
+        short = text[: (kept + 1) // 2] + ".." + text[len(text) - kept // 2 :]
+    return short
+
+
+def fitted_names(names: Sequence[str], width: int, scale: float = 0.42) -> list[str]:
+    """Return names that fit `width` pixels and still differ.
+
+    If one is too long, the words that all of them begin and end with are left out; then see `fitted`.
+    """
+    if len(names) < 2 or all(text_width(name, scale) <= width for name in names):
+        return [fitted(name, width, scale) for name in names]
+    words = [re.findall(r"[^_./ ]*[_./ ]|[^_./ ]+", name) for name in names]
+    room = min(map(len, words)) - 1  # a word of each name stays
+    before = min(_common(words), room)
+    after = min(_common([parts[::-1] for parts in words]), room - before)
+    cut = ["".join(parts[before : len(parts) - after]) for parts in words]
+    return [fitted(name.rstrip("_./ "), width, scale) for name in cut]
+
+
+def _common(words: Sequence[Sequence[str]]) -> int:
+    """Return the number of words with which all names begin."""
+    return next((i for i, column in enumerate(zip(*words, strict=False)) if len(set(column)) > 1), 0)
+
+
+def _ascii(text: str) -> str:
+    return text.encode("ascii", "replace").decode()
 
 
 def with_actions(

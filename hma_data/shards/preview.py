@@ -4,7 +4,7 @@
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,17 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import describe_resize, opencv
-from hma_data.episodes.sheets import INK, PAPER, Images, write_mp4, write_png, write_text
+from hma_data.episodes.sheets import (
+    INK,
+    PAPER,
+    Images,
+    fitted,
+    fitted_names,
+    text_width,
+    write_mp4,
+    write_png,
+    write_text,
+)
 from hma_data.errors import ShardError, TokenizerError
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_totals, token_column
@@ -28,7 +38,9 @@ THUMB, GAP, LABEL, STRIPS, FILM = 144, 4, 18, 22, 256  # pixels; STRIPS is the h
 DECODED = 16  # frames decoded at a time
 LINE, CURSOR, ZERO, UNKNOWN = (0, 114, 178), (213, 94, 0), (200, 200, 200), (225, 225, 225)
 MOST = 16  # strips; of further values only the number is shown
-LABELS, FOOT = 136, 16  # pixels left of the strips and below them
+LABELS, NAMES, FOOT = 240, 120, 16  # pixels left of the strips, of the names in them, and below the strips
+BESIDE = 232  # pixels by which the curves of the video are wider than its picture
+SMALL = 0.36  # scale of the text beside the strips
 WINDOW = 12  # frames of the model's window
 
 
@@ -135,7 +147,7 @@ class Curves:
         for dim in range(shown):
             self._strip(picture, dim, dim * tall, tall)
         text = f"0 to {self.seconds:.1f} s" + (f", {rest} more values" if rest else "")
-        write_text(picture, text, (LABELS, self.height - 4), 0.36)
+        write_text(picture, text, (LABELS, self.height - 4), SMALL)
         return picture
 
     def at(self, row: int) -> Images:
@@ -176,8 +188,14 @@ class Curves:
         cv2.polylines(picture, [points], False, LINE, 1, cv2.LINE_AA)
         picture[top + 2 : top + 3 + inner, LABELS - 1] = INK
         if tall >= 10:
-            write_text(picture, self.names[dim][:10], (4, top + tall // 2 + 4), 0.36)
-            write_text(picture, f"{self.low[dim]:.2g}..{self.high[dim]:.2g}", (66, top + tall // 2 + 4), 0.26)
+            height = top + tall // 2 + 4
+            limits = f"{self.low[dim]:.2g} to {self.high[dim]:.2g}"
+            write_text(picture, self._names[dim], (4, height), SMALL)
+            write_text(picture, limits, (LABELS - 6 - text_width(limits, SMALL), height), SMALL)
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return fitted_names(self.names[:MOST], NAMES - 8, SMALL)
 
 
 # -- in pictures
@@ -226,6 +244,7 @@ def preview(
     tokenizer: Tokenizer | None = None,
     only: Sequence[str] = (),
     exclude: Sequence[str] = (),
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Preview:
     """Write `sheet.png` and `preview.mp4` for episodes spread evenly over a shard set.
 
@@ -239,6 +258,7 @@ def preview(
         frames: largest number of frames of each episode in the video.
         tokenizer: tokenizer that decodes; None takes the set's own.
         only, exclude: episodes to choose from: ids, globs, or @FILE; see `chosen_ids`.
+        on_progress: called with (frames drawn, frames in all) after each frame of the video.
 
     Raises:
         ShardError: the set holds no episodes.
@@ -258,7 +278,16 @@ def preview(
     sheet, video = out / "sheet.png", out / "preview.mp4"
     write_png(sheet, np.concatenate([one.sheet(columns) for one in seen]))
     rate = shards.embodiment.rate_hz / shards.manifest.frame_stride
-    write_mp4(video, (frame for one in seen for frame in one.film(frames)), rate)
+    total = sum(min(row["length"], frames) for row in rows)
+
+    def film() -> Iterator[Images]:
+        drawn = (frame for one in seen for frame in one.film(frames))
+        for done, frame in enumerate(drawn, start=1):
+            yield frame
+            on_progress(done, total)
+
+    on_progress(0, total)
+    write_mp4(video, film(), rate)
     resized = [
         describe_resize(one, *one.size, shards.spec.image_size)
         for one in map(shards.embodiment.camera, cameras)
@@ -312,7 +341,7 @@ class _Seen:
             strip = np.full((LABEL + THUMB + GAP, width, 3), PAPER, np.uint8)
             named = [camera] if len(self._tokens) > 1 else []
             words = "   ".join([*named, *([] if number else [self.label])])
-            write_text(strip, words[:110], (GAP, LABEL - 5))
+            write_text(strip, fitted(words, width - 2 * GAP), (GAP, LABEL - 5))
             for place, picture in enumerate(pictures):
                 left = GAP + place * (THUMB + GAP)
                 strip[LABEL : LABEL + THUMB, left : left + THUMB] = _resized(picture, THUMB)
@@ -321,13 +350,13 @@ class _Seen:
 
     def film(self, most: int) -> Iterator[Images]:
         """Yield (H, W, 3) for each frame: the pictures, and the actions with a cursor at its time."""
-        curves = self._curves(FILM + 128, FILM)
-        cameras = len(self._tokens)
+        curves = self._curves(FILM + BESIDE, FILM)
+        width = (len(self._tokens) + 1) * FILM + BESIDE
         for start in range(0, min(self._length, most), DECODED):
             rows = np.arange(start, min(start + DECODED, self._length, most))
             for row, *pictures in zip(rows, *self._pictures(rows).values()):
-                bar = np.full((LABEL, (cameras + 1) * FILM + 128, 3), PAPER, np.uint8)
-                write_text(bar, self.label[: 40 * (cameras + 1)], (GAP, LABEL - 5))
+                bar = np.full((LABEL, width, 3), PAPER, np.uint8)
+                write_text(bar, fitted(self.label, width - 2 * GAP), (GAP, LABEL - 5))
                 parts = [*(_resized(picture, FILM) for picture in pictures), curves.at(int(row))]
                 yield np.concatenate([bar, np.concatenate(parts, axis=1)])
 

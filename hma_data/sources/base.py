@@ -253,17 +253,17 @@ def detect(uri: StrPath) -> str:
     uri = as_text(uri)
     if not uri:
         raise SourceError("", "the recording's path is empty", "name a file, a folder or a URI")
-    ours = {name: import_module(package).RECOGNITION for name, package in FORMATS.items()}
+    ours = _of_toolkit()
     if found := _by_uri(uri, ours):
         return found
     if _is_away(uri):
         return _by_uri(uri, _of_packages()[0]) or "rlds"
     path = local_path(uri)
     files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())[:2000]
-    if found := _by_files(path, files, ours):
+    if found := by_files(path, files, ours):
         return found
     theirs, broken = _of_packages()
-    if found := _by_uri(uri, theirs) or _by_files(path, files, theirs):
+    if found := _by_uri(uri, theirs) or by_files(path, files, theirs):
         return found
     if broken:
         raise broken[0]
@@ -275,6 +275,22 @@ def detect(uri: StrPath) -> str:
         fault, remedy = unreadable(files[0], "is not a recording of a known format", remedy)
         raise nothing_there(uri, path, fault, remedy)
     raise nothing_there(uri, path, "holds no files", remedy)
+
+
+def recognitions() -> Recognitions:
+    """Return how the formats are recognised: the built-in ones, then those of installed packages."""
+    return {**_of_packages()[0], **_of_toolkit()}
+
+
+def require_there(uri: StrPath) -> None:
+    """Raise SourceError if a local recording does not exist; a URI or a name of the hub is not looked at."""
+    uri = as_text(uri)
+    if uri and not _is_away(uri) and not _by_uri(uri, recognitions()):
+        local_path(uri)
+
+
+def _of_toolkit() -> Recognitions:
+    return {name: import_module(package).RECOGNITION for name, package in FORMATS.items()}
 
 
 def _of_packages() -> tuple[Recognitions, list[PluginError]]:
@@ -308,7 +324,7 @@ def _by_uri(uri: str, known: Recognitions) -> str | None:
     return next(by_name, None) or next(by_ending, None)
 
 
-def _by_files(path: Path, files: Sequence[Path], known: Recognitions) -> str | None:
+def by_files(path: Path, files: Sequence[Path], known: Recognitions) -> str | None:
     """Return the format that the files of a recording on this machine show."""
     for name, recognition in known.items():
         if any((path / place).is_file() for place in recognition.layout):
@@ -372,7 +388,7 @@ def local_path(uri: str) -> Path:
     if "://" in plain:
         remedy = "copy it here: only RLDS and LeRobot are read elsewhere"
         raise SourceError(uri, "is not on this machine", remedy)
-    raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
+    raise SourceError(uri, "does not exist", "check the path, or source.uri in the embodiment's YAML")
 
 
 def leaves(path: Path, folder: Path) -> bool:

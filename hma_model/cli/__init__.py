@@ -4,30 +4,68 @@ Every verb imports its modules when it runs, so that --help answers at once.
 """
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
+from typer.core import TyperGroup
 
+from hma_data import __version__
 from hma_data.bench import BENCHES
 from hma_data.cli import mount
-from hma_data.console import print_json, print_table
+from hma_data.console import interruptible, print_json, print_table
 from hma_data.cpu import bound_spinning, take_ordinary_priority
-from hma_data.errors import HMAError
+from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
 from hma_model.cli.hub import Json, hub_app
+from hma_model.cli.train import MODELS
+
+
+class _Verbs(TyperGroup):
+    """The verbs; a Ctrl-C that no verb explains ends in one line, where typer would say nothing."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with interruptible(lambda: "nothing more is written"):
+            return super().invoke(ctx)
+
 
 app = typer.Typer(
     name="hma",
+    cls=_Verbs,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Robot recordings to tokenized shards, to a world model, to the hub. Add --debug for tracebacks.",
 )
 _Wrong: type[typer.BadParameter] = typer.BadParameter.__mro__[2]  # ClickException of typer's click
+_TAG = re.compile(r"\[(?=[a-z#/@][^\[]*\])")  # the beginning of what rich takes for markup
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"hma {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    pass
+
+
+def _show_brackets(command: Any) -> None:
+    """Change the help of a command and of its commands so that rich prints brackets and what is in them."""
+    for item in (command, *command.params):
+        if getattr(item, "help", None):
+            item.help = _TAG.sub(r"\[", item.help)
+    for inner in getattr(command, "commands", {}).values():
+        _show_brackets(inner)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,7 +82,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or bool(os.environ.get("HMA_DEBUG"))
     try:
-        code = app([word for word in words if word != "--debug"], standalone_mode=False)
+        command = typer.main.get_command(app)
+        _show_brackets(command)
+        plain = [word for word in words if word != "--debug"]
+        code = command.main(plain, prog_name="hma", standalone_mode=False)
     except SystemExit as ended:  # a rank whose error another rank has reported
         return ended.code if isinstance(ended.code, int) else 1
     except HMAError as fault:
@@ -56,10 +97,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not fault.format_message().strip() or type(fault).__name__ == "NoArgsIsHelpError":
             return 2  # the help has been shown
         hint = f" — see {context.command_path} --help" if context else ""
-        said = fault.format_message().replace("Value error, ", "")  # of the enum options
+        said = fault.format_message().replace("Value error, ", "").replace("Input should be", "must be")
         return _fail(said + hint, 2)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted; run the same command again to continue", 130)
+        return _fail("interrupted", 130)
     except BrokenPipeError:
         sys.stderr.close()
         return 1
@@ -76,11 +117,22 @@ def _fail(text: str, code: int) -> int:
     return code
 
 
+FIGURES = {  # figures of `hma evaluate` as its table names them; the others have their names in the JSON
+    "against": "compared with",
+    "loss": "loss, nats a token",
+    "shuffled_loss": "loss with shuffled actions",
+    "baseline_loss": "loss of token frequencies alone",
+    "accuracy": "accuracy, share of tokens",
+    "psnr_action_gain_last": "last frame, true less shuffled, dB",
+}
 Checkpoint = Annotated[
     str, typer.Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
 Data = Annotated[Path, typer.Argument(help="A shard set.")]
-UnmaskSteps = Annotated[int, typer.Option("--unmask-steps", min=1, help="Decoding steps of a frame.")]
+Split = Annotated[Literal["train", "val"], typer.Option("--split", help="Split to take windows from.")]
+UnmaskSteps = Annotated[
+    int, typer.Option("--unmask-steps", min=1, help="Passes in which a discrete model decodes a frame.")
+]
 SampleSteps = Annotated[
     int | None,
     typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
@@ -106,21 +158,28 @@ def demo(
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Number of training steps.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of recording and training.")] = 0,
 ) -> None:
-    """Run the whole pipeline, small: record, convert, mix, train, publish, roll out, report.
+    """Run every step on two small simulated robots: record, convert, train, publish, roll out, report.
+
+    It takes a few minutes and downloads nothing.
 
     Example: hma demo --out demo
     """
     from hma_model.demo import demo as run
 
-    report = run(out, episodes=episodes, steps=steps, seed=seed)
+    with interruptible(lambda: f"finished steps are kept in {out}; run the same command again to continue"):
+        report = run(out, episodes=episodes, steps=steps, seed=seed)
     print(f"open {report}")
 
 
-@app.command()
+mount(app)
+cli_train.mount(app)
+
+
+@app.command(rich_help_panel=MODELS)
 def evaluate(
     checkpoint: Checkpoint,
     data: Data,
-    split: Annotated[str, typer.Option("--split", help="train or val.")] = "val",
+    split: Split = "val",
     windows: Annotated[int, typer.Option("--windows", min=1, help="Number of windows, evenly spaced.")] = 64,
     frames: Annotated[
         int | None, typer.Option("--frames", min=2, help="Frames of a window; by default the model's.")
@@ -134,32 +193,36 @@ def evaluate(
     cameras: Cameras = None,
     json: Json = False,
 ) -> None:
-    """Measure the loss and its baseline, and rollouts with true and shuffled actions.
+    """Measure the loss, and how well rollouts predict: with the true actions and with another window's.
 
     Example: hma evaluate runs/first shards/my_arm
     """
+    opened = _opened(checkpoint, data)
     from hma_model.evaluation.evaluate import evaluate as run
+    from hma_model.evaluation.evaluate import verdict
 
     found = run(
-        *_opened(checkpoint, data), split=split, count=windows, frames=frames, prompt=prompt, seed=seed,
+        *opened, split=split, count=windows, frames=frames, prompt=prompt, seed=seed,
         unmask_steps=unmask_steps, sample_steps=sample_steps, cameras=_names(cameras),
     )  # fmt: skip
     if json:
         print_json(found)
         return
-    plain = {key: value for key, value in found.items() if not isinstance(value, dict)}
-    print_table(["figure", "value"], list(plain.items()))
+    plain = [[FIGURES.get(key, key), value] for key, value in found.items() if not isinstance(value, dict)]
+    print_table(["figure", "value"], plain)
     columns = ["psnr", "psnr_last", "ssim"]
     rows = [[name, *(found[name][column] for column in columns)] for name in ("true", "shuffled", "copy")]
     print_table(["rollout", "PSNR dB", "last frame dB", "SSIM"], rows)
+    print("true: the window's actions; shuffled: another window's; copy: the prompt's last frame, repeated")
+    print(f"{checkpoint} {verdict(found)}")
 
 
-@app.command()
+@app.command(rich_help_panel=MODELS)
 def generate(
     checkpoint: Checkpoint,
     data: Data,
     out: Annotated[Path, typer.Option("--out", help="The video: .mp4 or .webp.")],
-    split: Annotated[str, typer.Option("--split", help="train or val.")] = "val",
+    split: Split = "val",
     window: Annotated[int, typer.Option("--window", min=0, help="Number of the window to start at.")] = 0,
     frames: Annotated[
         int | None,
@@ -171,17 +234,20 @@ def generate(
     temperature: Annotated[
         float, typer.Option("--temperature", min=0, help="0 takes the likeliest token.")
     ] = 0.0,
-    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollout.")] = 0,
     cameras: Cameras = None,
 ) -> None:
-    """Write a video of a rollout beside the truth.
+    """Write a video: the truth, and beside it what the model predicts from a few frames and the actions.
 
     Example: hma generate runs/first shards/my_arm --out rollout.mp4
     """
+    if out.suffix not in (".mp4", ".webp"):
+        raise UsageError("--out", f"{out} is neither .mp4 nor .webp")
+    opened = _opened(checkpoint, data)
     from hma_model.evaluation.rollout_video import rollout_video, write_video
 
     film = rollout_video(
-        *_opened(checkpoint, data), split=split, window=window, frames=frames, prompt=prompt, seed=seed,
+        *opened, split=split, window=window, frames=frames, prompt=prompt, seed=seed,
         unmask_steps=unmask_steps, sample_steps=sample_steps, temperature=temperature,
         cameras=_names(cameras),
     )  # fmt: skip
@@ -197,17 +263,29 @@ def _names(cameras: str | None) -> str | list[str] | None:
 
 def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
     """Return the model with the shard set's embodiment, its tokenizer, and the shard set."""
-    from hma_data.shards.preview import tokenizer_of
     from hma_data.shards.reader import ShardSet
+
+    shards = ShardSet(data)  # it and the checkpoint are refused before torch is imported
+    _require_checkpoint(checkpoint)
+    from hma_data.shards.preview import tokenizer_of
     from hma_model.network.model import HMA
 
-    shards = ShardSet(data)
     model = HMA.from_pretrained(checkpoint, embodiments=[shards.embodiment.id])
     return model.eval(), tokenizer_of(shards), shards
 
 
-mount(app)
-cli_train.mount(app)
+def _require_checkpoint(checkpoint: str) -> None:
+    """Refuse a folder of this machine that holds no checkpoint; a name in a folder is not one of the hub."""
+    from hma_data.storage.paths import is_repository
+    from hma_model.checkpoint.folder import resolve
+
+    if "://" in checkpoint or "@" in checkpoint:
+        return
+    folder = Path(checkpoint).expanduser()
+    if folder.parent.is_dir() or not is_repository(checkpoint):
+        resolve(folder)
+
+
 BENCHES["mup"] = "hma_model.bench.mup:BENCH"
 BENCHES |= {name: f"hma_model.bench.speed:{name.upper()}" for name in ("generate", "train", "waiting")}
-app.add_typer(hub_app, name="hub")
+app.add_typer(hub_app, name="hub", rich_help_panel=MODELS)

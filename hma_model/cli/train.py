@@ -6,23 +6,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hma_data.console import human_seconds, print_json
+from hma_data.cli.shards import refuse_early
+from hma_data.console import human_seconds, interruptible, print_json
 
 if TYPE_CHECKING:
     from hma_model.training.loop import TrainResult
 
 Overrides = Annotated[
-    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Dotted overrides of the recipe.")
+    list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Dotted overrides of the recipe.")
 ]
 Out = Annotated[Path | None, typer.Option("--out", help="The run's folder.")]
 Force = Annotated[bool, typer.Option("--force", help="Resume although the recipe or the shards changed.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+MODELS = "Models"  # the panel of `hma --help`
+STOPPED = "the run's checkpoints are kept; the same command continues from the newest"
 
 
 def mount(app: typer.Typer) -> None:
     """Add the verbs to the command."""
-    app.command("train")(train)
-    app.command("finetune")(finetune)
+    app.command("train", rich_help_panel=MODELS)(train)
+    app.command("finetune", rich_help_panel=MODELS)(finetune)
 
 
 def train(
@@ -32,17 +35,34 @@ def train(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Train; run it again to resume. On several GPUs: torchrun --nproc-per-node N --no-python hma train …
+    """Train a model on shard sets; run it again to resume.
 
-    Example: hma train discrete_tiny data=[shards/my_arm] --out runs/first
+    On several GPUs: torchrun --nproc-per-node N --no-python hma train …
+
+    Example: hma train discrete_tiny "data=[shards/my_arm]" --out runs/first
     """
-    from hma_model.training.loop import train as run
-    from hma_model.training.parallel import report_once
+    words = overrides or []
+    _refuse_early(recipe, words)
+    with interruptible(lambda: STOPPED):
+        from hma_model.training.loop import train as run
+        from hma_model.training.parallel import report_once
+        from hma_model.training.recipe import load_recipe
+
+        with report_once():
+            result = run(load_recipe(recipe, words), out=out, force=force)
+    _tell(result, json)
+
+
+def _refuse_early(recipe: str, overrides: list[str]) -> None:
+    """Refuse a wrong recipe, or a folder without shards, before torch is imported.
+
+    Under torchrun nothing is refused here: of all ranks, `report_once` lets only one report.
+    """
+    if "RANK" in os.environ:
+        return
     from hma_model.training.recipe import load_recipe
 
-    with report_once():
-        result = run(load_recipe(recipe, overrides or []), out=out, force=force)
-    _tell(result, json)
+    refuse_early(load_recipe(recipe, overrides).data)
 
 
 def finetune(
@@ -54,9 +74,7 @@ def finetune(
     ],
     overrides: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[SHARDS]... [KEY=VALUE]...", help="More shard sets; overrides of the recipe."
-        ),
+        typer.Argument(metavar="SHARDS|KEY=VALUE", help="More shard sets; overrides of the recipe."),
     ] = None,
     freeze_trunk: Annotated[
         bool, typer.Option("--freeze-trunk", help="Train stems and heads; keep the trunk as it is.")
@@ -70,14 +88,16 @@ def finetune(
 
     Example: hma finetune --from team/model --data shards/my_arm --freeze-trunk --out runs/my_arm
     """
-    from hma_model.training.loop import finetune as run
-    from hma_model.training.parallel import report_once
-
-    words = overrides or []
-    folders = [*data, *(Path(word) for word in words if "=" not in word)]
+    words = [word for word in overrides or [] if "=" in word]
+    folders = [*data, *(Path(word) for word in overrides or [] if "=" not in word)]
     options: dict[str, Any] = {"out": out, "freeze_trunk": freeze_trunk, "recipe": recipe, "force": force}
-    with report_once():
-        result = run(source, folders, overrides=[word for word in words if "=" in word], **options)
+    _refuse_early(recipe, [f"data={[str(folder) for folder in folders]}", *words])
+    with interruptible(lambda: STOPPED):
+        from hma_model.training.loop import finetune as run
+        from hma_model.training.parallel import report_once
+
+        with report_once():
+            result = run(source, folders, overrides=words, **options)
     _tell(result, json)
 
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 BASELINE_FRAMES = 200_000
+FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
 PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
 
 
@@ -339,6 +340,14 @@ def evaluate(
         **scores,
         "psnr_action_gain_last": scores["true"]["psnr_last"] - scores["shuffled"]["psnr_last"],
     }
+
+
+def verdict(found: Mapping[str, Any]) -> str:
+    """Return a sentence about the result of `evaluate`: whether the model follows its actions."""
+    said = f"{found['psnr_action_gain_last']:+.1f} dB on the last frame, true less shuffled actions"
+    if found["psnr_action_gain_last"] >= FOLLOWS_DB:
+        return f"follows its actions: {said}"
+    return f"does not follow its actions yet ({said})"
 
 
 def _losses(

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from hma_data.console import human_seconds
+from hma_data.console import human_times
 from hma_data.errors import MissingDependencyError
 from hma_data.storage.files import finite, write_atomic
 from hma_data.storage.paths import StrPath, as_path
@@ -262,30 +262,30 @@ class RunLog:
             self._said = text
 
     def _pace(self) -> tuple[float, str]:
-        """Return windows a second of the last steps, and the remaining time, other work included."""
+        """Return windows a second of the last steps, and the session's time so far and still needed."""
         done = max(self._last["step"] - self._begin, 1)
         seconds = max(sum(self._paces) / max(len(self._paces), 1), 1e-9)
         besides = max(time.monotonic() - self._opened - self._spent, 0.0) / done
         left = (self._steps - self._last["step"]) * (seconds + besides)
-        return self._last["windows"] / seconds, human_seconds(left)
+        return self._last["windows"] / seconds, human_times(time.monotonic() - self._opened, left)
 
     def _smooth(self) -> dict[str, float]:
         return {n: sum(v) / len(v) if v else math.nan for n, v in sorted(self._recent.items())}
 
     def _text(self) -> str:
-        rate, left = self._pace()
+        rate, times = self._pace()
         losses = ", ".join(f"{name} {value:.3f}" for name, value in self._smooth().items())
         held = f", validation {_number(self._evaluation.get('loss'))}" if self._evaluation else ""
         skipped = f", {self._last['skipped']} steps skipped" if self._last.get("skipped") else ""
         where = f"step {self._last['step']}/{self._steps}"
-        return f"{where}: loss {losses}{held}, {rate:.1f} windows/s, {left} left{skipped}"
+        return f"{where}: loss {losses}{held}, {rate:.1f} windows/s, {times}{skipped}"
 
     def _table(self) -> "Group":
         from rich.box import SIMPLE
         from rich.console import Group
         from rich.table import Table
 
-        rate, left = self._pace()
+        rate, times = self._pace()
         table = Table("embodiment", "loss", "perplexity", "validation", "baseline", box=SIMPLE)
         held = self._evaluation.get("loss_by_embodiment", {})
         ignoring = self._evaluation.get("baseline_by_embodiment", {})
@@ -293,7 +293,7 @@ class RunLog:
             known = [_number(values.get(name)) for values in (held, ignoring)]
             table.add_row(name, f"{loss:.3f}", f"{perplexity(loss):,.1f}" if self._nats else "-", *known)
         last = self._last
-        head = f"step {last['step']:,}/{self._steps:,}   {rate:.1f} windows/s   {left} left"
+        head = f"step {last['step']:,}/{self._steps:,}   {rate:.1f} windows/s   {times}"
         rest = f"lr {last['lr']:.2e}   {last.get('memory_mib', 0):,.0f} MiB"
         skipped = f"   {last['skipped']} steps skipped" if last.get("skipped") else ""
         return Group(f"{head}   {rest}{skipped}", table)

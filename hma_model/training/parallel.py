@@ -1,6 +1,6 @@
 """Train on several ranks under torchrun: join them, report their errors, and distribute the network.
 
-    torchrun --nproc-per-node 8 --no-python hma train discrete_base data=[…] --out runs/base
+    torchrun --nproc-per-node 8 --no-python hma train discrete_base "data=[…]" --out runs/base
 
 A recipe states the whole step, and the ranks share its passes. Training is therefore the same on any number
 of ranks. DDP keeps the whole network on every rank. FSDP2 shards the trunk's blocks; stems, heads, embeddings

@@ -186,7 +186,7 @@ def _version_folder(uri: str, files: Any, path: str) -> str:
     if is_listless(files) or files.isfile(f"{path}/features.json"):
         return path
     if not files.exists(path):
-        raise SourceError(uri, "does not exist", "check --source, or source.uri in the embodiment's YAML")
+        raise SourceError(uri, "does not exist", "check the path, or source.uri in the embodiment's YAML")
     found: list[Any] = []
     for pattern in ("*/features.json", "*/*/features.json"):
         if is_local(files):  # its name may contain the wildcards of patterns

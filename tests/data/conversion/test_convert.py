@@ -166,6 +166,21 @@ def test_two_jobs_on_one_folder_are_refused(toy_arm, toy_recording, tmp_path, bl
         run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer)
 
 
+def test_progress_reaches_its_total_in_encoded_frames(
+    toy_arm, toy_recording, tmp_path, block_tokenizer
+) -> None:
+    seen = []
+    settings = Settings(frames="strided", cameras=("top", "side"))
+    out = tmp_path / "out"
+    convert(
+        toy_arm, toy_recording, block_tokenizer, out, settings=settings,
+        on_progress=lambda state: seen.append((state.frames, state.total_frames)),
+    )  # fmt: skip
+    rows = sum(length // 2 for length in range(20, 32)) * 2
+    assert seen[0] == (0, rows)
+    assert seen[-1] == (rows, rows)
+
+
 def test_strided_rows_carry_the_whole_chunk(toy_arm, toy_recording, tmp_path, block_tokenizer) -> None:
     run(toy_arm, toy_recording, tmp_path / "out", block_tokenizer, Settings(frames="strided"))
     assert verify(tmp_path / "out") == []

@@ -20,6 +20,7 @@ from hma_model.evaluation.evaluate import (
     shuffled_actions,
     unconditional_baseline,
     validation_losses,
+    verdict,
     windows,
 )
 from hma_model.evaluation.metrics import teacher_forced, token_hits, token_nats
@@ -268,3 +269,10 @@ def test_a_model_of_another_tokenizer_is_refused(data):
 def test_a_split_without_windows_is_refused(model, data):
     with pytest.raises(UsageError, match="no window of 40 frames in val"):
         evaluate(model, Blocks(), data, frames=40)
+
+
+def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
+    assert verdict({"psnr_action_gain_last": 2.13}).startswith(
+        "follows its actions: +2.1 dB on the last frame"
+    )
+    assert verdict({"psnr_action_gain_last": 0.1}).startswith("does not follow its actions yet (+0.1 dB")

@@ -277,8 +277,8 @@ def test_after_a_resume_speed_and_time_left_are_of_this_sessions_steps(tmp_path,
         for step in range(1002, 1021):
             log.step(facts(step))
     first, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("step 1001/1100") and "8.0 windows/s, 1 min 39 s left" in first
-    assert last.startswith("step 1020/1100") and "16.0 windows/s, 40.0 s left" in last
+    assert first.startswith("step 1001/1100") and " 8.0 windows/s, 0 s so far, 1 min 39 s left" in first
+    assert last.startswith("step 1020/1100") and "16.0 windows/s, 0 s so far, 40 s left" in last
 
 
 def test_time_left_counts_what_is_done_between_steps(tmp_path, capsys, monkeypatch):
@@ -288,7 +288,7 @@ def test_time_left_counts_what_is_done_between_steps(tmp_path, capsys, monkeypat
         for step in range(1, 51):
             clock[0] += 0.5 + 1.0  # a second for evaluations a step
             log.step(facts(step))
-    assert "16.0 windows/s, 1 min 15 s left" in capsys.readouterr().err.splitlines()[-1]
+    assert "s so far, 1 min 15 s left" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_loss_that_is_no_number_leaves_the_shown_mean_one(tmp_path, capsys):

@@ -131,7 +131,7 @@ def test_an_out_that_cannot_be_named_is_one_clear_error(toy_arm: Embodiment, tmp
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--frequency-hz", "0"], "--frequency-hz: is 0.0: input should be greater than 0"),
+        (["--frequency-hz", "0"], "--frequency-hz: is 0.0, must be greater than 0"),
         (["--frequency-hz", "nan"], "--frequency-hz: is nan"),
         (["--frequency-hz", "inf"], "--frequency-hz: is inf"),
         (["--extend", "--overwrite"], "give one of them"),

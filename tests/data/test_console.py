@@ -1,0 +1,46 @@
+"""Progress off a terminal: amounts in their unit, elapsed and remaining time; tables as they are."""
+
+import pytest
+
+from hma_data import console
+from hma_data.errors import Interrupted
+
+
+def test_progress_tells_elapsed_from_remaining_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    with console.progress("convert arm", unit="frames") as update:
+        update(0, total=400)
+        clock[0] = 12.0
+        update(100, "3/9 episodes", total=400)
+        assert capsys.readouterr().err == (
+            "convert arm: 100/400 frames, 8.3/s, 12 s so far, 36 s left, 3/9 episodes\n"
+        )
+
+
+def test_bytes_have_their_own_unit_and_an_unknown_total_is_left_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with console.progress("verify", unit="bytes") as update:
+        update(0, total=45_400)
+        update(45_400, total=45_400)
+    assert "verify: 45.4 kB of 45.4 kB" in capsys.readouterr().err
+    with console.progress("verify", unit="bytes") as update:
+        update(0)
+    assert capsys.readouterr().err == "verify: 0 B, 0 s so far\n"
+
+
+def test_brackets_in_tables_are_text(capsys: pytest.CaptureFixture[str]) -> None:
+    console.print_table(["key [unit]", "n"], [["pose[rad]", 1]], title="in [a]")
+    out = capsys.readouterr().out
+    assert all(words in out for words in ("key [unit]", "pose[rad]", "in [a]"))
+
+
+def test_a_ctrl_c_becomes_an_error_with_the_words() -> None:
+    with (
+        pytest.raises(Interrupted, match="interrupted: 3 shards kept"),
+        console.interruptible(lambda: "3 shards kept"),
+    ):
+        raise KeyboardInterrupt
