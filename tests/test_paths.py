@@ -420,6 +420,7 @@ INNER = {  # take what a public function has made of a path already
         "file_fingerprint",
         "unfollowed",
         "nothing_there",
+        "by_files",
     },
     "hma_data.sources.hands.scan": {"scan_cached", "inspect_videos"},
     "hma_data.tokenizers.training.frames": {"read_pictures", "load_pools"},

@@ -225,31 +225,33 @@ class Embodiment(SpecModel):
         return write_yaml(self.to_dict())
 
     @classmethod
-    def from_yaml(cls, text: str, where: str = "embodiment.yaml") -> "Embodiment":
+    def from_yaml(cls, text: str, where: str = "embodiment.yaml", *, stored: bool = False) -> "Embodiment":
         """Return the embodiment of a YAML text; see `load`."""
-        return cls.from_values(parse_yaml(text, where), where)
+        return cls.from_values(parse_yaml(text, where), where, stored=stored)
 
     @classmethod
-    def load(cls, path: StrPath) -> "Embodiment":
+    def load(cls, path: StrPath, *, stored: bool = False) -> "Embodiment":
         """Return the embodiment of a YAML file.
 
         Args:
             path: str or path of the YAML.
+            stored: the YAML lies in shards or a checkpoint; keys of `source.layout` that older releases
+                ignored are ignored.
 
         Raises:
             RegistryError: the file has problems; the error lists them all, each with YAML path, value and
                 what is allowed.
         """
         file = as_path(path)
-        return cls.from_values(read_yaml(file), str(file))
+        return cls.from_values(read_yaml(file), str(file), stored=stored)
 
     @classmethod
-    def from_values(cls, values: Any, where: str) -> "Embodiment":
+    def from_values(cls, values: Any, where: str, *, stored: bool = False) -> "Embodiment":
         """Return the embodiment of a YAML's plain values; see `load`."""
-        found = problems(values)
+        found = problems(values, stored)
         if found:
             raise RegistryError(where, "; ".join(found), "hma registry schema prints what is allowed")
-        return cls.model_validate(values)
+        return cls.model_validate(values, context={"stored": stored})
 
 
 @dataclass(frozen=True)
@@ -268,19 +270,19 @@ class Problem:
         return text + (f"; allowed: {self.allowed}" if self.allowed else "")
 
 
-def problems(values: Any) -> list[str]:
+def problems(values: Any, stored: bool = False) -> list[str]:
     """Return all problems of a YAML's plain values, one line each; empty when it is valid."""
-    return [str(problem) for problem in find_problems(values)]
+    return [str(problem) for problem in find_problems(values, stored)]
 
 
-def find_problems(values: Any) -> list[Problem]:
-    """Return all problems of a YAML's plain values."""
+def find_problems(values: Any, stored: bool = False) -> list[Problem]:
+    """Return all problems of a YAML's plain values; for `stored`, see `Embodiment.load`."""
     if not isinstance(values, dict):
         return [Problem("", f"must be a mapping, is {type(values).__name__}")]
     questions = todos(values)
     found = [Problem(path, f"still {TODO}: {text}") for path, text in questions]
     try:
-        Embodiment.model_validate(values)
+        Embodiment.model_validate(values, context={"stored": stored})
     except ValidationError as fault:
         asked = {path for path, _ in questions}
         for item in fault.errors(include_url=False):

@@ -34,7 +34,6 @@ from hma_data.storage.files import atomic_path, file_sha256, parse_json, write_a
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath, place
-from hma_data.storage.yaml_io import parse_yaml
 from hma_data.tokenizers.base import TokenizerSpec
 
 MANIFEST, EPISODES = "manifest.json", "episodes.parquet"
@@ -180,7 +179,7 @@ class Manifest:
             check_version(values, path)
             manifest = cls(
                 plan=values["plan"],
-                embodiment=Embodiment.from_values(values["embodiment"], str(path)),
+                embodiment=Embodiment.from_values(values["embodiment"], str(path), stored=True),
                 tokenizer=TokenizerSpec.from_json(values["tokenizer"]),
                 shards=tuple(
                     ShardFile(**{**s, "row_groups": tuple(s["row_groups"])}) for s in values["shards"]
@@ -232,7 +231,7 @@ def stored_embodiment(folder: Path) -> Embodiment:
     """
     path = folder / EMBODIMENT
     text = path.read_text(encoding="utf-8", errors="replace")
-    return Embodiment.from_values(parse_yaml(text, str(path)), str(path))
+    return Embodiment.from_yaml(text, str(path), stored=True)
 
 
 def seal_problem(text: bytes) -> str:

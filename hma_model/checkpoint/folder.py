@@ -129,7 +129,7 @@ class Checkpoint:
 
     def embodiment(self, embodiment: str) -> Embodiment:
         """Return the embodiment as it was at training."""
-        return Embodiment.load(self.path(embodiment, YAML))
+        return Embodiment.load(self.path(embodiment, YAML), stored=True)
 
     def stats(self, embodiment: str) -> dict[str, Any]:
         """Return stats.json of an embodiment: at least {"action": {"mean": [...], "std": [...]}}."""

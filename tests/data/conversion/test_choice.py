@@ -129,7 +129,7 @@ def test_the_command_counts_what_it_leaves_out(tmp_path, arm_yaml) -> None:
     words = ["convert", "-e", arm_yaml, "--source", tmp_path / "toy.hdf5", "--tokenizer", "fsq-8"]
     words += ["--out", tmp_path / "out", "--workers", "0"]
     planned = hma(*words, "--dry-run", "--exclude", "demo_0", "--exclude", "demo_2")
-    assert "2 episodes, about 16 frames" in planned.stdout
+    assert "2 episodes, about 16 recorded frames" in planned.stdout
     assert "left out by only and exclude: 2 episodes" in planned.stdout
     done = hma(*words, "--json", "--only", "demo_[12]", "--exclude", "demo_1")
     assert (json.loads(done.stdout)["episodes"], json.loads(done.stdout)["left_out"]) == (1, 3)

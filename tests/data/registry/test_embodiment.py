@@ -279,6 +279,13 @@ def test_a_problem_of_one_part_hides_none_of_another() -> None:
     assert said[f"{layout}.episode"].startswith("unknown key of format hdf5, did you mean 'episodes'?")
 
 
+def test_shards_and_checkpoints_of_older_releases_may_have_layout_keys_that_were_ignored() -> None:
+    values = changed("source.layout", {"axes": "THWC"})
+    with pytest.raises(RegistryError, match="unknown key"):
+        Embodiment.from_values(values, "arm.yaml")
+    assert Embodiment.from_values(values, "arm.yaml", stored=True).source.layout == {"axes": "THWC"}
+
+
 def test_the_page_on_adding_a_robot_lists_every_layout_key() -> None:
     page = (Path(__file__).parents[3] / "docs" / "adding-a-robot.md").read_text()
     table = page[page.index("| format | key of `layout` |") :].split("\n\n")[0]
