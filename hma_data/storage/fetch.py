@@ -10,8 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import fsspec
-
 from hma_data.errors import HMAError, MissingDependencyError, SourceError, StorageAwayError
 
 CONNECT_S = 3.0  # seconds to wait for a server to answer
@@ -148,6 +146,8 @@ def file_system(uri: str) -> tuple[Any, str]:
         MissingDependencyError: the file system's package is not installed.
         ValueError: no file system is known by that scheme.
     """
+    import fsspec  # here: commands that read no URI start without it
+
     scheme = uri.split("://", 1)[0]
     options: dict[str, Any] = {}
     try:
