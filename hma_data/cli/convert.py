@@ -391,7 +391,7 @@ def _report(summary: "Summary", max_quarantine: float, json: bool) -> None:
         typer.echo(f"quarantine: {count:,} × {reason}", err=True)
     if summary.too_many:
         typer.echo(
-            f"error: {summary.out}: {totals['quarantined']:,} episodes are in quarantine, more than "
+            f"error: {summary.out}: {human_count(totals['quarantined'], 'episode')} in quarantine, more than "
             f"--max-quarantine {max_quarantine:g} allows; what was converted is kept "
             "— see quarantine.jsonl; --exclude leaves them out",
             err=True,
