@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import fsspec
+import safetensors  # noqa: F401: what a push imports, imported once
 from fsspec.implementations.local import LocalFileSystem
 
 from hma_model.hub import publish as hub
