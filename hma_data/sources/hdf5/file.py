@@ -378,18 +378,18 @@ def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDA
 
 
 def walk(group: h5py.Group) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Yield every dataset below `group` with its path, up to 5,000 keys; do not follow links."""
-    pending: list[tuple[str, h5py.Group]] = [("", group)]
+    """Yield every dataset below `group` with its path, up to 5,000 keys; do not follow links or cycles."""
+    pending: list[tuple[str, h5py.Group, tuple[h5py.Group, ...]]] = [("", group, (group,))]
     seen = 0
     while pending and seen <= MAX_KEYS:
-        prefix, current = pending.pop(0)
+        prefix, current, above = pending.pop(0)
         seen += len(current)
         for name in current:
             if not isinstance(current.get(name, getlink=True), h5py.HardLink):
                 continue
             item = current[name]
-            if isinstance(item, h5py.Group):
-                pending.append((f"{prefix}{name}/", item))
+            if isinstance(item, h5py.Group) and item not in above:
+                pending.append((f"{prefix}{name}/", item, (*above, item)))
             elif isinstance(item, h5py.Dataset):
                 yield f"{prefix}{name}", item
 

@@ -114,7 +114,7 @@ anything = st.recursive(
 # -- round trips
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(values=embodiments())
 def test_yaml_gives_the_same_embodiment_back(values: dict[str, Any]) -> None:
     made = Embodiment.from_values(values, "made")
@@ -122,7 +122,7 @@ def test_yaml_gives_the_same_embodiment_back(values: dict[str, Any]) -> None:
     assert again == made and again.digest == made.digest and again.to_yaml() == made.to_yaml()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(values=embodiments())
 def test_dims_names_and_mask_have_one_width(values: dict[str, Any]) -> None:
     made = Embodiment.from_values(values, "made")
@@ -328,7 +328,7 @@ def test_open_questions_are_the_problem_not_what_pydantic_says_of_them() -> None
     assert todos({"a": [{"b": "TODO: c?"}]}) == [("a[0].b", "c?")]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(value=anything, path=st.sampled_from(["id", "action", "cameras", "sync", "source", "cameras.0", "x"]))
 def test_any_value_anywhere_is_valid_or_has_problems_of_one_line(value: Any, path: str) -> None:
     values = changed(path, value)
@@ -378,7 +378,7 @@ def test_what_is_not_plain_yaml_is_refused_with_its_place(text: str, said: str) 
     assert str(found.value).startswith("arm.yaml: not valid YAML") and "\n" not in str(found.value)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(text=st.text(max_size=60) | st.text("a:-[]{}&*!?|>'\"# \n\t1", max_size=40))
 def test_any_text_is_parsed_or_refused_by_our_error(text: str) -> None:
     try:
@@ -387,7 +387,7 @@ def test_any_text_is_parsed_or_refused_by_our_error(text: str) -> None:
         assert "\n" not in str(fault)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     values=st.dictionaries(words, st.recursive(words | st.integers() | st.booleans(), st.lists), max_size=4)
 )

@@ -21,6 +21,7 @@ def _generate(**changes: Any) -> dict[str, Any]:
     return speed.GENERATE.defaults | SMALL | {"frames": 1, "ddim_steps": 2} | changes
 
 
+@pytest.mark.slow
 def test_a_results_settings_and_figures_are_named() -> None:
     words = [f"{key}={value}" for key, value in SMALL.items()] + ["kind=discrete", "cache=true", "frames=1"]
     done = CliRunner().invoke(app, ["bench", "generate", *words, "--json"])

@@ -73,6 +73,7 @@ def test_of_a_folder_hub_by_its_uri_the_trunk_alone_comes_along(leg, tmp_path):
     assert Checkpoint.open(result.checkpoint).embodiments == ("leg",)
 
 
+@pytest.mark.slow
 def test_the_command_finetunes_from_a_repository_and_the_run_goes_on_without_it(published, leg, tmp_path):
     cache = {"HF_ENDPOINT": published.url, "HF_HUB_CACHE": str(tmp_path / "c"), "HF_HUB_DISABLE_XET": "1"}
     words = ["finetune", "--from", REPO, "--data", str(leg), "--freeze-trunk", "--out", str(tmp_path / "run")]

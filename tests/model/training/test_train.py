@@ -66,6 +66,7 @@ def kill_at(step: int):
     return kill
 
 
+@pytest.mark.slow
 def test_training_beats_what_ignoring_everything_reaches(recipe, tmp_path):
     data = [str(make_shards(tmp_path / "arm", "arm", episodes=60, length=32))]
     network = {"layers": 2, "width": 32, "heads": 2}
