@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import fsspec
-import safetensors  # noqa: F401: what a push imports, imported once
+import safetensors  # noqa: F401 (a killed push imports it; here once)
 from fsspec.implementations.local import LocalFileSystem
 
 from hma_model.hub import publish as hub
