@@ -290,7 +290,7 @@ class SourceSpec(SpecModel):
 
 
 class Quality(SpecModel):
-    """What happens to an episode whose camera shows nothing that a model could learn."""
+    """The rule for an episode whose camera shows nothing that a model could learn."""
 
     blank: Verdict = Field("refuse", description="a camera shows one colour throughout, such as black")
     still: Verdict = Field("flag", description="a camera shows one picture throughout")

@@ -126,7 +126,7 @@ class KeyInfo:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a recording holds, found without an embodiment.
+    """The contents of a recording, found without an embodiment.
 
     Attributes:
         format: as `open_source` takes it.
