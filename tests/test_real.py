@@ -63,6 +63,7 @@ def test_inspect_and_convert(real_data: Path, tmp_path: Path, robot: str, record
     assert 10 * np.log10(255**2 / error) > 16  # the same picture, however coarse the tokens
 
 
+@pytest.mark.slow
 def test_an_episode_whose_video_is_missing_is_quarantined(real_data: Path, tmp_path: Path) -> None:
     uri = str(real_data / "lerobot/g1_v21")
     summary = convert(find("g1_inspire"), uri, "fsq-8", tmp_path / "o", settings=Settings(limit=2))

@@ -66,6 +66,7 @@ assert seen(data.batches(3, "fork"), 14) == seen(iter(dataset(sets)), 14)
 """
 
 
+@pytest.mark.slow
 def test_forked_workers_give_the_same_batches(sets: list[Path]) -> None:
     run_fresh(FORKING, *sets)
 

@@ -34,6 +34,7 @@ def test_a_column_is_as_pyarrow_gives_it(column: pa.Array, part: slice) -> None:
     np.testing.assert_array_equal(found, wanted.reshape(found.shape))
 
 
+@pytest.mark.slow
 def test_windows_are_read_without_pandas(tmp_path: Path) -> None:
     make_set(tmp_path / "set", 0, SMALL | {"frames": 300})
     code = (

@@ -455,6 +455,7 @@ def test_names_that_lead_elsewhere_are_left_there(published, tmp_path, name):
 # -- the token, and the command
 
 
+@pytest.mark.slow
 def test_the_command_never_shows_or_stores_the_token(server, source, tmp_path):
     environment = {
         "HF_ENDPOINT": server.url, "HF_TOKEN": TOKEN, "HF_HOME": str(tmp_path / "home"),

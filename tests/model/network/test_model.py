@@ -148,6 +148,7 @@ def test_each_conditioning_overfits_what_follows_from_actions(conditioning: Any)
     ("objective", "change"),
     [("policy", {"action_loss": "diffusion"}), ("forward", {"kind": "continuous", "grid": (4, 4)})],
 )
+@pytest.mark.slow
 def test_diffusion_heads_learn_a_handful_of_windows(objective: str, change: dict) -> None:
     losses = _overfit(objective, 200, **change)  # the noise of a nearly clean sample stays unknown
     assert sum(losses[-30:]) / 30 < 0.5 * sum(losses[:5]) / 5
