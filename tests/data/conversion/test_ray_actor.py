@@ -17,6 +17,8 @@ from hma_data.conversion.engines.ray import Answer, End, Worker
 from hma_data.errors import TokenizerError
 from tests.data.conversion.test_engines import PLAIN, MakeWork, Unit
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[3]
 
 

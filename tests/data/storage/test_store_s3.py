@@ -30,6 +30,8 @@ from hma_data.storage.files import cache_folder
 from hma_data.storage.remote import RemotePath, place, put_file
 from tests.conftest import ARM_YAML, BlockTokenizer
 
+pytestmark = pytest.mark.slow
+
 SMALL = Settings(val_fraction=0.2, shard_frames=60)
 ROOT = Path(__file__).parents[3]
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
