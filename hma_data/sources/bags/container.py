@@ -11,6 +11,7 @@ receipt are known, so a time range is read without the rest. A file has some tho
 import bz2
 import sqlite3
 import struct
+from abc import ABC, abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -150,7 +151,7 @@ class FileIndex:
         return self.channels[number]
 
 
-class IndexedFile:
+class IndexedFile(ABC):
     """A bag file that is read piece by piece; its unpacked chunks are kept in `chunks`.
 
     Every method of a container raises EpisodeError when the file is damaged.
@@ -191,9 +192,9 @@ class IndexedFile:
             self._indexed = self._make_index(file)
         return self._indexed
 
+    @abstractmethod
     def counts(self) -> Counter[Channel]:
         """Count the messages of each channel, from the index if there is one; also of empty channels."""
-        raise NotImplementedError
 
     def payloads(self, places: Sequence[FilePlace]) -> Iterator[Data]:
         """Yield the data of the messages at those places."""
@@ -205,21 +206,23 @@ class IndexedFile:
                 start, end = self._content(view, at)
                 yield view[start:end]
 
+    @abstractmethod
     def _make_index(self, file: BinaryIO) -> FileIndex:
-        raise NotImplementedError
+        """Return the pieces of the file, and its channels."""
 
+    @abstractmethod
     def _view(self, file: BinaryIO, at: int) -> "View":
         """Return the records of the piece at an offset, read lazily where they lie unpacked in the file."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _content(self, view: "View", at: int) -> tuple[int, int]:
         """Return where the data of the message at `at` begins and ends."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _in_piece(
         self, file: BinaryIO, index: FileIndex, piece: Piece, wanted: RecordFilter
     ) -> Iterator[Record]:
-        raise NotImplementedError
+        """Yield the wanted messages of a piece."""
 
 
 def take_last(found: dict[str, Record], records: Iterable[Record]) -> None:
