@@ -65,7 +65,7 @@ def shard_picture_findings(shards: ShardSet) -> Iterator[Finding]:
 
 
 def _cameras(shards: ShardSet) -> Iterator[_Camera]:
-    reader = EpisodeReader(shards, [token_column(shards.spec)[0]])
+    reader = _reader(shards)
     table = shards.episodes.sort_by([("shard", "ascending"), ("row_start", "ascending")])
     for episode in table.select(["id", "split", "shard", "row_start", "length"]).to_pylist():
         for name in shards.manifest.cameras:
@@ -80,11 +80,13 @@ def _cameras(shards: ShardSet) -> Iterator[_Camera]:
             yield _Camera(episode, name, variety, still and len(rows) > 1)
 
 
+def _reader(shards: ShardSet) -> EpisodeReader:
+    return EpisodeReader(shards, sorted(set(shards.manifest.layout.token_columns.values())))
+
+
 def _rows(shards: ShardSet, reader: EpisodeReader, episode: dict[str, Any], camera: str) -> NDArray[Any]:
-    """Return the tokens or latents (N, S) of a camera; the reader reads this column alone."""
-    length = episode["length"]
-    first = episode["row_start"] + length * shards.camera_index(camera)
-    return reader.rows(episode["shard"], first, length)[token_column(shards.spec)[0]]
+    """Return the tokens or latents (N, S) of a camera."""
+    return reader.episode(episode, camera)[token_column(shards.spec)[0]]
 
 
 def _looked_at(length: int) -> NDArray[np.int64]:
@@ -102,7 +104,7 @@ def _blank(shards: ShardSet, seen: Sequence[_Camera]) -> list[_Camera]:
         tokenizer = tokenizer_of(shards)
     except HMAError:
         return []
-    reader = EpisodeReader(shards, [token_column(shards.spec)[0]])
+    reader = _reader(shards)
     found: list[_Camera] = []
     misses = 0
     for one in ordered:
