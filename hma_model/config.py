@@ -76,6 +76,9 @@ OBJECTIVES: Mapping[str, Objective] = {
 CONDITIONINGS = ("modulation", "concat", "add", "cross_attention")
 _CHOICES = {
     "kind": ("discrete", "continuous"),
+    "training_pass": ("window", "pairs"),
+    "masked_input": ("learned", "previous"),
+    "position_init": ("random", "sinusoid"),
     "time_position": ("rotary", "learned"),
     "action_alignment": ("previous", "current"),
     "modulation_out": ("trunk", "embodiment"),
@@ -91,7 +94,14 @@ _AT_LEAST_ONE = (
     *("history_frames", "diffusion_depth", "diffusion_width", "diffusion_train_steps", "views"),
     *("diffusion_sample_steps", "diffusion_repeats"),
 )
-_SHARES = ("label_smoothing", "corrupt_max", "history_probability", "mask_ratio_min", "dropout")
+_SHARES = (
+    "label_smoothing",
+    "corrupt_max",
+    "history_probability",
+    "mask_ratio_min",
+    "dropout",
+    "whole_share",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +162,14 @@ class HMAConfig:
     history_probability: float = 0.2
     history_frames: int = 4  # the shortest such history
     mask_ratio_min: float = 0.0  # a masked frame's smallest mask probability
+    # The frames of a training pass that predicts video. "window": the window's, masked (paper). "pairs": the
+    # true frames, and a masked copy of each from the second on, which sees the true frames before it.
+    training_pass: str = "window"
+    whole_share: float = 0.5  # pairs: the share of copies that are wholly masked
+    # What a masked token is to the trunk. "learned": one vector (paper). "previous": that vector, added to
+    # the embedding of the frame before at its place.
+    masked_input: str = "learned"
+    position_init: str = "random"  # of places in a frame; "sinusoid": 2-D sinusoids
 
     diffusion_target: str = "noise"  # what the head predicts (paper); "velocity": well defined at full noise
     diffusion_depth: int = 3

@@ -114,14 +114,19 @@ def masked_val_loss(model: "HMA", batches: Iterable[Batch]) -> float:
 
 
 def digit_frequencies(
-    shards: ShardSet, max_frames: int = BASELINE_FRAMES, cameras: Cameras = FIRST
+    shards: ShardSet,
+    max_frames: int = BASELINE_FRAMES,
+    cameras: Cameras = FIRST,
+    factored: Sequence[int] | None = None,
 ) -> list[NDArray[np.float64]]:
     """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
+
+    `factored` states the values of each digit, low digit first; by default it is the tokenizer's.
 
     Of more than `max_frames` frames, only row groups spread evenly over them are counted, about `max_frames`
     frames at most.
     """
-    factored = shards.spec.factored or (shards.spec.vocab_size or 1,)
+    factored = factored or shards.spec.factored or (shards.spec.vocab_size or 1,)
     counts = [np.ones(values) for values in factored]
     files = list(zip(shards.shards("train"), shards.row_groups("train")))
     groups = [(name, group) for name, rows in files for group in range(len(rows))]
@@ -140,18 +145,24 @@ def unconditional_baseline(
     train: Mapping[str, ShardSet] | Sequence[StrPath | ShardSet],
     batches: Iterable[Batch],
     cameras: Cameras = FIRST,
+    factored: Sequence[int] | None = None,
 ) -> Means:
     """Return the cross-entropy of each embodiment's training frequencies, which ignores all input.
 
     Args:
         train: shard sets (or the str or path of each), whose train frames are counted, digit by digit.
         batches: validation windows of discrete tokens.
+        cameras: as `WindowDataset` takes them.
+        factored: values of each digit, low digit first; by default the tokenizer's.
 
     Returns:
         Nats a token by embodiment, over the frames from the second on, as in `masked_val_loss`.
     """
     sets = train.values() if isinstance(train, Mapping) else [_opened(item) for item in train]
-    scores = {s.embodiment.id: [np.log(p) for p in digit_frequencies(s, cameras=cameras)] for s in sets}
+    scores = {
+        s.embodiment.id: [np.log(p) for p in digit_frequencies(s, cameras=cameras, factored=factored)]
+        for s in sets
+    }
     means = Means()
     for batch in batches:
         assert batch.tokens is not None
@@ -360,7 +371,7 @@ def _losses(
     return {
         "loss": losses.mean(),
         "shuffled_loss": masked_val_loss(model, shuffled),
-        "baseline_loss": unconditional_baseline([shards], chosen(), cameras).mean(),
+        "baseline_loss": unconditional_baseline([shards], chosen(), cameras, model.config.factored).mean(),
         "perplexity": perplexity(losses.mean()),
         "accuracy": accuracy.mean(),
     }

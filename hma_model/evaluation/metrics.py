@@ -19,7 +19,7 @@ from torch.nn.functional import cross_entropy
 from hma_data.errors import UsageError
 from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
 from hma_model.network.stem import to_digits
-from hma_model.network.trunk import TimePositions, rotary_angles
+from hma_model.network.trunk import paired_times
 
 if TYPE_CHECKING:
     from hma_data.loading.dataset import Batch
@@ -163,13 +163,10 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
     given = align(config, batch.actions, batch.action_mask, count)
     both = ActionConditioning(*(torch.cat([x, x[:, 1:]], dim=1) for x in (given.chunks, given.known)))
-    positions = torch.cat([torch.arange(count), torch.arange(1, count)]).to(frames.device)
-    true = torch.arange(len(positions), device=frames.device) < count
-    allowed = (positions.unsqueeze(1) > positions) & true
-    allowed.fill_diagonal_(True)
-    times = TimePositions(positions, allowed, rotary_angles(config, positions))
+    times = paired_times(config, count, count, frames.device)
     masked = torch.full_like(frames[:, 1:], config.vocab_size)
-    x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)))
+    before = [*range(-1, count - 1), *range(count - 1)]
+    x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)), before)
     features = model.trunk(x, condition(model, both, groups, times.positions), times)
     scores = model.token_readout(model.video_features(features)[:, count:])
     return groups.unsort(model.token_readout.split(scores)).unflatten(2, config.token_grid)

@@ -283,13 +283,15 @@ class Rollout:
 
     def _embed(self, frame: TokenFrame | PatchFrame, fresh: int) -> Tensor:
         """Embed the last `fresh` frames and the new one as (B, fresh + 1, S, D)."""
-        past = self.frames[:, self.frames.shape[1] - fresh :]
+        carries = self.config.masked_input == "previous"
+        shown = max(fresh, int(carries))  # the new frame's masked tokens may need the frame before it
+        past = self.frames[:, self.frames.shape[1] - shown :]
         values = torch.cat([past, frame.values.unsqueeze(1)], dim=1)
         if isinstance(frame, TokenFrame):
-            return self.model.embed_tokens(values)
+            return self.model.embed_tokens(values)[:, shown - fresh :]
         known = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
         masked = torch.cat([known, frame.masked.unsqueeze(1)], dim=1)
-        return self.model.embed_patches(values, masked.unsqueeze(-1))
+        return self.model.embed_patches(values, masked.unsqueeze(-1))[:, shown - fresh :]
 
     def _cache(self) -> Cache:
         if self.cache is None:

@@ -86,7 +86,11 @@ class ActionConditioning:
     known: Tensor
 
     def frames(self, chosen: slice) -> "ActionConditioning":
-        """Return the chunks at those frames."""
+        """Return the chunks at those frames, as a view."""
+        return ActionConditioning(self.chunks[:, chosen], self.known[:, chosen])
+
+    def rows(self, chosen: list[int]) -> "ActionConditioning":
+        """Return the chunks at those frames, in that order."""
         return ActionConditioning(self.chunks[:, chosen], self.known[:, chosen])
 
 

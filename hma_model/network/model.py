@@ -363,15 +363,25 @@ class HMA(nn.Module):
             return frames.flatten(2).long()
         return patchify(frames.float() * config.latent_scale, config.patch)
 
-    def embed_tokens(self, tokens: Tensor) -> Tensor:
-        """Embed ids (B, T, S) as (B, T, S, D)."""
-        assert isinstance(self.trunk.embed, TokenEmbedding)
-        return self.trunk.embed(tokens)
+    def embed_tokens(self, tokens: Tensor, previous: Sequence[int] | None = None) -> Tensor:
+        """Embed ids (B, T, S) as (B, T, S, D).
 
-    def embed_patches(self, patches: Tensor, masked: Tensor) -> Tensor:
-        """Embed scaled patches (B, T, S, c*p*p) with masks of pixels (B, T, S, p*p or 1) as (B, T, S, D)."""
+        Args:
+            tokens: the vocabulary's size means masked.
+            previous: (T,) for each frame the index of the frame before it, or -1; by default the frames
+                follow one another.
+        """
+        assert isinstance(self.trunk.embed, TokenEmbedding)
+        return self.trunk.embed(tokens, range(-1, tokens.shape[1] - 1) if previous is None else previous)
+
+    def embed_patches(self, patches: Tensor, masked: Tensor, previous: Sequence[int] | None = None) -> Tensor:
+        """Embed scaled patches (B, T, S, c*p*p) with masks of pixels (B, T, S, p*p or 1) as (B, T, S, D).
+
+        `previous` is that of `embed_tokens`.
+        """
         assert isinstance(self.trunk.embed, LatentEmbedding)
-        return self.trunk.embed(patches, masked)
+        order = range(-1, patches.shape[1] - 1) if previous is None else previous
+        return self.trunk.embed(patches, masked, order)
 
     def video_features(self, features: Tensor) -> Tensor:
         """Return the features (B, T, S, D) of (B, T, N, D) without the action tokens."""

@@ -7,16 +7,18 @@ B batch, T frames, h,w token grid, S = h*w, M hidden tokens or chunks, K = strid
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.config import OBJECTIVES, HMAConfig, Readout
+from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
 from hma_model.network.conditioning import Groups, align, condition
 from hma_model.network.head import device_of, uniform
 from hma_model.network.stem import from_digits, to_digits
+from hma_model.network.trunk import TimePositions, paired_times
 
 if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
@@ -48,7 +50,7 @@ class Output:
 
 @dataclass
 class VideoMask:
-    """The masked and corrupted tokens of windows.
+    """The masked and corrupted tokens of the frames of a pass, which are T, or more with pairs.
 
     Attributes:
         masked: (B, T, S) bool, the tokens of the video loss; never those of frame 0.
@@ -57,6 +59,40 @@ class VideoMask:
 
     masked: Tensor
     corruption: Tensor
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The frames of a pass.
+
+    Attributes:
+        frames: for each frame of the pass the index of the frame of the window that it shows.
+        previous: for each the index in the pass of the true frame before it, or -1.
+        past: number of frames before the masked copies; all frames if there are none.
+        times: their times.
+    """
+
+    frames: list[int]
+    previous: list[int]
+    past: int
+    times: TimePositions
+
+    @classmethod
+    def of(cls, model: "HMA", count: int, objective: Objective) -> Self:
+        """Return the frames of a pass over windows of `count` frames."""
+        if model.config.training_pass == "window" or not objective.predicts_video or count < 2:
+            order = list(range(count))
+            return cls(order, [t - 1 for t in order], count, model.time_positions(count))
+        past = count if objective.readout else count - 1  # the last true frame is there only to be read
+        copies = list(range(1, count))
+        previous = [*range(-1, past - 1), *(t - 1 for t in copies)]
+        times = paired_times(model.config, past, count, model.device)
+        return cls([*range(past), *copies], previous, past, times)
+
+    @property
+    def predicted(self) -> slice:
+        """Return the frames of the pass that predict video."""
+        return slice(0 if self.past == len(self.frames) else self.past, None)
 
 
 def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torch.Generator | None) -> Output:
@@ -70,14 +106,21 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
     if stored is None:
         raise HMAError("batch", f"has no frames for a {config.kind} model", "use the model's tokenizer")
     frames, count, size = model.frame_values(stored), batch.actions.shape[1], len(batch.actions)
-    groups, times = Groups.of(batch.embodiment, size), model.time_positions(count)
+    groups, layout = Groups.of(batch.embodiment, size), Layout.of(model, count, chosen)
+    times, order, predicted = layout.times, layout.frames, layout.predicted
 
     context = getattr(batch, "context", None)  # the frames that the model sees, if not the true ones
     seen = frames if context is None else model.frame_values(context)
-    video = draw_video_mask(config, size, count, generator)
+    paired = layout.past < len(order)
+    if paired:
+        video = draw_pairs_mask(config, size, count, layout.past, generator)
+        seen = torch.cat([seen[:, : layout.past], frames[:, 1:]], dim=1)
+        frames = frames[:, 1:]  # those that are predicted
+    else:
+        video = draw_video_mask(config, size, count, generator, drift=chosen.predicts_video)
     inside = getattr(batch, "frame_mask", None)
     if inside is not None:  # padding of a short episode has no loss
-        video.masked &= inside.to(video.masked.device).unsqueeze(-1)
+        video.masked &= inside[:, order].to(video.masked.device).unsqueeze(-1)
     if not chosen.predicts_video:
         video.masked = torch.zeros_like(video.masked)
     dropped = torch.zeros_like(batch.action_mask)
@@ -88,23 +131,29 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
     given = None
     if chosen.sees_actions:
         given = align(config, batch.actions, batch.action_mask & ~dropped, count)
+        given = given.rows(order) if paired else given
     conditioning = condition(model, given, groups, times.positions)
-    x = _embed(model, seen, video, groups, generator)
+    x = _embed(model, seen, video, layout, groups, generator)
     features = model.trunk(x, conditioning, times)
 
     video_loss = action_loss = logits = None
     per_sample = torch.zeros(size, device=features.device)
     if chosen.readout is not None:
         action_loss, per_sample = _action_loss(
-            model, features, batch, dropped, chosen.readout, groups, generator
+            model, features[:, : layout.past], batch, dropped, chosen.readout, groups, generator
         )
     if chosen.predicts_video:
-        own = model.video_features(features)
-        predictors = own if config.kind == "discrete" else model.latent_readout(own, times.positions)
+        own, video.masked = model.video_features(features)[:, predicted], video.masked[:, predicted]
+        predictors = own
+        if config.kind == "continuous":
+            predictors = model.latent_readout(own, times.positions[predicted])
         video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
         if config.kind == "discrete" and not model.training:
-            scores = model.token_readout.split(model.token_readout(own.detach()))
+            every = torch.cat([model.video_features(features)[:, :1], own], dim=1) if paired else own
+            scores = model.token_readout.split(model.token_readout(every.detach()))
             logits = groups.unsort(scores).unflatten(2, config.token_grid)
+        if paired:
+            video.masked = F.pad(video.masked, (0, 0, 1, 0))
     loss = torch.zeros((), device=features.device)
     loss = loss if video_loss is None else loss + video_loss
     loss = loss if action_loss is None else loss + config.action_loss_weight * action_loss
@@ -123,13 +172,19 @@ def draw_objective(config: HMAConfig, generator: torch.Generator | None) -> str:
 
 
 def _embed(
-    model: "HMA", frames: Tensor, video: VideoMask, groups: Groups, generator: torch.Generator | None
+    model: "HMA",
+    frames: Tensor,
+    video: VideoMask,
+    layout: Layout,
+    groups: Groups,
+    generator: torch.Generator | None,
 ) -> Tensor:
     """Mask, corrupt and embed the frames; return the samples sorted by embodiment."""
     if model.config.kind == "discrete":
-        return model.embed_tokens(groups.sort(corrupt_tokens(model.config, frames, video, generator)))
+        corrupted = corrupt_tokens(model.config, frames, video, generator)
+        return model.embed_tokens(groups.sort(corrupted), layout.previous)
     masked = video.masked.to(frames.device).unsqueeze(-1)
-    return model.embed_patches(groups.sort(frames), groups.sort(masked))
+    return model.embed_patches(groups.sort(frames), groups.sort(masked), layout.previous)
 
 
 def _video_loss(
@@ -192,14 +247,32 @@ def _means(losses: Tensor, sample: Tensor, batch: int) -> Tensor:
 # -- what is hidden
 
 
+def draw_pairs_mask(
+    config: HMAConfig, batch: int, frames: int, past: int, generator: torch.Generator | None
+) -> VideoMask:
+    """Mask the copies of the frames from the second on, and corrupt the `past` frames before them.
+
+    A copy is wholly masked with probability `whole_share`, else its tokens are masked with probability
+    cos(u pi/2). The past is corrupted as by `draw_video_mask`, the copies' visible tokens never.
+    """
+    where = device_of(generator)
+    corruption = draw_video_mask(config, batch, frames, generator).corruption[:, :past]
+    whole = uniform((batch, frames - 1), generator, where) < config.whole_share
+    ratio = torch.cos(uniform((batch, frames - 1), generator, where) * (math.pi / 2))
+    ratio = torch.where(whole, 1.0, ratio.clamp(min=config.mask_ratio_min)).unsqueeze(-1)
+    copies = uniform((batch, frames - 1, config.tokens_per_frame), generator, where) < ratio
+    masked = torch.cat([copies.new_zeros(batch, past, copies.shape[2]), copies], dim=1)
+    return VideoMask(masked, F.pad(corruption, (0, frames - 1)))
+
+
 def draw_video_mask(
-    config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None
+    config: HMAConfig, batch: int, frames: int, generator: torch.Generator | None, drift: bool = True
 ) -> VideoMask:
     """Mask the tokens of each frame with probability cos(u pi/2), and corrupt a share of all tokens.
 
-    With `history_probability` a sample keeps a history of at least `history_frames` frames unmasked, and each
-    frame after it is corrupted more than the one before, as in a rollout of the model's own predictions.
-    Each sample has its own draws.
+    With `history_probability` a sample keeps a history of at least `history_frames` frames unmasked. With
+    `drift`, each frame after it is corrupted more than the one before, as in a rollout of the model's own
+    predictions. Each sample has its own draws.
     """
     tokens = config.tokens_per_frame
     where = device_of(generator)
@@ -215,10 +288,10 @@ def draw_video_mask(
 
     kept = 0.2 + 0.8 * uniform((batch, 1), generator, where)
     shrink = 0.9 + 0.1 * uniform((batch, frames), generator, where)
-    after = (index >= first) & long.unsqueeze(1)
-    drift = 1 - kept * torch.where(after, shrink, 1.0).cumprod(1)
+    after = (index >= first) & long.unsqueeze(1) & drift
+    more = 1 - kept * torch.where(after, shrink, 1.0).cumprod(1)
     base = config.corrupt_max * uniform((batch, 1), generator, where)
-    corruption = torch.where(after, torch.maximum(drift, base), base)
+    corruption = torch.where(after, torch.maximum(more, base), base)
     return VideoMask(masked, corruption if config.corrupt_max else torch.zeros_like(corruption))
 
 

@@ -48,7 +48,10 @@ def unpatchify(patches: Tensor, patch: int, grid: tuple[int, int]) -> Tensor:
 
 
 class TokenEmbedding(nn.Module):
-    """Token embeddings: the sum of the embeddings of a token's digits, or a learned vector if masked."""
+    """Token embeddings: the sum of the embeddings of a token's digits, or a learned vector if masked.
+
+    With `masked_input == "previous"`, the embedding of the frame before at its place is added to that vector.
+    """
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -56,33 +59,61 @@ class TokenEmbedding(nn.Module):
         self.vocab_size = config.vocab_size
         std = len(config.factored) ** -0.5
         self.digits = nn.ParameterList(torch.randn(v, config.width) * std for v in config.factored)
-        self.mask = nn.Parameter(torch.randn(config.width) * 0.02)
+        self.carries = config.masked_input == "previous"
+        self.mask = nn.Parameter(torch.randn(config.width) * (0.5 if self.carries else 0.02))
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Embed ids (B, T, S), where the vocabulary's size means masked, as (B, T, S, D)."""
-        masked = tokens == self.vocab_size
-        digits = to_digits(tokens.masked_fill(masked, 0), self.factored)
+    def forward(self, tokens: Tensor, previous: Sequence[int]) -> Tensor:
+        """Embed ids (B, T, S) as (B, T, S, D).
+
+        Args:
+            tokens: the vocabulary's size means masked.
+            previous: (T,) for each frame the index of the frame before it, or -1 if it is not there.
+        """
+        masked = (tokens == self.vocab_size).unsqueeze(-1)
+        digits = to_digits(tokens.masked_fill(masked.squeeze(-1), 0), self.factored)
         embedding = F.embedding(digits[..., 0], self.digits[0])
         for index in range(1, len(self.factored)):
             embedding = embedding + F.embedding(digits[..., index], self.digits[index])
-        return torch.where(masked.unsqueeze(-1), self.mask, embedding)
+        if not self.carries:
+            return torch.where(masked, self.mask, embedding)
+        return torch.where(masked, self.mask + carried(embedding.masked_fill(masked, 0), previous), embedding)
+
+
+def carried(values: Tensor, previous: Sequence[int]) -> Tensor:
+    """Return for each frame of (B, T, S, D) the values of the frame before it; zeros where there is none."""
+    index = torch.tensor(previous, device=values.device)
+    before = values.index_select(1, index.clamp(min=0))
+    return before * (index >= 0).to(values.dtype).view(-1, 1, 1)
 
 
 class LatentEmbedding(nn.Module):
-    """A linear embedding of patches of latents; a learned pixel first replaces the masked latent pixels."""
+    """A linear embedding of patches of latents; a learned pixel first replaces the masked latent pixels.
+
+    With `masked_input == "previous"`, the patch of the frame before is added to the masked pixels.
+    """
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.patch = config.patch
-        self.mask = nn.Parameter(torch.randn(config.channels) * 0.02)
+        self.carries = config.masked_input == "previous"
+        self.mask = nn.Parameter(torch.randn(config.channels) * (2.0 if self.carries else 0.02))
         self.linear = nn.Linear(config.patch_dim, config.width, bias=False)
         nn.init.normal_(self.linear.weight, std=config.patch_dim**-0.5)
 
-    def forward(self, patches: Tensor, masked: Tensor) -> Tensor:
-        """Embed patches (B, T, S, c*p*p) with masks of their pixels (B, T, S, p*p or 1) as (B, T, S, D)."""
-        pixels = patches.unflatten(-1, (-1, self.patch**2))
+    def forward(self, patches: Tensor, masked: Tensor, previous: Sequence[int]) -> Tensor:
+        """Embed patches (B, T, S, c*p*p) as (B, T, S, D).
+
+        Args:
+            patches: of the frames.
+            masked: (B, T, S, p*p or 1) bool, the masked pixels of the patches.
+            previous: (T,) for each frame the index of the frame before it, or -1 if it is not there.
+        """
+        pixels, hidden = patches.unflatten(-1, (-1, self.patch**2)), masked.unsqueeze(-2)
         mask = self.mask.to(patches.dtype).unsqueeze(-1)
-        filled = torch.where(masked.unsqueeze(-2), mask, pixels).flatten(-2)
+        if self.carries:
+            before = carried(pixels.masked_fill(hidden, 0).flatten(-2), previous)
+            mask = mask + before.view_as(pixels)
+        filled = torch.where(hidden, mask, pixels).flatten(-2)
         return self.linear(filled.to(self.linear.weight.dtype))
 
 

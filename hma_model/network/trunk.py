@@ -7,6 +7,7 @@ and values of past frames can be cached (`cache`).
 B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers, R cache slots.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -95,6 +96,33 @@ def window_times(config: HMAConfig, frames: int, device: torch.device | str) -> 
     age = positions.unsqueeze(1) - positions
     allowed = (age >= 0) & (age < config.frames)
     return TimePositions(positions, allowed, rotary_angles(config, positions), causal=frames <= config.frames)
+
+
+def paired_times(config: HMAConfig, past: int, frames: int, device: torch.device | str) -> TimePositions:
+    """Return the times of the first `past` frames, then of a copy of each frame from the second on.
+
+    A frame sees itself and the frames before it; a copy sees itself and the frames before it, no other copy.
+    """
+    positions = torch.cat([torch.arange(past), torch.arange(1, frames)]).to(device)
+    age = positions.unsqueeze(1) - positions
+    true = torch.arange(len(positions), device=device) < past
+    allowed = (age > 0) & (age < config.frames) & true
+    allowed.fill_diagonal_(True)
+    return TimePositions(positions, allowed, rotary_angles(config, positions))
+
+
+def sinusoids(grid: tuple[int, int], width: int) -> Tensor:
+    """Return 2-D sinusoids (S, D) of the places of a grid, of standard deviation 0.5.
+
+    A quarter of the channels each is a sine or cosine of the row or the column; the longest wave is four times
+    the larger side, the shortest two places.
+    """
+    quarter = -(-width // 4)
+    waves = torch.logspace(math.log2(4 * max(grid)), 1, quarter, base=2)
+    places = torch.cartesian_prod(*(torch.arange(side, dtype=torch.float32) for side in grid))
+    angles = places.unsqueeze(-1) * (2 * math.pi / waves)  # (S, 2, D / 4)
+    values = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(1)
+    return values[:, :width] * 0.5**0.5
 
 
 def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
@@ -334,6 +362,9 @@ class Trunk(nn.Module):
         tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
         self.embed = LatentEmbedding(config) if continuous else TokenEmbedding(config)
         self.position = nn.Parameter(torch.randn(positions, tokens, config.width) * 0.02)
+        if config.position_init == "sinusoid":
+            with torch.no_grad():
+                self.position[:, : config.tokens_per_frame] = sinusoids(config.token_grid, config.width)
         self.embed_norm = nn.LayerNorm(config.width, eps=1e-6) if continuous else nn.Identity()
         self.absent = nn.Parameter(torch.randn(positions, config.width) * 0.02)
         self.modulation: Modulation | None = None

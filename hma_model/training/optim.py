@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
+from hma_data.tokenizers.training.muon import muon_step
 from hma_model.training.parallel import gathered, like, local, whole
 
 if TYPE_CHECKING:
@@ -20,14 +21,55 @@ if TYPE_CHECKING:
     from hma_model.training.recipe import Recipe
 
 _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
+MUON_MOMENTUM = 0.95
+
+
+class BlocksByMuon(torch.optim.AdamW):
+    """AdamW, but for the groups marked `muon`, whose matrices take steps of Muon."""
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]
+        """Take one step; `closure` is not called."""
+        every = self.param_groups
+        self.param_groups = [group for group in every if not group["muon"]]
+        try:
+            super().step()
+        finally:
+            self.param_groups = every
+        for group in every:
+            if group["muon"]:
+                muon_step(group["params"], self.state, group["lr"], MUON_MOMENTUM, group["weight_decay"])
 
 
 def make_optimizer(model: "HMA", recipe: "Recipe") -> torch.optim.AdamW:
-    """Return AdamW for the trained parameters; each group has its `base_lr` and its parameters' `names`."""
+    """Return AdamW for the trained parameters; each group has its `base_lr` and its parameters' `names`.
+
+    With `optimizer: muon`, the matrices of the blocks are in groups of their own, marked `muon`.
+    """
     lr = learning_rate(recipe)
     groups = parameter_groups(model, lr, recipe.weight_decay)
     fused = model.device.type == "cuda"
-    return torch.optim.AdamW(groups, lr=lr, betas=recipe.betas, eps=recipe.eps, fused=fused)
+    if recipe.optimizer == "adamw":
+        return torch.optim.AdamW(groups, lr=lr, betas=recipe.betas, eps=recipe.eps, fused=fused)
+    parted = [part for group in groups for part in _parted(group, recipe.muon_lr)]
+    return BlocksByMuon(parted, lr=lr, betas=recipe.betas, eps=recipe.eps, fused=fused)
+
+
+def _parted(group: dict[str, Any], muon_lr: float) -> list[dict[str, Any]]:
+    """Return a group of AdamW as two, of which the second holds the blocks' matrices, for Muon."""
+    parts: list[dict[str, Any]] = []
+    for muon in (False, True):
+        chosen = [
+            (name, parameter)
+            for name, parameter in zip(group["names"], group["params"], strict=True)
+            if (name.startswith("trunk.blocks.") and parameter.ndim == 2) == muon
+        ]
+        if chosen:
+            names, parameters = map(list, zip(*chosen, strict=True))
+            rate = muon_lr if muon else group["base_lr"]
+            own = {"params": parameters, "names": names, "lr": rate, "base_lr": rate, "muon": muon}
+            parts.append({**group, **own})
+    return parts
 
 
 def learning_rate(recipe: "Recipe") -> float:
@@ -48,10 +90,10 @@ def lr_scale(step: int, recipe: "Recipe") -> float:
 
 
 def set_lr(optimizer: torch.optim.Optimizer, scale: float) -> float:
-    """Set the lr of every group to `base_lr` times the scale, and return the largest."""
+    """Set the lr of every group to `base_lr` times the scale, and return the largest, Muon's left out."""
     for group in optimizer.param_groups:
         group["lr"] = group["base_lr"] * scale
-    return max(group["lr"] for group in optimizer.param_groups)
+    return max(group["lr"] for group in optimizer.param_groups if not group.get("muon"))
 
 
 def parameter_groups(model: "HMA", lr: float, weight_decay: float) -> list[dict[str, Any]]:
@@ -104,8 +146,8 @@ def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
         f"{name}/{moment}": whole(torch.as_tensor(optimizer.state[parameter][moment]))
         for group in optimizer.param_groups
         for name, parameter in zip(group["names"], group["params"])
-        if optimizer.state.get(parameter)
         for moment in _MOMENTS
+        if moment in optimizer.state.get(parameter, {})
     }
 
 
@@ -113,7 +155,9 @@ def load_optimizer_state(optimizer: torch.optim.Optimizer, state: Mapping[str, T
     """Restore a result of `optimizer_state`; a parameter that it does not name begins without moments."""
     for group in optimizer.param_groups:
         for name, parameter in zip(group["names"], group["params"]):
-            if f"{name}/step" in state:
+            if f"{name}/exp_avg" in state and group.get("muon"):
+                optimizer.state[parameter] = {"exp_avg": like(state[f"{name}/exp_avg"].clone(), parameter)}
+            elif f"{name}/step" in state:
                 moments = {key: like(state[f"{name}/{key}"].clone(), parameter) for key in _MOMENTS[:2]}
                 step_device = parameter.device if optimizer.defaults.get("fused") else "cpu"
                 step = state[f"{name}/step"].clone().to(step_device)

@@ -138,11 +138,15 @@ class Recipe(_Settings):
 
     start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
+    # a token's digits: the tokenizer's, or each split further, such as 512 into 8 · 8 · 8 (FSQ's levels)
+    digits: Count = Field(0, ge=0, description="values of a digit; 0 takes the tokenizer's digits")
     # what the bias of the token readout starts with: the log frequencies of the training tokens
     readout_bias: Literal["frequencies", "zero"] = "frequencies"
 
     steps: Count = Field(1000, ge=1, le=10**12)
     lr: Number = Field(3e-4, gt=0, le=1e6)
+    optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: of the blocks' matrices")
+    muon_lr: Number = Field(0.02, gt=0, le=1e3, description="muon: the spectral norm of a step at most")
     lr_rule: Literal["plain", "paper"] = Field("plain", description="paper: see optim.learning_rate")
     warmup: Steps = Field(100, description="steps in which lr rises from 0")
     schedule: Literal["constant_with_warmup", "cosine"] = "constant_with_warmup"
@@ -190,6 +194,25 @@ class Recipe(_Settings):
         """Return the settings that must be the same when a run is resumed."""
         return {key: value for key, value in self.values().items() if key not in _FREE}
 
+    def factored(self, spec: "TokenizerSpec") -> tuple[int, ...]:
+        """Return the values of each digit of a token of this tokenizer, low digit first.
+
+        Raises:
+            RecipeError: the tokenizer's digits cannot be split into digits of `digits` values.
+        """
+        stated = spec.factored or (spec.vocab_size or 1,)
+        if not self.digits:
+            return stated
+        split: list[int] = []
+        for values in stated:
+            while values > 1 and values % self.digits == 0:
+                split.append(self.digits)
+                values //= self.digits
+            if values > 1:
+                fault = f"{self.digits} values do not divide the {stated} of {spec.name}"
+                raise RecipeError("recipe: digits", fault, "give 0, which takes the tokenizer's digits")
+        return tuple(split)
+
     def network(self, spec: "TokenizerSpec") -> HMAConfig:
         """Return the network's config for tokens of this tokenizer.
 
@@ -198,7 +221,7 @@ class Recipe(_Settings):
         """
         derived: dict[str, Any] = {"kind": spec.kind, "grid": spec.grid, "tokenizer": spec.to_json()}
         if spec.kind == "discrete":
-            derived["factored"] = spec.factored or (spec.vocab_size,)
+            derived["factored"] = self.factored(spec)
         else:
             derived.update(channels=spec.channels, latent_scale=spec.latent_scale)
         derived.update(frames=self.frames, objectives=self.objectives, views=view_count(self.cameras))

@@ -137,8 +137,8 @@ class Run:
         if plain or self.start:
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
-        cameras = self.recipe.cameras
-        shares = [[p * d for d in evaluate.digit_frequencies(s, cameras=cameras)] for p, s in drawn]
+        given: Any = {"cameras": self.recipe.cameras, "factored": self.model.config.factored}
+        shares = [[p * d for d in evaluate.digit_frequencies(s, **given)] for p, s in drawn]
         bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
@@ -272,7 +272,10 @@ class Run:
             if video and model.config.kind == "discrete":
                 if self._baseline is None:
                     batches = self._held_out_batches()
-                    self._baseline = evaluate.unconditional_baseline(self.sets, batches, recipe.cameras)
+                    digits = model.config.factored
+                    self._baseline = evaluate.unconditional_baseline(
+                        self.sets, batches, recipe.cameras, digits
+                    )
                 facts["perplexity"] = perplexity(facts["loss"])
                 facts["accuracy"] = accuracy.mean()
                 facts["accuracy_by_embodiment"] = accuracy.by_embodiment()

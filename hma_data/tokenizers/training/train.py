@@ -15,7 +15,7 @@ import math
 import platform
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
@@ -35,11 +35,10 @@ from hma_data.tokenizers.embedded import Autoencoder, FsqAutoencoder, FsqConfig,
 from hma_data.tokenizers.network import open_device
 from hma_data.tokenizers.training.eval import GREY, ssim_map
 from hma_data.tokenizers.training.frames import Pool, draw_batch, load_pools
+from hma_data.tokenizers.training.muon import Muon
 from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, TrainingRecipe, load_recipe
 
 START, END = 2**32 - 1, 2**32 - 2  # step numbers of the batches that initialise and measure a network
-ROUNDS = 5  # of the Newton–Schulz iteration; they bring the singular values near 1
-_A, _B, _C = 3.4445, -4.7750, 2.0315  # largest slope at zero that keeps values in (0, 1] near 1
 
 
 def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
@@ -209,50 +208,6 @@ def _optimizers(network: Autoencoder, recipe: TrainingRecipe) -> list[torch.opti
         Muon(matrices, lr=recipe.learning_rate, decay=recipe.weight_decay),
         torch.optim.Adam(others, lr=recipe.adam_learning_rate, betas=(0.9, 0.99)),
     ]
-
-
-def orthogonal(matrix: Tensor) -> Tensor:
-    """Return approximately the nearest matrix whose singular values are 1; (R, C) -> (R, C)."""
-    x = matrix / (matrix.norm() + 1e-7)
-    tall = x.shape[0] > x.shape[1]
-    x = x.T if tall else x
-    for _ in range(ROUNDS):
-        square = x @ x.T
-        x = _A * x + (_B * square + _C * square @ square) @ x
-    return x.T if tall else x
-
-
-class Muon(torch.optim.Optimizer):
-    """The Muon optimizer (Jordan et al. 2024): momentum made orthogonal before each step.
-
-    A convolution's weight (out, in, k, k) is treated as a matrix (out, in·k·k).
-
-    `lr` is the spectral norm of a step, multiplied by √(rows/columns) for tall matrices. Each step shrinks
-    the weights by lr·decay, which bounds their norm by 1/decay. Without `decay`, nothing bounds the norm of
-    the weights in a network that has no normalisation.
-    """
-
-    def __init__(
-        self, params: Iterable[Tensor], lr: float, momentum: float = 0.95, decay: float = 0.0
-    ) -> None:
-        super().__init__(params, {"lr": lr, "momentum": momentum, "decay": decay})
-
-    @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
-        """Take one step; `closure` is not called."""
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                grad = parameter.grad
-                if grad is None:
-                    continue
-                state = self.state[parameter]
-                if "momentum" not in state:
-                    state["momentum"] = torch.zeros_like(grad)
-                state["momentum"].lerp_(grad, 1 - group["momentum"])
-                flat = grad.lerp(state["momentum"], group["momentum"]).reshape(len(grad), -1)
-                update = orthogonal(flat) * max(1.0, flat.shape[0] / flat.shape[1]) ** 0.5
-                parameter.mul_(1 - group["lr"] * group["decay"])
-                parameter.add_(update.view(parameter.shape), alpha=-group["lr"])
 
 
 def _latent_penalty(latents: Tensor) -> Tensor:
