@@ -1,12 +1,15 @@
-"""Make the pictures of the tokenizers' corpus that come from no package: gym-pusht, and drawn scenes.
+"""Make the pictures of the tokenizers' corpus that no package has: gym-pusht, drawn scenes, the laboratory.
 
-    python recipes/tokenizer/draw.py OUT [--pusht 200] [--drawn 300] [--seed 20]
+    python recipes/tokenizer/draw.py OUT [--pusht 200] [--drawn 300] [--lab 0] [--seed 20]
 
-They are written to OUT/pusht/00000.png … and OUT/drawn/00000.png …, where the recipes expect them.
+They are written to OUT/pusht/00000.png … and OUT/drawn/00000.png …, where the recipes expect them. With --lab,
+OUT/lab/ gets that many pictures of each laboratory robot of the embedded world model, each a
+mosaic of four frames, so that a crop of half its side shows the robot as large as a recording does.
 """
 
 import argparse
 import math
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]
+LAB = ("pendulum", "planar_arm", "pusht_fast", "pusht_slow")  # beside the family's robots
 
 
 def push_pictures(count: int, seed: int) -> Iterator[Picture]:
@@ -91,6 +95,27 @@ def _draw_shape(canvas: Picture, rng: np.random.Generator, colour: tuple[float, 
         cv2.fillPoly(canvas, [np.asarray(box, np.int32)], colour, cv2.LINE_AA)
 
 
+def lab_pictures(count: int, seed: int) -> Iterator[Picture]:
+    """Yield `count` mosaics (256, 256, 3) of each laboratory robot of the embedded world model."""
+    from hma_data import lab
+    from hma_data.lab import family
+    from hma_data.registry.embodiment import find
+    from hma_data.tokenizers.base import get_tokenizer
+    from hma_data.tokenizers.training.frames import EPISODES, recording_frames
+
+    spec = get_tokenizer("fsq-8").spec
+    rng = np.random.default_rng([seed, 3])
+    for robot in (*family.TRUNK, *LAB):
+        embodiment = find(robot) if robot in LAB else family.embodiment(robot)
+        with tempfile.TemporaryDirectory() as folder:
+            recording = lab.record(robot, folder, EPISODES, seed)
+            each = -(-4 * count // EPISODES)
+            frames = np.stack(list(recording_frames(embodiment, recording, spec, frames=each)))
+        for four in rng.permutation(len(frames))[: 4 * count].reshape(-1, 4):
+            top, bottom = (np.hstack(list(frames[pair])) for pair in (four[:2], four[2:]))
+            yield np.vstack([top, bottom])
+
+
 def write_pictures(folder: Path, pictures: Iterator[Picture]) -> None:
     """Write folder/00000.png and the pictures that follow."""
     import cv2
@@ -106,11 +131,14 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--pusht", type=int, default=200, help="pictures of gym-pusht")
     parser.add_argument("--drawn", type=int, default=300, help="drawn scenes")
+    parser.add_argument("--lab", type=int, default=0, help="mosaics of each laboratory robot")
     parser.add_argument("--seed", type=int, default=20)
     arguments = parser.parse_args()
     write_pictures(arguments.out / "pusht", push_pictures(arguments.pusht, arguments.seed))
     rng = np.random.default_rng([arguments.seed, 2])
     write_pictures(arguments.out / "drawn", (draw_scene(rng) for _ in range(arguments.drawn)))
+    if arguments.lab:
+        write_pictures(arguments.out / "lab", lab_pictures(arguments.lab, arguments.seed))
 
 
 if __name__ == "__main__":
