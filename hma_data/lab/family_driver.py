@@ -1,0 +1,151 @@
+"""Drive the family's robots by random manoeuvres of 0.3 to 1.5 s.
+
+A manoeuvre goes to a pose (to a block, or anywhere), holds a velocity, weaves, or rests. Axes commanded by
+velocity turn back at their limits. A gripper closes round a block in its reach, and opens again later.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hma_data.lab.family_bodies import Body, wrapped
+from hma_data.lab.family_look import SIZE, Floats
+
+MANOEUVRES = ("block", "anywhere", "hold", "weave", "rest")
+CHANCES = (0.27, 0.26, 0.22, 0.15, 0.1)
+Manoeuvre = Callable[[Floats], Floats]  # pose (Q,) -> velocities (A,)
+
+
+class Driver:
+    """What commands a body in one episode."""
+
+    def __init__(self, body: Body, pose: Floats, rng: np.random.Generator) -> None:
+        self._body, self._rng = body, rng
+        self._tops = np.array([axis.speed for axis in body.commands])
+        self._follows = np.array([axis.target for axis in body.commands])
+        self._turns = np.array([axis.turns for axis in body.axes])
+        self._sign = np.ones(len(body.commands))
+        self._setpoint = pose[: len(body.commands)].copy()
+        self._left = 0
+        self._goal: Floats | None = None
+        self._opening = float(pose[-1])
+        self._manoeuvre: Manoeuvre = lambda pose: np.zeros(len(body.commands))
+
+    def __call__(self, pose: Floats, blocks: Floats, holding: bool) -> Floats:
+        """Return the next command (A,) at a pose (Q,) among blocks (B, 2)."""
+        lost = self._goal is None and not self._visible(pose)
+        if self._left == 0 or lost:
+            self._begin(
+                pose, blocks, holding, "anywhere" if lost else str(self._rng.choice(MANOEUVRES, p=CHANCES))
+            )
+        self._left -= 1
+        velocity = np.clip(self._manoeuvre(pose) * self._sign, -self._tops, self._tops)
+        if not self._body.car:
+            self._turn_back(pose, velocity)
+        return self._command(velocity)
+
+    def _command(self, velocity: Floats) -> Floats:
+        low, high = self._body.ranges
+        if self._goal is not None and not self._body.car:
+            self._setpoint = np.where(self._follows, self._goal, self._setpoint)
+        else:
+            self._setpoint = self._setpoint + velocity / self._body.hz
+        self._setpoint = np.clip(self._setpoint, *self._body.limits[:, : len(low)])
+        command = np.where(self._follows, self._setpoint, velocity)
+        if self._body.grip:
+            command[-1] = self._opening
+        return np.clip(command, low, high)
+
+    def _turn_back(self, pose: Floats, velocity: Floats) -> None:
+        """Turn round the axes that leave the inner nine tenths of their limits, if a velocity is held."""
+        low, high = self._body.limits
+        margin = 0.05 * (high - low)
+        at = np.where(self._follows, self._setpoint, pose)
+        outward = ((at < low + margin) & (velocity < 0)) | ((at > high - margin) & (velocity > 0))
+        outward &= ~self._turns
+        if self._goal is None:
+            self._sign[outward] *= -1
+            velocity[outward] *= -1
+
+    def _begin(self, pose: Floats, blocks: Floats, holding: bool, kind: str) -> None:
+        """Begin a manoeuvre; choose how long it lasts, and what the gripper does in it."""
+        rng, hz = self._rng, self._body.hz
+        self._left = max(1, round(hz * rng.uniform(0.3, 0.8 if kind == "rest" else 1.5)))
+        self._sign[:] = 1
+        self._setpoint = np.where(self._follows, self._setpoint, pose[: len(self._setpoint)])
+        self._goal = self._pose_near(blocks, pose) if kind == "block" else None
+        if kind == "anywhere":
+            self._goal = self._random_pose()
+        if self._goal is not None:
+            self._manoeuvre = self._steer if self._body.car else self._approach(self._goal)
+        else:
+            self._manoeuvre = {"hold": self._hold, "weave": self._weave, "rest": self._rest}[kind]()
+        if self._body.grip:
+            tip, _ = self._body.mechanism.tip(pose)
+            near = bool((np.linalg.norm(blocks - tip, axis=1) < 8.0).any())
+            chance = 0.65 if holding else 0.9 if near else 0.25
+            closed = float(rng.random() < chance)
+            self._opening = 1 - closed if self._body.grip == "gripper" else closed
+
+    def _visible(self, pose: Floats) -> bool:
+        """Check whether the tip is well inside the picture."""
+        tip, _ = self._body.mechanism.tip(pose)
+        return bool(tip.min() > 4 and tip.max() < SIZE - 4)
+
+    def _random_pose(self) -> Floats:
+        for _ in range(8):
+            pose: Floats = self._rng.uniform(*self._body.limits)
+            if self._visible(pose):
+                break
+        return pose
+
+    def _pose_near(self, blocks: Floats, pose: Floats) -> Floats:
+        """Return the one of some random poses that brings the tip nearest to a block, or a step beyond it."""
+        here, _ = self._body.mechanism.tip(pose)
+        block = blocks[self._rng.integers(len(blocks))]
+        point = block if self._body.grip else block + (block - here) * 0.3
+        spread = 0.5 * (self._body.limits[1] - self._body.limits[0])
+        best, least = pose, np.inf
+        for trial in range(60):  # forty anywhere, twenty near the best of them
+            other = (
+                best + self._rng.normal(0, 0.1, len(pose)) * spread if trial >= 40 else self._random_pose()
+            )
+            other = np.clip(other, *self._body.limits)
+            far = float(np.linalg.norm(self._body.mechanism.tip(other)[0] - point))
+            if far < least:
+                best, least = other, far
+        return best
+
+    def _approach(self, goal: Floats) -> Manoeuvre:
+        gain = self._rng.uniform(3, 7)
+
+        def drive(pose: Floats) -> Floats:
+            error = goal - pose
+            return gain * np.where(self._turns, wrapped(error), error)
+
+        return drive
+
+    def _steer(self, pose: Floats) -> Floats:
+        """Return the speed and turn rate of a car that goes to the goal's place."""
+        assert self._goal is not None
+        way = self._goal[:2] - pose[:2]
+        far = float(np.hypot(*way))
+        bearing = float(wrapped(np.arctan2(way[1], way[0]) - pose[2:3])[0])
+        ahead = self._tops[0] * min(1.0, far / 12) * max(0.25, np.cos(bearing))
+        return np.array([ahead, 4.0 * bearing if far > 3 else 0.0])
+
+    def _hold(self) -> Manoeuvre:
+        count = len(self._tops)
+        velocity = self._tops * self._rng.uniform(0.4, 1.0, count) * self._rng.choice((-1, 1), count)
+        if count > 1 and self._rng.random() < 0.4:
+            velocity[self._rng.integers(count)] = 0.0
+        return lambda pose: velocity
+
+    def _weave(self) -> Manoeuvre:
+        count, rng = len(self._tops), self._rng
+        strength, hz = self._tops * rng.uniform(0.5, 1.0, count), rng.uniform(0.3, 1.0, count)
+        phase, seconds = rng.uniform(0, 2 * np.pi, count), iter(np.arange(10_000) / self._body.hz)
+        return lambda pose: strength * np.sin(2 * np.pi * hz * next(seconds) + phase)
+
+    def _rest(self) -> Manoeuvre:
+        return lambda pose: np.zeros(len(self._tops))
