@@ -39,6 +39,7 @@ STEM, HEAD, YAML, STATS, CARD = (
 )  # fmt: skip
 PARTS = (STEM, HEAD, YAML, STATS, CARD)  # the card is last: its presence means that the others are there
 SAMPLE = "sample.png"  # optional, shown in the model card
+EMBEDDED, EMBEDDED_NAME = Path(__file__).parents[1] / "embedded", "embedded"  # comes along with the package
 _APART = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was cut short: do it again"
 
@@ -203,7 +204,7 @@ def resolve(folder: StrPath) -> Path:
     """Return the folder of a checkpoint: the path itself, or the newest of a run's `checkpoints/`.
 
     Args:
-        folder: str or path of it.
+        folder: str or path of it; `embedded` is the checkpoint that comes along with the package.
 
     Raises:
         CheckpointError: there is none.
@@ -211,6 +212,8 @@ def resolve(folder: StrPath) -> Path:
     folder = as_path(folder)
     if (folder / CONFIG).is_file():
         return folder
+    if str(folder) == EMBEDDED_NAME and not folder.exists():
+        return EMBEDDED
     steps = training_checkpoints(folder)
     if steps:
         return steps[-1]
