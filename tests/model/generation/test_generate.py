@@ -24,6 +24,7 @@ LAYOUTS = {
         "temporal_norm": False, "final_norm": False,
     },
     "cross": {"conditioning": ("add", "cross_attention")},
+    "previous": {"masked_input": "previous"},
 }  # fmt: skip
 
 
@@ -52,7 +53,7 @@ def test_the_cache_changes_nothing(layout: str, prompt: int, actions: bool) -> N
     assert torch.equal(cached, plain)
 
 
-@pytest.mark.parametrize("layout", ["rotary", "released"])
+@pytest.mark.parametrize("layout", ["rotary", "released", "previous"])
 def test_the_cache_changes_no_latents(layout: str) -> None:
     model = small_model(kind="continuous", diffusion_clip=1.0, **LAYOUTS[layout])
     for parameter in model.latent_readout.diffusion.parameters():

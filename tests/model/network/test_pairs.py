@@ -1,0 +1,117 @@
+"""Training on pairs: the true frames, and masked copies that see the true frames before them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hma_data.loading.rows import Batch
+from hma_model.evaluation.metrics import teacher_forced
+from hma_model.network.model import HMA
+from hma_model.network.objectives import Layout, draw_pairs_mask
+from hma_model.network.trunk import sinusoids
+from tests.model.network_parts import small_batch, small_config, small_model
+
+WHOLE = {
+    "training_pass": "pairs", "whole_share": 1.0, "corrupt_max": 0.0, "history_probability": 0.0,
+    "label_smoothing": 0.0,
+}  # fmt: skip
+NAMES = ["arm", "hand.v1", "arm"]
+
+
+def _seed(value: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(value)
+
+
+def _batch(model: HMA) -> Batch:
+    made = small_batch(model.config, NAMES)
+    return Batch(NAMES, made.actions, made.action_mask, tokens=made.tokens, latents=made.latents)
+
+
+@pytest.mark.parametrize("masked_input", ["learned", "previous"])
+@pytest.mark.parametrize("objective", ["forward", "full"])
+def test_whole_copies_have_the_loss_of_each_frame_after_its_true_past(masked_input, objective):
+    model = small_model(masked_input=masked_input, **WHOLE)
+    batch = _batch(model)
+    if objective == "full":  # hides chunks, so the frames are compared without any
+        batch = replace(batch, action_mask=torch.zeros_like(batch.action_mask))
+        batch.action_mask[:, 0] = True
+    output = model(batch, objective, _seed())
+    nats, _ = teacher_forced(model, batch)
+    if objective == "forward":
+        assert torch.allclose(output.per_sample, nats.mean(dim=1), atol=1e-5)
+    assert output.masked.shape == batch.tokens.shape
+    assert output.masked[:, 1:].all() and not output.masked[:, 0].any()
+    assert output.video_logits is not None and output.video_logits.shape[:4] == batch.tokens.shape
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("objective", ["forward", "passive", "policy", "inverse", "full"])
+def test_every_objective_trains_on_pairs(kind, objective):
+    model = small_model(kind=kind, training_pass="pairs", masked_input="previous").train()
+    output = model(_batch(model), objective, _seed())
+    output.loss.backward()
+    gradients = [p.grad for p in model.trunk.parameters() if p.grad is not None]
+    assert output.loss.isfinite() and all(g.isfinite().all() for g in gradients)
+    assert sum(g.abs().sum() for g in gradients) > 0
+
+
+def test_a_copy_sees_neither_other_copies_nor_later_frames():
+    model = small_model(masked_input="previous", **WHOLE)
+    batch = _batch(model)
+    before = model(batch, "forward", _seed()).video_logits
+    changed = replace(batch, tokens=batch.tokens.clone())
+    changed.tokens[:, 3:] = (changed.tokens[:, 3:] + 5) % model.config.vocab_size
+    after = model(changed, "forward", _seed()).video_logits
+    assert torch.equal(before[:, :4], after[:, :4]) and not torch.equal(before[:, 4], after[:, 4])
+
+
+def test_padding_has_no_loss():
+    model = small_model(**WHOLE)
+    batch = _batch(model)
+    inside = torch.ones(3, model.config.frames, dtype=torch.bool)
+    inside[1, 3:] = False
+    batch.frame_mask = inside
+    output = model(batch, "forward", _seed())
+    assert not output.masked[1, 3:].any() and output.masked[1, 1:3].all()
+
+
+def test_half_of_the_copies_are_wholly_masked_and_the_past_never():
+    config = small_config(training_pass="pairs", whole_share=0.5, grid=(8, 8))
+    mask = draw_pairs_mask(config, 400, 6, 5, _seed())
+    assert mask.masked.shape == (400, 10, 64) and not mask.masked[:, :5].any()
+    assert abs(mask.masked[:, 5:].all(2).float().mean().item() - 0.5) < 0.06
+    assert (mask.corruption[:, 5:] == 0).all() and (mask.corruption[:, :5] > 0).all()
+
+
+@pytest.mark.parametrize(("objective", "past"), [("forward", 4), ("full", 5), ("policy", 5)])
+def test_only_an_objective_that_reads_it_has_the_last_true_frame(objective, past):
+    from hma_model.config import OBJECTIVES
+
+    model = small_model(training_pass="pairs")
+    layout = Layout.of(model, 5, OBJECTIVES[objective])
+    assert layout.past == past
+    assert layout.frames == [*range(past), *((1, 2, 3, 4) if objective != "policy" else ())]
+
+
+@pytest.mark.parametrize("objective", ["policy", "inverse"])
+def test_frames_that_actions_are_read_from_are_not_corrupted_like_a_rollout(objective, monkeypatch):
+    from hma_model.network import objectives
+
+    model, rates = small_model(corrupt_max=0.1, history_probability=1.0), []
+    original = objectives.corrupt_tokens
+    monkeypatch.setattr(
+        objectives, "corrupt_tokens", lambda *given: rates.append(given[2].corruption) or original(*given)
+    )
+    model(_batch(model), objective, _seed())
+    assert rates[0].max() <= 0.1 and np.ptp(rates[0].numpy(), axis=1).max() == 0
+
+
+def test_sinusoids_tell_neighbours_from_others():
+    places = sinusoids((8, 8), 64)
+    assert places.shape == (64, 64) and abs(places.std().item() - 0.5) < 0.1
+    distance = torch.cdist(places, places).fill_diagonal_(torch.inf)
+    nearest = distance.argmin(1)
+    rows, columns = torch.arange(64) // 8, torch.arange(64) % 8
+    assert ((rows - nearest // 8).abs() + (columns - nearest % 8).abs() == 1).all()
