@@ -15,6 +15,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
+import torch
+
 from hma_data import lab
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
@@ -23,18 +25,14 @@ from hma_data.errors import HMAError
 from hma_data.lab import family
 from hma_data.registry.embodiment import find
 from hma_data.shards.manifest import MANIFEST
+from hma_data.tokenizers.base import Tokenizer
 
 OTHERS = ("pendulum", "planar_arm", "pusht_fast", "pusht_slow")
 Frames = Literal["all", "strided"]
 
 
-def make(
-    robot: str, out: Path, episodes: int, seed: int, tokenizer: str, frames: Frames, threads: int
-) -> str:
+def make(robot: str, out: Path, episodes: int, seed: int, tokenizer: str | Tokenizer, frames: Frames) -> str:
     """Record and convert one robot; return a line that tells what was made."""
-    import torch
-
-    torch.set_num_threads(threads)
     begun = time.monotonic()
     embodiment = find(robot) if robot in lab.RECORDERS else family.embodiment(robot)
     (out / "embodiments" / f"{robot}.yaml").write_text(embodiment.to_yaml())
@@ -74,9 +72,11 @@ def main() -> None:
     todo = [robot for robot in robots if not (out / "shards" / robot / MANIFEST).is_file()]
     print(f"{len(robots)} robots, {len(robots) - len(todo)} of them done already", flush=True)
     threads = max(1, usable_cores() // arguments.workers)
-    options = (out, arguments.episodes, arguments.seed, arguments.tokenizer, arguments.frames, threads)
+    options = (out, arguments.episodes, arguments.seed, arguments.tokenizer, arguments.frames)
     failed = 0
-    with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        arguments.workers, get_context("spawn"), torch.set_num_threads, (threads,)
+    ) as pool:
         jobs = {pool.submit(make, robot, *options): robot for robot in todo}
         for done, job in enumerate(as_completed(jobs), start=1):
             try:
