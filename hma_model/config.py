@@ -158,6 +158,9 @@ class HMAConfig:
     action_loss_weight: float = 0.5  # relative to the video loss
     label_smoothing: float = 0.01
     corrupt_max: float = 0.2  # discrete: a sample's share of digits replaced at random is U(0, this)
+    # continuous: the noise in a visible frame has this times its corruption as standard deviation; the corruption
+    # is drawn as that of digits, so corrupt_max and the history below count here too
+    latent_noise: float = 0.0
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
     history_frames: int = 4  # the shortest such history
@@ -274,6 +277,8 @@ def _check_scalars(config: HMAConfig) -> None:
     for name in _SHARES:
         if not 0 <= getattr(config, name) <= 1:
             raise _refuse(name, getattr(config, name), "a share from 0 to 1")
+    if not (math.isfinite(config.latent_noise) and config.latent_noise >= 0):
+        raise _refuse("latent_noise", config.latent_noise, "a number of at least 0")
     for name in ("latent_scale", "rotary_base", "diffusion_clip"):
         if not (math.isfinite(value := getattr(config, name)) and value > 0):
             raise _refuse(name, value, "a positive number")

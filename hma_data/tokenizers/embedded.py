@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -127,21 +127,28 @@ class FsqConfig(BaseModel):
 
     Attributes:
         levels: number of levels of each digit's channels; `[[8, 8, 8], [8, 8, 8]]` is two digits of 512.
-        width: channels at 1/8 and at 1/16 of the picture's side.
+        width: channels at 1/8 and, if there are two, at 1/16 of the picture's side; tokens lie at the last.
         hidden: channels inside the residual blocks at 1/8 and 1/16.
-        encoder_blocks: residual blocks at 1/8 and at 1/16.
-        decoder_blocks: residual blocks at 1/16, 1/8 and 1/4.
+        encoder_blocks: residual blocks at each width.
+        decoder_blocks: residual blocks at each width in reverse order, then at 1/4.
         fine_width: channels of the decoder at 1/4.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     levels: tuple[tuple[Annotated[int, Field(ge=2)], ...], ...] = ((8, 8, 8), (8, 8, 8))
-    width: tuple[Width, Width] = (128, 256)
+    width: tuple[Width] | tuple[Width, Width] = (128, 256)
     hidden: Width = 128
-    encoder_blocks: tuple[Blocks, Blocks] = (3, 4)
-    decoder_blocks: tuple[Blocks, Blocks, Blocks] = (5, 4, 1)
+    encoder_blocks: tuple[Blocks, ...] = (3, 4)
+    decoder_blocks: tuple[Blocks, ...] = (5, 4, 1)
     fine_width: Width = 48
+
+    @model_validator(mode="after")
+    def _fit(self) -> "FsqConfig":
+        count = len(self.width)
+        if (len(self.encoder_blocks), len(self.decoder_blocks)) != (count, count + 1):
+            raise ValueError(f"give {count} encoder_blocks and {count + 1} decoder_blocks for {count} widths")
+        return self
 
     @field_validator("levels")
     @classmethod
@@ -208,12 +215,12 @@ class FsqAutoencoder(nn.Module):
     """An autoencoder of `encoder`, `quantizer` and `decoder`; `forward` is the training pass."""
 
     format, shape = "hma-fsq-1", FsqConfig
-    stride = 2 * PATCH
     linear_gain = 1.7  # least-squares estimate of z as 1.7 u, from u = erf(z/√2), z standard normal
 
     def __init__(self, config: FsqConfig) -> None:
         super().__init__()
         self.config = config
+        self.stride = PATCH * len(config.width)
         widths, hidden, channels = config.width, config.hidden, sum(len(digit) for digit in config.levels)
         self.encoder = Encoder(channels, widths, hidden, config.encoder_blocks)
         self.quantizer = Quantizer(config)

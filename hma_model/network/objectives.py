@@ -16,7 +16,7 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.config import OBJECTIVES, HMAConfig, Objective, Readout
 from hma_model.network.conditioning import Groups, align, condition
-from hma_model.network.head import device_of, uniform
+from hma_model.network.head import device_of, randn, uniform
 from hma_model.network.stem import from_digits, to_digits
 from hma_model.network.trunk import TimePositions, paired_times
 
@@ -184,6 +184,9 @@ def _embed(
         corrupted = corrupt_tokens(model.config, frames, video, generator)
         return model.embed_tokens(groups.sort(corrupted), layout.previous)
     masked = video.masked.to(frames.device).unsqueeze(-1)
+    if spread := model.config.latent_noise:
+        rate = spread * video.corruption.to(frames.device)[..., None, None]
+        frames = frames + rate * randn(frames.shape, generator, frames.device)
     return model.embed_patches(groups.sort(frames), groups.sort(masked), layout.previous)
 
 

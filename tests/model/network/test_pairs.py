@@ -85,6 +85,18 @@ def test_half_of_the_copies_are_wholly_masked_and_the_past_never():
     assert (mask.corruption[:, 5:] == 0).all() and (mask.corruption[:, :5] > 0).all()
 
 
+def test_noise_in_the_past_of_latents_has_the_spread_of_its_corruption(monkeypatch):
+    model, seen = small_model(kind="continuous", training_pass="pairs", latent_noise=2.0), []
+    original = model.embed_patches
+    monkeypatch.setattr(model, "embed_patches", lambda *given: seen.append(given[0]) or original(*given))
+    batch = _batch(model)
+    model(batch, "forward", _seed())
+    rate = draw_pairs_mask(model.config, 3, 5, 4, _seed()).corruption[:, :4]
+    true = model.frame_values(batch.latents)[[0, 2, 1]][:, :4]  # sorted by embodiment
+    noise = (seen[0][:, :4] - true).flatten(2)
+    assert (noise.std(dim=2) / (2 * rate[[0, 2, 1]]) - 1).abs().max() < 0.25
+
+
 @pytest.mark.parametrize(("objective", "past"), [("forward", 4), ("full", 5), ("policy", 5)])
 def test_only_an_objective_that_reads_it_has_the_last_true_frame(objective, past):
     from hma_model.config import OBJECTIVES
