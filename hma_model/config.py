@@ -91,7 +91,7 @@ _CHOICES = {
 }
 _AT_LEAST_ONE = (
     *("layers", "width", "heads", "mlp_ratio", "frames", "channels", "patch", "action_tokens", "base_width"),
-    *("history_frames", "diffusion_depth", "diffusion_width", "diffusion_train_steps", "views"),
+    *("merge", "history_frames", "diffusion_depth", "diffusion_width", "diffusion_train_steps", "views"),
     *("diffusion_sample_steps", "diffusion_repeats"),
 )
 _SHARES = (
@@ -123,6 +123,7 @@ class HMAConfig:
     dropout: float = 0.0  # in the MLPs
 
     factored: tuple[int, ...] = (512, 512)  # discrete: values a digit, low digit first
+    merge: int = 1  # discrete: the side of a square of stored tokens that becomes one token of the trunk
     channels: int = 4  # continuous: the latents' channels,
     patch: int = 2  # the side of a patch that becomes one token,
     latent_scale: float = 1.0  # and the factor by which stored latents are multiplied
@@ -158,8 +159,8 @@ class HMAConfig:
     action_loss_weight: float = 0.5  # relative to the video loss
     label_smoothing: float = 0.01
     corrupt_max: float = 0.2  # discrete: a sample's share of digits replaced at random is U(0, this)
-    # continuous: the noise in a visible frame has this times its corruption as standard deviation; the corruption
-    # is drawn as that of digits, so corrupt_max and the history below count here too
+    # continuous: the standard deviation of the noise in a visible frame, in units of its corruption, which is
+    # drawn as that of digits, so corrupt_max and the history below count here too
     latent_noise: float = 0.0
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
@@ -199,7 +200,7 @@ class HMAConfig:
     @property
     def token_grid(self) -> tuple[int, int]:
         """Return (views · h, w), the grid of the tokens that the trunk sees in a frame."""
-        side = self.patch if self.kind == "continuous" else 1
+        side = self.patch if self.kind == "continuous" else self.merge
         return self.views * self.grid[0] // side, self.grid[1] // side
 
     @property
@@ -227,8 +228,18 @@ class HMAConfig:
 
     @property
     def vocab_size(self) -> int:
-        """Return the number of token ids; this number is also the id that means masked."""
+        """Return the number of ids of a stored token; this number is also the id that means masked."""
         return math.prod(self.factored)
+
+    @property
+    def digits(self) -> tuple[int, ...]:
+        """Return the values of each digit of a token of the trunk, which are merge² stored tokens."""
+        return self.factored * self.merge**2
+
+    @property
+    def mask_id(self) -> int:
+        """Return the number of ids of a token of the trunk, which is also the id that means masked."""
+        return math.prod(self.digits)
 
     @property
     def patch_dim(self) -> int:
@@ -297,6 +308,10 @@ def _check_shapes(config: HMAConfig) -> None:
         raise _refuse(
             "heads", config.heads, f"a width a head that is even, not {config.head_dim}, for rotary time"
         )
+    if config.kind == "discrete" and any(side % config.merge for side in config.grid):
+        raise _refuse("merge", config.merge, f"a divisor of both sides of the grid, {config.grid}")
+    if config.kind == "discrete" and config.mask_id >= 2**62:
+        raise _refuse("merge", config.merge, "fewer tokens: their ids together must fit 62 bits")
     if config.kind == "continuous" and any(side % config.patch for side in config.grid):
         raise _refuse("patch", config.patch, f"a divisor of both sides of the grid, {config.grid}")
 

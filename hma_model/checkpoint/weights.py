@@ -123,7 +123,7 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
         "frames": config.frames * width if config.time_position == "learned" else 0,
     }
     if config.kind == "discrete":
-        needed["factored"] = sum(config.factored) * width
+        needed["factored"] = sum(config.digits) * width
     else:
         needed["diffusion_depth"] = config.diffusion_depth * config.diffusion_width**2
         needed["channels"] = config.patch_dim * width

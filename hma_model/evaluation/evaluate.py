@@ -146,6 +146,7 @@ def unconditional_baseline(
     batches: Iterable[Batch],
     cameras: Cameras = FIRST,
     factored: Sequence[int] | None = None,
+    merge: int = 1,
 ) -> Means:
     """Return the cross-entropy of each embodiment's training frequencies, which ignores all input.
 
@@ -154,6 +155,7 @@ def unconditional_baseline(
         batches: validation windows of discrete tokens.
         cameras: as `WindowDataset` takes them.
         factored: values of each digit, low digit first; by default the tokenizer's.
+        merge: the side of a square of tokens that counts as one, as `HMAConfig.merge`.
 
     Returns:
         Nats a token by embodiment, over the frames from the second on, as in `masked_val_loss`.
@@ -171,7 +173,7 @@ def unconditional_baseline(
             for digit in scores[name]:
                 nats -= digit[rest % len(digit)]
                 rest //= len(digit)
-            means.add([name], np.array([nats.mean()]))
+            means.add([name], np.array([nats.mean() * merge**2]))
     return means
 
 
@@ -371,7 +373,9 @@ def _losses(
     return {
         "loss": losses.mean(),
         "shuffled_loss": masked_val_loss(model, shuffled),
-        "baseline_loss": unconditional_baseline([shards], chosen(), cameras, model.config.factored).mean(),
+        "baseline_loss": unconditional_baseline(
+            [shards], chosen(), cameras, model.config.factored, model.config.merge
+        ).mean(),
         "perplexity": perplexity(losses.mean()),
         "accuracy": accuracy.mean(),
     }

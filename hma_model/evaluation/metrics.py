@@ -23,7 +23,6 @@ from hma_model.network.trunk import paired_times
 
 if TYPE_CHECKING:
     from hma_data.loading.dataset import Batch
-    from hma_model.config import HMAConfig
     from hma_model.network.model import HMA
 
 SSIM_WINDOW = 7
@@ -144,14 +143,14 @@ def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
     assert batch.tokens is not None
     config, held = model.config, model.config.frames
     first = _part(batch, slice(held))
-    parts = [_scored(config, first, _at_once(model, first))]
+    parts = [_scored(model, first, _at_once(model, first))]
     for t in range(held, batch.tokens.shape[1]):  # the past of such a frame begins after the first frame
         own = _part(batch, slice(t + 1 - held, t + 1))
         assert own.tokens is not None
         seen = own.tokens.clone()
         seen[:, -1] = config.vocab_size
         logits = model.video_logits(seen, own.actions, own.embodiment, own.action_mask)
-        parts.append(_scored(config, own, logits[:, -1:]))
+        parts.append(_scored(model, own, logits[:, -1:]))
     nats, hits = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
     return nats, hits
 
@@ -159,12 +158,12 @@ def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
 def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     """Return scores (B, T-1, h, w, F, V) of the masked frames, computed in one pass."""
     assert batch.tokens is not None
-    config, frames = model.config, batch.tokens.flatten(2)
+    config, frames = model.config, model.frame_values(batch.tokens)
     count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
     given = align(config, batch.actions, batch.action_mask, count)
     both = ActionConditioning(*(torch.cat([x, x[:, 1:]], dim=1) for x in (given.chunks, given.known)))
     times = paired_times(config, count, count, frames.device)
-    masked = torch.full_like(frames[:, 1:], config.vocab_size)
+    masked = torch.full_like(frames[:, 1:], config.mask_id)
     before = [*range(-1, count - 1), *range(count - 1)]
     x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)), before)
     features = model.trunk(x, condition(model, both, groups, times.positions), times)
@@ -178,9 +177,10 @@ def _part(batch: "Batch", frames: slice) -> "Batch":
     return replace(batch, tokens=batch.tokens[:, frames], actions=batch.actions[:, frames], action_mask=known)
 
 
-def _scored(config: "HMAConfig", batch: "Batch", logits: Tensor) -> tuple[Tensor, Tensor]:
+def _scored(model: "HMA", batch: "Batch", logits: Tensor) -> tuple[Tensor, Tensor]:
     """Score the last frames of a batch, as many as `logits` has."""
     assert batch.tokens is not None
-    true, factored = batch.tokens[:, -logits.shape[1] :], config.factored
-    nats = token_nats(logits, true, factored).mean(dim=(2, 3))
-    return nats, token_hits(logits, true, factored).float().mean(dim=(2, 3))
+    config, last = model.config, batch.tokens[:, -logits.shape[1] :]
+    true = model.frame_values(last).unflatten(2, config.token_grid)
+    nats = token_nats(logits, true, config.digits).mean(dim=(2, 3))
+    return nats, token_hits(logits, true, config.digits).float().mean(dim=(2, 3))

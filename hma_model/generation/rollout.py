@@ -29,7 +29,7 @@ from hma_model.config import HMAConfig
 from hma_model.network.conditioning import ActionConditioning, Groups, condition, unknown
 from hma_model.network.head import LatentReadout, TokenReadout, uniform
 from hma_model.network.model import HMA
-from hma_model.network.stem import from_digits, unpatchify
+from hma_model.network.stem import from_digits, split_tokens, unpatchify
 from hma_model.network.trunk import (
     Conditioning,
     LayerCache,
@@ -105,7 +105,7 @@ class TokenFrame:
     """A frame of discrete tokens that is unmasked step by step.
 
     Attributes:
-        values: (B, S) int64 ids; the vocabulary's size means masked.
+        values: (B, S) int64 ids of the trunk's tokens; `mask_id` means masked.
     """
 
     def __init__(self, values: Tensor, mask_id: int, decoding: Decoding) -> None:
@@ -375,14 +375,15 @@ class Rollout:
         """Return a new frame, wholly masked."""
         shape, device = (self.batch, self.config.tokens_per_frame), self.model.device
         if self.config.kind == "discrete":
-            mask_id = self.config.vocab_size
+            mask_id = self.config.mask_id
             return TokenFrame(torch.full(shape, mask_id, device=device), mask_id, self.decoding)
         return PatchFrame(torch.zeros(*shape, self.config.patch_dim, device=device), self.decoding)
 
     def _show(self, values: Tensor) -> Tensor:
         values = self.groups.unsort(values)
         if self.config.kind == "discrete":
-            return values.unflatten(1, self.config.token_grid)
+            config = self.config
+            return split_tokens(values, config.merge, config.vocab_size, config.token_grid)
         latents = unpatchify(values.unsqueeze(1), self.config.patch, self.config.token_grid)
         return latents.squeeze(1) / self.config.latent_scale
 

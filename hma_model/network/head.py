@@ -41,9 +41,9 @@ class TokenReadout(nn.Module):
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
-        self.factored, self.smoothing = config.factored, config.label_smoothing
+        self.factored, self.smoothing = config.digits, config.label_smoothing
         self.multiplier = config.base_width / config.width if config.mup else 1.0
-        self.linear = nn.Linear(config.width, sum(config.factored))
+        self.linear = nn.Linear(config.width, sum(config.digits))
         nn.init.normal_(self.linear.weight, std=0.02)
         nn.init.zeros_(self.linear.bias)
 
@@ -63,12 +63,18 @@ class TokenReadout(nn.Module):
 
     def loss(self, features: Tensor, digits: Tensor) -> Tensor:
         """Return the cross-entropy (M,), summed over digits, of features (M, D) and digits (M, F)."""
+        if len(set(self.factored)) == 1:
+            scores = self.split(self(features)).flatten(0, 1)
+            losses = F.cross_entropy(
+                scores, digits.flatten(), reduction="none", label_smoothing=self.smoothing
+            )
+            return losses.view(digits.shape).sum(1)
         parts = self(features).split(list(self.factored), dim=-1)
-        losses = [
+        each = [
             F.cross_entropy(part, digits[:, i], reduction="none", label_smoothing=self.smoothing)
             for i, part in enumerate(parts)
         ]
-        return torch.stack(losses).sum(0)
+        return torch.stack(each).sum(0)
 
 
 class LatentReadout(nn.Module):

@@ -20,7 +20,7 @@ from hma_data.storage.paths import StrPath
 from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
 from hma_model.network.head import ActionHead, LatentReadout, TokenReadout
-from hma_model.network.stem import LatentEmbedding, Stem, TokenEmbedding, patchify
+from hma_model.network.stem import LatentEmbedding, Stem, TokenEmbedding, merge_tokens, patchify
 from hma_model.network.trunk import Conditioning, TimePositions, Trunk, window_times
 
 if TYPE_CHECKING:
@@ -196,12 +196,12 @@ class HMA(nn.Module):
             action_mask: (B, T) bool, True where a chunk is known; by default all are.
 
         Returns:
-            (B, T, h, w, F, V) float32, low digit first.
+            (B, T, h, w, F, V) float32, low digit first; with `merge`, of the trunk's tokens and their digits.
         """
         self._require("discrete", "video_logits")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
         conditioning = self._condition(actions, action_mask, groups, times)
-        x = self.embed_tokens(groups.sort(tokens.flatten(2)))
+        x = self.embed_tokens(groups.sort(self.frame_values(tokens)))
         scores = self.token_readout(self.video_features(self.trunk(x, conditioning, times)))
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
 
@@ -347,7 +347,7 @@ class HMA(nn.Module):
         return window_times(self.config, frames, self.device)
 
     def frame_values(self, frames: Tensor) -> Tensor:
-        """Return the token ids (B, T, S), or the scaled patches (B, T, S, c*p*p), of stored frames.
+        """Return the trunk's token ids (B, T, S), or the scaled patches (B, T, S, c*p*p), of stored frames.
 
         Args:
             frames: tokens (B, T, h, w) int64, or latents (B, T, c, H, W).
@@ -360,14 +360,14 @@ class HMA(nn.Module):
             fault = f"a frame has the shape {shape}, but the model takes {config.frame_shape}"
             raise HMAError("frames", fault, "use the model's tokenizer")
         if config.kind == "discrete":
-            return frames.flatten(2).long()
+            return merge_tokens(frames.long(), config.merge, config.vocab_size)
         return patchify(frames.float() * config.latent_scale, config.patch)
 
     def embed_tokens(self, tokens: Tensor, previous: Sequence[int] | None = None) -> Tensor:
         """Embed ids (B, T, S) as (B, T, S, D).
 
         Args:
-            tokens: the vocabulary's size means masked.
+            tokens: the configuration's `mask_id` means masked.
             previous: (T,) for each frame the index of the frame before it, or -1; by default the frames
                 follow one another.
         """

@@ -205,7 +205,7 @@ def _video_loss(
     rows = rows.to(features.device)
     chosen, targets = features.flatten(0, 2)[rows], groups.sort(frames).flatten(0, 2)[rows]
     if model.config.kind == "discrete":
-        losses = model.token_readout.loss(chosen, to_digits(targets, model.config.factored))
+        losses = model.token_readout.loss(chosen, to_digits(targets, model.config.digits))
     else:
         losses = model.latent_readout.diffusion.loss(targets, chosen, generator)
     return losses.sum() / max(len(rows), 1), groups.unsort(_means(losses, sample, len(frames)))
@@ -301,16 +301,16 @@ def draw_video_mask(
 def corrupt_tokens(
     config: HMAConfig, tokens: Tensor, mask: VideoMask, generator: torch.Generator | None
 ) -> Tensor:
-    """Replace digits of token ids (B, T, S) at random, and set masked ids to the vocabulary's size."""
-    digits = to_digits(tokens, config.factored)
+    """Replace digits of token ids (B, T, S) at random, and set masked ids to `mask_id`."""
+    digits = to_digits(tokens, config.digits)
     if config.corrupt_max:
-        values = torch.tensor(config.factored, device=tokens.device)
+        values = torch.tensor(config.digits, device=tokens.device)
         random = (uniform(digits.shape, generator, tokens.device) * values).long()
         draw = uniform(digits.shape, generator, tokens.device)
         hit = draw < mask.corruption.to(tokens.device)[..., None, None]
         digits = torch.where(hit, torch.minimum(random, values - 1), digits)
-    corrupted = from_digits(digits, config.factored)
-    return corrupted.masked_fill(mask.masked.to(tokens.device), config.vocab_size)
+    corrupted = from_digits(digits, config.digits)
+    return corrupted.masked_fill(mask.masked.to(tokens.device), config.mask_id)
 
 
 def drop_chunks(present: Tensor, generator: torch.Generator | None) -> Tensor:

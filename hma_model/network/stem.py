@@ -6,6 +6,7 @@ c channels, H,W latent grid, p patch side, A values of an action, K = stride*A v
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 
 import torch
 import torch.nn.functional as F
@@ -33,6 +34,29 @@ def from_digits(digits: Tensor, factored: Sequence[int]) -> Tensor:
     return tokens
 
 
+def merge_tokens(tokens: Tensor, side: int, vocab_size: int) -> Tensor:
+    """Convert ids (B, T, h, w) to ids (B, T, S) of squares of side² tokens, row by row, the first one lowest.
+
+    A square with a token that is masked (`vocab_size`) is masked: vocab_size ** side².
+    """
+    if side == 1:
+        return tokens.flatten(2)
+    b, t, height, width = tokens.shape
+    split = tokens.reshape(b, t, height // side, side, width // side, side).transpose(3, 4)
+    parts = split.reshape(b, t, -1, side * side)
+    masked = (parts == vocab_size).any(-1)
+    whole = from_digits(parts.masked_fill(masked.unsqueeze(-1), 0), (vocab_size,) * side**2)
+    return whole.masked_fill(masked, vocab_size ** (side * side))
+
+
+def split_tokens(tokens: Tensor, side: int, vocab_size: int, grid: tuple[int, int]) -> Tensor:
+    """Convert ids (..., S) of squares to ids (..., h, w) of their tokens; `grid` is (h/side, w/side)."""
+    if side == 1:
+        return tokens.unflatten(-1, grid)
+    parts = to_digits(tokens, (vocab_size,) * side**2).unflatten(-1, (side, side)).unflatten(-3, grid)
+    return parts.transpose(-3, -2).flatten(-4, -3).flatten(-2)
+
+
 def patchify(latents: Tensor, patch: int) -> Tensor:
     """Convert latents (B, T, c, H, W) to patches (B, T, S, c*p*p)."""
     b, t, c, height, width = latents.shape
@@ -55,10 +79,10 @@ class TokenEmbedding(nn.Module):
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
-        self.factored = config.factored
-        self.vocab_size = config.vocab_size
-        std = len(config.factored) ** -0.5
-        self.digits = nn.ParameterList(torch.randn(v, config.width) * std for v in config.factored)
+        self.factored = config.digits
+        self.mask_id = config.mask_id
+        std = len(config.digits) ** -0.5
+        self.digits = nn.ParameterList(torch.randn(v, config.width) * std for v in config.digits)
         self.carries = config.masked_input == "previous"
         self.mask = nn.Parameter(torch.randn(config.width) * (0.5 if self.carries else 0.02))
 
@@ -66,14 +90,20 @@ class TokenEmbedding(nn.Module):
         """Embed ids (B, T, S) as (B, T, S, D).
 
         Args:
-            tokens: the vocabulary's size means masked.
+            tokens: the configuration's `mask_id` means masked.
             previous: (T,) for each frame the index of the frame before it, or -1 if it is not there.
         """
-        masked = (tokens == self.vocab_size).unsqueeze(-1)
+        masked = (tokens == self.mask_id).unsqueeze(-1)
         digits = to_digits(tokens.masked_fill(masked.squeeze(-1), 0), self.factored)
-        embedding = F.embedding(digits[..., 0], self.digits[0])
-        for index in range(1, len(self.factored)):
-            embedding = embedding + F.embedding(digits[..., index], self.digits[index])
+        if len(self.factored) > 2:  # one sum over all digits
+            starts = torch.tensor([0, *accumulate(self.factored[:-1])], device=tokens.device)
+            rows = (digits + starts).flatten(0, -2)
+            embedding = F.embedding_bag(rows, torch.cat(list(self.digits)), mode="sum")
+            embedding = embedding.view(*tokens.shape, -1)
+        else:
+            embedding = F.embedding(digits[..., 0], self.digits[0])
+            for index in range(1, len(self.factored)):
+                embedding = embedding + F.embedding(digits[..., index], self.digits[index])
         if not self.carries:
             return torch.where(masked, self.mask, embedding)
         return torch.where(masked, self.mask + carried(embedding.masked_fill(masked, 0), previous), embedding)

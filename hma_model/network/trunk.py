@@ -114,7 +114,7 @@ def paired_times(config: HMAConfig, past: int, frames: int, device: torch.device
 def sinusoids(grid: tuple[int, int], width: int) -> Tensor:
     """Return 2-D sinusoids (S, D) of the places of a grid, of standard deviation 0.5.
 
-    A quarter of the channels each is a sine or cosine of the row or the column; the longest wave is four times
+    A quarter of the channels each is a sine or cosine of the row or the column; the longest wave is 4 times
     the larger side, the shortest two places.
     """
     quarter = -(-width // 4)

@@ -139,7 +139,8 @@ class Run:
         drawn = zip(self.train_data.mixture.p, self.sets.values())
         given: Any = {"cameras": self.recipe.cameras, "factored": self.model.config.factored}
         shares = [[p * d for d in evaluate.digit_frequencies(s, **given)] for p, s in drawn]
-        bias = np.log(np.concatenate([sum(digits) for digits in zip(*shares)]))
+        digits = [sum(digit) for digit in zip(*shares)]
+        bias = np.log(np.concatenate(digits * self.model.config.merge**2))
         own = self.model.token_readout.linear.bias
         own.copy_(torch.from_numpy(bias).to(own))
 
@@ -272,9 +273,8 @@ class Run:
             if video and model.config.kind == "discrete":
                 if self._baseline is None:
                     batches = self._held_out_batches()
-                    digits = model.config.factored
                     self._baseline = evaluate.unconditional_baseline(
-                        self.sets, batches, recipe.cameras, digits
+                        self.sets, batches, recipe.cameras, model.config.factored, model.config.merge
                     )
                 facts["perplexity"] = perplexity(facts["loss"])
                 facts["accuracy"] = accuracy.mean()

@@ -17,7 +17,7 @@ from torch import Tensor
 from hma_data.loading.dataset import Batch
 from hma_model.config import OBJECTIVES
 from hma_model.network.head import uniform
-from hma_model.network.stem import from_digits, unpatchify
+from hma_model.network.stem import from_digits, split_tokens, unpatchify
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -91,7 +91,8 @@ def _predicted(
         hidden = context.clone()
         hidden[rows, at] = config.vocab_size
         digits = model.video_logits(hidden, actions, names, known)[rows, at].argmax(-1)
-        return from_digits(digits, config.factored)
+        tokens = from_digits(digits, config.digits).flatten(1)
+        return split_tokens(tokens, config.merge, config.vocab_size, config.token_grid)
     scaled = context.float() * config.latent_scale
     mask = torch.zeros(context.shape[:2] + context.shape[3:], dtype=torch.bool, device=context.device)
     mask[rows, at] = True

@@ -2,8 +2,8 @@
 
     python recipes/tokenizer/draw.py OUT [--pusht 200] [--drawn 300] [--lab 0] [--seed 20]
 
-They are written to OUT/pusht/00000.png … and OUT/drawn/00000.png …, where the recipes expect them. With --lab,
-OUT/lab/ gets that many pictures of each laboratory robot of the embedded world model, each a
+They are written to OUT/pusht/00000.png … and OUT/drawn/00000.png …, where the recipes expect them. With
+--lab, OUT/lab/ gets that many pictures of each laboratory robot of the embedded world model, each a
 mosaic of four frames, so that a crop of half its side shows the robot as large as a recording does.
 """
 

@@ -25,6 +25,7 @@ LAYOUTS = {
     },
     "cross": {"conditioning": ("add", "cross_attention")},
     "previous": {"masked_input": "previous"},
+    "merged": {"merge": 2, "masked_input": "previous"},
 }  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from hma_data.loading.rows import Batch
 from hma_model.evaluation.metrics import teacher_forced
 from hma_model.network.model import HMA
 from hma_model.network.objectives import Layout, draw_pairs_mask
+from hma_model.network.stem import merge_tokens, split_tokens, to_digits
 from hma_model.network.trunk import sinusoids
 from tests.model.network_parts import small_batch, small_config, small_model
 
@@ -29,10 +30,10 @@ def _batch(model: HMA) -> Batch:
     return Batch(NAMES, made.actions, made.action_mask, tokens=made.tokens, latents=made.latents)
 
 
-@pytest.mark.parametrize("masked_input", ["learned", "previous"])
+@pytest.mark.parametrize("changes", [{}, {"masked_input": "previous"}, {"merge": 2}], ids=str)
 @pytest.mark.parametrize("objective", ["forward", "full"])
-def test_whole_copies_have_the_loss_of_each_frame_after_its_true_past(masked_input, objective):
-    model = small_model(masked_input=masked_input, **WHOLE)
+def test_whole_copies_have_the_loss_of_each_frame_after_its_true_past(changes, objective):
+    model = small_model(**changes, **WHOLE)
     batch = _batch(model)
     if objective == "full":  # hides chunks, so the frames are compared without any
         batch = replace(batch, action_mask=torch.zeros_like(batch.action_mask))
@@ -41,9 +42,10 @@ def test_whole_copies_have_the_loss_of_each_frame_after_its_true_past(masked_inp
     nats, _ = teacher_forced(model, batch)
     if objective == "forward":
         assert torch.allclose(output.per_sample, nats.mean(dim=1), atol=1e-5)
-    assert output.masked.shape == batch.tokens.shape
+    shape = (*batch.tokens.shape[:2], *model.config.token_grid)
+    assert output.masked.shape == shape
     assert output.masked[:, 1:].all() and not output.masked[:, 0].any()
-    assert output.video_logits is not None and output.video_logits.shape[:4] == batch.tokens.shape
+    assert output.video_logits is not None and output.video_logits.shape[:4] == shape
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
@@ -127,3 +129,37 @@ def test_sinusoids_tell_neighbours_from_others():
     nearest = distance.argmin(1)
     rows, columns = torch.arange(64) // 8, torch.arange(64) % 8
     assert ((rows - nearest // 8).abs() + (columns - nearest % 8).abs() == 1).all()
+
+
+def test_squares_of_tokens_become_one_and_come_apart_again():
+    tokens = torch.randint(0, 32768, (2, 3, 6, 4), generator=_seed())
+    merged = merge_tokens(tokens, 2, 32768)
+    assert merged.shape == (2, 3, 6) and merged.max() < 32768**4
+    assert torch.equal(split_tokens(merged, 2, 32768, (3, 2)), tokens)
+    digits = to_digits(merged[0, 0, 3], (32768,) * 4)  # second row of squares, second column
+    assert torch.equal(digits, tokens[0, 0, 2:4, 2:4].flatten())
+    tokens[1, 2, 5, 0] = 32768
+    masked = merge_tokens(tokens, 2, 32768) == 32768**4
+    assert masked.nonzero().tolist() == [[1, 2, 4]]
+
+
+@pytest.mark.parametrize("factored", [(6, 4), (4, 4, 4), (5, 3, 2)])
+def test_the_embedding_and_the_loss_are_sums_over_the_digits(factored):
+    model = small_model(factored=factored, label_smoothing=0.1)
+    config, embed, readout = model.config, model.trunk.embed, model.token_readout
+    tokens = torch.randint(0, config.vocab_size, (2, 3, 16), generator=_seed())
+    digits = to_digits(tokens, factored)
+    rows = [weight[digits[..., i]].double() for i, weight in enumerate(embed.digits)]
+    assert torch.allclose(model.embed_tokens(tokens).double(), sum(rows), atol=1e-5)
+
+    features = torch.randn(7, config.width, generator=_seed())
+    goal = torch.stack([torch.randint(0, v, (7,), generator=_seed(v)) for v in factored], dim=1)
+    scores = (features.double() @ readout.linear.weight.double().T + readout.linear.bias.double()).split(
+        factored, 1
+    )
+    logs = [part.log_softmax(1) for part in scores]
+    expected = sum(
+        -0.9 * log.gather(1, goal[:, i : i + 1]).squeeze(1) - 0.1 * log.mean(1) for i, log in enumerate(logs)
+    )
+    if readout.multiplier == 1:
+        assert torch.allclose(readout.loss(features, goal).double(), expected, atol=1e-4)
