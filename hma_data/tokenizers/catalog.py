@@ -111,6 +111,11 @@ _ROWS = (
         "embedded", "hma_data.tokenizers.embedded", {"image_size": 128}, file="fsq.safetensors",
     ),
     Entry(
+        "fsq-lab", "discrete", 128, (16, 16),
+        "sharp on clean small pictures, 15 bits a token; the embedded world model's",
+        "embedded", "hma_data.tokenizers.embedded", {"image_size": 128}, file="fsq-lab.safetensors",
+    ),
+    Entry(
         "vae-8", "continuous", 256, (32, 32),
         "continuous without a download: 4 channels at 1/8 of the side, fast on a CPU",
         "embedded", "hma_data.tokenizers.embedded", {"image_size": 256}, file="vae.safetensors",

@@ -139,7 +139,7 @@ class Recipe(_Settings):
     start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
     # a token's digits: the tokenizer's, or each split further, such as 512 into 8 · 8 · 8 (FSQ's levels)
-    digits: Count = Field(0, ge=0, description="values of a digit; 0 takes the tokenizer's digits")
+    digits: Count = Field(0, description="0 takes the tokenizer's; 8 splits 512 into 8 · 8 · 8")
     # what the bias of the token readout starts with: the log frequencies of the training tokens
     readout_bias: Literal["frequencies", "zero"] = "frequencies"
 
@@ -197,20 +197,17 @@ class Recipe(_Settings):
     def factored(self, spec: "TokenizerSpec") -> tuple[int, ...]:
         """Return the values of each digit of a token of this tokenizer, low digit first.
 
-        Raises:
-            RecipeError: the tokenizer's digits cannot be split into digits of `digits` values.
+        With `digits`, each of the tokenizer's digits is split into as many of that many values as divide it.
         """
         stated = spec.factored or (spec.vocab_size or 1,)
         if not self.digits:
             return stated
         split: list[int] = []
         for values in stated:
-            while values > 1 and values % self.digits == 0:
+            while values % self.digits == 0:
                 split.append(self.digits)
                 values //= self.digits
-            if values > 1:
-                fault = f"{self.digits} values do not divide the {stated} of {spec.name}"
-                raise RecipeError("recipe: digits", fault, "give 0, which takes the tokenizer's digits")
+            split += [values] if values > 1 else []
         return tuple(split)
 
     def network(self, spec: "TokenizerSpec") -> HMAConfig:

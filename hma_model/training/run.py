@@ -55,6 +55,9 @@ class Run:
         if recipe.self_forward and recipe.parallel == "fsdp" and self.world.size > 1:
             fault = "does not work with parallel=fsdp on several ranks"
             raise RecipeError("recipe: self_forward", fault, "use parallel=ddp")
+        if recipe.optimizer == "muon" and recipe.parallel == "fsdp" and self.world.size > 1:
+            fault = "muon does not work with parallel=fsdp on several ranks"
+            raise RecipeError("recipe: optimizer", fault, "use parallel=ddp")
         try:
             self.sets = open_sets(recipe.data, recipe.cameras)
         except UsageError as wrong:
