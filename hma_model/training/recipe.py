@@ -139,7 +139,7 @@ class Recipe(_Settings):
     start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
     # a token's digits: the tokenizer's, or each split further, such as 512 into 8 · 8 · 8 (FSQ's levels)
-    digits: Count = Field(0, description="0 takes the tokenizer's; 8 splits 512 into 8 · 8 · 8")
+    digits: Count = Field(0, ge=0, description="0 takes the tokenizer's; 8 splits 512 into 8 · 8 · 8")
     # what the bias of the token readout starts with: the log frequencies of the training tokens
     readout_bias: Literal["frequencies", "zero"] = "frequencies"
 
@@ -200,7 +200,7 @@ class Recipe(_Settings):
         With `digits`, each of the tokenizer's digits is split into as many of that many values as divide it.
         """
         stated = spec.factored or (spec.vocab_size or 1,)
-        if not self.digits:
+        if self.digits < 2:
             return stated
         split: list[int] = []
         for values in stated:
@@ -250,9 +250,11 @@ def make_recipe(values: Mapping[str, Any], where: str = "recipe") -> Recipe:
         given["model"] = {key: getattr(network, key) for key in given["model"]} if network else {}
     recipe = _validated(Recipe, given, "", faults)
     if recipe is not None and not faults:
-        side = recipe.model.get("patch", 1)  # any grid that the patches divide will do for this check
+        # any grid that the patches divide, and digits so few that they may be merged, will do for this check
+        side = recipe.model.get("patch", 1) * recipe.model.get("merge", 1)
         try:
-            HMAConfig(**{"patch": 1, **recipe.model, "objectives": recipe.objectives, "grid": (side, side)})
+            given = {"patch": 1, **recipe.model, "objectives": recipe.objectives}
+            HMAConfig(**given, grid=(side, side), factored=(2,))
             return recipe
         except RecipeError as fault:
             key = fault.where.replace("model.objectives", "objectives")
