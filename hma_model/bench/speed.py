@@ -60,6 +60,8 @@ WAITS: dict[str, dict[str, str]] = {
     **{f"{count:,} spins": {"GOMP_SPINCOUNT": str(count)} for count in (1_000, 10_000, 50_000, 200_000)},
     "one thread": {"OMP_NUM_THREADS": "1"},
 }
+ATTENTION = ("attention", "flash", "fmha")  # in the names of operators and kernels
+PRODUCTS = ("::mm", "addmm", "bmm", "gemm", "cutlass")
 OPENMP = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OMP_NUM_THREADS")
 
 
@@ -88,7 +90,7 @@ def make_model(settings: dict[str, Any], kind: str = "discrete") -> "HMA":
         torch.set_num_threads(settings["threads"])
     torch.manual_seed(0)
     grid = (32, 32) if kind == "continuous" else (16, 16)
-    network = {key: settings[key] for key in NETWORK}
+    network = {key: settings[key] for key in NETWORK} | {"training_pass": settings.get("pass", "window")}
     model = HMA(HMAConfig(kind=kind, frames=settings["window"], grid=grid, **network))
     dims = settings["action_dims"]
     model.add_embodiment(ActionSpace(ROBOT, dims, 1, (0.0,) * dims, (1.0,) * dims, (True,) * dims))
@@ -204,7 +206,10 @@ def _frame_seconds(model: "HMA", settings: dict[str, Any], cache: bool) -> list[
 
 def train(settings: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one result for each kind; raise UsageError for a wrong setting."""
-    return [in_fresh_process(measure_steps, settings, kind) for kind in _kinds("train", settings)]
+    return [
+        in_fresh_process(measure_steps, settings, kind)
+        for kind in _kinds("train", settings, **{"pass": ("window", "pairs")})
+    ]
 
 
 def measure_steps(settings: dict[str, Any], kind: str) -> dict[str, Any]:
@@ -214,7 +219,7 @@ def measure_steps(settings: dict[str, Any], kind: str) -> dict[str, Any]:
     if settings["compile"]:
         model.trunk.compile()
     seconds = _step_seconds(model, settings)
-    told = ("precision", "batch", "window", "optimizer", "compile", "checkpointing")
+    told = ("precision", "batch", "window", "pass", "optimizer", "compile", "checkpointing")
     return {
         "kind": kind,
         "device": _device_name(model.device),
@@ -222,8 +227,29 @@ def measure_steps(settings: dict[str, Any], kind: str) -> dict[str, Any]:
         "seconds_per_step": round(min(seconds), 4),
         "median_seconds_per_step": round(median(seconds), 4),
         "windows_per_second": round(settings["batch"] / min(seconds), 4),
+        **_shares(model, settings),
         **_memory(model.device),
     }
+
+
+def _shares(model: "HMA", settings: dict[str, Any]) -> dict[str, float]:
+    """Return the shares of a step's time in matrix products, in attention, and in everything else.
+
+    They are the profiler's self times of operators, on a GPU those of kernels.
+    """
+    from torch.profiler import ProfilerActivity, profile
+
+    cuda = model.device.type == "cuda"
+    with profile(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as found:
+        _step_seconds(model, {**settings, "steps": 0})
+    spent = {"products": 0.0, "attention": 0.0, "other": 0.0}
+    for one in found.key_averages():
+        name = one.key.lower()
+        kind = "attention" if any(word in name for word in ATTENTION) else "other"
+        if kind == "other" and any(word in name for word in PRODUCTS):
+            kind = "products"
+        spent[kind] += one.self_device_time_total if cuda else one.self_cpu_time_total
+    return {f"share_of_{kind}": round(time / sum(spent.values()), 3) for kind, time in spent.items()}
 
 
 def _step_seconds(model: "HMA", settings: dict[str, Any]) -> list[float]:
@@ -363,6 +389,7 @@ TRAIN = Bench(
         **COMMON,
         "steps": 3,  # measured, after a warm-up
         "batch": 2,
+        "pass": "window",  # window | pairs, see HMAConfig.training_pass
         "checkpointing": False,  # recompute each block in the backward pass
         "optimizer": True,
     },
