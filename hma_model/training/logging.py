@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 METRICS, KINDS, EVENTS = "metrics.jsonl", ("train", "eval"), "tensorboard"
 PLAIN_SECONDS = 10.0
 SMOOTHING = 20  # steps over which a shown loss is averaged
+LISTED = 6  # robots whose losses a line of progress names
 PACING = 50  # steps from which the speed and the remaining time are estimated
 
 
@@ -274,7 +275,7 @@ class RunLog:
 
     def _text(self) -> str:
         rate, times = self._pace()
-        losses = ", ".join(f"{name} {value:.3f}" for name, value in self._smooth().items())
+        losses = _listed(self._smooth())
         held = f", validation {_number(self._evaluation.get('loss'))}" if self._evaluation else ""
         skipped = f", {self._last['skipped']} steps skipped" if self._last.get("skipped") else ""
         where = f"step {self._last['step']}/{self._steps}"
@@ -297,6 +298,18 @@ class RunLog:
         rest = f"lr {last['lr']:.2e}   {last.get('memory_mib', 0):,.0f} MiB"
         skipped = f"   {last['skipped']} steps skipped" if last.get("skipped") else ""
         return Group(f"{head}   {rest}{skipped}", table)
+
+
+def _listed(losses: dict[str, float]) -> str:
+    """Return the losses by name; of more than a line holds, their mean, the lowest and the highest."""
+    if len(losses) <= LISTED:
+        return ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
+    ends = [
+        f"{name} {losses[name]:.3f}"
+        for name in (min(losses, key=losses.__getitem__), max(losses, key=losses.__getitem__))
+    ]
+    mean = sum(losses.values()) / len(losses)
+    return f"{mean:.3f} over {len(losses)} robots ({ends[0]} to {ends[1]})"
 
 
 def _number(value: float | None) -> str:

@@ -1,8 +1,11 @@
 """The optimizer: what decays, muP's scaling, schedules, and moments that come back."""
 
+from collections import defaultdict
+
 import pytest
 import torch
 
+from hma_data.tokenizers.training.muon import muon_step
 from hma_model.training.optim import (
     learning_rate,
     load_optimizer_state,
@@ -10,6 +13,7 @@ from hma_model.training.optim import (
     make_optimizer,
     optimizer_state,
     parameter_groups,
+    set_lr,
 )
 from hma_model.training.recipe import make_recipe
 from tests.model.robots import CONFIG, make_model
@@ -82,8 +86,9 @@ def test_the_papers_rule_grows_with_the_batch_up_to_eight_times(windows, factor)
     assert learning_rate(recipe) == pytest.approx(1e-4 * factor)
 
 
-def test_moments_come_back_and_the_next_step_is_the_same():
-    recipe = make_recipe({})
+@pytest.mark.parametrize("optimizer", ["adamw", "muon"])
+def test_moments_come_back_and_the_next_step_is_the_same(optimizer):
+    recipe = make_recipe({"optimizer": optimizer})
     first, second = make_model(ROBOTS), make_model(ROBOTS)
     optimizers = make_optimizer(first, recipe), make_optimizer(second, recipe)
 
@@ -99,3 +104,32 @@ def test_moments_come_back_and_the_next_step_is_the_same():
     for model, optimizer in zip((first, second), optimizers):
         step(model, optimizer, 2)
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters()))
+
+
+def test_muon_takes_the_blocks_matrices_and_adamw_the_rest():
+    model = make_model(ROBOTS)
+    optimizer = make_optimizer(model, make_recipe({"optimizer": "muon", "muon_lr": 0.01, "lr": 1e-3}))
+    by_muon = {n for group in optimizer.param_groups if group["muon"] for n in group["names"]}
+    assert by_muon == {
+        n for n, p in model.named_parameters() if n.startswith("trunk.blocks.") and p.ndim == 2
+    }
+    names = [name for group in optimizer.param_groups for name in group["names"]]
+    assert sorted(names) == sorted(name for name, _ in model.named_parameters())
+    assert set_lr(optimizer, 0.5) == 5e-4
+
+
+@pytest.mark.parametrize("shape", [(24, 8), (8, 24), (16, 16)])
+def test_a_step_of_muon_is_the_gradient_made_orthogonal(shape):
+    torch.manual_seed(0)
+    matrices = [torch.nn.Parameter(torch.randn(shape)) for _ in range(3)]
+    before = [matrix.detach().clone() for matrix in matrices]
+    for matrix in matrices:
+        matrix.grad = torch.randn(shape)
+    muon_step(matrices, defaultdict(dict), lr=0.1, momentum=0.0, decay=0.5)
+    tall = max(1.0, shape[0] / shape[1]) ** 0.5
+    for matrix, old in zip(matrices, before):
+        step = (old * (1 - 0.1 * 0.5) - matrix.detach()) / (0.1 * tall)
+        u, _, v = torch.linalg.svd(matrix.grad.double(), full_matrices=False)
+        values = torch.linalg.svdvals(step.double())
+        assert values.min() > 0.6 and values.max() < 1.3
+        assert (u.T @ step.double() @ v.T).diagonal().min() > 0.6  # along the gradient's own directions

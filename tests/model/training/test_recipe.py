@@ -7,7 +7,7 @@ import torch
 
 from hma_data.errors import RecipeError, UsageError
 from hma_data.storage.paths import shipped
-from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers.base import TokenizerSpec, get_tokenizer
 from hma_model.training.recipe import differences, load_recipe, make_recipe, parse_overrides
 from tests.model.robots import SPEC
 
@@ -25,7 +25,7 @@ def write(tmp_path: Path):
 def test_overrides_reach_nested_keys_and_are_yaml():
     given = ["model.layers=2", "lr=1e-3", "data=[a, b]", "mixture.weights.arm=2", "out=null"]
     recipe = load_recipe("discrete_tiny", given)
-    assert recipe.model == {"layers": 2, "width": 128, "heads": 4}
+    assert recipe.model == {**load_recipe("discrete_tiny").model, "layers": 2}
     assert (recipe.lr, recipe.data, recipe.out) == (1e-3, ("a", "b"), None)
     assert recipe.mixture.weights == {"arm": 2.0}
 
@@ -219,6 +219,8 @@ def test_every_shipped_recipe_validates_and_makes_a_network(name):
             name="svd-vae", version=1, kind="continuous", image_size=256, grid=(32, 32), channels=4,
             dtype="float16", latent_scale=0.18215,
         )  # fmt: skip
+    elif name == "world":
+        spec = get_tokenizer("fsq-lab").spec
     config = recipe.network(spec)
     assert config.kind == spec.kind and config.frames == recipe.frames
 
