@@ -311,7 +311,7 @@ class Rails:
 def _rails(rng: np.random.Generator, frame: float, colors: list[Color], joint: Color) -> tuple[Rails, str]:
     count, upright, target = int(rng.integers(2, 6)), bool(rng.random() < 0.5), rng.random() < 0.5
     gap = float(rng.uniform(0.8, 1.0) * 100 / (count - 1) if count > 2 else rng.uniform(40, 70))
-    places = SIZE / 2 + gap * (np.arange(count) - (count - 1) / 2)
+    places = SIZE / 2 + gap * (np.arange(count, dtype=np.float64) - (count - 1) / 2)
     size = (rng.uniform(7, 10), min(rng.uniform(7, 10), gap * 0.38))
     speeds = rng.uniform(7, 12, count) / frame
     axes = [
