@@ -94,8 +94,9 @@ class Driver:
         return bool(tip.min() > 4 and tip.max() < SIZE - 4)
 
     def _random_pose(self) -> Floats:
+        low, high = self._body.limits
         for _ in range(8):
-            pose: Floats = self._rng.uniform(*self._body.limits)
+            pose = self._rng.uniform(low, high)
             if self._visible(pose):
                 break
         return pose
@@ -106,7 +107,8 @@ class Driver:
         block = blocks[self._rng.integers(len(blocks))]
         point = block if self._body.grip else block + (block - here) * 0.3
         spread = 0.5 * (self._body.limits[1] - self._body.limits[0])
-        best, least = pose, np.inf
+        best: Floats = pose
+        least = np.inf
         for trial in range(60):  # forty anywhere, twenty near the best of them
             other = (
                 best + self._rng.normal(0, 0.1, len(pose)) * spread if trial >= 40 else self._random_pose()

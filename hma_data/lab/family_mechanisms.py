@@ -47,8 +47,13 @@ class Axis:
 class Mechanism(Protocol):
     """The moving parts of a kind."""
 
-    axes: tuple[Axis, ...]
-    commands: tuple[Axis, ...]
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """Return the Q axes of the pose."""
+
+    @property
+    def commands(self) -> tuple[Axis, ...]:
+        """Return the A axes of the command."""
 
     def fixed(self) -> list[Shape]:
         """Return the parts that never move, drawn below everything else."""
@@ -305,8 +310,8 @@ class Rails:
 
 def _rails(rng: np.random.Generator, frame: float, colors: list[Color], joint: Color) -> tuple[Rails, str]:
     count, upright, target = int(rng.integers(2, 6)), bool(rng.random() < 0.5), rng.random() < 0.5
-    gap = rng.uniform(0.8, 1.0) * 100 / (count - 1) if count > 2 else rng.uniform(40, 70)
-    places = SIZE / 2 + gap * (np.arange(count) - (count - 1) / 2)
+    gap = float(rng.uniform(0.8, 1.0) * 100 / (count - 1) if count > 2 else rng.uniform(40, 70))
+    places = SIZE / 2 + gap * (np.arange(count, dtype=np.float64) - (count - 1) / 2)
     size = (rng.uniform(7, 10), min(rng.uniform(7, 10), gap * 0.38))
     speeds = rng.uniform(7, 12, count) / frame
     axes = [

@@ -10,50 +10,54 @@ Two robots of the family are for the demo and never among these: `hma_data.lab.f
 import argparse
 import shutil
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
-from typing import Literal
-
-import torch
+from typing import Any
 
 from hma_data import lab
+from hma_data.conversion.engines import Attempt, Report, Work
+from hma_data.conversion.engines.local import run
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.cpu import usable_cores
-from hma_data.errors import HMAError
 from hma_data.lab import family
 from hma_data.registry.embodiment import find
 from hma_data.shards.manifest import MANIFEST
 from hma_data.tokenizers.base import Tokenizer
 
 OTHERS = ("pendulum", "planar_arm", "pusht_fast", "pusht_slow")
-Frames = Literal["all", "strided"]
 
 
-def make(robot: str, out: Path, episodes: int, seed: int, tokenizer: str | Tokenizer, frames: Frames) -> str:
-    """Record and convert one robot; return a line that tells what was made."""
-    begun = time.monotonic()
-    embodiment = find(robot) if robot in lab.RECORDERS else family.embodiment(robot)
-    (out / "embodiments" / f"{robot}.yaml").write_text(embodiment.to_yaml())
-    folder = out / "recordings"
-    recording = next(iter(sorted(folder.glob(f"{robot}*"))), None)
-    recording = recording or lab.record(robot, folder, episodes, seed)
-    recorded = time.monotonic() - begun
-    shards = out / "shards" / robot
-    summary = convert(
-        embodiment, recording, tokenizer, shards, settings=Settings(val_fraction=0.05, frames=frames)
-    )
-    if recording.is_dir():
-        shutil.rmtree(recording)
-    else:
-        recording.unlink()
-    splits = summary.manifest.splits
-    counts = ", ".join(f"{name} {split['episodes']}" for name, split in splits.items())
-    whole = f"{counts} episodes, {sum(split['frames'] for split in splits.values()):,} frames"
-    refused = f", {summary.manifest.quarantined} in quarantine" if summary.manifest.quarantined else ""
-    converted = time.monotonic() - begun - recorded
-    return f"{whole}{refused}; {recorded:.0f} s recording, {converted:.0f} s converting"
+def make_work(
+    out: Path, episodes: int, seed: int, tokenizer: str | Tokenizer, settings: Settings, workers: int
+) -> Work:
+    """Return the function that records and converts a robot, and returns a line that tells what was made."""
+    import torch
+
+    torch.set_num_threads(max(1, usable_cores() // workers))
+
+    def work(robot: str, report: Report, attempt: Attempt) -> str:
+        begun = time.monotonic()
+        embodiment = find(robot) if robot in lab.RECORDERS else family.embodiment(robot)
+        (out / "embodiments").mkdir(parents=True, exist_ok=True)
+        (out / "embodiments" / f"{robot}.yaml").write_text(embodiment.to_yaml())
+        folder = out / "recordings"
+        recording = next(iter(sorted(folder.glob(f"{robot}*"))), None)
+        if recording is None:
+            recording = lab.record(robot, folder, episodes, seed, lambda done, total: report(done))
+        recorded = time.monotonic()
+        summary = convert(
+            embodiment, recording, tokenizer, out / "shards" / robot, settings=settings,
+            on_progress=lambda state: report(state.episodes),
+        )  # fmt: skip
+        shutil.rmtree(recording) if recording.is_dir() else recording.unlink()
+        splits, refused = summary.manifest.splits, summary.manifest.quarantined
+        counts = ", ".join(f"{name} {split['episodes']}" for name, split in splits.items())
+        frames = sum(split["frames"] for split in splits.values())
+        took = f"{recorded - begun:.0f} s recording, {time.monotonic() - recorded:.0f} s converting"
+        return f"{robot}: {counts} episodes, {frames:,} frames, {refused} in quarantine; {took}"
+
+    return work
 
 
 def main() -> None:
@@ -66,26 +70,17 @@ def main() -> None:
     parser.add_argument("--tokenizer", default="fsq-8")
     parser.add_argument("--frames", choices=("all", "strided"), default="all", help="rows, as hma convert's")
     parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    out, robots = arguments.out, arguments.robots
-    (out / "embodiments").mkdir(parents=True, exist_ok=True)
-    todo = [robot for robot in robots if not (out / "shards" / robot / MANIFEST).is_file()]
-    print(f"{len(robots)} robots, {len(robots) - len(todo)} of them done already", flush=True)
-    threads = max(1, usable_cores() // arguments.workers)
-    options = (out, arguments.episodes, arguments.seed, arguments.tokenizer, arguments.frames)
-    failed = 0
-    with ProcessPoolExecutor(
-        arguments.workers, get_context("spawn"), torch.set_num_threads, (threads,)
-    ) as pool:
-        jobs = {pool.submit(make, robot, *options): robot for robot in todo}
-        for done, job in enumerate(as_completed(jobs), start=1):
-            try:
-                line = job.result()
-            except HMAError as fault:
-                line, failed = f"failed: {fault}", failed + 1
-            print(f"{done}/{len(todo)} {jobs[job]}: {line}", flush=True)
-    if failed:
-        raise SystemExit(f"{failed} robots failed; the same command tries them again")
+    given = parser.parse_args()
+    todo = [robot for robot in given.robots if not (given.out / "shards" / robot / MANIFEST).is_file()]
+    print(f"{len(given.robots)} robots, {len(given.robots) - len(todo)} of them done already", flush=True)
+    settings = Settings(val_fraction=0.05, frames=given.frames)
+    work = partial(make_work, given.out, given.episodes, given.seed, given.tokenizer, settings)
+    for done, line in enumerate(run(todo, work, given.workers, _ignore), start=1):
+        print(f"{done}/{len(todo)} {line}", flush=True)
+
+
+def _ignore(number: int, event: Any) -> None:
+    """Take the reports of a robot's work, which only show that it lives."""
 
 
 if __name__ == "__main__":

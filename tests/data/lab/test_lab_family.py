@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hma_data.conversion.engines import FIRST
 from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.family import HELD_OUT, TRUNK, embodiment, episode
@@ -186,8 +188,8 @@ def test_recipe_leaves_shards_and_no_recording(tmp_path: Path, block_tokenizer: 
     assert spec and spec.loader
     recipe = module_from_spec(spec)
     spec.loader.exec_module(recipe)
-    (tmp_path / "embodiments").mkdir()
-    line = recipe.make("arm1_02", tmp_path, 2, SEED, block_tokenizer, "strided")
+    work = recipe.make_work(tmp_path, 2, SEED, block_tokenizer, Settings(frames="strided"), 1)
+    line = work("arm1_02", lambda event: None, FIRST)
     assert "80 frames" in line and not list((tmp_path / "recordings").iterdir())
     assert (tmp_path / "shards" / "arm1_02" / MANIFEST).is_file()
     assert Embodiment.load(tmp_path / "embodiments" / "arm1_02.yaml") == embodiment("arm1_02")
