@@ -1,11 +1,13 @@
-"""Record third-party simulators as if they were robots, for the demo, tests and experiments.
+"""Record simulators as if they were robots, for the demo, tests and experiments.
 
 A recorder is a module with `record(part, robot, episodes, seed)`, which writes the episodes of those numbers
 to the path `part`; it is imported on use. Every robot of RECORDERS has its embodiment in the registry under
-the same id.
+the same id. The made-up robots of `hma_data.lab.family` are without number; `family.embodiment` describes
+those that are not in the registry.
 """
 
 import os
+import re
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,7 +26,10 @@ RECORDERS = {  # robot -> its module, and the name of its recording
     "pendulum": ("hma_data.lab.pendulum", "pendulum"),
     "planar_arm": ("hma_data.lab.planar_arm", "planar_arm.hdf5"),
     "planar_arm_lerobot": ("hma_data.lab.planar_arm", "planar_arm_lerobot"),
+    "arm3_55": ("hma_data.lab.family", "arm3_55.hdf5"),
+    "mover_52": ("hma_data.lab.family", "mover_52"),
 }
+FAMILY = re.compile(r"(arm[1-4]|mover|gantry|rails|crane)_\d+")
 
 
 def record(
@@ -33,7 +38,7 @@ def record(
     """Record a laboratory robot.
 
     Args:
-        robot: a key of RECORDERS.
+        robot: a key of RECORDERS, or a name of the family, such as arm2_07.
         out: str or path of the folder to put the recording in; made if it does not exist.
         episodes: number of episodes, at least one.
         seed: the same seed gives the same bytes.
@@ -47,11 +52,11 @@ def record(
         OutputError: the recording is already there, or cannot be written.
         MissingDependencyError: the simulator, or the writer of the format, is not installed.
     """
-    if robot not in RECORDERS:
+    if robot not in RECORDERS and not FAMILY.fullmatch(robot):
         raise UsageError(robot, "is not a laboratory robot", f"known: {', '.join(RECORDERS)}")
     if episodes < 1:
         raise UsageError("episodes", f"{episodes} asked for", "ask for at least one")
-    module, name = RECORDERS[robot]
+    module, name = RECORDERS.get(robot, ("hma_data.lab.family", f"{robot}.hdf5"))
     final = as_path(out) / name
     if final.exists():
         raise OutputError(final, "exists already", "remove it or record into another folder")

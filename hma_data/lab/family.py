@@ -1,142 +1,152 @@
-"""Simulate a family of made-up robots that differ in axes, rate, meaning of the command and look.
+"""Record a family of made-up robots that differ in axes, rate, meaning of the command and look.
 
-A name, such as `arm3_04`, decides everything about a robot; see `hma_data.lab.family_bodies`. All are seen
-from above and push one to three loose blocks without dynamics: a block is moved along the shortest way out
-of the part that touches it, and stays inside the picture. A closed gripper, or a magnet that is on, carries a
-block. The command in a frame is applied between its picture and the next; the motion obeys the limits.
+A name, such as `arm3_04`, decides everything about a robot: `hma_data.lab.family_bodies` draws it. All are
+recorded to HDF5, but the last of HELD_OUT to MCAP. The robots are seen from above and push one to three loose
+blocks (`hma_data.lab.family_world`). The command in a frame is applied between its picture and the next; the
+motion obeys the limits.
 
 The reward is the distance that the blocks moved, in px. An episode is a success if some block ends MOVED px
 or more from its first place. T frames, A commands, Q axes, B blocks.
 """
 
-import zlib
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.lab.family_bodies import GRIP, Body
+from hma_data.lab.family_bodies import Body
 from hma_data.lab.family_driver import Driver
-from hma_data.lab.family_look import SIZE, Floats, block_shapes, draw, shrunk
-from hma_data.lab.writers import Demo
+from hma_data.lab.family_look import SIZE, Floats
+from hma_data.lab.family_mechanisms import Axis
+from hma_data.lab.family_world import start
+from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
+from hma_data.registry.embodiment import Embodiment
 
-SECONDS, MOVED, REACH = 8.0, 5.0, 8.0  # of an episode; for success; of a gripper
-TRUNK = (
-    "arm1_02", "arm1_03", "arm2_02", "arm2_07", "arm2_12", "arm2_50", "arm3_01", "arm3_04", "arm3_08", "arm3_11",
-    "arm4_01", "arm4_04", "mover_02", "mover_04", "mover_06", "mover_10", "mover_59", "gantry_04", "gantry_05",
-    "rails_03", "rails_09", "crane_01", "crane_04", "crane_08",
+SECONDS, MOVED = 8.0, 5.0  # of an episode; for success
+TRUNK: tuple[str, ...] = (
+    "arm1_02", "arm1_03", "arm2_02", "arm2_07", "arm2_12", "arm2_50", "arm3_01", "arm3_04",
+    "arm3_08", "arm3_11", "arm4_01", "arm4_04", "mover_02", "mover_04", "mover_06", "mover_10",
+    "mover_59", "gantry_04", "gantry_05", "rails_03", "rails_09", "crane_01", "crane_04", "crane_08",
 )  # fmt: skip
-HELD_OUT = ("arm3_55", "mover_52")
+HELD_OUT = ("arm3_55", "mover_52")  # not for pre-training: the demo's new robots
+PROVENANCE = {
+    "recording": "made by hma_data.lab.family; everything about the robot is drawn from its name",
+    "frequency_hz": "the simulator's control rate",
+    "action": "commands as given; the motion obeys the limits",
+    "success": f"some block ended {MOVED:g} px or more of the {SIZE} by {SIZE} px picture from where it lay",
+}
+NOTES = "Random manoeuvres: going to a pose or a block, holding a velocity, weaving, resting."
+EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps; episodes are a minute apart
 
 
-class World:
-    """A body at a pose (Q,) among its blocks (B, 2)."""
-
-    def __init__(self, body: Body, pose: Floats, blocks: Floats) -> None:
-        self.body, self.pose, self.blocks = body, pose.copy(), blocks.copy()
-        self.held = -1  # the block that is carried
-        self._grasp = np.zeros(2)  # its place from the tip, in the tip's direction and beside it
-        self._radii = np.array([block.radius for block in body.blocks])
-        self._push()
-
-    @property
-    def state(self) -> Floats:
-        """Return (Q + 2·B + 1,): pose, blocks, and the number of the carried block or -1."""
-        return np.concatenate([self.pose, self.blocks.ravel(), [self.held]])
-
-    def advance(self, command: Floats) -> None:
-        """Simulate one control step under a command (A,)."""
-        before = self.body.holds(self.pose)
-        self.pose = self.body.moved(self.pose, command)
-        if self.body.grip:
-            self._carry(before)
-        self._push()
-
-    def picture(self) -> NDArray[np.uint8]:
-        """Draw the table, the blocks and the body; (SIZE, SIZE, 3) RGB."""
-        image = self.body.canvas.copy()
-        for block, place in zip(self.body.blocks, self.blocks, strict=True):
-            draw(image, block_shapes(block, place))
-        draw(image, self.body.mechanism.shapes(self.pose))
-        return shrunk(image)
-
-    def _carry(self, before: bool) -> None:
-        """Grasp, move along or release a block; fingers stop at it."""
-        tip, angle = self.body.mechanism.tip(self.pose)
-        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        gripper = self.body.grip == "gripper"
-        if not self.body.holds(self.pose):
-            self.held = -1
-            return
-        if self.held < 0 and not (gripper and before):
-            far = np.linalg.norm(self.blocks - tip, axis=1)
-            if far.min() < REACH:
-                self.held = int(far.argmin())
-                self._grasp = turn @ (self.blocks[self.held] - tip) * (1.0, 0.0 if gripper else 1.0)
-        if self.held >= 0:
-            self.blocks[self.held] = tip + self._grasp @ turn
-            if gripper:
-                self.pose[-1] = max(self.pose[-1], min(GRIP - 0.01, (self._radii[self.held] - 0.9) / 8))
-
-    def _push(self) -> None:
-        """Move the blocks out of the parts, off each other and inside the walls."""
-        parts = [part for part in self.body.mechanism.shapes(self.pose) if part.pushes]
-        ends = np.array([_segment(part.points) for part in parts]).reshape(-1, 2, 2)
-        radii = np.array([part.radius for part in parts])
-        free = np.arange(len(self.blocks)) != self.held
-        for _ in range(3):
-            depth, way = _overlap(self.blocks, self._radii, ends, radii)
-            depth[:, ~free] = 0
-            worst, columns = depth.argmax(axis=0), np.arange(len(self.blocks))
-            deepest = depth[worst, columns]
-            self.blocks += way[worst, columns] * np.maximum(deepest, 0)[:, None]
-            apart = self._separate(free)
-            low, high = self._radii[:, None], SIZE - self._radii[:, None]
-            self.blocks = np.clip(self.blocks, low, high)
-            if deepest.max() <= 0 and not apart:
-                break
-
-    def _separate(self, free: NDArray[np.bool_]) -> bool:
-        touched = False
-        for one in range(len(self.blocks)):
-            for other in range(one):
-                gap = self.blocks[one] - self.blocks[other]
-                far = float(np.hypot(*gap)) or 1e-6
-                depth = self._radii[one] + self._radii[other] - far
-                if depth > 0:
-                    shares = np.array([free[one], free[other]]) / max(1, free[one] + free[other])
-                    self.blocks[one] += gap / far * depth * shares[0]
-                    self.blocks[other] -= gap / far * depth * shares[1]
-                    touched = True
-        return touched
+def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
+    """Record a robot as a file of robomimic's layout, or as a folder of MCAP files; see `hma_data.lab`."""
+    body = Body.of(robot)
+    if not _in_bags(robot):
+        env_args = {"env_name": robot, "type": 2, "env_kwargs": {"control_freq": body.hz}}
+        write_hdf5(part, (episode(body, seed, number) for number in episodes), env_args)
+        return
+    part.mkdir()
+    for number in episodes:
+        _write_bag(part / f"episode_{number:04d}.mcap", body, seed, number)
 
 
-def _segment(points: Floats) -> Floats:
-    """Return the (2, 2) ends of what pushes for a shape: a polygon's is its middle."""
-    return points if len(points) == 2 else np.repeat(points.mean(axis=0)[None], 2, axis=0)
+def embodiment(robot: str) -> Embodiment:
+    """Return the embodiment of a robot of the family.
+
+    Raises:
+        UsageError: the name is none of the family's.
+    """
+    body = Body.of(robot)
+    bags = _in_bags(robot)
+    components = [_component(body, number, bags) for number in range(len(body.commands))]
+    spaces = {_space(body, axis) for axis in body.commands}
+    units = {axis.unit for axis in body.axes}
+    key = "/joint_states.position" if bags else "obs/joint_pos"
+    pose = {"key": key, "dims": len(body.axes), "names": [axis.name for axis in body.axes]}
+    if len(units) == 1:
+        pose["unit"] = units.pop()
+    image = "/camera/image/compressed" if bags else "obs/image"
+    values = {
+        "id": robot,
+        "description": f"A made-up {body.description}, at {body.hz} Hz",
+        "robot": body.description.partition(",")[0],
+        "kind": "simulation",
+        "frequency_hz": body.hz,
+        "target_hz": body.hz / body.stride,
+        "action": {"space": spaces.pop() if len(spaces) == 1 else "mixed", "components": components},
+        "state": {"components": [pose]},
+        "cameras": [{"name": "top", "key": image, "size": [SIZE, SIZE]}],
+        "source": {"format": "rosbag" if bags else "hdf5"},
+        "license": "Apache-2.0",
+        "provenance": PROVENANCE,
+        "notes": NOTES,
+    }
+    if bags:
+        values["sync"] = {"primary": "top", "max_skew_ms": 1500 / body.hz}
+    return Embodiment.from_values(values, f"embodiment {robot}")
 
 
-def _overlap(blocks: Floats, sizes: Floats, ends: Floats, radii: Floats) -> tuple[Floats, Floats]:
-    """Return how deep each of P parts is in each block (P, B), and the way out (P, B, 2)."""
-    if not len(ends):
-        return np.zeros((1, len(blocks))), np.zeros((1, len(blocks), 2))
-    start, along = ends[:, None, 0], ends[:, None, 1] - ends[:, None, 0]
-    length = np.maximum((along**2).sum(axis=-1), 1e-9)
-    share = np.clip(((blocks[None] - start) * along).sum(axis=-1) / length, 0, 1)
-    gap = blocks[None] - start - share[..., None] * along
-    far = np.linalg.norm(gap, axis=-1)
-    way = np.where(far[..., None] > 1e-6, gap / np.maximum(far, 1e-6)[..., None], (1.0, 0.0))
-    return radii[:, None] + sizes - far, way
+def _in_bags(robot: str) -> bool:
+    return robot == HELD_OUT[-1]
 
 
-def start(body: Body, seed: int, number: int) -> tuple[World, np.random.Generator]:
-    """Return the world at the start of an episode, and the generator of its driver."""
-    rng = np.random.default_rng((seed, zlib.crc32(body.name.encode()), number))
-    low, high = body.limits
-    pose = rng.uniform(low + 0.1 * (high - low), high - 0.1 * (high - low))
-    if body.grip:
-        pose[-1] = float(body.grip == "gripper")
-    return World(body, pose, rng.uniform(18, SIZE - 18, (len(body.blocks), 2))), rng
+def _space(body: Body, axis: Axis) -> str:
+    if body.grip == axis.name:
+        return "mixed"
+    if body.kind == "mover":
+        return "eef_pose" if axis.target else "base_velocity"
+    return "joint_position" if axis.target else "joint_velocity"
+
+
+def _component(body: Body, number: int, bags: bool) -> dict[str, Any]:
+    axis = body.commands[number]
+    part: dict[str, Any] = {"key": "actions", "dims": 1, "names": [axis.name], "range": list(axis.range)}
+    if bags:
+        part["key"] = f"/command.twist.linear.{'xyz'[number]}"
+    elif len(body.commands) > 1:
+        part["slice"] = [number, number + 1]
+    if axis.command_unit:
+        part["unit"] = axis.command_unit
+    if axis.name == body.grip:
+        part["normalize"] = False
+    if axis.name == "gripper":
+        part["gripper"] = "open_is_high"
+    return part
+
+
+def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
+    """Write pictures, poses and commands at the control rate; receipt is 0.5 to 20 ms later."""
+    import cv2
+
+    demo = episode(body, seed, number)
+    rng = np.random.default_rng((seed, 7, number))
+    messages: list[Message] = []
+    for row, command in enumerate(demo.actions):
+        stamp = EPOCH_NS + number * 60_000_000_000 + round(row * 1e9 / body.hz)
+        _, png = cv2.imencode(".png", demo.observations["image"][row][..., ::-1])
+        image = {"format": "png", "data": png.reshape(-1)}
+        pose, empty = demo.observations["joint_pos"][row], np.empty(0)
+        joints = {"name": [a.name for a in body.axes], "position": pose, "velocity": empty, "effort": empty}
+        linear, turn = (
+            ros_value("geometry_msgs/msg/Vector3", *part.tolist())
+            for part in (np.pad(command.astype(np.float64), (0, 3 - len(command))), np.zeros(3))
+        )
+        twist = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
+        for topic, kind, frame, fields in (
+            ("/camera/image/compressed", "sensor_msgs/msg/CompressedImage", "camera", image),
+            ("/joint_states", "sensor_msgs/msg/JointState", "table", joints),
+            ("/command", "geometry_msgs/msg/TwistStamped", "table", twist),
+        ):
+            late = (
+                rng.integers(12_000_000, 20_000_000)
+                if frame == "camera"
+                else rng.integers(500_000, 2_000_000)
+            )
+            messages.append(Message(topic, stamp, stamp + int(late), kind, frame, fields))
+    facts = {"success": str(demo.success).lower(), "seed": str(seed)}
+    write_mcap(path, messages, {"robot": body.name, **facts})
 
 
 def episode(body: Body, seed: int, number: int) -> Demo:

@@ -127,5 +127,5 @@ def shrunk(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _fixed(points: Floats) -> NDArray[np.int32]:
-    """Convert picture coordinates to the drawing's, in OpenCV's fixed point; pixel centres are whole there."""
+    """Convert coordinates to the drawing's, in OpenCV's fixed point; pixel centres are whole there."""
     return np.rint((points * SCALE - 0.5) * 2**SHIFT).astype(np.int32)

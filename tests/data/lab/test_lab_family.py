@@ -1,0 +1,193 @@
+"""The made-up family: a name decides a robot, its commands decide the motion, and its recordings convert."""
+
+import re
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.conversion.job import convert
+from hma_data.errors import UsageError
+from hma_data.lab import RECORDERS, record
+from hma_data.lab.family import HELD_OUT, TRUNK, embodiment, episode
+from hma_data.lab.family_bodies import Body
+from hma_data.lab.family_look import SIZE
+from hma_data.lab.family_mechanisms import MAKERS
+from hma_data.lab.family_world import World, start
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import MANIFEST
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from hma_data.sources.base import open_source
+from hma_data.storage.paths import shipped
+from tests.conftest import BlockTokenizer
+
+ROBOTS = (
+    "arm1_02",
+    "arm2_12",
+    "arm3_55",
+    "arm4_04",
+    "mover_10",
+    "mover_52",
+    "gantry_04",
+    "rails_09",
+    "crane_01",
+)
+SEED = 3
+
+
+def still(world: World) -> np.ndarray[Any, Any]:
+    """Return the command that keeps a world as it is: no velocity, and each target where its axis is."""
+    follows = [axis.target for axis in world.body.commands]
+    return np.where(follows, world.pose[: len(follows)], 0.0)
+
+
+def driven(robot: str, command: str, steps: int) -> tuple[World, list[np.ndarray[Any, Any]]]:
+    """Return a world some steps from its start at the lowest, highest or still command, and its pictures."""
+    world, _ = start(Body.of(robot), SEED, 0)
+    pictures = [world.picture()]
+    for _ in range(steps):
+        low, high = world.body.ranges
+        world.advance({"low": low, "high": high}[command] if command != "still" else still(world))
+        pictures.append(world.picture())
+    return world, pictures
+
+
+def test_trunk_has_all_kinds_and_no_robot_that_is_held_out() -> None:
+    assert len(set(TRUNK)) == 24 and not set(TRUNK) & set(HELD_OUT)
+    assert {Body.of(robot).kind for robot in TRUNK} == set(MAKERS)
+    rates = {embodiment(robot).effective_hz for robot in (*TRUNK, *HELD_OUT)}
+    assert all(5 <= rate <= 10 and rate == int(rate) for rate in rates)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_same_seed_gives_the_same_episode(robot: str) -> None:
+    body = Body.of(robot)
+    first, again, other = (episode(body, SEED, number) for number in (0, 0, 1))
+    for key in ("image", "joint_pos"):
+        assert first.observations[key].tobytes() == again.observations[key].tobytes()
+    assert first.actions.tobytes() == again.actions.tobytes() != other.actions.tobytes()
+    assert first.observations["image"].shape == (8 * body.hz, SIZE, SIZE, 3)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_recorded_commands_make_the_recorded_pictures(robot: str) -> None:
+    demo = episode(Body.of(robot), SEED, 2)
+    world, _ = start(Body.of(robot), SEED, 2)
+    for picture, command in zip(demo.observations["image"], demo.actions, strict=True):
+        np.testing.assert_array_equal(world.picture(), picture)
+        world.advance(command.astype(np.float64))
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_other_commands_make_other_pictures_and_no_command_a_still_one(robot: str) -> None:
+    steps = 6 * Body.of(robot).stride
+    low, high, rest = (driven(robot, command, steps)[1] for command in ("low", "high", "still"))
+    np.testing.assert_array_equal(low[0], high[0])
+    changed = np.abs(low[-1].astype(int) - high[-1]).max(axis=-1) > 60
+    assert changed.sum() > 150
+    np.testing.assert_array_equal(rest[0], rest[-1])
+
+
+@pytest.mark.parametrize("robot", [*TRUNK, *HELD_OUT])
+def test_commands_fill_the_range_of_the_embodiment(robot: str) -> None:
+    body, parts = Body.of(robot), embodiment(robot).action.components
+    actions = episode(body, SEED, 0).actions
+    assert actions.shape[1] == len(parts) == embodiment(robot).action_dim
+    for values, part in zip(actions.T, parts, strict=True):
+        low, high = part.range or (0, 0)
+        assert low - 1e-5 <= values.min() and values.max() <= high + 1e-5
+        assert np.ptp(values) > 0.25 * (high - low)
+
+
+@pytest.mark.parametrize("robot", [*TRUNK, *HELD_OUT])
+def test_blocks_stay_inside_and_out_of_the_parts_that_push(robot: str) -> None:
+    body = Body.of(robot)
+    states = episode(body, SEED, 0).states[:: body.stride]
+    radii = np.array([block.radius for block in body.blocks])[:, None]
+    for state in states:
+        pose, blocks, held = (
+            state[: len(body.axes)],
+            state[len(body.axes) : -1].reshape(-1, 2),
+            int(state[-1]),
+        )
+        assert (blocks >= radii - 1e-9).all() and (blocks <= SIZE - radii + 1e-9).all()
+        for number, place in enumerate(blocks):
+            free = number != held and (abs(place - SIZE / 2) < SIZE / 2 - radii[number] - 2).all()
+            for part in body.mechanism.shapes(pose):
+                if free and part.pushes and len(part.points) == 2 and len(blocks) == 1:
+                    share = np.linspace(0, 1, 200)[:, None]
+                    line = part.points[0] + share * (part.points[1] - part.points[0])
+                    assert np.linalg.norm(line - place, axis=1).min() > part.radius + radii[number] - 0.5
+
+
+def test_most_robots_push_a_block_in_some_of_their_episodes() -> None:
+    pushed = [any(episode(Body.of(robot), SEED, number).success for number in range(3)) for robot in TRUNK]
+    assert sum(pushed) >= 20
+
+
+@pytest.mark.parametrize(("robot", "hold", "release"), [("arm2_07", 0.0, 1.0), ("crane_01", 1.0, 0.0)])
+def test_what_is_held_moves_with_the_tip_until_it_is_released(
+    robot: str, hold: float, release: float
+) -> None:
+    world, _ = start(Body.of(robot), SEED, 1)
+    world.blocks[0] = world.body.mechanism.tip(world.pose)[0]
+    begun = world.blocks[0].copy()
+
+    def drive(speed: float, grip: float) -> None:
+        for _ in range(world.body.hz):
+            world.advance(np.array([speed] * (len(world.pose) - 1) + [grip]))
+
+    drive(0.0, hold)
+    assert world.held == 0
+    np.testing.assert_allclose(world.blocks[0], begun, atol=2)
+    drive(0.4, hold)
+    assert np.linalg.norm(world.blocks[0] - begun) > 5
+    np.testing.assert_allclose(world.blocks[0], world.body.mechanism.tip(world.pose)[0], atol=2)
+    drive(0.0, release)
+    assert world.held == -1
+
+
+@pytest.mark.parametrize("robot", HELD_OUT)
+def test_registry_has_what_the_family_says(robot: str) -> None:
+    assert Embodiment.load(shipped("registry") / "lab" / f"{robot}.yaml") == embodiment(robot)
+    assert robot in RECORDERS
+
+
+@pytest.mark.parametrize("robot", ["arm2_07", *HELD_OUT])
+def test_recording_converts(robot: str, block_tokenizer: BlockTokenizer, tmp_path: Path) -> None:
+    own, demos = embodiment(robot), [episode(Body.of(robot), SEED, number) for number in range(2)]
+    path = record(robot, tmp_path, 2, SEED)
+    source = open_source(own.source.format)
+    first = source.read(str(path), source.episode_ids(str(path))[0], own)
+    stream = first.streams["top"]
+    np.testing.assert_array_equal(stream.frames(np.arange(9)), demos[0].observations["image"][:9])
+    convert(own, path, block_tokenizer, tmp_path / "shards")
+    assert verify(tmp_path / "shards") == []
+    shards = ShardSet(tmp_path / "shards")
+    kept = {
+        shards.episode_rows(row["episode_index"])["action"].tobytes() for row in shards.episodes.to_pylist()
+    }
+    assert kept == {demo.actions.tobytes() for demo in demos}
+    assert shards.manifest.quarantined == 0
+
+
+def test_name_that_is_no_kind_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=re.escape("arm5_01")):
+        Body.of("arm5_01")
+    with pytest.raises(UsageError, match="is not a laboratory robot"):
+        record("arm5_01", tmp_path, 1)
+
+
+def test_recipe_leaves_shards_and_no_recording(tmp_path: Path, block_tokenizer: BlockTokenizer) -> None:
+    spec = spec_from_file_location("record_world", shipped("recipes") / "world" / "record.py")
+    assert spec and spec.loader
+    recipe = module_from_spec(spec)
+    spec.loader.exec_module(recipe)
+    (tmp_path / "embodiments").mkdir()
+    line = recipe.make("arm1_02", tmp_path, 2, SEED, block_tokenizer, "strided")
+    assert "80 frames" in line and not list((tmp_path / "recordings").iterdir())
+    assert (tmp_path / "shards" / "arm1_02" / MANIFEST).is_file()
+    assert Embodiment.load(tmp_path / "embodiments" / "arm1_02.yaml") == embodiment("arm1_02")
