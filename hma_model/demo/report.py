@@ -2,9 +2,10 @@
 
 import platform
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 TAU = 3.0
 FINETUNED, SCRATCH = "embedded trunk, finetuned", "from scratch"
 BARS = {"shuffled": 2.0, "copy": 1.5}  # dB of the last frame by which a model that follows is above
-NAMES = {"true": "true actions", "shuffled": "shuffled actions", "copy": "repeating the prompt's last frame"}
+NAMES = {"true": "true actions", "shuffled": "shuffled actions", "copy": "the prompt's last frame repeated"}
 
 OWN_DATA = """
 hma inspect DATA                                          # what is in the recording
@@ -74,27 +75,26 @@ def _films(page: Page, made: Demo) -> None:
         about = find(robot)
         page.section(f"{robot}: {about.robot}")
         caption = (
-            f"Three held-out windows in turn, at {film.fps:g} Hz. Left: what happened. Middle: the model with "
-            "the same actions. Right: the model with the actions of another window. Grey border: the "
+            f"Three held-out windows in turn, at {film.fps:g} Hz. Left: what happened. Middle: the model "
+            "with the same actions. Right: the model with the actions of another window. Grey border: the "
             f"{film.prompt} true frames of the prompt. Green border: predicted. Below: the actions. The "
             "windows are those with the most motion, the other actions those that differ most."
         )
         page.picture(webp_bytes(film.frames, film.fps), "webp", caption)
-        page.text(verdict(made, robot))
+        page.text(verdict(made.figures[robot]))
 
 
-def verdict(made: Demo, robot: str) -> str:
-    """Return a line on a robot: the last frame's PSNR, and whether the model follows its actions."""
-    last = {name: made.figures[robot][name]["psnr_last"] for name in NAMES}
+def verdict(found: Mapping[str, Any]) -> str:
+    """Return a line on a result of `evaluate`: the last frame's PSNR, and whether the model follows."""
+    last = {name: found[name]["psnr_last"] for name in NAMES}
     figures = ", ".join(f"{last[name]:.1f} dB with {text}" for name, text in NAMES.items())
     gains = {name: last["true"] - last[name] for name in BARS}
     reached = all(gain >= BARS[name] for name, gain in gains.items())
     above = " and ".join(f"{gain:+.1f} dB over {name} (bar: {BARS[name]:g})" for name, gain in gains.items())
     said = "The model follows its actions" if reached else "The bar is not reached"
-    windows, draws = made.figures[robot]["windows"], made.figures[robot]["draws"]
     return (
-        f"{said}: {above}. PSNR of the last frame: {figures}; means of {windows} held-out windows"
-        f" and {draws} draws of shuffled actions."
+        f"{said}: {above}. PSNR of the last frame: {figures}; means of {found['windows']} held-out windows"
+        f" and {found['draws']} draws of shuffled actions."
     )
 
 
