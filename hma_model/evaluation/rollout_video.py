@@ -87,17 +87,16 @@ def rollout_video(
     roll = partial(rollout, model, tokenizer, batch, prompt=prompt, seed=seed, **sampling)
     true = roll()
     changed = roll(actions=swapped, truth=true.truth)
-    panels = {
-        "truth": (true.truth, batch.actions),
-        "model, true actions": (true.predicted, batch.actions),
-        "model, other actions": (changed.predicted, swapped),
-    }
-    fps = shards.embodiment.effective_hz
-    parts = []
+    panels = (
+        ("truth", true.truth, batch.actions, length),
+        ("model, true actions", true.predicted, batch.actions, prompt),
+        ("model, other actions", changed.predicted, swapped, prompt),
+    )
+    fps, parts = shards.embodiment.effective_hz, []
     for i in range(len(chosen)):
         columns = [
-            _column(name, films[i], actions[i].numpy(), shards, prompt if films is not true.truth else length)
-            for name, (films, actions) in panels.items()
+            _column(name, films[i], actions[i].numpy(), shards, given)
+            for name, films, actions, given in panels
         ]
         parts.append(_with_time(np.concatenate(columns, axis=2), prompt))
         if len(chosen) > 1:
