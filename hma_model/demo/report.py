@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from hma_model.training.loop import TrainResult
 
 TAU = 3.0
+SHOWN = 3  # windows of a robot's film
 FINETUNED, SCRATCH = "embedded trunk, finetuned", "from scratch"
 BARS = {"shuffled": 2.0, "copy": 1.5}  # dB of the last frame by which a model that follows is above
 NAMES = {"true": "true actions", "shuffled": "shuffled actions", "copy": "the prompt's last frame repeated"}
@@ -71,15 +72,16 @@ def write_report(made: Demo) -> Path:
 
 
 def _films(page: Page, made: Demo) -> None:
+    prompt = next(iter(made.films.values())).prompt
+    page.text(
+        "Left: what happened. Middle: the model with the same actions. Right: the model with the actions of "
+        f"another window. Grey border: the true frames, of which the model gets {prompt}. Green border: "
+        "predicted. The bars are the actions. All pictures are decoded from tokens. Shown are the held-out "
+        "windows with the most motion, and the other actions that differ most from their own."
+    )
     for robot, film in made.films.items():
-        about = find(robot)
-        page.section(f"{robot}: {about.robot}")
-        caption = (
-            f"Three held-out windows in turn, at {film.fps:g} Hz. Left: what happened. Middle: the model "
-            "with the same actions. Right: the model with the actions of another window. Grey border: the "
-            f"{film.prompt} true frames of the prompt. Green border: predicted. Below: the actions. The "
-            "windows are those with the most motion, the other actions those that differ most."
-        )
+        page.section(f"{robot}: {find(robot).robot}")
+        caption = f"{robot}: {SHOWN} held-out windows in turn, at the model's {film.fps:g} Hz"
         page.picture(webp_bytes(film.frames, film.fps), "webp", caption)
         page.text(verdict(made.figures[robot]))
 
@@ -166,7 +168,7 @@ def _training(page: Page, made: Demo) -> None:
         f"{name}: {result.step:,} steps, {result.seconds:.0f} s, {result.masked_val_loss:.2f} nats a token"
         for name, result in made.runs.items()
     )
-    page.section("Training", f"The same recipe and network on both robots. {'. '.join(said)}.")
+    page.section("Training", f"The same recipe and network, trained on both robots. {'; '.join(said)}.")
     curves = {name: _course(result) for name, result in made.runs.items()}
     baseline = made.runs[FINETUNED].baseline
     assert baseline is not None

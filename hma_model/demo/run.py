@@ -33,7 +33,7 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
 from hma_model.demo.made import TIMINGS, Demo
-from hma_model.demo.report import FINETUNED, SCRATCH, TAU, write_report
+from hma_model.demo.report import FINETUNED, SCRATCH, SHOWN, TAU, write_report
 
 if TYPE_CHECKING:
     from hma_model.evaluation.rollout_video import RolloutVideo
@@ -45,7 +45,7 @@ RESULTS = "results.json"
 OURS = {"recordings", "shards", "run", "scratch", "hub", "pulled", "report.html", TIMINGS, RESULTS}
 EPISODES = 32
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
-SHOWN, LONGEST = 3, 16  # windows of a film, and frames of each
+LONGEST = 16  # frames of a window of the film
 
 
 def demo(out: StrPath, *, episodes: int = EPISODES, steps: int | None = None, seed: int = 0) -> Path:
