@@ -43,12 +43,11 @@ START, ROBOTS = EMBEDDED_NAME, HELD_OUT  # the trunk, and robots that it has not
 RECIPES = {FINETUNED: "demo", SCRATCH: "demo_scratch"}
 RESULTS = "results.json"
 OURS = {"recordings", "shards", "run", "scratch", "hub", "pulled", "report.html", TIMINGS, RESULTS}
-EPISODES = 32
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
 LONGEST = 16  # frames of a window of the film
 
 
-def demo(out: StrPath, *, episodes: int = EPISODES, steps: int | None = None, seed: int = 0) -> Path:
+def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: int = 0) -> Path:
     """Run the demo, with its results in `out`.
 
     Args:
