@@ -45,7 +45,7 @@ from hma_data.tokenizers.training import train as tokenizer_train
 from hma_data.tokenizers.training.frames import frames_of, read_frames, recording_frames
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import Checkpoint, resolve, training_checkpoints
-from hma_model.demo import demo
+from hma_model.demo.run import demo
 from hma_model.evaluation.evaluate import evaluate, unconditional_baseline, windows
 from hma_model.evaluation.rollout_video import RolloutVideo, write_video
 from hma_model.hub import datasets as hub_data
@@ -391,7 +391,7 @@ PUBLIC = (
     "hma_data.sources.lerobot.source", "hma_data.sources.rlds.source", "hma_data.tokenizers.base",
     "hma_data.tokenizers.training.frames", "hma_data.tokenizers.training.recipe",
     "hma_data.tokenizers.training.eval", "hma_data.tokenizers.training.train",
-    "hma_model.checkpoint.folder", "hma_model.checkpoint.io", "hma_model.demo",
+    "hma_model.checkpoint.folder", "hma_model.checkpoint.io", "hma_model.demo.run",
     "hma_model.evaluation.evaluate", "hma_model.evaluation.rollout_video", "hma_model.hub.datasets",
     "hma_model.hub.listing", "hma_model.hub.publish", "hma_model.hub.sample", "hma_model.network.model",
     "hma_model.released.conversion",

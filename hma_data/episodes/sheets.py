@@ -86,22 +86,34 @@ def _ascii(text: str) -> str:
 
 
 def with_actions(
-    frames: Images, actions: NDArray[np.float32], low: NDArray[np.float64], high: NDArray[np.float64]
+    frames: Images,
+    actions: NDArray[np.float32],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    names: Sequence[str] = (),
 ) -> Images:
-    """Return frames (N, H, W, 3) with a bar below them for each action dim, from `low` to `high` (A,)."""
+    """Return frames (N, H, W, 3) with a bar below them for each action dim, from `low` to `high` (A,).
+
+    The names stand beside the bars if there is room for them. A line marks the value zero.
+    """
     count, height, width = frames.shape[:3]
     dims = actions.shape[1]
-    line = max(3, min(8, 96 // max(dims, 1)))
+    line = max(3, min(14 if names else 8, 96 // max(dims, 1)))
+    shown = fitted_names(names, width // 3, 0.36) if line >= 12 else []
+    left = max((text_width(name, 0.36) + 6 for name in shown), default=0)
     out = np.full((count, height + dims * line + 4, width, 3), PAPER, np.uint8)
     out[:, :height] = frames
-    span = np.where(high > low, high - low, 1.0)
+    span, right = np.where(high > low, high - low, 1.0), width - 1 - left
     share = np.clip((actions - low) / span, 0, 1)
     zero = np.clip((0 - low) / span, 0, 1)
-    for t in range(count):
-        for d in range(dims):
-            top = height + 2 + d * line
-            a, b = sorted((round(zero[d] * (width - 1)), round(share[t, d] * (width - 1))))
+    for d in range(dims):
+        top, origin = height + 2 + d * line, left + round(zero[d] * right)
+        for t in range(count):
+            a, b = sorted((origin, left + round(share[t, d] * right)))
             out[t, top : top + line - 1, a : b + 1] = BAR if actions[t, d] >= 0 else NEGATIVE
+            if shown:
+                out[t, top : top + line, origin] = INK
+                write_text(out[t], shown[d], (2, top + line - 4), 0.36)
     return out
 
 

@@ -7,7 +7,7 @@ the prompt again. In a batch, the time of a frame is the time of the step divide
 `train`: a step computes the loss of a batch of random windows and its gradients, clips them, and updates the
 weights with AdamW.
 
-`waiting`: steps and frames of a model as large as that of `hma demo`, for each way in which threads wait for
+`waiting`: steps and frames of a small model (4 layers of width 128), for each way in which threads wait for
 one another (see `hma_data.cpu`), alone on the machine and beside processes that keep every core busy. The
 cases are interleaved and measured several times; the median counts. The CPU seconds show the cost of
 spinning.

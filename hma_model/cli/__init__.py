@@ -119,6 +119,7 @@ def _fail(text: str, code: int) -> int:
 
 FIGURES = {  # figures of `hma evaluate` as its table names them; the others have their names in the JSON
     "against": "compared with",
+    "draws": "draws of shuffled actions",
     "loss": "loss, nats a token",
     "shuffled_loss": "loss with shuffled actions",
     "baseline_loss": "loss of token frequencies alone",
@@ -154,17 +155,19 @@ def demo(
     ),
     episodes: Annotated[
         int, typer.Option("--episodes", min=4, help="Episodes of each of the two robots.")
-    ] = 24,
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Number of training steps.")] = None,
+    ] = 32,
+    steps: Annotated[
+        int | None, typer.Option("--steps", min=1, help="Steps of each training at most.")
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of recording and training.")] = 0,
 ) -> None:
-    """Run every step on two small simulated robots: record, convert, train, publish, roll out, report.
+    """Show a world model two new robots: record, convert, finetune, publish, roll out, report.
 
     It takes a few minutes and downloads nothing.
 
     Example: hma demo --out demo
     """
-    from hma_model.demo import demo as run
+    from hma_model.demo.run import demo as run
 
     with interruptible(lambda: f"finished steps are kept in {out}; run the same command again to continue"):
         report = run(out, episodes=episodes, steps=steps, seed=seed)
@@ -213,7 +216,10 @@ def evaluate(
     columns = ["psnr", "psnr_last", "ssim"]
     rows = [[name, *(found[name][column] for column in columns)] for name in ("true", "shuffled", "copy")]
     print_table(["rollout", "PSNR dB", "last frame dB", "SSIM"], rows)
-    print("true: the window's actions; shuffled: another window's; copy: the prompt's last frame, repeated")
+    print(
+        f"true: the window's actions; shuffled: another window's, mean of {found['draws']} draws; "
+        "copy: the prompt's last frame, repeated"
+    )
     print(f"{checkpoint} {verdict(found)}")
 
 

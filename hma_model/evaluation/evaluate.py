@@ -3,8 +3,9 @@
 The loss is the cross-entropy in nats a token of each fully masked frame, given the true frames and actions
 before it. It is averaged over the frames from the second on. The baseline is the same cross-entropy for the
 frequencies of the training tokens: a model that ignores its input would reach it. A rollout continues from
-its own predictions. Rollouts are made with the true actions and with the actions of another window; the
-difference shows how much the model uses the actions.
+its own predictions. Rollouts are made with the true actions and with shuffled ones, those of another window;
+the difference shows how much the model uses the actions. Which window gets which actions is drawn several
+times, and the figures of shuffled actions are means over the draws.
 
 B batch, T frames, P frames of the prompt, h,w grid, F digits, V values a digit, S pixels a side, C cameras.
 """
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 BASELINE_FRAMES = 200_000
+DRAWS = 5  # of other windows' actions
 FOLLOWS_DB = 0.5  # gain of the last frame's PSNR from which a model is said to follow its actions
 PSNR_LIMIT = 60.0  # dB; the PSNR of equal pictures, and with it a mean over frames, would be infinite
 
@@ -263,14 +265,15 @@ def cameras_for(model: "HMA", shards: ShardSet, cameras: Cameras | None = None) 
     return cameras
 
 
-def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0) -> Tensor:
+def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0) -> Tensor:
     """Replace each window's chunks from `begin` on by those of another window of the same embodiment.
 
-    A window that is the only one of its embodiment gets its own chunks in reverse. Return (B, T, K).
+    Every `draw` pairs the windows anew. A window that is the only one of its embodiment gets its own chunks
+    in reverse. Return (B, T, K).
     """
     actions = batch.actions.clone()
     source = batch.actions[:, begin:]
-    rng = np.random.default_rng([seed, 1])
+    rng = np.random.default_rng([seed, 1 + draw])
     for name in dict.fromkeys(batch.embodiment):
         own = rng.permutation([i for i, other in enumerate(batch.embodiment) if other == name])
         if len(own) == 1:
@@ -290,6 +293,7 @@ def evaluate(
     frames: int | None = None,
     prompt: int | None = None,
     batch_size: int = 16,
+    draws: int = DRAWS,
     seed: int = 0,
     cameras: Cameras | None = None,
     **sampling: Unpack[Sampling],
@@ -304,6 +308,7 @@ def evaluate(
         count: windows, evenly spaced; all windows if the split has fewer.
         frames: T of a window; by default the model's.
         prompt: true frames a rollout starts from.
+        draws: how often each window gets the actions of another one; figures are means over the draws.
         seed: of the rollouts.
         cameras: as `WindowDataset` takes them; None takes those that the model was trained on.
         sampling: options of `HMA.generate` for the rollouts.
@@ -330,28 +335,31 @@ def evaluate(
     def chosen() -> Iterator[Batch]:
         return windows(shards, split, length, count, batch_size, cameras)
 
-    table = _losses(model, shards, chosen, cameras)
-    rollouts: dict[str, list[Pictures]] = {"true": [], "shuffled": [], "copy": []}
+    table = _losses(model, shards, chosen, cameras, draws)
+    scores: dict[str, list[_Scores]] = {"true": [], "shuffled": [], "copy": []}
     for number, batch in enumerate(chosen()):
         roll = partial(rollout, model, tokenizer, batch, prompt=first, seed=seed + number, **sampling)
         true = roll()
-        other = roll(actions=shuffled_actions(batch, first - 1, seed), truth=true.truth)
         still = true.predicted.copy()
         still[:, first:] = still[:, first - 1 : first]
-        for name, made in (("true", true.predicted), ("shuffled", other.predicted), ("copy", still)):
-            rollouts[name].append(Pictures(first, made, true.truth))
-    scores = {name: _scores(parts) for name, parts in rollouts.items()}
+        scores["true"].append(_Scores.of(true))
+        scores["copy"].append(_Scores.of(replace(true, predicted=still)))
+        for draw in range(draws):
+            other = shuffled_actions(batch, first - 1, seed, draw)
+            scores["shuffled"].append(_Scores.of(roll(actions=other, truth=true.truth)))
+    figures = {name: _Scores.means(parts) for name, parts in scores.items()}
     return {
         "embodiment": shards.embodiment.id,
         "split": split,
-        "windows": sum(len(part.truth) for part in rollouts["true"]),
+        "windows": sum(len(part.psnr) for part in scores["true"]),
         "frames": length,
         "prompt": first,
+        "draws": draws,
         "against": "decoded tokens",
         "cameras": cameras if isinstance(cameras, str) else ", ".join(cameras),
         **table,
-        **scores,
-        "psnr_action_gain_last": scores["true"]["psnr_last"] - scores["shuffled"]["psnr_last"],
+        **figures,
+        "psnr_action_gain_last": figures["true"]["psnr_last"] - figures["shuffled"]["psnr_last"],
     }
 
 
@@ -364,12 +372,16 @@ def verdict(found: Mapping[str, Any]) -> str:
 
 
 def _losses(
-    model: "HMA", shards: ShardSet, chosen: Callable[[], Iterator[Batch]], cameras: Cameras
+    model: "HMA", shards: ShardSet, chosen: Callable[[], Iterator[Batch]], cameras: Cameras, draws: int
 ) -> dict[str, Any]:
     losses, accuracy = validation_losses(model, chosen())
     if model.config.kind == "continuous":
         return {"loss": losses.mean()}
-    shuffled = (replace(batch, actions=shuffled_actions(batch)) for batch in chosen())
+    shuffled = (
+        replace(batch, actions=shuffled_actions(batch, draw=draw))
+        for draw in range(draws)
+        for batch in chosen()
+    )
     return {
         "loss": losses.mean(),
         "shuffled_loss": masked_val_loss(model, shuffled),
@@ -381,21 +393,30 @@ def _losses(
     }
 
 
-def _scores(parts: list[Pictures]) -> dict[str, Any]:
-    signal, similarity = [], []
-    for part in parts:
-        truth, predicted = part.truth[:, part.prompt :], part.predicted[:, part.prompt :]
+@dataclass(frozen=True)
+class _Scores:
+    """PSNR (B, P) in dB and SSIM (B, P) of predicted frames."""
+
+    psnr: NDArray[np.float64]
+    ssim: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, pictures: Pictures) -> "_Scores":
+        truth, predicted = (part[:, pictures.prompt :] for part in (pictures.truth, pictures.predicted))
         size, shape = truth.shape[:2], (-1, *truth.shape[2:])
         truth, predicted = truth.reshape(shape), predicted.reshape(shape)
-        signal.append(np.minimum(psnr(truth, predicted), PSNR_LIMIT).reshape(size))
-        similarity.append(ssim(truth, predicted))
-    by_frame = np.concatenate(signal).mean(axis=0)
-    return {
-        "psnr": float(by_frame.mean()),
-        "psnr_last": float(by_frame[-1]),
-        "psnr_by_frame": [round(float(value), 3) for value in by_frame],
-        "ssim": float(np.concatenate(similarity).mean()),
-    }
+        signal = np.minimum(psnr(truth, predicted), PSNR_LIMIT)
+        return cls(signal.reshape(size), ssim(truth, predicted).reshape(size))
+
+    @staticmethod
+    def means(parts: "list[_Scores]") -> dict[str, Any]:
+        by_frame = np.concatenate([part.psnr for part in parts]).mean(axis=0)
+        return {
+            "psnr": float(by_frame.mean()),
+            "psnr_last": float(by_frame[-1]),
+            "psnr_by_frame": [round(float(value), 3) for value in by_frame],
+            "ssim": float(np.concatenate([part.ssim for part in parts]).mean()),
+        }
 
 
 def _opened(item: StrPath | ShardSet) -> ShardSet:

@@ -70,6 +70,10 @@ class Page:
         """Add a heading and a paragraph."""
         self._parts.append(f"<h2>{_text(title)}</h2>" + (f"<p>{_text(text)}</p>" if text else ""))
 
+    def text(self, text: str) -> None:
+        """Add a paragraph."""
+        self._parts.append(f"<p>{_text(text)}</p>")
+
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Add a table; columns of numbers are aligned to the right."""
         numeric = [all(isinstance(row[i], int | float) for row in rows) for i in range(len(columns))]
@@ -126,14 +130,12 @@ def loss_curves(
     training: Mapping[str, Sequence[tuple[int, float]]],
     validation: Mapping[str, Sequence[tuple[int, float]]],
     label: str,
-    baseline: float | None = None,
 ) -> bytes:
     """Plot losses over training, one curve a robot: training as a running mean, evaluations as markers.
 
     Args:
         training, validation: robot -> (step, loss).
         label: the label of the losses' axis.
-        baseline: the loss of the token frequencies, as a dotted line; None leaves it out.
     """
     figure, axes = _axes("training step", label)
     for i, name in enumerate(sorted(training)):
@@ -145,9 +147,25 @@ def loss_curves(
         if validation.get(name):
             steps, losses = np.array(validation[name], float).T
             axes.plot(steps, losses, MARKERS[i % len(MARKERS)], color=colour, ms=5)
-    if baseline is not None:
-        axes.axhline(baseline, color="#555555", ls=":", label="token frequencies alone")
     axes.legend(frameon=False, fontsize=9, ncols=1 + len(training) // 8)
+    return svg_bytes(figure)
+
+
+def held_out_losses(curves: Mapping[str, Sequence[tuple[float, float]]], baseline: float) -> bytes:
+    """Plot held-out losses over the time spent in training.
+
+    Args:
+        curves: name -> (seconds, nats a token).
+        baseline: the loss of the token frequencies, as a dotted line.
+    """
+    figure, axes = _axes("seconds of training", "held-out loss, nats a token")
+    for i, (name, points) in enumerate(curves.items()):
+        seconds, nats = np.array(points, float).T
+        axes.plot(seconds, nats, color=COLOURS[i], ls=STYLES[i], marker=MARKERS[i], ms=5, label=name)
+    axes.axhline(baseline, color="#555555", ls=":", label="token frequencies alone")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    axes.legend(frameon=False, fontsize=9)
     return svg_bytes(figure)
 
 

@@ -1,8 +1,12 @@
-"""Show rollouts, as a video or a sheet: truth, prediction with its actions, prediction with other actions."""
+"""Show rollouts, as a video or a sheet: truth, prediction with its actions, prediction with other actions.
 
-from collections.abc import Iterable, Mapping
+B windows, T frames, H×W pixels of a panel, A action dims.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -24,13 +28,15 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 SMALLEST = 192  # minimum width in pixels at which a picture is shown
+HOLD = 0.9  # seconds for which the end of a window stands, where another one follows
+GIVEN, PREDICTED = (150, 150, 150), (0, 158, 115)  # borders of true frames and of predictions
 SHEETS = "pictures"  # the folder of a run's sheets
 COLUMNS = 8  # frames in a row of a sheet
 
 
 @dataclass(frozen=True)
 class RolloutVideo:
-    """Frames (T, H, W, 3) uint8 at `fps`; the first `prompt` of them are true frames, not predictions."""
+    """Frames (T, H, W, 3) uint8 at `fps`; the first `prompt` of each window are true, not predictions."""
 
     frames: NDArray[np.uint8]
     fps: float
@@ -43,18 +49,20 @@ def rollout_video(
     shards: ShardSet,
     *,
     split: str = "val",
-    window: int = 0,
+    window: int | Sequence[int] = 0,
+    other: Sequence[int] | None = None,
     frames: int | None = None,
     prompt: int = 2,
     seed: int = 0,
     cameras: Cameras | None = None,
     **sampling: Unpack[Sampling],
 ) -> RolloutVideo:
-    """Roll out from one window of a shard set, with its own actions and with those of another window.
+    """Roll out from windows of a shard set, with their own actions and with those of other windows.
 
     Args:
         model: in eval mode, with the shard set's embodiment.
-        window: the number of the window among the windows of this length.
+        window: the number of the window among the windows of this length; several are shown in turn.
+        other: for each the number of the window whose actions it gets; None takes one half the set away.
         frames: how many to predict; None fills the model's window.
         prompt: how many true frames to start from.
         seed: of the rollouts.
@@ -68,39 +76,102 @@ def rollout_video(
     require_tokenizer(model.config, shards.spec, shards.folder)
     length = prompt + frames if frames else max(model.config.frames, prompt + 1)
     dataset = WindowDataset(shards, split, length, cameras=cameras_for(model, shards, cameras))
-    count = len(dataset)
-    if window >= count:
-        fault = f"has {count} windows of {length} frames in {split}, none with number {window}"
+    chosen, count = [window] if isinstance(window, int) else list(window), len(dataset)
+    if max(chosen) >= count:
+        fault = f"has {count} windows of {length} frames in {split}, none with number {max(chosen)}"
         raise UsageError(shards.folder, fault)
-    batch = dataset.batch([window])
-    other = dataset.batch([(window + count // 2) % count]).actions if count > 1 else None
+    batch = dataset.batch(chosen)
     swapped = batch.actions.clone()
-    swapped[:, prompt - 1 :] = (batch.actions.flip(1) if other is None else other)[:, prompt - 1 :]
+    theirs = dataset.batch(other or [(number + count // 2) % count for number in chosen]).actions
+    swapped[:, prompt - 1 :] = (batch.actions.flip(1) if count == 1 else theirs)[:, prompt - 1 :]
     roll = partial(rollout, model, tokenizer, batch, prompt=prompt, seed=seed, **sampling)
     true = roll()
     changed = roll(actions=swapped, truth=true.truth)
+    panels = (
+        ("truth", true.truth, batch.actions, length),
+        ("model, true actions", true.predicted, batch.actions, prompt),
+        ("model, other actions", changed.predicted, swapped, prompt),
+    )
+    fps, parts = shards.embodiment.effective_hz, []
+    for i in range(len(chosen)):
+        columns = [
+            _column(name, films[i], actions[i].numpy(), shards, given)
+            for name, films, actions, given in panels
+        ]
+        parts.append(_with_time(np.concatenate(columns, axis=2), prompt))
+        if len(chosen) > 1:
+            parts.append(parts[-1][-1:].repeat(round(HOLD * fps), axis=0))
+    return RolloutVideo(np.concatenate(parts), fps, prompt)
+
+
+def lively_windows(
+    shards: ShardSet, length: int, prompt: int, *, count: int = 3, split: str = "val", candidates: int = 48
+) -> tuple[list[int], list[int]]:
+    """Choose windows in which much moves, and for each the window whose actions differ most from its own.
+
+    Of evenly spaced windows those come first in which most tokens change after the prompt; an episode comes
+    a second time only after all others.
+
+    Args:
+        shards: a shard set of discrete tokens.
+        length, prompt: frames of a window, and those of its prompt.
+        count, split: how many windows of which split.
+        candidates: number of windows to choose from.
+
+    Returns:
+        The numbers of the windows, and the numbers of those with other actions, for `rollout_video`.
+    """
+    dataset = WindowDataset(shards, split, length)
+    numbers = np.unique(np.linspace(0, len(dataset) - 1, candidates).astype(np.int64))
+    batch = dataset.batch(numbers)
+    assert batch.tokens is not None
+    changed = (batch.tokens[:, prompt:] != batch.tokens[:, prompt - 1 : prompt]).float().mean(dim=(1, 2, 3))
+    turns: dict[int, list[int]] = {}  # candidates by episode, the liveliest first
+    for i in np.argsort(-changed.numpy(), kind="stable").tolist():
+        turns.setdefault(int(batch.episode[i]), []).append(i)
+    chosen = [i for turn in zip_longest(*turns.values()) for i in turn if i is not None][:count]
+    actions = batch.actions[:, prompt - 1 :]
+    scaled = (actions / actions.std(dim=(0, 1)).clamp(min=1e-6)).flatten(1)
+    far = [int((scaled - scaled[i]).square().sum(dim=1).argmax()) for i in chosen]
+    return [int(numbers[i]) for i in chosen], [int(numbers[i]) for i in far]
+
+
+def _column(
+    name: str, film: NDArray[np.uint8], actions: NDArray[np.float32], shards: ShardSet, given: int
+) -> NDArray[np.uint8]:
+    """Return a panel's frames (T, H, W, 3): title, picture with a border, and its actions as bars.
+
+    The border tells the first `given` frames, which are true, from those that the model predicts.
+    """
+    scale = max(1, -(-SMALLEST // film.shape[2]))
+    large = np.pad(film.repeat(scale, 1).repeat(scale, 2), ((0, 0), (4, 4), (4, 4), (0, 0)))
+    for t in range(len(large)):
+        edge = np.array(GIVEN if t < given else PREDICTED, np.uint8)
+        large[t, :4] = large[t, -4:] = edge
+        large[t, :, :4] = large[t, :, -4:] = edge
     stats = shards.manifest.stats["action"]
     low, high = np.array(stats["min"]), np.array(stats["max"])
-    own, foreign = (actions[0, :, : len(low)].numpy() for actions in (batch.actions, swapped))
-    panels = {
-        "truth": with_actions(true.truth[0], own, low, high),
-        "true actions": with_actions(true.predicted[0], own, low, high),
-        "other actions": with_actions(changed.predicted[0], foreign, low, high),
-    }
-    return RolloutVideo(_side_by_side(panels, prompt), shards.embodiment.effective_hz, prompt)
+    barred = with_actions(large, actions[:, : len(low)], low, high, shards.embodiment.action.names())
+    padded = np.pad(barred, ((0, 0), (42, 4), (6, 6), (0, 0)), constant_values=250)
+    for t, sheet in enumerate(padded):
+        if given == len(film):
+            about = "recorded"
+        else:
+            about = "prompt: true frames" if t < given else "predicted"
+        write_text(sheet, name, (8, 17), 0.5)
+        write_text(sheet, about, (8, 34), 0.4)
+    return padded
 
 
-def _side_by_side(panels: dict[str, NDArray[np.uint8]], prompt: int) -> NDArray[np.uint8]:
-    scale = max(1, -(-SMALLEST // next(iter(panels.values())).shape[2]))
-    border = ((0, 0), (24, 6), (6, 6), (0, 0))
-    enlarged = (frames.repeat(scale, 1).repeat(scale, 2) for frames in panels.values())
-    padded = [np.pad(frames, border, constant_values=250) for frames in enlarged]
-    film = np.concatenate(padded, axis=2)
-    for t, sheet in enumerate(film):
-        for i, name in enumerate(panels):
-            label = f"{name}: prompt" if i and t < prompt else name
-            write_text(sheet, label, (8 + i * padded[0].shape[2], 16), 0.46)
-    return film
+def _with_time(film: NDArray[np.uint8], prompt: int) -> NDArray[np.uint8]:
+    """Add a line below the frames that grows with time, in the colours of the borders."""
+    count, _, width = film.shape[:3]
+    out = np.pad(film, ((0, 0), (0, 8), (0, 0), (0, 0)), constant_values=250)
+    edges = np.linspace(6, width - 6, count + 1).astype(int)
+    for t in range(count):
+        for past in range(t + 1):
+            out[t, -6:-2, edges[past] : edges[past + 1]] = GIVEN if past < prompt else PREDICTED
+    return out
 
 
 def write_video(path: StrPath, film: RolloutVideo) -> None:

@@ -22,6 +22,8 @@ from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import (
     CARD,
     CONFIG,
+    EMBEDDED,
+    EMBEDDED_NAME,
     PARTS,
     README,
     SAMPLE,
@@ -45,6 +47,10 @@ if TYPE_CHECKING:
 Content = Path | bytes
 Store = FolderStore | Repository  # a place where a checkpoint or a shard set is published
 SHOWN = 50  # ids that an error lists
+_ADD_ONE = (
+    f"Add one: hma finetune --from {EMBEDDED_NAME} --data SHARDS --out RUN, "
+    "with shards of hma convert --tokenizer {name}"
+)
 
 
 def open_store(
@@ -142,9 +148,15 @@ def _pull(
     for name in wanted:
         check_id(name, store.name)
         if name not in there:
-            known = ", ".join(there[:SHOWN]) or "none"
+            known = f"it has: {', '.join(there[:SHOWN]) or 'none'}"
             away = " in the cache, and is out of reach" if store.from_cache else ""
-            raise HubError(store.name, f"has no embodiment {name!r}{away}", f"it has: {known}")
+            if store.name == str(EMBEDDED):
+                raise HubError(
+                    EMBEDDED_NAME,
+                    f"has no embodiment {name!r}",
+                    f"{known}. {_ADD_ONE.format(**values['tokenizer'])}",
+                )
+            raise HubError(store.name, f"has no embodiment {name!r}{away}", known)
         lacking = [part for part in PARTS if f"embodiments/{name}/{part}" not in files]
         if lacking and not store.from_cache:
             fault = f"lacks {lacking[0]} of embodiment {name!r}"

@@ -12,6 +12,7 @@ import torch
 from hma_data.errors import CheckpointError, UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
+from hma_model.evaluation import evaluate as module
 from hma_model.evaluation.evaluate import (
     digit_frequencies,
     evaluate,
@@ -219,9 +220,9 @@ def test_each_picture_is_decoded_once(data, model):
             return super().decode(tokens)
 
     tokenizer = Counting()
-    found = evaluate(model, tokenizer, data, count=5, prompt=1, batch_size=2)
+    found = evaluate(model, tokenizer, data, count=5, prompt=1, batch_size=2, draws=3)
     truth, predicted = found["windows"] * 4, found["windows"] * 3
-    assert tokenizer.decoded == truth + 2 * predicted  # with the true actions and with others
+    assert tokenizer.decoded == truth + (1 + 3) * predicted  # with the true actions and with three others
 
 
 def test_a_rollout_over_a_truth_that_is_known_is_the_same(model, batch):
@@ -241,6 +242,26 @@ def test_shuffled_actions_are_another_windows_of_the_same_embodiment(batch):
     shuffled = shuffled_actions(mixed)[:, 0, 0].long().tolist()
     assert sorted(shuffled) == [0, 1, 2, 3, 4]
     assert all(a != b and (a - b) % 2 == 0 for a, b in enumerate(shuffled))
+
+
+def test_every_draw_shuffles_anew(batch):
+    batch.actions[:, 0, 0] = torch.arange(5.0)
+    draws = [tuple(shuffled_actions(batch, draw=draw)[:, 0, 0].tolist()) for draw in range(5)]
+    assert len(set(draws)) > 1 and draws[0] == tuple(shuffled_actions(batch)[:, 0, 0].tolist())
+
+
+def test_figures_of_shuffled_actions_are_means_over_the_draws(data, model, monkeypatch):
+    real = module.shuffled_actions
+    one = []
+    for draw in range(3):
+        monkeypatch.setattr(module, "shuffled_actions", lambda *a, draw=0, only=draw: real(*a[:3], draw=only))
+        one.append(evaluate(model, Blocks(), data, count=5, prompt=1, batch_size=2, draws=1))
+    monkeypatch.setattr(module, "shuffled_actions", real)
+    found = evaluate(model, Blocks(), data, count=5, prompt=1, batch_size=2, draws=3)
+    assert found["true"] == one[0]["true"] and found["draws"] == 3
+    for key in ("psnr_last", "ssim"):
+        assert found["shuffled"][key] == pytest.approx(np.mean([part["shuffled"][key] for part in one]))
+    assert found["shuffled_loss"] == pytest.approx(np.mean([part["shuffled_loss"] for part in one]))
 
 
 def test_shuffling_keeps_the_actions_among_the_prompt(batch):

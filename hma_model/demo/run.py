@@ -1,0 +1,233 @@
+"""Run the whole pipeline on two new robots (`hma demo`), with the same functions as every other verb.
+
+The demo records two laboratory robots in two formats, converts the recordings to tokenized shards and mixes
+them. It finetunes the embedded trunk, which has seen neither robot, on both, and trains the same network from
+scratch for comparison. It publishes the finetuned model to a folder hub, pulls it back one robot at a time,
+rolls it out on episodes that it has not seen, and writes a report of one page. It downloads nothing. A second
+run in the same folder continues an interrupted one.
+"""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hma_data import lab
+from hma_data.console import human_bytes, progress
+from hma_data.conversion.engines import Attempt, Report, Retry, Work
+from hma_data.conversion.engines.local import run as run_local
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.cpu import usable_cores
+from hma_data.errors import OutputError, ShardError
+from hma_data.lab.family import HELD_OUT
+from hma_data.loading.dataset import open_sets
+from hma_data.loading.mixture import Mixture
+from hma_data.registry.embodiment import find
+from hma_data.shards.manifest import MANIFEST
+from hma_data.shards.preview import tokenizer_of
+from hma_data.shards.reader import ShardSet
+from hma_data.shards.verify import verify
+from hma_data.shards.windows import WindowIndex
+from hma_data.storage.files import write_atomic
+from hma_data.storage.paths import StrPath, as_path
+from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
+from hma_model.demo.made import TIMINGS, Demo
+from hma_model.demo.report import FINETUNED, SCRATCH, SHOWN, TAU, write_report
+
+if TYPE_CHECKING:
+    from hma_model.evaluation.rollout_video import RolloutVideo
+    from hma_model.training.loop import TrainResult
+
+START, ROBOTS = EMBEDDED_NAME, HELD_OUT  # the trunk, and robots that it has not seen
+RECIPES = {FINETUNED: "demo", SCRATCH: "demo_scratch"}
+RESULTS = "results.json"
+OURS = {"recordings", "shards", "run", "scratch", "hub", "pulled", "report.html", TIMINGS, RESULTS}
+WINDOWS = 24  # held-out windows of each robot; the figures are means over them
+LONGEST = 16  # frames of a window of the film
+
+
+def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: int = 0) -> Path:
+    """Run the demo, with its results in `out`.
+
+    Args:
+        out: str or path of a folder.
+        episodes: the number recorded for each robot.
+        steps: steps of each training at most; None takes those of the recipes.
+        seed: the seed of recording and training.
+
+    Returns:
+        The path of the report, `out`/report.html.
+
+    Raises:
+        OutputError: the folder holds something else.
+        CheckpointError: the embedded trunk is missing or damaged.
+    """
+    out = as_path(out)
+    if out.exists() and not out.is_dir():
+        raise OutputError(out, "is not a folder", "choose another --out")
+    if foreign := sorted({item.name for item in out.glob("*")} - OURS):
+        raise OutputError(out, f"holds {', '.join(foreign[:3])}", "choose an empty or new --out")
+    made = Demo(out, Checkpoint.open(START))
+    with made.stage(1, "record and convert"):
+        record_and_convert(made, episodes, seed)
+    with made.stage(2, "mix"):
+        mix(made)
+    with made.stage(3, "train"):
+        train_both(made, steps, seed)
+    with made.stage(4, "publish and pull"):
+        publish(made)
+    with made.stage(5, "roll out"):
+        roll_out(made)
+    names = {"true": "psnr_last", "shuffled": "psnr_last_shuffled", "copy": "psnr_last_copy"}
+    figures = {
+        robot: {name: found[key]["psnr_last"] for key, name in names.items()}
+        for robot, found in made.figures.items()
+    }
+    results = {"seconds": sum(made.seconds.values()), "embodiments": figures}
+    write_atomic(out / RESULTS, json.dumps(results, indent=1))
+    return write_report(made)
+
+
+def _worker(out: Path, tokenizer: str, episodes: int, seed: int, workers: int) -> Work:
+    """Return the function that records and converts a robot; it reports (stage, episodes so far).
+
+    It returns the robot, its recording, and whether more episodes than allowed are in quarantine.
+    """
+
+    def work(robot: str, report: Report, attempt: Attempt) -> tuple[str, Path, bool]:
+        folder = out / "recordings"
+        recording = next(iter(sorted(folder.glob(f"{robot}*"))), None)
+        if recording is None:
+            recording = lab.record(
+                robot, folder, episodes, seed, lambda done, total: report(("recorded", done))
+            )
+        report(("recorded", episodes))
+        summary = convert(
+            find(robot), str(recording), tokenizer, out / "shards" / robot,
+            settings=Settings(val_fraction=0.15, frames="strided"),
+            on_progress=lambda state: report(("converted", state.episodes)),
+        )  # fmt: skip
+        return robot, recording, summary.too_many
+
+    return work
+
+
+def record_and_convert(made: Demo, episodes: int, seed: int) -> None:
+    """Record episodes of each robot, and convert them to verified shard sets (stage 1).
+
+    Each robot has its own process, which ends when this process ends.
+    """
+    finished = all((made.out / "shards" / robot / MANIFEST).is_file() for robot in ROBOTS)
+    workers = 0 if finished or usable_cores() == 1 else len(ROBOTS)
+    counts: dict[tuple[int, str], int] = {}
+    with progress("record and convert", 2 * len(ROBOTS) * episodes, "episodes") as update:
+
+        def show(number: int, event: Any) -> None:
+            if not isinstance(event, Retry):
+                counts[number, event[0]] = event[1]
+                update(sum(counts.values()))
+
+        work = partial(_worker, made.out, made.tokenizer, episodes, seed)
+        results = list(run_local(ROBOTS, work, workers, show))
+    for robot, recording, refused in sorted(results):
+        folder = made.out / "shards" / robot
+        problems = verify(folder)
+        if problems or refused:
+            raise ShardError(folder, "; ".join(problems) or "too many episodes are in quarantine")
+        made.recordings[robot], made.sets[robot] = recording, ShardSet(folder)
+        manifest = made.sets[robot].manifest
+        size = manifest.to_json()["totals"]["bytes"]
+        made.sizes.update({f"recording {robot}": _size(recording), f"shards {robot}": size})
+        splits = ", ".join(f"{name} {split['episodes']}" for name, split in manifest.splits.items())
+        print(f"  {robot}: {splits} episodes, {human_bytes(size)}, verified", flush=True)
+
+
+def mix(made: Demo) -> None:
+    """Compute how often each robot is drawn (stage 2)."""
+    frames = made.start.config.frames
+    sets = open_sets(list(made.sets.values()))
+    counts = {name: WindowIndex.of(shards, "train", frames).count for name, shards in sets.items()}
+    made.mixture = Mixture.of(counts, TAU)
+    for name, count, p in zip(made.mixture.names, counts.values(), made.mixture.p, strict=True):
+        print(f"  {name}: {count:,} windows, drawn with p = {p:.3f}", flush=True)
+
+
+def train_both(made: Demo, steps: int | None, seed: int) -> None:
+    """Finetune the trunk on both robots, and train the same network from scratch (stage 3)."""
+    from hma_model.training.loop import finetune, train
+    from hma_model.training.recipe import load_recipe, network_values
+
+    data = [str(shards.folder.absolute()) for shards in made.sets.values()]
+    own = [f"seed={seed}", f"mixture.temperature={TAU}"]
+    recipes = {name: load_recipe(file, [*own, f"data=[{', '.join(data)}]"]) for name, file in RECIPES.items()}
+    limits = {name: min(recipe.steps, steps or recipe.steps) for name, recipe in recipes.items()}
+    made.runs[FINETUNED] = _finished(
+        finetune(
+            START, data, out=made.out / "run", recipe=RECIPES[FINETUNED],
+            overrides=[*own, f"steps={limits[FINETUNED]}"],
+        )
+    )  # fmt: skip
+    config = made.start.config
+    network = {"model": network_values(config), "frames": config.frames, "digits": config.factored[0]}
+    scratch = recipes[SCRATCH].model_copy(update={**network, "steps": limits[SCRATCH]})
+    made.runs[SCRATCH] = _finished(train(scratch, out=made.out / "scratch"))
+    for name, result in made.runs.items():
+        said = f"held-out loss {result.masked_val_loss:.3f} nats a token after {result.seconds:.0f} s"
+        print(f"  {name}: {said}", flush=True)
+    print(f"  token frequencies alone: {made.runs[FINETUNED].baseline:.3f}", flush=True)
+
+
+def _finished(result: "TrainResult") -> "TrainResult":
+    if result.interrupted:
+        raise KeyboardInterrupt  # the run has saved a checkpoint
+    return result
+
+
+def publish(made: Demo) -> None:
+    """Push the checkpoint to a folder hub, and pull each robot back alone (stage 4)."""
+    from hma_model.hub import publish as hub
+
+    published = made.out / "hub" / "demo" / "lab"
+    hub.push(made.runs[FINETUNED].checkpoint, str(published))
+    for robot in ROBOTS:
+        made.pulled[robot] = hub.pull(str(published), [robot], made.out / "pulled" / robot)
+        made.sizes[f"checkpoint for {robot} alone"] = _size(made.pulled[robot])
+    made.sizes["checkpoint of both"] = _size(published)
+
+
+def roll_out(made: Demo) -> None:
+    """Compute each robot's figures and film with the model pulled for it alone (stage 5).
+
+    The robots run in parallel, each in one thread, because a second thread speeds up small products little.
+    """
+    from hma_data.tokenizers.network import single_threads
+    from hma_model.evaluation.evaluate import default_prompt, evaluate
+    from hma_model.evaluation.rollout_video import lively_windows, rollout_video
+    from hma_model.network.model import HMA
+
+    def roll(robot: str) -> tuple[dict[str, Any], "RolloutVideo"]:
+        shards = made.sets[robot]
+        model = HMA.from_pretrained(str(made.pulled[robot]), embodiments=[robot]).eval()
+        tokenizer = tokenizer_of(shards)
+        found = evaluate(model, tokenizer, shards, count=WINDOWS, batch_size=8)
+        lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
+        prompt = max(2, default_prompt(model.config.frames))
+        length = min(LONGEST, max(lengths) // shards.row_stride)
+        window, other = lively_windows(shards, length, prompt, count=SHOWN)
+        film = rollout_video(
+            model, tokenizer, shards, window=window, other=other, frames=length - prompt, prompt=prompt
+        )
+        return found, film
+
+    with single_threads(len(made.sets)) as pool:
+        results = list(pool.map(roll, made.sets))
+    for robot, (found, film) in zip(made.sets, results, strict=True):
+        made.figures[robot], made.films[robot] = found, film
+        own, other = (f"{found[key]['psnr_last']:.1f} dB" for key in ("true", "shuffled"))
+        print(f"  {robot}: last frame PSNR {own} with its actions, {other} with shuffled ones", flush=True)
+
+
+def _size(path: Path) -> int:
+    files = [path] if path.is_file() else [item for item in path.rglob("*") if item.is_file()]
+    return sum(item.stat().st_size for item in files)

@@ -1,0 +1,55 @@
+"""Films of rollouts: which windows they show, and how truth, prompt and prediction differ in them."""
+
+import numpy as np
+import pytest
+import torch
+
+from hma_data.loading.dataset import WindowDataset
+from hma_data.shards.reader import ShardSet
+from hma_model.evaluation import rollout_video as module
+from hma_model.evaluation.rollout_video import lively_windows, rollout_video
+from tests.model.evaluation.test_evaluate import Blocks
+from tests.model.robots import make_model
+from tests.model.shards import make_shards
+
+LENGTH, PROMPT = 6, 2
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> ShardSet:
+    return ShardSet(make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm", episodes=6, held_out=3))
+
+
+def test_windows_with_motion_come_from_different_episodes_and_get_unlike_actions(shards: ShardSet) -> None:
+    dataset = WindowDataset(shards, "val", LENGTH)
+    chosen, others = lively_windows(shards, LENGTH, PROMPT, count=3, candidates=len(dataset))
+    batch, everything = dataset.batch(chosen), dataset.batch(range(len(dataset)))
+    assert len(set(batch.episode.tolist())) == 3
+
+    def motion(tokens: torch.Tensor) -> torch.Tensor:
+        return (tokens[:, PROMPT:] != tokens[:, PROMPT - 1 : PROMPT]).float().mean(dim=(1, 2, 3))
+
+    assert motion(batch.tokens)[0] == motion(everything.tokens).max()
+    theirs = dataset.batch(others)
+    for i in range(3):
+        assert not torch.equal(batch.actions[i, PROMPT - 1 :], theirs.actions[i, PROMPT - 1 :])
+
+
+def test_borders_tell_the_prompt_from_predictions_and_the_truth_has_none_of_those(shards: ShardSet) -> None:
+    film = rollout_video(
+        make_model({"arm": 2}), Blocks(), shards, window=[0, 9], other=[9, 0], frames=LENGTH - PROMPT,
+        prompt=PROMPT,
+    )  # fmt: skip
+    held = round(module.HOLD * film.fps)
+    assert len(film.frames) == 2 * (LENGTH + held)
+    assert (film.frames[LENGTH - 1 : LENGTH + held] == film.frames[LENGTH - 1]).all()
+    width = film.frames.shape[2]
+    assert width >= 3 * module.SMALLEST
+    for t in range(LENGTH):
+        row = film.frames[t, 43].reshape(3, width // 3, 3)  # in the upper borders of the three panels
+        colours = [tuple(panel[width // 6]) for panel in row.tolist()]
+        predicted = module.GIVEN if t < PROMPT else module.PREDICTED
+        assert colours == [module.GIVEN, predicted, predicted]
+    panels = np.split(film.frames, 3, axis=2)
+    picture = slice(46, 46 + module.SMALLEST)
+    assert (panels[0][:PROMPT, picture] == panels[1][:PROMPT, picture]).all()
