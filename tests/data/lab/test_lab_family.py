@@ -14,10 +14,10 @@ from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.family import HELD_OUT, TRUNK, embodiment, episode
-from hma_data.lab.family_bodies import Body
-from hma_data.lab.family_look import SIZE
-from hma_data.lab.family_mechanisms import MAKERS
-from hma_data.lab.family_world import World, start
+from hma_data.lab.family.bodies import Body
+from hma_data.lab.family.look import SIZE
+from hma_data.lab.family.mechanisms import MAKERS
+from hma_data.lab.family.world import World, start
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet

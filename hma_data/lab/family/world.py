@@ -11,8 +11,8 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.lab.family_bodies import GRIP, Body
-from hma_data.lab.family_look import SIZE, Floats, block_shapes, draw, shrunk
+from hma_data.lab.family.bodies import GRIP, Body
+from hma_data.lab.family.look import SIZE, Floats, block_shapes, draw, shrunk
 
 REACH = 8.0  # of a gripper, from its tip
 

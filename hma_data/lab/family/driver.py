@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hma_data.lab.family_bodies import Body
-from hma_data.lab.family_look import SIZE, Floats
-from hma_data.lab.family_mechanisms import wrapped
+from hma_data.lab.family.bodies import Body
+from hma_data.lab.family.look import SIZE, Floats
+from hma_data.lab.family.mechanisms import wrapped
 
 MANOEUVRES = ("block", "anywhere", "hold", "weave", "rest")
 CHANCES = (0.27, 0.26, 0.22, 0.15, 0.1)

@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from hma_data.lab.family_look import SIZE, Color, Floats, Shape, box
+from hma_data.lab.family.look import SIZE, Color, Floats, Shape, box
 
 FINGER = 3.6  # half the width of a finger
 

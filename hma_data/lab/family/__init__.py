@@ -1,8 +1,8 @@
 """Record a family of made-up robots that differ in axes, rate, meaning of the command and look.
 
-A name, such as `arm3_04`, decides everything about a robot: `hma_data.lab.family_bodies` draws it. All are
+A name, such as `arm3_04`, decides everything about a robot: `hma_data.lab.family.bodies` draws it. All are
 recorded to HDF5, but the last of HELD_OUT to MCAP. The robots are seen from above and push one to three loose
-blocks (`hma_data.lab.family_world`). The command in a frame is applied between its picture and the next; the
+blocks (`hma_data.lab.family.world`). The command in a frame is applied between its picture and the next; the
 motion obeys the limits.
 
 The reward is the distance that the blocks moved, in px. An episode is a success if some block ends MOVED px
@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.lab.family_bodies import Body
-from hma_data.lab.family_driver import Driver
-from hma_data.lab.family_look import SIZE, Floats
-from hma_data.lab.family_mechanisms import Axis
-from hma_data.lab.family_world import start
+from hma_data.lab.family.bodies import Body
+from hma_data.lab.family.driver import Driver
+from hma_data.lab.family.look import SIZE, Floats
+from hma_data.lab.family.mechanisms import Axis
+from hma_data.lab.family.world import start
 from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
 from hma_data.registry.embodiment import Embodiment
 

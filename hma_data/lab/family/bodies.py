@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import UsageError
-from hma_data.lab.family_look import DARK, LIGHT, Block, Color, Floats, background, contrast, draw, vivid
-from hma_data.lab.family_mechanisms import MAKERS, Axis, Mechanism, wrapped
+from hma_data.lab.family.look import DARK, LIGHT, Block, Color, Floats, background, contrast, draw, vivid
+from hma_data.lab.family.mechanisms import MAKERS, Axis, Mechanism, wrapped
 
 STRIDES = {10: (1, 2), 15: (3,), 20: (2, 4), 25: (5,), 30: (3, 5), 50: (5, 10)}  # rate -> model strides
 GRIP = 0.6  # opening below which a gripper holds
