@@ -124,7 +124,7 @@ def lively_windows(
     dataset = WindowDataset(shards, split, length)
     numbers = np.unique(np.linspace(0, len(dataset) - 1, candidates).astype(np.int64))
     batch = dataset.batch(numbers)
-    assert batch.tokens is not None
+    assert batch.tokens is not None and batch.episode is not None
     changed = (batch.tokens[:, prompt:] != batch.tokens[:, prompt - 1 : prompt]).float().mean(dim=(1, 2, 3))
     turns: dict[int, list[int]] = {}  # candidates by episode, the liveliest first
     for i in np.argsort(-changed.numpy(), kind="stable").tolist():
