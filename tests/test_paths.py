@@ -17,7 +17,6 @@ import torch
 from hma_data.conversion.job import convert, convert_share, plan_conversion
 from hma_data.conversion.output import Share
 from hma_data.conversion.plan import Settings, estimate
-from hma_data.conversion.recipe import load_jobs
 from hma_data.conversion.rewrite import merge, restat, split
 from hma_data.errors import HMAError, UsageError
 from hma_data.inspection.infer import infer
@@ -117,7 +116,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     (folder / "run/metrics.jsonl").write_text('{"kind": "train", "step": 1, "loss": 2.0}\n')
     write_magvit2(folder / "magvit2.safetensors")
     write_recipe(folder).rename(folder / "tokenizer.yaml")
-    (folder / "jobs.yaml").write_text("jobs: [{embodiment: so100, out: somewhere}]")
     (folder / "training.yaml").write_text("data: [somewhere]\nout: run\n")
     (folder / "foreign").mkdir()
     (folder / "foreign/letter.txt").write_text("dear")
@@ -289,7 +287,6 @@ CASES: dict[str, Callable[[Made, Given, Path], Any]] = {
     ),
     "infer": lambda made, given, out: infer(given(made.lerobot), "my_arm"),
     "convert": converted,
-    "jobs of a recipe": lambda made, given, out: load_jobs(given(made.jobs)),
     "shard set": lambda made, given, out: (
         Manifest.load(given(made.shards)).to_text(),
         describe(given(made.shards)),
@@ -380,7 +377,7 @@ def test_home_is_meant_by_a_tilde_in_any_form(tmp_path: Path, monkeypatch: pytes
 # -- the annotations of what is public
 
 PUBLIC = (
-    "hma_data.conversion.job", "hma_data.conversion.recipe",
+    "hma_data.conversion.job",
     "hma_data.conversion.plan", "hma_data.conversion.rewrite",
     "hma_data.inspection.infer", "hma_data.inspection.inspect", "hma_data.lab", "hma_data.loading.dataset",
     "hma_data.loading.mixture", "hma_data.registry.catalog", "hma_data.registry.embodiment",

@@ -1,4 +1,4 @@
-"""Measure `hma convert`: overhead beside the tokenizer, and whether the memory of its workers stays constant."""
+"""Measure `hma convert`: overhead beside the tokenizer, and memory of its workers over time."""
 
 import multiprocessing
 import os
