@@ -212,7 +212,7 @@ class Marker(SpecModel):
     With `equals`, only messages at which the value becomes `equals` count; without it, every message does.
     """
 
-    key: str = Field(min_length=1, description="/topic or /topic.field.path; for a service, its event topic")
+    key: str = Field(min_length=1, description="/topic or /topic.field.path")
     equals: bool | Number | str | None = None
 
     @model_validator(mode="after")
