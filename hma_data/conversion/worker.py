@@ -27,8 +27,7 @@ from hma_data.conversion.output import Made
 from hma_data.conversion.plan import ShardUnit, camera_fault, read_clip
 from hma_data.cpu import usable_cores
 from hma_data.episodes.episode import Clip
-from hma_data.episodes.images import prepared
-from hma_data.episodes.quality import PictureCheck, picture_flags
+from hma_data.episodes.images import PictureCheck, picture_flags, prepared
 from hma_data.errors import (
     EpisodeError,
     HMAError,

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.align import nearest
 from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import Images
-from hma_data.episodes.quality import BLANK, PictureCheck
+from hma_data.episodes.images import BLANK, Images, PictureCheck
 
 Severity = Literal["error", "warn", "info"]
 SEVERITIES: tuple[Severity, ...] = ("info", "warn", "error")

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import EpisodeError, HMAError, OutputError
-from hma_data.registry.layouts import HandsLayout
+from hma_data.registry.components import HandsLayout
 from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint, local_path, unfollowed
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding

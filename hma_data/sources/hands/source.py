@@ -34,9 +34,8 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Episode, Floats, Signal
 from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.registry.components import Vector
+from hma_data.registry.components import HandsLayout, Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.common.survey import listed
 from hma_data.sources.common.video_file import VideoFile

@@ -27,8 +27,7 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
-from hma_data.sources.hdf5.layout import as_rgb, encoded, picture_kind
-from hma_data.sources.hdf5.source import TEXT_KEYS, json_of
+from hma_data.sources.hdf5.source import TEXT_KEYS, as_rgb, encoded, json_of, picture_kind
 
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")

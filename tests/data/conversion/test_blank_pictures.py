@@ -16,8 +16,7 @@ from skimage import data as skimage_data
 from hma_data.conversion import worker
 from hma_data.conversion.job import Summary, convert
 from hma_data.conversion.plan import Settings
-from hma_data.episodes.images import resize
-from hma_data.episodes.quality import PictureCheck
+from hma_data.episodes.images import PictureCheck, resize
 from hma_data.errors import SourceError
 from hma_data.inspection.inspect import examine
 from hma_data.inspection.shard_pictures import shard_picture_findings

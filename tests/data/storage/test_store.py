@@ -16,10 +16,10 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import ShardError, StorageAwayError, StorageError
 from hma_data.registry.embodiment import Embodiment
+from hma_data.shards import reader as shard_cache
 from hma_data.shards.preview import describe
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
-from hma_data.storage import cache as shard_cache
 from hma_data.storage import remote as store
 from hma_data.storage.files import file_sha256
 from hma_data.storage.remote import RangeFile, RemotePath, place, put_bytes, put_file
