@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 BENCHES: dict[str, str] = {  # name -> module:object; hma_model adds its own
     "convert": "hma_data.bench.convert:BENCH",
     "lerobot": "hma_data.bench.sources:LEROBOT",
-    "loader": "hma_data.bench.shards:LOADER",
-    "shards": "hma_data.bench.shards:SHARDS",
+    "loader": "hma_data.bench.loader:BENCH",
     "sources": "hma_data.bench.sources:BENCH",
 }
 
