@@ -11,8 +11,6 @@ machine too. So the loop is short. `hma bench waiting` compares the choices; fig
 """
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 SPINS = 1_000  # turns of the loop: on a quiet machine nearly as quick as more, on a busy one as PASSIVE
 
@@ -21,15 +19,6 @@ def take_ordinary_priority() -> None:
     """Set the default scheduling for this thread where it has real-time priority."""
     if hasattr(os, "sched_getscheduler") and os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-
-@contextmanager
-def ordinary_priority() -> Iterator[None]:
-    """Restore ordinary priority after a block that may encode video."""
-    try:
-        yield
-    finally:
-        take_ordinary_priority()
 
 
 def bound_spinning() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from hma_data.cpu import ordinary_priority, take_ordinary_priority
+from hma_data.cpu import take_ordinary_priority
 from hma_data.registry.embodiment import Embodiment
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
@@ -23,16 +23,20 @@ settings.load_profile("new" if os.environ.get("HMA_FUZZ") else "same")
 @pytest.hookimpl(wrapper=True)
 def pytest_fixture_setup() -> Generator[None, Any, Any]:
     """Videos are encoded in fixtures too."""
-    with ordinary_priority():
+    try:
         return (yield)
+    finally:
+        take_ordinary_priority()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Generator[None, Any, Any]:
     """A test that encodes AV1 leaves the others, and the processes that they start, their turns."""
     take_ordinary_priority()
-    with ordinary_priority():
+    try:
         return (yield)
+    finally:
+        take_ordinary_priority()
 
 
 # Why a test may be skipped, by the words of its reason; any other skip fails a run of CI.

@@ -16,11 +16,9 @@ if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
 BENCHES: dict[str, str] = {  # name -> module:object; hma_model adds its own
-    "convert": "hma_data.bench.commands:CONVERT",
-    "lerobot": "hma_data.bench.lerobot:BENCH",
-    "loader": "hma_data.bench.shards:LOADER",
-    "registry": "hma_data.bench.commands:REGISTRY",
-    "shards": "hma_data.bench.shards:SHARDS",
+    "convert": "hma_data.bench.convert:BENCH",
+    "lerobot": "hma_data.bench.sources:LEROBOT",
+    "loader": "hma_data.bench.loader:BENCH",
     "sources": "hma_data.bench.sources:BENCH",
 }
 

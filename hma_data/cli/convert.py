@@ -1,7 +1,8 @@
-"""Run `hma convert`: one conversion, a recipe of several, a share of one, or only its plan."""
+"""Run `hma convert`: a conversion, a share of one, or only its plan."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,31 +18,46 @@ from hma_data.console import (
     print_table,
     progress,
 )
-from hma_data.errors import HMAError, Interrupted, UsageError
+from hma_data.errors import UsageError
 
 if TYPE_CHECKING:
     from hma_data.conversion.job import Progress, Shared, Summary
     from hma_data.conversion.output import Share
-    from hma_data.conversion.recipe import ConversionJob
+    from hma_data.conversion.plan import Settings
 
 SHOWN = 20  # reasons of quarantine that are printed
 DATA, BAD, OLD = "What is kept, and the split", "Episodes that cannot be used", "If --out holds a shard set"
-JOBS, RARE = "Several conversions, several machines", "Rarely needed"
+JOBS, RARE = "Several machines", "Rarely needed"
 
 Text = str | None
 CHOICE = "ID|GLOB|@FILE"
 
 
+@dataclass(frozen=True)
+class _Job:
+    """The conversion that the options state."""
+
+    embodiment: str
+    out: Path
+    source: str | None
+    tokenizer: str
+    weights: str | None
+    device: str
+    workers: int
+    engine: Literal["local", "ray"]
+    frequency_hz: float | None
+    max_quarantine: float
+    episode_timeout: float
+    settings: "Settings"
+
+
 def convert(
     embodiment: Annotated[
-        Text, Option("--embodiment", "-e", help="The robot: an id of the registry, or a YAML file.")
-    ] = None,
-    out: Annotated[Path | None, Option(help="Folder of the shard set.")] = None,
+        str, Option("--embodiment", "-e", help="The robot: an id of the registry, or a YAML file.")
+    ],
+    out: Annotated[Path, Option(help="Folder of the shard set.")],
     source: Annotated[
         Text, Option(help="Recording: file, folder or URI; default: source.uri of the YAML.")
-    ] = None,
-    recipe: Annotated[
-        Path | None, Option(help="Several conversions: a YAML as in recipes/convert.", rich_help_panel=JOBS)
     ] = None,
     tokenizer: Annotated[str, Option(help="Name of the tokenizer; see hma tokenizer list.")] = "fsq-16",
     weights: Annotated[
@@ -136,39 +152,27 @@ def convert(
     Example: hma convert -e my_arm.yaml --source ./demo.hdf5 --out shards/my_arm
     """
     from hma_data.conversion.output import Share
-    from hma_data.conversion.recipe import job_of_options, load_jobs
+    from hma_data.conversion.plan import Settings
 
     if extend and overwrite:
         raise UsageError("hma convert", "--extend keeps what --overwrite deletes", "give one of them")
-    if recipe:
-        if embodiment or out or source:
-            raise UsageError("--recipe", "states embodiment, source and out itself", "leave the options out")
-        jobs = load_jobs(recipe)
-    elif embodiment is None or out is None:
-        raise UsageError("hma convert", "needs --embodiment and --out, or --recipe", "see hma convert --help")
-    else:
-        job = job_of_options(
-            embodiment=embodiment,
-            out=out,
-            source=source,
-            tokenizer=tokenizer,
-            weights=weights,
-            device=device,
-            workers=workers,
-            engine=engine,
-            limit=limit,
-            only=tuple(only or ()),
-            exclude=tuple(exclude or ()),
-            frames=frames,
-            frequency_hz=frequency_hz,
-            cameras=tuple(cameras or ()),
-            shard_frames=shard_frames,
-            val_fraction=val_fraction,
-            seed=seed,
-            max_quarantine=max_quarantine,
-            episode_timeout=episode_timeout,
-        )
-        jobs = [job]
+    names = tuple(name.strip() for word in cameras or () for name in word.split(",") if name.strip())
+    choice = tuple(only or ()), tuple(exclude or ())
+    settings = Settings(frames, names, val_fraction, seed, limit, shard_frames, *choice)
+    job = _Job(
+        embodiment=embodiment,
+        out=out,
+        source=source,
+        tokenizer=tokenizer,
+        weights=weights,
+        device=device,
+        workers=workers,
+        engine=engine,
+        frequency_hz=frequency_hz,
+        max_quarantine=max_quarantine,
+        episode_timeout=episode_timeout,
+        settings=settings,
+    )
     share = None
     if shard_index is not None and shard_count is not None:
         share = Share(shard_index, shard_count)
@@ -178,32 +182,11 @@ def convert(
             raise UsageError("--shard-index", "cannot be combined with --overwrite or --engine ray")
     elif shard_index is not None or shard_count is not None:
         raise UsageError("hma convert", "--shard-index and --shard-count belong together", "give both")
-
-    def run(job: "ConversionJob") -> bool:
-        return _plan(job, json) if dry_run else _convert(job, json, extend, overwrite, share)
-
-    _run_all(jobs, run)
+    sound = _plan(job, json) if dry_run else _convert(job, json, extend, overwrite, share)
+    raise typer.Exit(0 if sound else 1)
 
 
-def _run_all(jobs: "list[ConversionJob]", run: "Callable[[ConversionJob], bool]") -> None:
-    """Run each job and exit; of several jobs, one that fails does not stop the others."""
-    if len(jobs) == 1:
-        raise typer.Exit(0 if run(jobs[0]) else 1)
-    failed = 0
-    for job in jobs:
-        try:
-            failed += not run(job)
-        except Interrupted:
-            raise
-        except HMAError as fault:
-            failed += 1
-            typer.echo(f"error: {job.embodiment}: {fault}", err=True)
-    if failed:
-        typer.echo(f"error: {failed} of {len(jobs)} conversions failed", err=True)
-    raise typer.Exit(1 if failed else 0)
-
-
-def _convert(job: "ConversionJob", json: bool, extend: bool, overwrite: bool, share: "Share | None") -> bool:
+def _convert(job: _Job, json: bool, extend: bool, overwrite: bool, share: "Share | None") -> bool:
     """Run a conversion, or a share of it; return False if too many episodes are in quarantine."""
     robot = _ready(job)
     from hma_data.conversion.engines import Limits
@@ -233,7 +216,7 @@ def _convert(job: "ConversionJob", json: bool, extend: bool, overwrite: bool, sh
     return not summary.too_many
 
 
-def _kept(job: "ConversionJob", overwrite: bool) -> str:
+def _kept(job: _Job, overwrite: bool) -> str:
     """Return what a Ctrl-C leaves, and how to go on."""
     from hma_data.storage.remote import is_remote, place
 
@@ -245,7 +228,7 @@ def _kept(job: "ConversionJob", overwrite: bool) -> str:
     return f"{human_count(shards, 'finished shard')} in {job.out} kept; {again}"
 
 
-def _plan(job: "ConversionJob", json: bool) -> bool:
+def _plan(job: _Job, json: bool) -> bool:
     robot = _ready(job)
     from hma_data.conversion.job import plan_conversion
     from hma_data.conversion.plan import estimate
@@ -304,7 +287,7 @@ def _print_cameras(line: str, pictures: dict[str, tuple[int, int]], robot: Any, 
         print(describe_resize(robot.camera(name), height, width, size))
 
 
-def _ready(job: "ConversionJob") -> Any:
+def _ready(job: _Job) -> Any:
     """Return the robot; refuse what can be seen from the command line before torch is imported."""
     from hma_data.registry.embodiment import find
     from hma_data.sources.base import require_there
@@ -317,7 +300,7 @@ def _ready(job: "ConversionJob") -> Any:
 
 
 @contextmanager
-def _shown(job: "ConversionJob") -> "Iterator[Callable[[Progress], None]]":
+def _shown(job: _Job) -> "Iterator[Callable[[Progress], None]]":
     with progress(f"convert {Path(job.embodiment).stem}") as update:
         told = 0
 

@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,13 +34,9 @@ def registry_list(
     words: Annotated[
         list[str] | None, Argument(help="Only those with all these words in id, robot or description.")
     ] = None,
-    kind: Annotated[Literal["real", "simulation", "human"] | None, Option(help="Only this kind.")] = None,
     source: Annotated[
         str | None, Option(help=f"Only this format: {', '.join(FORMATS)}, or a package's.")
     ] = None,
-    space: Annotated[str | None, Option(help="Only this action space.")] = None,
-    dims: Annotated[int | None, Option(help="Only this number of action dims.")] = None,
-    hz: Annotated[str | None, Option(help="Only this rate, or: unknown.")] = None,
     json: Json = False,
 ) -> None:
     """List every embodiment that can be found by its id.
@@ -57,14 +52,10 @@ def registry_list(
             broken += [f"{entry.path}: {_line(problem)}" for problem in entry.problems]
         else:
             found.setdefault(entry.facts["id"], entry.facts)
-    exact = {"kind": kind, "format": source, "space": space, "action_dim": dims}
-    exact = {key: wanted for key, wanted in exact.items() if wanted is not None}
     rows = [
         row
         for _, row in sorted(found.items())
-        if all(row[key] == wanted for key, wanted in exact.items())
-        and (hz is None or _rate_is(row["frequency_hz"], hz))
-        and _mentions(row, words or [])
+        if (source is None or row["format"] == source) and _mentions(row, words or [])
     ]
     if json:
         print_json(rows)
@@ -84,13 +75,6 @@ def registry_list(
 def _mentions(row: dict[str, Any], words: list[str]) -> bool:
     text = f"{row['id']} {row['robot']} {row['description']}".lower()
     return all(word.lower() in text for word in words)
-
-
-def _rate_is(rate: float | str | None, wanted: str) -> bool:
-    if isinstance(rate, int | float):
-        with suppress(ValueError):
-            return rate == float(wanted)
-    return wanted == (rate or "null")
 
 
 @registry_app.command("show")

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.conversion.cameras import read_clip
-from hma_data.conversion.plan import Plan, ShardUnit, differences, pack, shard_size
+from hma_data.conversion.plan import Plan, ShardUnit, differences, pack, read_clip, shard_size
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepared
 from hma_data.errors import EpisodeError, OutputError

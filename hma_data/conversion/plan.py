@@ -1,8 +1,11 @@
-"""Plan which episode goes into which shard, before anything is decoded.
+"""Plan which episode goes into which shard, and with which cameras, before anything is decoded.
 
 The plan depends on the recording, the embodiment, the tokenizer and the settings alone, never
 on the number of workers, so that every run and every machine makes the same files. `estimate` says what the
 work will cost.
+
+Without a choice of cameras, only the primary one is stored. All cameras of the YAML are read even then: a
+stream that is not stored still limits the time at which every stream runs.
 """
 
 import hashlib
@@ -17,13 +20,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hma_data.conversion.cameras import chosen, read_clip
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepare
-from hma_data.errors import HMAError, SourceError, UsageError
+from hma_data.errors import EpisodeError, HMAError, SourceError, StorageAwayError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import digest, plan_hash
 from hma_data.shards.schema import RowLayout
-from hma_data.sources.base import EpisodeRef, open_source
+from hma_data.sources.base import EpisodeRef, Source, open_source
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
@@ -142,7 +146,7 @@ def make_plan(
     ((name, count),) = Counter(ref.id for ref in refs).most_common(1)
     if count > 1:
         raise SourceError(source, f"has two episodes with id {name!r}")
-    cameras = chosen(embodiment, settings.cameras)
+    cameras = chosen_cameras(embodiment, settings.cameras)
     splits = choose_splits(refs, settings.val_fraction, settings.seed)
     target = settings.shard_frames or shard_size(sum(ref.frames for ref in refs))
     units = [
@@ -238,6 +242,68 @@ def _short(value: Any) -> str:
     if isinstance(value, dict):
         return f"{value['name']} {value.get('weights_sha256', '')[:8]}".strip() if "name" in value else ""
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+# -- cameras
+
+
+def chosen_cameras(embodiment: Embodiment, cameras: Sequence[str]) -> list[str]:
+    """Return the names of the cameras to store; the first one is that of the first token column.
+
+    Args:
+        cameras: names; ("all",) takes all of the YAML, the primary one first; none takes the primary one.
+
+    Raises:
+        RegistryError: the embodiment lacks a camera.
+    """
+    primary = embodiment.primary_camera.name
+    if tuple(cameras) == ("all",):
+        return [primary, *(camera.name for camera in embodiment.cameras if camera.name != primary)]
+    return list(dict.fromkeys(embodiment.camera(name).name for name in cameras)) or [primary]
+
+
+def read_clip(
+    source: Source, uri: str, episode_id: str, embodiment: Embodiment, cameras: Sequence[str]
+) -> Clip:
+    """Return an episode with the cameras that are stored.
+
+    A fault of a camera that is not stored does not refuse the episode: it is then read without those.
+
+    Raises:
+        EpisodeError: the episode cannot be used. If it could be without one of several cameras, the error
+            names that camera.
+    """
+
+    def read(names: Sequence[str]) -> Clip:
+        robot = embodiment.with_cameras(names)
+        return to_clip(source.read(uri, episode_id, robot), robot)
+
+    def is_readable(names: Sequence[str]) -> bool:
+        try:
+            return bool(len(read(names)))
+        except (EpisodeError, SourceError):
+            return False
+
+    every = [camera.name for camera in embodiment.cameras]
+    try:
+        return read(every)
+    except StorageAwayError:
+        raise
+    except (EpisodeError, SourceError) as fault:
+        if len(cameras) < len(every) and is_readable(cameras):
+            return read(cameras)
+        for name in cameras if len(cameras) > 1 else ():
+            if is_readable([other for other in cameras if other != name]):
+                raise camera_fault(episode_id, name, cameras, fault) from fault
+        raise
+
+
+def camera_fault(episode_id: str, camera: str, cameras: Sequence[str], fault: Exception) -> EpisodeError:
+    """Return the error of an episode in which one of several cameras cannot be read."""
+    said = fault.fault if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}"
+    others = ",".join(name for name in cameras if name != camera)
+    remedy = f"--cameras {others} leaves {camera} out"
+    return EpisodeError(episode_id, f"camera {camera} cannot be read: {said}", remedy)
 
 
 # -- the cost

@@ -21,15 +21,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.conversion.cameras import camera_fault, read_clip
 from hma_data.conversion.engines import FIRST, Attempt, Report, Step, Work
 from hma_data.conversion.extend import Content, kept_frames
 from hma_data.conversion.output import Made
-from hma_data.conversion.plan import ShardUnit
+from hma_data.conversion.plan import ShardUnit, camera_fault, read_clip
 from hma_data.cpu import usable_cores
 from hma_data.episodes.episode import Clip
-from hma_data.episodes.images import prepared
-from hma_data.episodes.quality import PictureCheck, picture_flags
+from hma_data.episodes.images import PictureCheck, picture_flags, prepared
 from hma_data.errors import (
     EpisodeError,
     HMAError,

@@ -26,9 +26,7 @@ from hma_data.inspection.infer_choices import (
     instruction,
     is_gripper,
     likely,
-    names_of,
     shown,
-    space_of,
     states,
     vectors,
 )
@@ -196,7 +194,6 @@ class _Draft:
         found, facts = self.found, self.found.facts
         name = facts.get("dataset") or found.uri.rstrip("/").rsplit("/", 1)[-1]
         spaces = get_args(Space)
-        space = space_of(self.action.keys, facts)
         values: dict[str, Any] = {
             "id": embodiment_id,
             "description": f"{found.robot or 'robot'} as recorded in {name}",
@@ -205,7 +202,7 @@ class _Draft:
             "frequency_hz": self._rate() or f"{TODO}: at how many Hz were actions recorded?",
             "target_hz": 2,
             "action": {
-                "space": space or f"{TODO}: one of {', '.join(spaces[:-1])} or {spaces[-1]}?",
+                "space": f"{TODO}: one of {', '.join(spaces[:-1])} or {spaces[-1]}?",
                 "components": [self._component(key) for key in self.action.keys],
             },
         }
@@ -240,7 +237,7 @@ class _Draft:
         return whole if whole and abs(self.hz / whole - 1) < tolerance else round(self.hz, 3) or None
 
     def _component(self, key: KeyInfo) -> dict[str, Any]:
-        component = _named(key, key.names or names_of(key, self.found.facts))
+        component = _named(key, key.names)
         switch = key.dtype == "bool" or (is_gripper(key.key) and not self.bag)  # in bags: metres, or 0 to 255
         return component | ({"normalize": False} if component["dims"] == 1 and switch else {})
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.quality import PictureCheck
+from hma_data.episodes.images import PictureCheck
 from hma_data.errors import HMAError
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import EpisodeReader, ShardSet

@@ -175,7 +175,7 @@ class _Cache:
 
     def __init__(self) -> None:
         code = hashlib.blake2b(f"{version('pydantic')} {version('pyyaml')}".encode(), digest_size=12)
-        for module in ("__init__", "catalog", "components", "embodiment", "layouts", "../storage/yaml_io"):
+        for module in ("__init__", "catalog", "components", "embodiment", "../storage/yaml_io"):
             code.update((Path(__file__).parent / f"{module}.py").read_bytes())
         self._path = cache_folder() / f"registry-{code.hexdigest()}.json"
         self._kept: dict[str, dict[str, Any]] = {}

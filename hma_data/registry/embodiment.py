@@ -21,6 +21,7 @@ from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_va
 from hma_data.errors import RegistryError
 from hma_data.registry.catalog import file_id, registry_files, registry_folders
 from hma_data.registry.components import (
+    LAYOUTS,
     Action,
     Camera,
     Component,
@@ -34,7 +35,6 @@ from hma_data.registry.components import (
     Sync,
     Vector,
 )
-from hma_data.registry.layouts import LAYOUTS
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml

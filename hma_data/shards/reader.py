@@ -1,11 +1,21 @@
 """Read a shard set: its episodes and its rows, one row group at a time.
 
+Whole shards of remote sets are kept on this machine, by their sha256, so that later epochs read them locally.
+They are files of `$HMA_CACHE/shards` and take at most `$HMA_CACHE_GB` gigabytes (default 20; 0 keeps none).
+The shards unused for longest are deleted to make room, but none that was used in the last hour.
+
 N rows, S tokens a frame, A values of an action.
 """
 
+import fcntl
+import os
+import shutil
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,13 +27,15 @@ from numpy.typing import NDArray
 from hma_data.errors import ShardError, UsageError
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile
 from hma_data.shards.schema import mask_columns, to_numpy, token_column
-from hma_data.storage.cache import kept_shard, limit_bytes
-from hma_data.storage.files import parse_json
+from hma_data.storage.files import cache_folder, file_sha256, parse_json, part_of
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
-from hma_data.storage.remote import RangeFile, RemotePath, parquet_file, place
+from hma_data.storage.remote import AHEAD, RangeFile, RemotePath, parquet_file, place
 
 Ints = NDArray[np.int64]
+LIMIT, DEFAULT_GB = "HMA_CACHE_GB", 20.0
+IN_USE_S = 3600.0
+SPARE, SPARE_BYTES = 0.1, 5 * 10**9  # free space to leave: a tenth of the disk, but at most 5 GB
 
 
 @dataclass(frozen=True)
@@ -273,3 +285,94 @@ def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:
     if isinstance(codes, pa.ChunkedArray):
         codes = codes.chunk(0) if codes.num_chunks else pa.DictionaryArray.from_arrays([], [])
     return to_numpy(codes.indices).astype(np.int64), codes.dictionary.to_pylist()
+
+
+# -- shards kept on this machine
+
+
+def limit_bytes() -> int:
+    """Return how many bytes of shards may be kept.
+
+    Raises:
+        UsageError: $HMA_CACHE_GB is not a number of gigabytes.
+    """
+    stated = os.environ.get(LIMIT) or DEFAULT_GB
+    try:
+        return int(float(stated) * 1e9)
+    except (ValueError, OverflowError) as fault:
+        text = f"{stated!r} is no number of gigabytes"
+        raise UsageError(f"${LIMIT}", text, "give for example 20, or 0 for no cache") from fault
+
+
+def kept_shard(path: RemotePath, sha256: str, size: int) -> Path | None:
+    """Return a shard's copy on this machine; download it if there is none.
+
+    The result is None where the copy does not fit or the cache cannot be written: read it by ranges.
+
+    Args:
+        sha256, size: as its manifest states.
+
+    Raises:
+        ShardError: its bytes are not those of the manifest.
+        StorageError: it cannot be read; StorageAwayError: the store does not answer.
+    """
+    folder = cache_folder() / "shards"
+    final = folder / f"{sha256}.parquet"
+    try:
+        if _is_there(final, size):
+            return final
+        folder.mkdir(parents=True, exist_ok=True)
+        with (lock := folder / f".{sha256}.lock").open("w") as handle:
+            fcntl.flock(handle, fcntl.LOCK_EX)  # only one of the processes that want it downloads it
+            try:
+                if _is_there(final, size):
+                    return final
+                return _download(path, sha256, size, final) if _make_room(folder, size) else None
+            finally:
+                lock.unlink(missing_ok=True)
+    except OSError:  # the cache cannot be written
+        return None
+
+
+def _is_there(final: Path, size: int) -> bool:
+    """Check whether a shard is kept; if so, mark it as used now."""
+    with suppress(OSError):
+        if final.stat().st_size == size:
+            os.utime(final)
+            return True
+    return False
+
+
+def _download(path: RemotePath, sha256: str, size: int, final: Path) -> Path:
+    part = part_of(final)
+    try:
+        with part.open("wb") as out:
+            shutil.copyfileobj(RangeFile(path, size), out, AHEAD)
+        if file_sha256(part) != sha256:
+            fault = "its bytes are not those of the manifest (sha256 differs)"
+            raise ShardError(path, fault, "run hma shards verify to see what is damaged")
+        part.replace(final)
+    finally:
+        part.unlink(missing_ok=True)
+    return final
+
+
+def _make_room(folder: Path, size: int) -> bool:
+    """Delete the shards unused for longest until `size` more bytes fit; return False if they cannot."""
+    found = []
+    for path in folder.iterdir():
+        with suppress(OSError):
+            facts = path.stat()
+            found.append((facts.st_mtime, facts.st_size, path))
+    limit, disk = limit_bytes(), shutil.disk_usage(folder)
+    usable = disk.free - min(int(SPARE * disk.total), SPARE_BYTES)
+    over = max(sum(item[1] for item in found) + size - limit, size - usable)
+    old = [item for item in sorted(found) if item[0] < time.time() - IN_USE_S]
+    if size > limit or over > sum(item[1] for item in old):
+        return False
+    for _, length, path in old:
+        if over <= 0:
+            break
+        path.unlink(missing_ok=True)
+        over -= length
+    return True

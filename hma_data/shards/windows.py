@@ -141,11 +141,6 @@ class WindowIndex:
         row = min(int(self.first_rows(last)[0]) + self.span - 1, int(self.last_rows(last)[0]))
         return int(np.searchsorted(self.edges, row, side="right")) - 1
 
-    def episode_starts(self, group: int) -> Ints:
-        """Return the rows of a row group, counted from its first, at which an episode with windows begins."""
-        first, after = np.searchsorted(self._starts, self.edges[group : group + 2])
-        return self._starts[first:after] - self.edges[group]
-
 
 def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
     """Return the first rows (G+1,) and the places (G, 2) of all row groups of a split."""

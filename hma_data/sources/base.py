@@ -100,7 +100,7 @@ class KeyInfo:
         still: indices of the values of a vector that never change in the sampled episodes.
         low, high: smallest and largest finite number in the sampled episodes; of pictures in mono16, their
             values before they are scaled.
-        swapped: whether red and blue are swapped in the pictures: sure, hint, no; None where it is unknown.
+        swapped: whether red and blue are swapped in the pictures: sure, no; None where it is unknown.
         skew_ms: p50, p95 and max distance from the first camera's frames, for a stream with its own clock.
         encoding: of a bag's pictures, as their messages state it: rgb8, mono8, mono16.
     """

@@ -3,15 +3,10 @@
 ROS definitions come from the bag. ROS 2 bags before Iron have none; for them the standard types of Humble are
 used, and then those of the newest release. A message of any encoding is read through `child` and
 `field_names`.
-
-Service introspection publishes each call on `<service>/_service_event`. rosbag2 stores with it the definition
-of the service, not of the event (https://github.com/ros2/rosbag2, issue 2365). So the definition of the event
-is built here: info, and the request and response where contents are published.
 """
 
 import dataclasses
 import json
-import re
 import struct
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -28,13 +23,6 @@ TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 TIME = "builtin_interfaces/msg/Time"
 HEADER = "std_msgs/msg/Header"
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
-EVENT = re.compile(r"\w+/srv/\w+_Event")
-CALL = re.compile(r"^---\s*$", re.MULTILINE)  # between request and response
-SEPARATOR = re.compile(r"^={80}\s*$", re.MULTILINE)
-REQUEST_SENT, REQUEST_RECEIVED, RESPONSE_SENT, RESPONSE_RECEIVED = range(4)
-# The event that stands for a call: the first of these that is recorded.
-OF_A_CALL = (REQUEST_RECEIVED, REQUEST_SENT, RESPONSE_SENT, RESPONSE_RECEIVED)
-EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 
 
 def decode(channel: Channel, data: Data, where: str) -> Any:
@@ -129,7 +117,7 @@ def ros_store(channel: Channel) -> tuple[Any, str]:
 
     kind = normalize_msgtype(channel.type)
     stores = [get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.LATEST)]
-    if is_service_event(channel) or channel.schema.strip():
+    if channel.schema.strip():
         stores = [get_typestore(Stores.EMPTY)]
         stores[0].register(_definitions(channel, kind))
     for store in stores:
@@ -145,8 +133,6 @@ def _definitions(channel: Channel, kind: str) -> Any:
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     text = channel.schema.decode("utf-8")
-    if is_service_event(channel) and channel.schema_encoding != "ros2idl":
-        return event_definitions(channel.type, kind, text)
     if channel.schema_encoding in ("ros1msg", "ros2msg"):
         return get_types_from_msg(text, kind)
     if channel.schema_encoding != "ros2idl":
@@ -157,65 +143,6 @@ def _definitions(channel: Channel, kind: str) -> Any:
     for part in text.split(IDL_SEPARATOR)[1:]:
         types |= get_types_from_idl(part.partition("\n")[2])  # the first line names the type
     return types
-
-
-# -- services
-
-
-def is_service_event(channel: Channel) -> bool:
-    """Check whether a channel's messages are events of a service."""
-    return channel.encoding == "cdr" and EVENT.fullmatch(channel.type) is not None
-
-
-def event_type(data: Data) -> int:
-    """Return the event of a call that a message reports, REQUEST_SENT to RESPONSE_RECEIVED.
-
-    Raises:
-        ValueError: the message is not an event.
-    """
-    if len(data) < 5 or data[4] > RESPONSE_RECEIVED:
-        raise ValueError("a message is not an event of a service")
-    return data[4]
-
-
-def event_definitions(stated: str, kind: str, text: str) -> dict[str, Any]:
-    """Return rosbags' definitions of an event's type and of the types in it.
-
-    Args:
-        stated: its name in the bag, `std_srvs/srv/SetBool_Event`.
-        kind: the name to define it under.
-        text: the service's definition, or the event's own.
-
-    Raises:
-        ValueError: the bag holds no definition.
-    """
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    package, _, name = stated.removesuffix("_Event").split("/")
-    sections = [part for part in SEPARATOR.split(text.replace("\r\n", "\n")) if part.strip()]
-    if not sections:
-        raise ValueError(f"the bag does not carry the definition of {package}/srv/{name}")
-    body, *rest = sections
-    if not CALL.search(body):
-        return dict(get_types_from_msg(text, kind))
-    known = get_typestore(Stores.LATEST).fielddefs
-    types: dict[str, Any] = {EVENT_INFO: known[EVENT_INFO], TIME: known[TIME]}
-    members = CALL.split(re.sub(r"^\s*SRV:.*\n", "", body))[:2]
-    others = "".join(f"\n{'=' * 80}\n{part.strip()}\n" for part in rest)
-    for part, fields in zip(("Request", "Response"), members, strict=True):
-        types |= get_types_from_msg(_members(fields) + others, f"{package}/msg/{name}_{part}")
-    event = (
-        "service_msgs/ServiceEventInfo info\n"
-        f"{package}/{name}_Request[<=1] request\n{package}/{name}_Response[<=1] response\n"
-    )
-    return types | get_types_from_msg(event, kind)
-
-
-def _members(body: str) -> str:
-    """Return the fields of a request or response; add the byte that CDR needs where there are none."""
-    lines = [line.split("#")[0].strip() for line in body.splitlines()]
-    fields = [line for line in lines if line and "=" not in line.replace("<=", "")]
-    return body if fields else f"{body}\nuint8 structure_needs_at_least_one_member\n"
 
 
 # -- any message

@@ -291,8 +291,7 @@ def _channels(base: sqlite3.Connection) -> dict[int, Channel]:
     for topic_id, topic, kind, encoding in base.execute(
         "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
     ):
-        service = str(kind).removesuffix("_Event")  # rosbag2 keeps the definition of a service's events there
-        schema_encoding, schema = definitions.get(kind) or definitions.get(service) or ("", "")
+        schema_encoding, schema = definitions.get(kind) or ("", "")
         channels[topic_id] = Channel(
             str(topic), str(kind), str(encoding), str(schema_encoding), str(schema).encode()
         )

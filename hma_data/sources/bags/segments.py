@@ -5,14 +5,13 @@ tables are cached for the other episodes of the same bag, while no file changes;
 its own time range. F pictures of the primary camera in order of receipt; an episode is a run of them.
 
 A marker is a message that begins or ends an episode: `source.segments.start` and `stop`. It counts when it
-arrives, or when a field of it becomes a value. A service's call counts once, whichever of its events were
-recorded. M messages of the marker's topic.
+arrives, or when a field of it becomes a value.
 """
 
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,14 +26,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.container import Channel, Record, RecordFilter
 from hma_data.sources.bags.images import VIDEO, picture_kind
-from hma_data.sources.bags.messages import (
-    OF_A_CALL,
-    child,
-    decode,
-    event_type,
-    head_stamp,
-    is_service_event,
-)
+from hma_data.sources.bags.messages import decode, head_stamp
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
 
 SECOND_NS = 10**9
@@ -261,24 +253,16 @@ class MarkerTrack:
         self.marker, self._where = marker, where
         self._field = parse_key(marker.key, topics, where)
         self.track = TopicTrack(self._field.topic)
-        self._kinds = bytearray()  # of each message: whether it fits, or which event of a call it is
-        self._service = False
+        self._fitting: list[bool] = []  # of each message
         self._seen: dict[str, None] = {}
 
     def add(self, place: BagPlace, record: Record) -> None:
         """Add the next message of the topic."""
-        self._service = self._service or is_service_event(record.channel)
         message = None
         if self.marker.equals is not None:
             message = decode(record.channel, record.data, self._where)
-            self._kinds.append(self._fits(message))
-        elif self._service:
-            try:
-                self._kinds.append(event_type(record.data))
-            except ValueError as fault:
-                raise EpisodeError(self._where, f"{self._field.topic}: {fault}") from fault
+            self._fitting.append(self._fits(message))
         else:
-            self._kinds.append(True)
             with suppress(EpisodeError):  # it only has to arrive; its time of receipt serves
                 message = decode(record.channel, record.data, self._where)
         self.track.add(record.channel, record.log_ns, place, message)
@@ -286,13 +270,10 @@ class MarkerTrack:
     def moments(self) -> Rows:
         """Return the indices of the messages that count, in order of receipt."""
         order = self.track.order()
-        kinds = np.frombuffer(self._kinds, np.uint8)[order]
-        if self.marker.equals is not None:
-            becomes = (kinds == 1) & (np.concatenate([[0], kinds[:-1]]) != 1)
-            return order[becomes]
-        if self._service and len(kinds):
-            return order[kinds == next(kind for kind in OF_A_CALL if kind in kinds)]
-        return order
+        if self.marker.equals is None:
+            return order
+        fitting = np.array(self._fitting, bool)[order]
+        return order[fitting & ~np.concatenate([[False], fitting[:-1]])]
 
     def never(self) -> str:
         """Describe that the marker did not come, and the values that came instead."""
@@ -302,9 +283,7 @@ class MarkerTrack:
         return f"{self.marker.key} never becomes {self.marker.equals!r}, {known}"
 
     def _fits(self, message: Any) -> bool:
-        value, wanted = self._value(message), self.marker.equals
-        if value is None:
-            return False
+        value, wanted = self._field.value(message, self._where), self.marker.equals
         if len(self._seen) < SHOWN:
             self._seen[str(value)] = None
         if isinstance(wanted, str) or isinstance(value, str):
@@ -318,13 +297,3 @@ class MarkerTrack:
             raise EpisodeError(
                 self._where, f"{self.marker.key} is not a single value", "name one field of it"
             ) from fault
-
-    def _value(self, message: Any) -> Any:
-        """Return the value at the key; None for a service event without a request or response."""
-        field, steps = self._field, self._field.steps
-        if self._service and steps and steps[0] in ("request", "response"):
-            if not len(child(message, str(steps[0]))):
-                return None
-            if len(steps) < 2 or isinstance(steps[1], str):  # the list holds one
-                field = replace(field, steps=(steps[0], 0, *steps[1:]))
-        return field.value(message, self._where)

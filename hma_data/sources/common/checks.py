@@ -3,12 +3,10 @@
 Times: rate, jitter, repeated stamps, stamps that go back, pauses, lost frames. T samples of a stream; times
 are float64 seconds in the order of receipt.
 
-Pictures: still, blank, of several sizes, red and blue swapped. Two signs show that channels are swapped. The
-first holds for pictures that were decoded from JPEG or video and then stored without loss: every pixel is
-then a result of the conversion from YCbCr, which gives only a quarter of all colours. The channel order in
-which all pixels are such results is the right one. The second sign is the scene: indoors and outdoors,
-saturated pixels are warm (red > green > blue) far more often than cold. This sign is weak, because a blue
-table looks the same, so it gives only a hint. n pictures, H×W pixels, uint8 RGB.
+Pictures: still, blank, of several sizes, red and blue swapped. That shows in pictures that were decoded from
+JPEG or video and then stored without loss: every pixel is then a result of the conversion from YCbCr, which
+gives only a quarter of all colours. The channel order in which all pixels are such results is the right one.
+n pictures, H×W pixels, uint8 RGB.
 """
 
 import re
@@ -22,8 +20,7 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.align import nearest
 from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import Images
-from hma_data.episodes.quality import BLANK, PictureCheck
+from hma_data.episodes.images import BLANK, Images, PictureCheck
 
 Severity = Literal["error", "warn", "info"]
 SEVERITIES: tuple[Severity, ...] = ("info", "warn", "error")
@@ -40,7 +37,6 @@ PAIRS = 16  # pairs of neighbouring pictures compared, for a camera over all its
 PIXELS = 4096  # pixels of a picture whose colours are checked
 DISTINCT = 1_000  # least number of distinct colours for the YCbCr sign
 SURE, CHANCE = 0.98, 0.6  # share of colours that YCbCr gives: least in the right order, most in the other
-COLD = 0.15  # share of cold pixels (saturated, blue > green > red) above which a hint is given
 STILL = 0.5  # least share of equal neighbours that is reported
 
 
@@ -260,8 +256,6 @@ class Look:
         changes: how often the size changes within an episode.
         neighbours, same: pairs of neighbouring pictures compared, and equal ones among them.
         blank, episodes: episodes in which the camera shows one colour; all episodes looked at.
-        red, blue: sums of the means, over `pictures`.
-        warm, cold: shares of saturated pixels, summed over `pictures`.
         colours: some of the colours met.
     """
 
@@ -273,10 +267,6 @@ class Look:
     same: int = 0
     blank: int = 0
     episodes: int = 0
-    red: float = 0.0
-    blue: float = 0.0
-    warm: float = 0.0
-    cold: float = 0.0
     colours: list[NDArray[np.uint8]] = field(default_factory=list)
     _check: PictureCheck | None = None
     _size: tuple[int, int] = (0, 0)
@@ -301,20 +291,15 @@ class Look:
             if self._check.contrast > BLANK:
                 self.blank, self._check = self.blank - 1, None
         step = max(1, int(np.sqrt(size[0] * size[1] / PIXELS)))
-        for frame in frames:
-            pixels = frame[::step, ::step].reshape(-1, 3)  # on a grid over the picture
-            self.red += float(pixels[:, 0].mean())
-            self.blue += float(pixels[:, 2].mean())
-            warm, cold = _tones(pixels)
-            self.warm, self.cold = self.warm + warm, self.cold + cold
-            self.colours.append(pixels)
+        if self.lossless:
+            self.colours += [frame[::step, ::step].reshape(-1, 3) for frame in frames]
 
     def swapped(self) -> tuple[str, str]:
         """Check whether red and blue are swapped; return the answer and its reason.
 
-        The answer is sure, hint, no (they are certainly in order), or empty where it is unknown.
+        The answer is sure, no (they are certainly in order), or empty where it is unknown.
         """
-        if self.lossless and self.colours:
+        if self.colours:
             colours = np.unique(np.concatenate(self.colours), axis=0)
             straight, turned = ycbcr_share(colours), ycbcr_share(colours[:, ::-1])
             if straight is not None and turned is not None:
@@ -325,20 +310,7 @@ class Look:
                     )
                 if straight >= SURE and turned <= CHANCE:
                     return "no", ""  # even where the scene is blue
-        count = max(self.pictures, 1)
-        cold, warm = self.cold / count, self.warm / count
-        if cold > COLD and cold > 4 * warm and self.blue > 1.25 * self.red:
-            return "hint", f"{cold:.0%} of its pixels are cold, {warm:.0%} warm; a blue scene looks the same"
         return "", ""
-
-
-def _tones(pixels: NDArray[np.uint8]) -> tuple[float, float]:
-    """Return the shares of saturated pixels that are warm (red > green > blue) and cold (blue > … > red)."""
-    red, green, blue = pixels.astype(np.int16).T
-    strong = np.abs(red - blue) > 32
-    warm = strong & (red >= green) & (green >= blue)
-    cold = strong & (blue >= green) & (green >= red)
-    return float(warm.mean()), float(cold.mean())
 
 
 def ycbcr_share(colours: NDArray[np.uint8]) -> float | None:
@@ -426,10 +398,6 @@ def picture_findings(looks: dict[str, Look]) -> Iterator[Finding]:
             remedy = "the camera may be slower than its rate"
             yield Finding("still", "warn", said, remedy, key, {"share": share, "pairs": look.neighbours})
         sureness, reason = look.swapped()
-        if sureness in ("sure", "hint"):
-            said = f"{key}: red and blue {'are' if sureness == 'sure' else 'may be'} swapped: {reason}"
-            remedy = (
-                "set color: bgr in the YAML" if sureness == "sure" else "look at a preview of the pictures"
-            )
-            yield Finding("colour", "warn" if sureness == "sure" else "info", said, remedy, key,
-                          {"confidence": sureness})  # fmt: skip
+        if sureness == "sure":
+            said, remedy = f"{key}: red and blue are swapped: {reason}", "set color: bgr in the YAML"
+            yield Finding("colour", "warn", said, remedy, key)

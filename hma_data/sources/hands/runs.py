@@ -3,7 +3,7 @@
 A point is a side and a part of the hand: `left/center`, `right/wrist`, `left/landmarks`. A component's key is
 a point, with `/next` for its value at the next labelled frame of the run, or `/delta` for next minus current.
 
-`hma_data.registry.layouts.HandsLayout` lists the keys of `source.layout`.
+`hma_data.registry.components.HandsLayout` lists the keys of `source.layout`.
 
 N labelled frames of a video, n of a run, w values of a point (2, or 42 for landmarks).
 """
@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import EpisodeError, SourceError
+from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import Embodiment
-from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import local_path, nothing_there
 from hma_data.sources.common.video_file import opened
 from hma_data.sources.hands import VIDEO_SUFFIXES

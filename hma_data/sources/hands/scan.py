@@ -1,8 +1,7 @@
-"""Run the detector over whole videos: for labels, for a table of labels, and for `hma inspect`.
+"""Run the detector over whole videos: for labels, and for `hma inspect`.
 
-`detect` writes a table for a folder once, and `labels: landmarks` then reads it: all runs become episodes,
-and the table can be corrected by hand. `labels: detector` uses `scan_cached` while it reads: detections are
-cached by the content of the video and the models.
+`labels: detector` uses `scan_cached` while it reads: detections are cached by the content of the video and
+the models.
 
 R hands found.
 """
@@ -15,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.errors import EpisodeError, HMAError, OutputError
-from hma_data.registry.layouts import HandsLayout
+from hma_data.errors import EpisodeError, HMAError
+from hma_data.registry.components import HandsLayout
 from hma_data.sources.base import Inspection, KeyInfo, file_fingerprint, local_path, unfollowed
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.survey import Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
-from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands, load_models
+from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands
 from hma_data.sources.hands.runs import (
     POINTS,
     SIDES,
@@ -34,7 +33,6 @@ from hma_data.sources.hands.runs import (
     videos_of,
 )
 from hma_data.storage.files import atomic_path, cache_folder
-from hma_data.storage.paths import StrPath, as_path, as_text
 
 BATCH = 8  # frames decoded together: 200 MB of 4K pictures
 LOOKED_AT, FRAMES = 5, 12  # most videos that are searched for hands by an inspection, and frames of each
@@ -70,33 +68,6 @@ def scan(name: str, video: VideoFile, detector: MediaPipeHands, frames: Iterable
     )
 
 
-def detect(folder: StrPath, out: StrPath, models: StrPath | None = None, mirrored: bool = False) -> int:
-    """Find the hands in all videos of a folder and write them as a table; see HandTable.
-
-    Args:
-        folder: str or path of a folder of videos, or of one video.
-        out: str or path of the file to write, .parquet.
-        models, mirrored: see `load_models` and MediaPipeHands.
-
-    Returns:
-        the number of hands found.
-
-    Raises:
-        SourceError: no videos, no models.
-        EpisodeError: a video is damaged.
-    """
-    import pyarrow as pa
-
-    final = as_path(out)
-    if final.suffix != ".parquet":
-        raise OutputError(final, "does not end in .parquet", "name a .parquet file")
-    detector = MediaPipeHands(load_models(models), mirrored=mirrored)
-    videos = videos_of(as_text(folder))
-    found = [scan(name, VideoFile(video.path), detector) for name, video in videos.items()]
-    _write(final, pa.concat_tables(found))
-    return sum(len(each) for each in found)
-
-
 def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout: HandsLayout) -> HandLabels:
     """Return the hands of a video; run the detector only where they are not cached.
 
@@ -110,7 +81,8 @@ def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout
     key = hashlib.sha256(repr(facts).encode()).hexdigest()[:32]
     kept = cache_folder() / "hands" / f"{key}.parquet"
     if not kept.is_file():
-        _write(kept, scan(path.name, video, detector))
+        with atomic_path(kept) as part:
+            pq.write_table(scan(path.name, video, detector), part, compression="zstd")
     table = pq.read_table(kept)
     scores = table["score"].to_numpy()
     good = scores >= layout.min_score
@@ -118,13 +90,6 @@ def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout
     landmarks = table["landmarks"].combine_chunks().flatten().to_numpy().reshape(-1, 42)[good]
     frames = table["frame"].to_numpy()[good]
     return labels_from_rows(frames, sides, scores[good], {"landmarks": landmarks}, range(len(video)))
-
-
-def _write(final: Path, table: Any) -> None:
-    import pyarrow.parquet as pq
-
-    with atomic_path(final) as part:
-        pq.write_table(table, part, compression="zstd")
 
 
 # -- inspection

@@ -17,8 +17,7 @@ needed hand does: see the module `runs`.
 With annotations, each run of at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain
 name `clip.mp4` is the longest run. Runs of one video share a group, so that they come into one split. The
 detector runs only while an episode is read; so with it, a video is one episode, `clip.mp4`: its longest run.
-`scan.detect` writes a table of labels, with which all runs become episodes. The episode's metadata and flags
-count the frames that are held, masked and left out.
+The episode's metadata and flags count the frames that are held, masked and left out.
 
 T frames of an episode.
 """
@@ -34,9 +33,8 @@ from numpy.typing import NDArray
 from hma_data.episodes.episode import Episode, Floats, Signal
 from hma_data.episodes.images import Images
 from hma_data.errors import EpisodeError, SourceError
-from hma_data.registry.components import Vector
+from hma_data.registry.components import HandsLayout, Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.common.survey import listed
 from hma_data.sources.common.video_file import VideoFile

@@ -27,8 +27,7 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
-from hma_data.sources.hdf5.layout import as_rgb, encoded, picture_kind
-from hma_data.sources.hdf5.source import TEXT_KEYS, json_of
+from hma_data.sources.hdf5.source import TEXT_KEYS, as_rgb, encoded, json_of, picture_kind
 
 LENGTHS = 1_000  # most episodes whose lengths are reported and whose keys are compared
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
@@ -175,7 +174,7 @@ def _length(sizes: dict[str, int]) -> int:
 
 
 def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict[str, str]:
-    """Return facts about the recording: simulator, controller, layout, and the key of the instruction."""
+    """Return facts about the recording: simulator, layout, and the key of the instruction."""
     data = group.file.get("data")
     simulated = [group.attrs.get("sim"), group.file.attrs.get("sim")]
     simulator = ""
@@ -188,28 +187,9 @@ def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict
     return {
         "environment": str(said.get("env_name") or ""),
         "simulator": simulator,
-        "controller": _controller(said),
         "layout": "one file an episode" if place.group == WHOLE_FILE else "",
         "instruction": next((name for name in TEXT_KEYS if text(group.attrs.get(name))), ""),
     }
-
-
-def _controller(said: dict[str, Any]) -> str:
-    """Return robosuite's controller, e.g. OSC_POSE.
-
-    `absolute` is added where it takes poses instead of changes of poses.
-    """
-    found: Any = said.get("controller_configs")
-    if isinstance(found, list) and found:
-        found = found[0]
-    parts = found.get("body_parts") if isinstance(found, dict) else None
-    if isinstance(parts, dict):  # since robosuite 1.5
-        arms = [part for part in parts.values() if isinstance(part, dict) and "type" in part]
-        found = next(iter(arms), None)
-    if not isinstance(found, dict) or not isinstance(found.get("type"), str):
-        return ""
-    absolute = found.get("control_delta") is False or found.get("input_type") == "absolute"
-    return f"{found['type']} absolute" if absolute else str(found["type"])
 
 
 def _rate(

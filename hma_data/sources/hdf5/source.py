@@ -12,11 +12,16 @@ is the embodiment's `frequency_hz`, unless `layout.timestamps` names a key of se
 states have one row more than the actions (ManiSkill), `last_observation: drop` leaves out the row after the
 last action.
 
-T frames of an episode.
+Pictures are raw arrays of several shapes and number types, or one JPEG or PNG a row. Colour pictures of 8
+bits are read as they are, with their axes found from the shape. Other arrays are read as pictures only where
+`source.layout` says what their numbers mean: `layout: {axes: TCHW, pixels: 0-1}`.
+
+T frames of an episode, n of them asked for, H×W pixels, C channels.
 """
 
 import hashlib
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,10 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_times
+from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.registry.components import Vector
+from hma_data.registry.components import Hdf5Layout, Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.registry.layouts import Hdf5Layout
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose, file_fingerprint
 from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
@@ -41,14 +46,27 @@ from hma_data.sources.hdf5.file import (
     is_elsewhere,
     member,
     numbers,
+    rows,
     text,
     walk,
 )
-from hma_data.sources.hdf5.layout import PictureRows, layout_of, picture_kind
 from hma_data.storage.paths import StrPath, as_text
 
 TEXT_KEYS = ("language_instruction", "language_raw", "instruction", "lang", "task_description", "task")
+PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
+_CHANNELS = (1, 3, 4)
+_SLACK = 1e-3  # share of the range by which values may exceed it, as resizing can cause
 _SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "val")
+
+
+def layout_of(embodiment: Embodiment | None) -> Hdf5Layout:
+    """Return the layout that the YAML states; all defaults without an embodiment.
+
+    Its `episodes` is a pattern, WHOLE_FILE where every file is one episode, or None: found from the file.
+    """
+    layout = Hdf5Layout.model_validate((embodiment.source.layout or {}) if embodiment else {})
+    pattern = layout.episodes
+    return layout.model_copy(update={"episodes": pattern and (pattern.strip("/") or WHOLE_FILE)})
 
 
 def open() -> "Hdf5Source":
@@ -139,7 +157,7 @@ class Hdf5Source:
 
     def _pictures(
         self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Hdf5Layout, times: Floats
-    ) -> PictureRows:
+    ) -> "PictureRows":
         try:
             return PictureRows(self._finder, self._files, place, key, layout, times)
         except EpisodeError as fault:
@@ -271,3 +289,135 @@ def json_of(holder: Any, name: str) -> dict[str, Any]:
     except (json.JSONDecodeError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}
+
+
+# -- pictures
+
+
+class PictureRows:
+    """A camera's Stream: the pictures of one dataset, `rows` in all.
+
+    Args:
+        finder, files: of the source; the dataset is kept open in `files`.
+        place, key: the episode, and the dataset in it.
+        layout: of the source, from the YAML.
+        times: (T,) seconds of the frames; rows after the last one are not used.
+
+    Raises:
+        EpisodeError: the dataset is missing, or holds no colour pictures.
+    """
+
+    def __init__(
+        self,
+        finder: EpisodeFinder,
+        files: OpenFiles,
+        place: EpisodeGroup,
+        key: str,
+        layout: Hdf5Layout,
+        times: Floats,
+    ) -> None:
+        self.timestamps = times
+        self._finder, self._files, self._place = finder, files, place
+        self._key, self._layout, self._where = key, layout, f"{place} {key}"
+        found = dataset(finder.group(place), key, str(place))
+        self.rows = len(found)
+        self._kind = picture_kind(found, layout)
+        if self._kind is None:
+            fault = f"{key!r} holds {found.shape} {found.dtype}, not colour pictures"
+            raise EpisodeError(place, fault, _remedy(found, layout))
+        if self._kind == "raw":
+            _axes(found.shape, layout, self._where)
+
+    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+        """See Stream."""
+        with explained(self._place):
+            group = self._finder.group(self._place)
+            found = rows(self._files.cached(self._place.file, group, self._key, str(self._place)), indices)
+        if self._kind == "raw":
+            return as_rgb(
+                _as_bytes(found, self._layout, self._where), _axes(found.shape, self._layout, self._where)
+            )
+        if not len(found):
+            return np.zeros((0, 1, 1, 3), np.uint8)
+        pictures = [
+            decode_image(encoded(row), f"{self._where}[{index}]")
+            for row, index in zip(found, indices, strict=True)
+        ]
+        if len({picture.shape for picture in pictures}) > 1:
+            raise EpisodeError(self._place, f"{self._key!r} has pictures of several sizes")
+        return np.stack(pictures)
+
+
+def picture_kind(found: h5py.Dataset, layout: Hdf5Layout | None = None) -> str | None:
+    """Return `raw` or `encoded` by dtype and shape; None where the dataset cannot hold pictures."""
+    shape: tuple[int, ...] = found.shape or ()
+    if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
+        channels_first = layout.axes == "TCHW" if layout and layout.axes else shape[1:2] in ((1,), (3,))
+        if len(shape) == 3 or (len(shape) == 4 and (shape[3] in _CHANNELS or channels_first)):
+            return "raw"
+    padded = found.dtype == np.uint8 and len(shape) == 2
+    one_a_row = len(shape) == 1 and (found.dtype.kind in "SV" or _is_bytes(found.dtype))
+    return "encoded" if padded or one_a_row else None
+
+
+def as_rgb(pictures: NDArray[np.uint8], axes: str | None = None) -> Images:
+    """Convert (n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) to (n, H, W, 3)."""
+    if pictures.ndim == 3:
+        pictures = pictures[..., None]
+    elif axes == "TCHW" or (axes is None and pictures.shape[3] not in _CHANNELS):
+        pictures = pictures.transpose(0, 2, 3, 1)
+    if pictures.shape[3] == 1:
+        pictures = np.repeat(pictures, 3, axis=3)
+    return np.ascontiguousarray(pictures[..., :3])
+
+
+def encoded(row: Any) -> NDArray[np.uint8]:
+    """Return the bytes of one encoded picture, a row of bytes; zeros after its end do no harm."""
+    if isinstance(row, np.ndarray):
+        return row.view(np.uint8).reshape(-1)
+    return np.frombuffer(row.tobytes() if isinstance(row, np.void) else row, np.uint8)
+
+
+def _axes(shape: tuple[int, ...], layout: Hdf5Layout, where: str) -> str:
+    """Return THW, THWC or TCHW: from the YAML, else by the axis whose size is a number of channels."""
+    if len(shape) == 3:
+        return "THW"
+    last, first = shape[3] in _CHANNELS, shape[1] in _CHANNELS
+    if layout.axes:
+        if not (first if layout.axes == "TCHW" else last):
+            fault = f"holds pictures {shape[1:]}, source.layout.axes says {layout.axes}"
+            raise EpisodeError(where, fault, "correct source.layout.axes in the YAML")
+        return layout.axes
+    if last and first:
+        fault = f"holds pictures {shape[1:]}, whose channels may be first or last"
+        raise EpisodeError(where, fault, "set source.layout.axes to TCHW or THWC")
+    return "THWC" if last else "TCHW"
+
+
+def _as_bytes(pictures: NDArray[Any], layout: Hdf5Layout, where: str) -> NDArray[np.uint8]:
+    """Convert pictures of another number type to uint8, by the range in `layout.pixels`."""
+    if pictures.dtype == np.uint8:
+        return pictures
+    highest = PIXELS[layout.pixels or "0-255"]
+    values = pictures.astype(np.float32)
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    if not (-_SLACK * highest <= low and high <= highest * (1 + _SLACK)):  # false for NaN too
+        fault = f"holds values from {low:g} to {high:g}, source.layout.pixels says {layout.pixels}"
+        raise EpisodeError(where, fault, f"set it to one of {', '.join(PIXELS)}")
+    return np.rint(np.clip(values, 0, highest) * (255 / highest)).astype(np.uint8)
+
+
+def _is_bytes(dtype: np.dtype[Any]) -> bool:
+    """Check whether rows of varying length are bytes or text, not references or other numbers."""
+    inner = h5py.check_vlen_dtype(dtype)
+    if inner is None:
+        return h5py.check_string_dtype(dtype) is not None
+    return np.dtype(inner).kind in "iu" and np.dtype(inner).itemsize == 1
+
+
+def _remedy(found: h5py.Dataset, layout: Hdf5Layout) -> str:
+    shape: tuple[int, ...] = found.shape or ()
+    numbers = found.dtype.kind in "fiu" and found.dtype != np.uint8
+    if numbers and len(shape) == 4 and 3 in (shape[1], shape[3]) and not layout.pixels:
+        return f"if they are colours, set source.layout.pixels to their range: {', '.join(PIXELS)}"
+    return "expected (T, H, W, 3) uint8, or encoded pictures"

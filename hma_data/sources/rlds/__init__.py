@@ -1,4 +1,4 @@
-"""Read RLDS / Open X-Embodiment: TFDS folders of TFRecord or ArrayRecord files, without TensorFlow."""
+"""Read RLDS / Open X-Embodiment: TFDS folders of TFRecord files, without TensorFlow."""
 
 from hma_data.sources.base import Recognition
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import fsspec
 from pydantic import BaseModel, ConfigDict, NonNegativeInt, ValidationError
@@ -22,8 +22,7 @@ from pydantic.alias_generators import to_camel
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.base import local_path
 from hma_data.sources.rlds.features import Feature, read_features
-from hma_data.sources.rlds.records import Framing, RecordFile, is_array_record, open_records
-from hma_data.sources.rlds.tf_example import Example
+from hma_data.sources.rlds.records import Example, Framing, RecordFile, open_records
 from hma_data.storage.fetch import attempt, fetch_whole, file_system, is_listless, is_local
 
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
@@ -48,7 +47,7 @@ class _DatasetInfo(BaseModel):
 
     name: str = ""
     version: str = ""
-    file_format: Literal["tfrecord", "array_record"] = "tfrecord"
+    file_format: str = "tfrecord"
     splits: tuple[_StatedSplit, ...] = ()
 
     def shard_path(self, split: _StatedSplit, number: int) -> str:
@@ -208,6 +207,9 @@ def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) 
         fault = "has no features.json, without which its records cannot be understood"
         raise SourceError(uri, fault, "copy it from where the records are from, or write it with TFDS")
     info = _dataset_info(files, f"{root}/dataset_info.json")
+    if info.file_format not in ("tfrecord", "array_record"):
+        fault = f"holds {info.file_format} files; TFRecord and ArrayRecord files can be read"
+        raise SourceError(uri, fault, "write it again with TFDS, as file_format tfrecord")
     listing = [only] if only else None
     if not only and not is_listless(files):
         listing = attempt(files, uri, lambda: sorted(files.find(root, maxdepth=2)))
@@ -216,12 +218,8 @@ def _open(uri: str, files: Any, root: str, only: str, changed: tuple[int, ...]) 
         shards, more = _named_shards(files, root, info, listing or [])
         problems += more
     if not shards:
-        fault = "holds no TFRecord or ArrayRecord file"
+        fault = "holds no TFRecord file"
         raise SourceError(uri, fault, "names are like name-train.tfrecord-00000-of-00001")
-    paths = [shard.path for items in shards.values() for shard in items]
-    if not is_local(files) and any(map(is_array_record, paths)):
-        fault = "holds ArrayRecord files, which are read from this machine's disks only"
-        raise SourceError(uri, fault, "copy it here")
     return Folder(
         uri=uri,
         features=read_features(described, f"{root}/features.json"),

@@ -1,54 +1,46 @@
-"""Find and read the records of TFRecord and ArrayRecord files, with their checksums verified.
+"""Find and read the records of TFRecord files, and the features of a record, a tf.train.Example.
 
 A TFRecord is its length (uint64), the masked CRC-32C of those eight bytes, the data, and the masked CRC-32C
 of the data; all little endian (format: TensorFlow's TFRecord). A scan reads only the length and the
 checksums, 16 bytes a record. A remote file is read no further than the record that is asked for.
 
-ArrayRecord files are read from this machine only, with the `array_record` package. It does not tell the
-offset of a record, so a record is found by its number.
-
-Where the records of a file lie is kept in `$HMA_CACHE/rlds`, by default `~/.cache/hma/rlds`, while the file
-keeps its state (size and date, or ETag). Deleting it costs a new scan.
+An Example maps names to lists of bytes, float32 or int64. Parsing only finds where each list lies; byte
+strings stay views into the record. So a feature that is not read costs nothing.
+(Format: protobuf encoding; messages Example, Features, Feature of TensorFlow.)
 """
 
-import hashlib
-import logging
 import os
-import re
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
-from zipfile import BadZipFile
 
 import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import EpisodeError, MissingDependencyError, OutputError, SourceError
-from hma_data.storage.fetch import attempt, fetch, info, is_local, mark, protocol
-from hma_data.storage.files import atomic_path, cache_folder
+from hma_data.errors import EpisodeError, SourceError
+from hma_data.storage.fetch import attempt, fetch, info, is_local, mark
 from hma_data.storage.kinds import LFS, unreadable
 
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
 READ_AHEAD = 32 << 10  # bytes of one request, while records are shorter than that
-KEPT_EVERY = 32  # new records after which an index is written; fewer of a local file are scanned just as fast
-RANDOM_ACCESS = "readahead_buffer_size:0,max_parallelism:0"  # for the array_record package
+VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+KINDS = {1: "bytes", 2: "float", 3: "int"}  # field numbers of Feature's lists
+Span = tuple[int, int]
 Read = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Framing:
     """The positions of the N records of a file."""
 
-    offsets: NDArray[np.int64]  # first byte of each record's data; in an ArrayRecord file the record's number
+    offsets: NDArray[np.int64]  # first byte of each record's data
     lengths: NDArray[np.int64]  # bytes of data
     checks: NDArray[np.uint32]  # checksums of the data as stored
     fault: str = ""  # why reading stopped after the last record; empty where the file ends there
@@ -66,37 +58,27 @@ EMPTY = Framing(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uin
 
 
 class RecordFile:
-    """One record file of `size` bytes, on an fsspec file system; `state` changes when the file does."""
+    """One TFRecord file of `size` bytes, on an fsspec file system."""
 
-    def __init__(self, files: Any, path: str, size: int, state: str) -> None:
+    def __init__(self, files: Any, path: str, size: int) -> None:
         self._files, self._path, self._size = files, path, size
-        self._scan, self._pick = scan_tfrecord, read_tfrecord
-        if is_array_record(path):
-            self._scan, self._pick = scan_array_record, read_array_record
-        digest = hashlib.sha256(f"{protocol(files)}://{path}\n{state}".encode()).hexdigest()[:32]
-        self._index = cache_folder() / "rlds" / f"{digest}.npz"
-        self._frames: Framing | None = None
-        self._kept = 0  # records in the index on disk
+        self._frames = EMPTY
         self._lock = Lock()
 
     def framing(self, limit: int = -1) -> Framing:
         """Return where the records lie; for a remote file at least the first `limit`, -1 for all.
 
         Raises:
-            SourceError: the file cannot be read, or is not of its format.
+            SourceError: the file cannot be read, or is compressed.
         """
         with self._lock:
-            if self._frames is None:
-                self._frames = _load_index(self._index)
-                self._kept = len(self._frames)
             if not (self._frames.whole or 0 <= limit <= len(self._frames)):
-                local = is_local(self._files)
-                stop = -1 if local else limit
-                self._frames = frames = self._scan(self._files, self._path, self._size, self._frames, stop)
-                if len(frames) - self._kept >= KEPT_EVERY or (frames.whole and not local):
-                    _save_index(self._index, frames)
-                    self._kept = len(frames)
+                self._frames = self._scanned(limit)
             return self._frames
+
+    def _scanned(self, limit: int) -> Framing:
+        stop = -1 if is_local(self._files) else limit
+        return scan_tfrecord(self._files, self._path, self._size, self._frames, stop)
 
     def read(self, index: int, where: str) -> bytes:
         """Return the data of a record, with its checksum verified; `where` is the episode, for the error.
@@ -108,12 +90,15 @@ class RecordFile:
         frames = self.framing(index + 1)
         if index >= len(frames):
             raise EpisodeError(where, f"{self._path}: {frames.fault or f'ends after {len(frames)} records'}")
-        return self._pick(self._files, self._path, frames, index, where)
+        return self._picked(frames, index, where)
 
-
-def is_array_record(path: str) -> bool:
-    """Check for an ArrayRecord file by its name, such as toy-train.array_record-00000-of-00001."""
-    return re.search(r"\.array_?record\b", path.rsplit("/", 1)[-1]) is not None
+    def _picked(self, frames: Framing, index: int, where: str) -> bytes:
+        offset, length = int(frames.offsets[index]), int(frames.lengths[index])
+        data = fetch(self._files, self._path, offset, offset + length)
+        if masked_crc(data) != frames.checks[index]:
+            fault = f"the {length} bytes at byte {offset} of {self._path} fail their checksum"
+            raise EpisodeError(where, fault)
+        return data
 
 
 def open_records(files: Any, path: str) -> RecordFile:
@@ -138,26 +123,11 @@ _remote_state = lru_cache(maxsize=4096)(_state)
 
 @lru_cache(maxsize=4096)
 def _opened(files: Any, path: str, size: int, state: str, pid: int) -> RecordFile:
-    return RecordFile(files, path, size, state)
+    if ".array_record" in path.rsplit("/", 1)[-1]:
+        from hma_data.sources.rlds.array_record import ArrayRecordFile
 
-
-def _load_index(path: Path) -> Framing:
-    """Return the index kept for a file; EMPTY where there is none, or it is damaged."""
-    try:
-        with np.load(path) as held:
-            columns = held["offsets"], held["lengths"], held["checks"]
-            return Framing(*columns, str(held["fault"]), bool(held["whole"]))
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-        return EMPTY
-
-
-def _save_index(path: Path, frames: Framing) -> None:
-    """Write an index to disk; log a failure and continue without it."""
-    try:
-        with atomic_path(path) as part, part.open("wb") as file:
-            np.savez(file, **vars(frames))
-    except (OSError, OutputError) as fault:
-        log.info("the index of records cannot be kept: %s", fault)
+        return ArrayRecordFile(files, path, size)
+    return RecordFile(files, path, size)
 
 
 # -- TFRecord
@@ -238,62 +208,150 @@ class _Window:
         return self._data[start - self._start : end - self._start]
 
 
-def read_tfrecord(files: Any, path: str, frames: Framing, index: int, where: str) -> bytes:
-    """Return the data of one record of a TFRecord file; see `RecordFile.read`."""
-    offset, length = int(frames.offsets[index]), int(frames.lengths[index])
-    data = fetch(files, path, offset, offset + length)
-    if masked_crc(data) != frames.checks[index]:
-        raise EpisodeError(where, f"the {length} bytes at byte {offset} of {path} fail their checksum")
-    return data
+# -- tf.train.Example
 
 
-# -- ArrayRecord
-
-
-def scan_array_record(files: Any, path: str, size: int, known: Framing = EMPTY, limit: int = -1) -> Framing:
-    """Return the numbers, lengths and CRC-32C of an ArrayRecord file's records.
-
-    Every record is read once; a damaged one gets length 0, and fails when it is read. Of the arguments, those
-    of `scan_tfrecord`, only `path` is used.
+class Example:
+    """The features of one record of the episode `where`.
 
     Raises:
-        MissingDependencyError: the array_record package is not installed.
+        EpisodeError: (here and in every method) the bytes are not an Example, a feature is missing
+            or of another kind.
     """
-    reader = _open_array_record(path)
-    if not reader.ok():
-        why = "is no ArrayRecord file"
+
+    def __init__(self, data: bytes, where: str) -> None:
+        self._data, self._where = data, where
         try:
-            reader.read([0])  # its error says why
-        except RuntimeError as error:
-            why = str(error)
-        fault, remedy = unreadable(Path(path), why, "")
-        return replace(EMPTY, fault=f"{fault} — {remedy}" if remedy else fault, whole=True)
-    count = reader.num_records()
-    lengths, checks = np.zeros(count, np.int64), np.zeros(count, np.uint32)
-    for index in range(count):
+            self._lists = dict(_features(data))
+        except ValueError as fault:
+            raise EpisodeError(where, f"is not a tf.train.Example: {fault}") from fault
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._lists
+
+    @property
+    def size(self) -> int:
+        """Return the number of bytes of the record."""
+        return len(self._data)
+
+    def blobs(self, name: str) -> list[memoryview]:
+        """Return the byte strings of a feature, as views into the record."""
+        return self._items(name, "bytes")
+
+    def numbers(self, name: str) -> NDArray[np.float32] | NDArray[np.int64]:
+        """Return the (n,) numbers of a feature, float32 or int64 as stored."""
+        if self._list(name)[0] == "float":
+            return self._joined(name, "float", lambda data: data.view("<f4"))
+        return self.ints(name)
+
+    def ints(self, name: str) -> NDArray[np.int64]:
+        """Return the (n,) integers of a feature."""
+        return self._joined(name, "int", varints)
+
+    def _joined(self, name: str, kind: str, parse: Callable[[NDArray[np.uint8]], NDArray]) -> NDArray:
         try:
-            [data] = reader.read([index])
-        except RuntimeError:
+            parts = [parse(np.frombuffer(item, np.uint8)) for item in self._items(name, kind)]
+        except ValueError as fault:
+            raise EpisodeError(self._where, f"{name}: {fault}") from fault
+        return parts[0] if len(parts) == 1 else np.concatenate([parse(np.zeros(0, np.uint8)), *parts])
+
+    def _list(self, name: str) -> tuple[str, Span]:
+        if name not in self._lists:
+            raise EpisodeError(self._where, f"has no feature {name!r}")
+        return self._lists[name]
+
+    def _items(self, name: str, kind: str) -> list[memoryview]:
+        found, (start, stop) = self._list(name)
+        if found not in (kind, "empty"):
+            raise EpisodeError(self._where, f"{name} is a list of {found}, not of {kind}")
+        view = memoryview(self._data)
+        try:
+            return [view[slice(*span)] for number, _, span in fields(self._data, start, stop) if number == 1]
+        except ValueError as fault:
+            raise EpisodeError(self._where, f"{name}: {fault}") from fault
+
+
+def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Decode packed varints to int64, without a loop over them.
+
+    Raises:
+        ValueError: the last is cut off, or one is longer than ten bytes.
+    """
+    last = np.flatnonzero(data < 0x80)
+    if len(last) == len(data):
+        return data.astype(np.int64)
+    if not len(last) or last[-1] != len(data) - 1:
+        raise ValueError("its last varint is cut off")
+    first = np.concatenate([[0], last[:-1] + 1])
+    lengths = last - first + 1
+    if lengths.max() > 10:
+        raise ValueError("a varint is longer than ten bytes")
+    values = np.zeros(len(last), np.uint64)
+    for place in range(int(lengths.max())):
+        longer = np.flatnonzero(lengths > place)
+        bits = (data[first[longer] + place] & 0x7F).astype(np.uint64)
+        values[longer] |= bits << np.uint64(7 * place)
+    return values.view(np.int64)
+
+
+def _features(data: bytes) -> Iterator[tuple[str, tuple[str, Span]]]:
+    """Yield (name, (kind, span of its list)) of each feature: the entries of Example.features.feature."""
+    for number, wire, (start, stop) in fields(data, 0, len(data)):
+        if number != 1 or wire != BYTES:
             continue
-        lengths[index], checks[index] = len(data), google_crc32c.value(data)
-    return Framing(np.arange(count, dtype=np.int64), lengths, checks)
+        for entry, entry_wire, span in fields(data, start, stop):
+            if entry == 1 and entry_wire == BYTES:
+                yield _entry(data, *span)
 
 
-def read_array_record(files: Any, path: str, frames: Framing, index: int, where: str) -> bytes:
-    """Return the data of one record of an ArrayRecord file; see `RecordFile.read`."""
-    try:
-        [data] = _open_array_record(path).read([index])
-    except RuntimeError as fault:
-        raise EpisodeError(where, f"cannot be read from {path}: {fault}") from fault
-    if google_crc32c.value(data) != frames.checks[index]:
-        raise EpisodeError(where, f"record {index} of {path} has changed since the file was indexed")
-    return bytes(data)
+def _entry(data: bytes, start: int, stop: int) -> tuple[str, tuple[str, Span]]:
+    """Parse a map entry: key 1, value 2."""
+    name, value = "", ("empty", (start, start))
+    for number, wire, span in fields(data, start, stop):
+        if wire == BYTES and number == 1:
+            name = data[slice(*span)].decode()
+        elif wire == BYTES and number == 2:
+            for kind, kind_wire, inner in fields(data, *span):
+                if kind in KINDS and kind_wire == BYTES:
+                    value = (KINDS[kind], inner)
+    return name, value
 
 
-def _open_array_record(path: str) -> Any:
-    try:
-        from array_record.python.array_record_module import ArrayRecordReader
-    except ImportError as fault:
-        said = "ArrayRecord files need the package array-record"
-        raise MissingDependencyError(path, said, "uv sync --extra arrayrecord") from fault
-    return ArrayRecordReader(path, RANDOM_ACCESS)
+def fields(data: bytes, position: int, end: int) -> Iterator[tuple[int, int, Span]]:
+    """Yield (field number, wire type, span of its payload) of each field of a message.
+
+    Raises:
+        ValueError: it is no message.
+    """
+    while position < end:
+        tag, position = varint(data, position, end)
+        wire, start = tag & 7, position
+        if wire == BYTES:
+            length, start = varint(data, position, end)
+            position = start + length
+        elif wire == VARINT:
+            position = varint(data, position, end)[1]
+        elif wire in (FIXED32, FIXED64):
+            position += 4 if wire == FIXED32 else 8
+        else:
+            raise ValueError(f"wire type {wire} at byte {start}")
+        if position > end:
+            raise ValueError(f"the field at byte {start} reaches beyond its message")
+        yield tag >> 3, wire, (start, position)
+
+
+def varint(data: bytes, position: int, end: int) -> tuple[int, int]:
+    """Return (value, position after it).
+
+    Raises:
+        ValueError: it is cut off, or longer than ten bytes.
+    """
+    value = shift = 0
+    while position < end and shift < 70:
+        byte = data[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, position
+        shift += 7
+    raise ValueError(f"no varint at byte {position}")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hma_data import bench
-from hma_data.bench import lerobot as bench_lerobot
 from hma_data.bench import sources
 from hma_data.bench.sources import CASES, actions, scene
 from hma_data.episodes.align import to_clip
@@ -42,9 +41,7 @@ def test_the_report_has_the_promised_form() -> None:
     assert said["machine"]["cores"] >= 1 and said["results"] == [{"frames": 1}]
 
 
-@pytest.mark.parametrize(
-    "name", ["rlds-png-256", "hdf5-jpeg-640x480", "mcap-h264-640x480", "lerobot-h264-strided"]
-)
+@pytest.mark.parametrize("name", ["rlds-png-256", "hdf5-gzip-256", "mcap-jpeg-640x480"])
 def test_a_generated_recording_shows_what_was_drawn(name: str, tmp_path: Path) -> None:
     case = CASES[name]
     robot, uri = case.embodiment(), str(case.write(tmp_path, 2, 12, 5))
@@ -62,12 +59,20 @@ def test_every_generated_recording_has_an_embodiment() -> None:
     assert [case.embodiment().source.format for case in CASES.values()] == [c.format for c in CASES.values()]
 
 
+@pytest.mark.slow
 def test_sources_are_measured_with_units() -> None:
     settings = sources.BENCH.defaults | {"formats": ["rlds-jpeg-256"], "frames": 8, "episodes": 2}
     results = sources.run(settings)
     assert {one["processes"] for one in results} <= {1, 2} and results[0]["frames"] == 8
     units = ("frames_per_second", "frames_per_cpu_second", "peak_rss_mib", "recorded_bytes_per_frame")
     assert all(one[unit] > 0 for one in results for unit in units)
+
+
+def test_a_conversion_is_measured_beside_its_tokenizer() -> None:
+    small = {"episodes": 4, "frames": 4, "pixels": 32, "workers": 0, "tokenizer": "raw"}
+    (found,) = bench.load("convert").run(bench.load("convert").defaults | small)
+    assert (found["episodes"], found["workers"]) == (4, 0)
+    assert found["frames_per_second"] > 0 and found["tokenizer_cpu_seconds"] >= 0
 
 
 def test_a_format_that_is_not_there_is_refused() -> None:
@@ -77,7 +82,7 @@ def test_a_format_that_is_not_there_is_refused() -> None:
 
 @pytest.mark.slow
 def test_our_reader_is_measured_beside_lerobots() -> None:
-    results = bench_lerobot.run({"episodes": 2, "frames": 8, "height": 48, "width": 64, "seed": 0})
+    results = sources.run_lerobot({"episodes": 2, "frames": 8, "height": 48, "width": 64, "seed": 0})
     assert [(one["reader"], one["order"], one["frames"]) for one in results] == [
         ("hma", "in order", 8), ("hma", "random", 2), ("lerobot", "in order", 8), ("lerobot", "random", 2),
     ]  # fmt: skip

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hma_data.bench import shards as bench_shards
+from hma_data.bench import loader
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from tests.data.loading.test_pools import SMALL
@@ -13,7 +13,7 @@ from tests.data.loading.test_pools import SMALL
 @pytest.mark.slow
 def test_every_case_reports_speed_opening_and_memory() -> None:
     settings = SMALL | {"embodiments": 2, "windows": 64, "runs": 1}
-    results = bench_shards.measure_loader(settings)
+    results = loader.run(settings)
     assert [one["case"] for one in results] == ["mixture", "random"]
     figures = (
         "windows_per_second",
@@ -27,7 +27,7 @@ def test_every_case_reports_speed_opening_and_memory() -> None:
 
 
 def test_a_generated_set_of_one_shard_is_sound(tmp_path: Path) -> None:
-    folder = bench_shards.make_set(tmp_path / "set", 0, SMALL | {"frames": 1_500})
+    folder = loader.make_set(tmp_path / "set", 0, SMALL | {"frames": 1_500})
     assert verify(folder) == []
     assert ShardSet(folder).manifest.splits["train"] == {
         "episodes": 25,
@@ -39,6 +39,6 @@ def test_a_generated_set_of_one_shard_is_sound(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("frames", "shards"), [(6_000, 4), (6_060, 5)])
 def test_a_generated_set_has_as_many_frames_as_asked(tmp_path: Path, frames: int, shards: int) -> None:
-    splits = ShardSet(bench_shards.make_set(tmp_path / "set", 0, SMALL | {"frames": frames})).manifest.splits
+    splits = ShardSet(loader.make_set(tmp_path / "set", 0, SMALL | {"frames": frames})).manifest.splits
     assert splits["train"]["shards"] == shards
     assert splits["train"]["frames"] >= frames

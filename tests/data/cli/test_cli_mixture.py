@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from hma_data.bench.shards import make_set
+from hma_data.bench.loader import make_set
 from hma_data.errors import UsageError
 from hma_model.cli import app
 from tests.data.loading.test_pools import SMALL

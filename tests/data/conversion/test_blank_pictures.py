@@ -1,27 +1,32 @@
 """Black, frozen and repeating cameras: refused or flagged at conversion, and found in shards that exist."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 from skimage import data as skimage_data
 
 from hma_data.conversion import worker
 from hma_data.conversion.job import Summary, convert
 from hma_data.conversion.plan import Settings
-from hma_data.episodes.images import resize
-from hma_data.episodes.quality import PictureCheck
+from hma_data.episodes.images import PictureCheck, resize
 from hma_data.errors import SourceError
 from hma_data.inspection.inspect import examine
+from hma_data.inspection.shard_pictures import shard_picture_findings
 from hma_data.registry.embodiment import Embodiment, problems
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.base import get_tokenizer
 from tests.command import hma
 from tests.conftest import ARM_YAML, BlockTokenizer
 from tests.data import bag_files, videos
+from tests.data.conversion.test_cameras import OLDER
 from tests.data.sources.lerobot.test_lerobot import embodiment as lerobot_arm
 
 KINDS = ("good", "black", "frozen", "repeated")
@@ -42,14 +47,14 @@ def pictures(kind: str, height: int = videos.HEIGHT, width: int = videos.WIDTH) 
     return frames
 
 
-def write_hdf5(path: Path, episodes: dict[str, np.ndarray]) -> Path:
+def write_hdf5(path: Path, episodes: dict[str, np.ndarray], side: str = "good") -> Path:
     with h5py.File(path, "w") as file:
         for name, frames in episodes.items():
             group = file.create_group(f"data/{name}")
             draw = np.random.default_rng(len(name))
             group["actions"] = draw.normal(size=(len(frames), 3)).astype(np.float32)
             group["obs/image"] = frames
-            group["obs/side"] = pictures("good")[: len(frames)]
+            group["obs/side"] = pictures(side)[: len(frames)]
     return path
 
 
@@ -200,24 +205,45 @@ def test_noise_does_not_hide_a_frozen_camera_and_a_small_motion_does_not_look_fr
 
 @pytest.fixture(scope="module")
 def old_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A set with a black and a frozen episode, as a release without the rule made it."""
+    """A set with a black and a frozen episode, and a black second camera, as made without the rule."""
     folder = tmp_path_factory.mktemp("old")
-    path = write_hdf5(folder / "toy.hdf5", {kind: pictures(kind) for kind in KINDS})
+    path = write_hdf5(folder / "toy.hdf5", {kind: pictures(kind) for kind in KINDS}, side="black")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worker, "picture_flags", lambda *arguments: {})
         robot = Embodiment.from_yaml(ARM_YAML)
-        convert(robot, path, get_tokenizer("fsq-8"), folder / "out", settings=Settings(val_fraction=0.0))
+        settings = Settings(val_fraction=0.0, cameras=("all",))
+        convert(robot, path, get_tokenizer("fsq-8"), folder / "out", settings=settings)
     return folder / "out"
 
 
-def test_doctor_finds_black_and_frozen_episodes_in_old_shards(old_shards: Path) -> None:
+def test_doctor_finds_black_and_frozen_episodes_of_each_camera(old_shards: Path) -> None:
     done = hma("doctor", old_shards, "--json")
-    found = {finding["check"]: finding for finding in json.loads(done.stdout)["findings"]}
+    found = {(one["check"], one["key"]): one for one in json.loads(done.stdout)["findings"]}
     assert done.returncode == 1
-    assert (found["blank"]["severity"], found["blank"]["numbers"]["episodes"]) == ("error", ["black"])
-    assert found["blank"]["numbers"]["train_share"] == pytest.approx(1 / 4)
-    assert "25.0% of the training frames: black" in found["blank"]["message"]
-    assert (found["still"]["severity"], found["still"]["numbers"]["episodes"]) == ("warn", ["frozen"])
+    black, still = found["blank", "top"], found["still", "top"]
+    assert (black["severity"], black["numbers"]["episodes"]) == ("error", ["black"])
+    assert black["numbers"]["train_share"] == pytest.approx(1 / 4)
+    assert "25.0% of the training frames: black" in black["message"]
+    assert (still["severity"], still["numbers"]["episodes"]) == ("warn", ["frozen"])
+    assert found["blank", "side"]["numbers"]["episodes"] == sorted(KINDS)
+    assert found["blank", "side"]["message"].startswith("camera side shows one colour")
+    assert ("still", "side") not in found
+
+
+def test_doctor_looks_at_each_camera_where_it_has_rows_of_its_own(tmp_path: Path) -> None:
+    shutil.copytree(OLDER / "two_cameras", tmp_path / "set")
+    shard = tmp_path / "set" / "train" / "shard-00000.parquet"
+    table = pq.read_table(shard)
+    frozen = pc.and_(pc.equal(table["camera"], "side"), pc.equal(table["episode_index"], 1))
+    tokens = [
+        [0] * 64 if still else row
+        for still, row in zip(frozen.to_pylist(), table["tokens"].to_pylist(), strict=True)
+    ]
+    place = table.schema.get_field_index("tokens")
+    table = table.set_column(place, table.field("tokens"), pa.array(tokens, table.field("tokens").type))
+    pq.write_table(table, shard)
+    (found,) = shard_picture_findings(ShardSet(tmp_path / "set"))
+    assert (found.check, found.key, found.numbers["episodes"]) == ("still", "side", ["demo_1"])
 
 
 def test_without_the_tokenizer_doctor_still_names_what_never_changes(tmp_path, block_tokenizer) -> None:

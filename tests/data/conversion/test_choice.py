@@ -1,4 +1,4 @@
-"""Episodes chosen by id, by glob and by a file of ids: in the command, the YAML and the recipe."""
+"""Episodes chosen by id, by glob and by a file of ids: in the command and the YAML."""
 
 import json
 from pathlib import Path
@@ -134,11 +134,6 @@ def test_the_command_counts_what_it_leaves_out(tmp_path, arm_yaml) -> None:
     done = hma(*words, "--json", "--only", "demo_[12]", "--exclude", "demo_1")
     assert (json.loads(done.stdout)["episodes"], json.loads(done.stdout)["left_out"]) == (1, 3)
     fails(hma(*words, "--dry-run", "--only", "demo_9"), 2, "--only: 'demo_9' matches no episode", "demo_")
-    recipe = {"embodiment": str(arm_yaml), "source": str(tmp_path / "toy.hdf5"), "out": str(tmp_path / "r")}
-    jobs = [{**recipe, "tokenizer": "fsq-8", "workers": 0, "exclude": ["demo_[0-2]"]}]
-    (tmp_path / "recipe.yaml").write_text(json.dumps({"jobs": jobs}))
-    done = hma("convert", "--recipe", tmp_path / "recipe.yaml", "--dry-run", "--json")
-    assert (json.loads(done.stdout)["episodes"], json.loads(done.stdout)["left_out"]) == (1, 3)
 
 
 def test_inspect_and_doctor_take_the_episodes_that_the_yaml_chooses(

@@ -20,9 +20,8 @@ from hma_data.conversion.engines import Limits
 from hma_data.conversion.job import convert, convert_share
 from hma_data.conversion.output import LOCK, Share, locked
 from hma_data.conversion.plan import Settings
-from hma_data.conversion.recipe import load_jobs
-from hma_data.errors import HMAError, OutputError, RecipeError
-from hma_data.registry.embodiment import Embodiment, find
+from hma_data.errors import HMAError, OutputError
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.verify import verify
 from hma_data.sources.hdf5.source import Hdf5Source
@@ -399,48 +398,6 @@ def test_an_episode_that_breaks_off_in_the_middle_leaves_nothing_of_itself(
             if name != "demo_4":
                 file.copy(f"data/{name}", other.require_group("data"))
     assert summary.manifest.splits["train"]["episodes"] + summary.manifest.splits["val"]["episodes"] == 11
-
-
-# -- recipes
-
-
-def test_a_recipe_holds_several_conversions_with_common_defaults(tmp_path: Path) -> None:
-    path = tmp_path / "two.yaml"
-    path.write_text(
-        "defaults: {tokenizer: fsq-8, workers: 2}\n"
-        "jobs:\n  - {embodiment: a, out: x}\n  - {embodiment: b, out: y, workers: 0, limit: 3}\n"
-    )
-    first, second = load_jobs(path)
-    assert (first.tokenizer, first.workers, first.limit) == ("fsq-8", 2, None)
-    assert (second.tokenizer, second.workers, second.settings.limit) == ("fsq-8", 0, 3)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (
-            "jobs: [{embodiment: a, out: x, tokeniser: b}]",
-            "unknown key 'tokeniser', did you mean 'tokenizer'",
-        ),
-        ("jobs: [{embodiment: a}]", r"jobs\[0\]: lacks out"),
-        ("jobs: [{embodiment: a, out: x, limit: none}]", "limit is 'none'"),
-        ("jobs: [{embodiment: a, out: x}, {embodiment: b, out: ./x}]", "two jobs write"),
-        ("job: []", "lacks jobs"),
-        ("jobs: [a]", "jobs.0 is 'a'"),
-        ("{jobs: [{embodiment: a, out: x}], default: {}}", "unknown key 'default'"),
-    ],
-)
-def test_a_wrong_recipe_is_one_clear_error(text: str, said: str, tmp_path: Path) -> None:
-    path = tmp_path / "wrong.yaml"
-    path.write_text(text)
-    with pytest.raises(RecipeError, match=said):
-        load_jobs(path)
-
-
-def test_the_shipped_recipes_are_valid() -> None:
-    for path in sorted((ROOT / "recipes" / "convert").glob("*.yaml")):
-        for job in load_jobs(path):
-            find(job.embodiment)
 
 
 def test_limits_are_kept_apart_from_errors_of_the_job(

@@ -79,7 +79,6 @@ def test_rlds_actions_in_parts_come_in_order_and_read_back(tmp_path: Path) -> No
         "action/gripper_closedness_action",
     ]
     assert values["action"]["components"][2]["normalize"] is False
-    assert values["action"]["space"] == "eef_delta"
     clip = first_clip(path, values)
     want = np.concatenate([numbers(T, 3), numbers(T, 3), numbers(T, 1)], axis=1).astype(np.float32)
     np.testing.assert_allclose(clip.actions, want, rtol=1e-6)
@@ -96,7 +95,9 @@ def test_rlds_cameras_states_and_questions(tmp_path: Path) -> None:
     assert values["source"]["instruction"] == "observation/natural_language_instruction"
     assert "split" not in values["source"] and values["source"]["episodes"] == 1
     asked = questions(values)
-    assert asked.keys() == {"robot", "kind", "frequency_hz", "provenance.frequency_hz", "provenance.action"}
+    assert asked.keys() == {
+        "robot", "kind", "frequency_hz", "action.space", "provenance.frequency_hz", "provenance.action",
+    }  # fmt: skip
     assert "base_displacement_vector never changes" in asked["provenance.action"]
     assert "observation/depth" in values["notes"] and "terminate_episode" in values["notes"]
 
@@ -174,40 +175,15 @@ def robomimic(path: Path, arguments: dict[str, Any]) -> Path:
     return path
 
 
-def test_robomimic_is_a_simulation_with_names_by_its_controller(tmp_path: Path) -> None:
+def test_robomimic_is_a_simulation_with_its_rate(tmp_path: Path) -> None:
     path = robomimic(tmp_path / "demo.hdf5", ROBOMIMIC)
     values = inferred(path)
-    assert not questions(values)
-    assert values["action"] == {
-        "space": "eef_delta",
-        "components": [
-            {"key": "actions", "dims": 7, "names": ["dx", "dy", "dz", "drx", "dry", "drz", "gripper"]}
-        ],
-    }
+    assert questions(values).keys() == {"action.space"}
+    assert values["action"]["components"] == [{"key": "actions", "dims": 7}]
     assert (values["kind"], values["robot"], values["frequency_hz"]) == ("simulation", "Panda", 20)
     assert keys(values, "cameras") == ["obs/agentview_image", "obs/robot0_eye_in_hand_image"]
     assert keys(values, "state") == [f"obs/robot0_{n}" for n in ("eef_pos", "eef_quat", "gripper_qpos")]
     np.testing.assert_array_equal(first_clip(path, values).actions, numbers(T, 7).astype(np.float32))
-
-
-@pytest.mark.parametrize(
-    ("controller", "space"),
-    [
-        ({"type": "OSC_POSE", "control_delta": False}, "eef_pose"),
-        (
-            {"type": "BASIC", "body_parts": {"right": {"type": "OSC_POSE", "input_type": "delta"}}},
-            "eef_delta",
-        ),
-        ([{"type": "JOINT_VELOCITY"}], "joint_velocity"),
-        ({"type": "OF_MY_OWN"}, None),
-        ("broken", None),
-    ],
-)
-def test_the_controller_decides_the_space(tmp_path: Path, controller: Any, space: str | None) -> None:
-    arguments = {**ROBOMIMIC, "env_kwargs": {"controller_configs": controller}}
-    values = inferred(robomimic(tmp_path / "demo.hdf5", arguments))
-    assert ("action.space" in questions(values)) == (space is None)
-    assert space is None or values["action"]["space"] == space
 
 
 def test_libero_states_once_and_no_embedding(tmp_path: Path) -> None:
@@ -272,7 +248,6 @@ def test_a_simulators_state_is_not_the_robots(tmp_path: Path) -> None:
     values = inferred(tmp_path / "run.hdf5")
     assert "state" not in values and values["kind"] == "simulation"
     assert keys(values, "action") == ["joint_velocities", "gripper_actuations"]
-    assert values["action"]["space"] == "joint_velocity"
     first_clip(tmp_path / "run.hdf5", values)
 
 
@@ -298,9 +273,7 @@ def test_other_hdf5_takes_rate_and_times_from_the_recording(tmp_path: Path) -> N
     assert values["source"]["instruction"] == "language_instruction"
     assert keys(values, "action") == ["teleop/joint_velocity", "teleop/gripper"]
     assert values["action"]["components"][1] == {"key": "teleop/gripper", "dims": 1, "normalize": False}
-    assert (
-        values["action"]["space"] == "joint_velocity" and "teleop" in questions(values)["provenance.action"]
-    )
+    assert "teleop" in questions(values)["provenance.action"]
     clip = first_clip(path, values)
     np.testing.assert_allclose(clip.timestamps, stamps - stamps[0], atol=1e-6)
     assert clip.episode.instruction == "stack the cups"
@@ -383,8 +356,6 @@ def test_lerobot_names_in_every_form(tmp_path: Path, stated: Any, names: list[st
     (path / "meta/info.json").write_text(json.dumps(info))
     values = inferred(path)
     assert values["action"]["components"][0].get("names") == names
-    if names and "wrist" in names[0]:
-        assert values["action"]["space"] == "joint_position"
 
 
 def test_lerobot_depth_and_grey_features_are_left_out(tmp_path: Path) -> None:

@@ -68,7 +68,6 @@ def test_both_arms_and_their_grippers_form_the_action(tmp_path: Path, form: str)
         "/left_gripper/command.data",
     ]
     assert values["action"]["components"][1]["names"] == ["r1", "r2"]
-    assert values["action"]["space"] == "joint_position"
     assert keys(values, "state") == [
         "/ee_pose.pose.position",
         "/ee_pose.pose.orientation",
@@ -76,7 +75,7 @@ def test_both_arms_and_their_grippers_form_the_action(tmp_path: Path, form: str)
         "/right_arm/joint_states.position",
     ]
     assert values["frequency_hz"] == 30 and values["sync"]["max_skew_ms"] == 150
-    assert questions(values).keys() == {"robot", "kind"}
+    assert questions(values).keys() == {"robot", "kind", "action.space"}
     assert first_clip(path, values).actions.shape[1] == 5
 
 
@@ -92,7 +91,6 @@ def test_several_commands_are_a_question_that_names_the_others(tmp_path: Path) -
     )
     values = inferred(path)
     assert keys(values, "action") == ["/cmd_vel.linear", "/cmd_vel.angular"]
-    assert values["action"]["space"] == "base_velocity"
     assert "/desired_pose.pose.position" in questions(values)["provenance.action"]
     assert keys(values, "state") == ["/joint_states.position"]
     first_clip(path, values)
@@ -134,7 +132,6 @@ def test_a_trajectory_commands_by_its_first_point(tmp_path: Path) -> None:
     assert values["action"]["components"] == [
         {"key": "/arm_controller/joint_trajectory.points[0].positions", "dims": 2, "names": ["a", "b"]}
     ]
-    assert values["action"]["space"] == "joint_position"
     assert (first_clip(path, values).actions == 1).all()
 
 

@@ -262,12 +262,6 @@ def test_pictures_that_never_were_jpeg_are_no_proof() -> None:
     assert ycbcr_share(data.astronaut().reshape(-1, 3)[::20]) == pytest.approx(0.24, abs=0.04)
 
 
-def test_a_blue_scene_in_jpeg_is_only_a_hint() -> None:
-    look = Look(lossless=False)
-    look.add(data.coffee()[None, ..., ::-1], np.array([0]))
-    assert look.swapped()[0] == "hint"
-
-
 @pytest.mark.real
 @pytest.mark.parametrize(
     "recording",

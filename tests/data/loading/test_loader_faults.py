@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from hma_data.bench.shards import make_set
+from hma_data.bench.loader import make_set
 from hma_data.errors import ShardError, UsageError
 from hma_data.loading.dataset import MixtureDataset, WindowDataset
 from hma_data.shards import writer

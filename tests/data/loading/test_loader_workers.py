@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from hma_data.bench.shards import make_set
+from hma_data.bench.loader import make_set
 from hma_data.loading.dataset import Batch, MixtureDataset, WindowDataset, as_batch
 from hma_data.shards import writer
 from tests.data.fresh import run_fresh

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hma_data.bench.shards import LOADER, make_set
+from hma_data.bench.loader import BENCH, make_set
 from hma_data.loading.pools import LARGEST_POOL, UnitAssignment, WindowSequence, pool_size, spread
 from hma_data.loading.rows import MIB, Decoder
 from hma_data.shards import writer
@@ -15,7 +15,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import WindowIndex
 from tests.data.shards.test_windows import fake
 
-SMALL = LOADER.defaults | {
+SMALL = BENCH.defaults | {
     "frames": 6_000,
     "shard_frames": 1_500,
     "episode": 60,

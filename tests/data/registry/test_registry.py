@@ -214,6 +214,7 @@ def test_lerobot_features_have_the_widths_names_and_picture_sizes() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_lerobot_makes_a_dataset_of_the_features(tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 

@@ -277,13 +277,3 @@ def test_row_groups_of_large_frames_hold_fewer_of_them(tmp_path: Path) -> None:
     assert groups == [80, 10, 85, 15]
     stored = file.read_row_group(3, ["latents"]).column(0).combine_chunks().flatten().to_numpy()
     np.testing.assert_array_equal(stored.reshape(15, -1)[:, 0], np.arange(85, 100))
-
-
-@pytest.mark.slow
-def test_the_benchmark_of_shards_runs() -> None:
-    from hma_data.bench import shards
-
-    results = shards.measure_shards(shards.SHARDS.defaults | {"frames": 400, "episode": 20})
-    assert [result["step"] for result in results] == ["write", "read", "verify", "verify --quick"]
-    assert all(result["frames_per_second"] > 0 and result["peak_rss_mib"] > 0 for result in results)
-    assert results[0]["bytes_per_frame"] > results[0]["token_bytes_per_frame"] > 500

@@ -1,6 +1,5 @@
-"""Several episodes in one bag: by pauses, by messages, by calls of a service."""
+"""Several episodes in one bag: by pauses, by messages."""
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from tests.data.bag_files import SOURCE, START_NS
-from tests.data.bag_parts import KINDS, STATE, TASK, Said, make_run, mcap, parted, ros1
+from tests.data.bag_parts import KINDS, STATE, TASK, Said, make_run, parted, ros1
 
 GAP = "{gap_s: 1}"
 RECORDING = "{start: {key: /state.data, equals: true}, stop: {key: /state.data, equals: false}}"
@@ -164,74 +163,6 @@ def test_each_episode_has_the_instruction_said_nearest_to_its_beginning(tmp_path
     refs = SOURCE.index(str(path), embodiment)
     told = [SOURCE.read(str(path), ref.id, embodiment).instruction for ref in refs]
     assert told == ["reach", "push", "pull"]
-
-
-# -- services
-
-
-def event(kind: int, at_s: float, data: bool | None, success: bool | None = None) -> bytes:
-    """A std_srvs/srv/SetBool_Event in CDR, as the ROS middleware lays it out."""
-    seconds, nanoseconds = divmod(START_NS + round(at_s * 1e9), 10**9)
-    body = struct.pack("<B3xiI16s4xq", kind, seconds, nanoseconds, bytes(range(16)), round(at_s * 10))
-    body += struct.pack("<I", 0) if data is None else struct.pack("<IB3x", 1, data)
-    if success is None:
-        return b"\x00\x01\x00\x00" + body + struct.pack("<I", 0)
-    return b"\x00\x01\x00\x00" + body + struct.pack("<IB3xI", 1, success, 1) + b"\x00"
-
-
-def calls(
-    kinds: tuple[int, ...], *made: tuple[float, bool], contents: bool = True
-) -> list[tuple[str, str, str, float, bytes]]:
-    """Each call as those of its events that were recorded, 1 ms apart."""
-    definition = "bool data\n---\nbool success\nstring message\n"
-    found = []
-    for at_s, value in made:
-        for i, kind in enumerate(kinds):
-            asked, answered = contents and kind < 2, contents and kind >= 2
-            data = event(kind, at_s, value if asked else None, True if answered else None)
-            said = ("/record/_service_event", "std_srvs/srv/SetBool_Event", definition, at_s + i / 1e3, data)
-            found.append(said)
-    return found
-
-
-@pytest.mark.parametrize("kinds", [(1, 2), (0, 3), (0, 1, 2, 3)])
-def test_every_call_of_a_service_counts_once(kinds: tuple[int, ...], tmp_path: Path) -> None:
-    made = calls(kinds, (0.99, True), (2.99, True), contents=False)
-    path = mcap(tmp_path, make_run(60), made)
-    assert lengths(path, parted("{start: {key: /record/_service_event}}")) == [20, 30]
-
-
-@pytest.mark.parametrize("kinds", [(1, 2), (0, 3), (0, 1, 2, 3)])
-@pytest.mark.parametrize("key", ["request[0].data", "request.data"])
-def test_what_a_service_was_asked_starts_and_stops(kinds: tuple[int, ...], key: str, tmp_path: Path) -> None:
-    path = mcap(tmp_path, make_run(60), calls(kinds, (0.99, True), (1.99, False), (2.99, True), (3.99, True)))
-    topic = f"/record/_service_event.{key}"
-    both = f"{{start: {{key: '{topic}', equals: true}}, stop: {{key: '{topic}', equals: false}}}}"
-    assert lengths(path, parted(both)) == [10, 10, 20]
-
-
-def test_a_service_that_was_never_called_is_told(tmp_path: Path) -> None:
-    path = mcap(tmp_path, make_run(20), calls((1, 2), (0.5, False)))
-    wanted = parted("{start: {key: '/record/_service_event.request[0].data', equals: true}}")
-    with pytest.raises(EpisodeError, match=r"never becomes True, it is False"):
-        SOURCE.read(str(path), "run", wanted)
-
-
-@pytest.mark.real
-@pytest.mark.parametrize("kind", ["mcap", "db3"])
-def test_events_of_a_real_bag_are_decoded_by_their_services_definition(kind: str, real_data: Path) -> None:
-    from hma_data.sources.bags.bag import Bag
-    from hma_data.sources.bags.container import RecordFilter
-    from hma_data.sources.bags.messages import decode
-
-    path = real_data / "ros2/rosbag2/rosbag2_cpp/test/rosbag2_cpp/bags" / f"topics_and_services.{kind}"
-    found = [
-        decode(record.channel, record.data, "")
-        for _, record in Bag(path).records(RecordFilter(frozenset({"/add_two_ints/_service_event"})))
-    ]
-    assert [message.info.event_type for message in found] == [1, 2] * 3
-    assert [(m.request[0].a, m.request[0].b) for m in found[::2]] == [(1, 3), (2, 3), (3, 3)]
-    assert [m.response[0].sum for m in found[1::2]] == [4, 5, 6]
 
 
 # -- cost

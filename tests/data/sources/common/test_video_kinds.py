@@ -10,7 +10,7 @@ import av
 import numpy as np
 import pytest
 
-from hma_data.cpu import ordinary_priority
+from hma_data.cpu import take_ordinary_priority
 from hma_data.errors import EpisodeError
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
@@ -187,8 +187,8 @@ def test_frames_made_from_a_damaged_one_are_refused_up_to_the_next_keyframe(tmp_
 
 @pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no schedulers to choose from")
 def test_encoding_av1_leaves_the_process_its_turn_among_others(tmp_path: Path) -> None:
-    with ordinary_priority():
-        make(tmp_path / "v.mp4", *AV1, gop=2)
+    make(tmp_path / "v.mp4", *AV1, gop=2)
+    take_ordinary_priority()
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 

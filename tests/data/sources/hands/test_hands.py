@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hma_data.conversion.job import convert
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
+from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import find
-from hma_data.registry.layouts import HandsLayout
 from hma_data.sources.base import detect, open_source
 from hma_data.sources.hands.runs import (
     KEYS,

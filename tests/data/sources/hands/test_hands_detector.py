@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -31,7 +32,6 @@ from hma_data.sources.hands.detect import (
     square_of_palm,
     square_of_points,
 )
-from hma_data.sources.hands.scan import detect
 from tests.data import hands_files as made
 from tests.data.videos import encode
 
@@ -255,7 +255,10 @@ def test_a_folder_of_videos_becomes_episodes_whose_hands_are_the_tables(
     assert (clip.actions[:, 0] > clip.actions[:, 2]).all()  # facing us, the left hand is at our right
     np.testing.assert_array_equal(clip.actions[:-1], clip.states[1:])
 
-    assert detect(short, tmp_path / "hands.parquet", str(models)) == 48
+    finder = MediaPipeHands(load_models(models))
+    table = hands_scan.scan("clip.mp4", VideoFile(short / "clip.mp4"), finder)
+    pq.write_table(table, tmp_path / "hands.parquet")
+    assert len(table) == 48
     labels = made.hand_video("landmarks", hz=30, annotations=str(tmp_path / "hands.parquet"))
     again = open_source("hands").read(str(short), "clip.mp4#0", labels)
     np.testing.assert_array_equal(again.actions[0].values, episode.actions[0].values)

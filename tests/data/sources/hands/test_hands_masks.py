@@ -16,8 +16,8 @@ from hma_data.episodes.sheets import write_mp4
 from hma_data.errors import RegistryError, SourceError
 from hma_data.inspection.infer import infer
 from hma_data.loading.dataset import WindowDataset
+from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import Embodiment
-from hma_data.registry.layouts import HandsLayout
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source

@@ -1,4 +1,4 @@
-"""The index of records kept on disk, and remote files read a range at a time."""
+"""Where the records of a file lie, and remote files read a range at a time."""
 
 import json
 import os
@@ -18,17 +18,11 @@ from hma_data.sources.rlds import records
 from hma_data.sources.rlds.folder import open_folder
 from hma_data.storage import fetch as fetching
 from tests.data import rlds_files
-from tests.data.rlds_files import encode, frame, tensor
+from tests.data.rlds_files import encode, tensor
 
 RLDS = open_source("rlds")
 FILES = fsspec.filesystem("file")
 STEPS = {"a": tensor((2,)), "pad": tensor((4000,))}
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "rlds"
 
 
 def record(index: int, pad: int = 0) -> dict:
@@ -57,50 +51,10 @@ def number(folder: Path | str, name: str) -> float:
     return float(open_folder(str(folder)).example(name)[0].numbers("steps/a")[0])
 
 
-# -- kept on disk
+# -- damage
 
 
-def test_a_second_process_reads_the_index_and_scans_nothing(tmp_path, cache, monkeypatch):
-    path = shard(dataset(tmp_path / "d"))
-    first = reopened(path).framing()
-    assert len(list(cache.iterdir())) == 1
-    monkeypatch.setattr("hma_data.sources.rlds.records._data_end", None)
-    again = reopened(path)
-    np.testing.assert_array_equal(again.framing().offsets, first.offsets)
-    assert again.read(70, "e") == encode(record(70))
-
-
-def test_a_short_file_leaves_no_index(tmp_path, cache):
-    assert len(reopened(shard(dataset(tmp_path / "d", 5))).framing()) == 5
-    assert not cache.exists()
-
-
-def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("HMA_CACHE", str(tmp_path / "file"))
-    assert len(reopened(shard(dataset(tmp_path / "d"))).framing()) == 100
-
-
-def test_another_file_of_that_name_is_indexed_anew(tmp_path, cache):
-    path = shard(dataset(tmp_path / "d"))
-    reopened(path).framing()
-    path.write_bytes(b"".join(frame(encode(record(500 + i))) for i in range(80)))
-    again = reopened(path)
-    assert len(again.framing()) == 80
-    assert again.read(79, "e") == encode(record(579))
-    assert len(list(cache.iterdir())) == 2
-
-
-@pytest.mark.parametrize("size", [0, 100])
-def test_a_damaged_index_is_made_again(tmp_path, cache, size):
-    path = shard(dataset(tmp_path / "d"))
-    reopened(path).framing()
-    [kept] = cache.iterdir()
-    kept.write_bytes(kept.read_bytes()[:size])
-    assert reopened(path).read(99, "e") == encode(record(99))
-
-
-def test_damaged_data_are_an_error_however_the_index_came(tmp_path):
+def test_damaged_data_are_an_error(tmp_path):
     path = shard(dataset(tmp_path / "d"))
     offset = int(reopened(path).framing().offsets[50])
     content = bytearray(path.read_bytes())
@@ -191,12 +145,10 @@ def test_over_http_only_the_bytes_that_are_needed_come(served):
     assert number(uri, "train/000033") == 33
 
 
-def test_a_remote_index_grows_no_further_than_asked_and_is_kept(served, cache):
+def test_a_remote_index_grows_no_further_than_asked(served):
     folder, uri, handler = served
     dataset(folder / "d", 100, 1, pad=20_000)
     assert [number(uri, f"train/{i:06d}") for i in (3, 40)] == [3, 40]
-    records._remote_state.cache_clear()
-    records._opened.cache_clear()
     handler.asked.clear()
     assert number(uri, "train/000030") == 30
     assert len([name for name, _ in handler.asked if "tfrecord" in name]) == 1

@@ -1,0 +1,172 @@
+"""Measure `hma convert`: overhead beside the tokenizer, and memory of its workers over time."""
+
+import multiprocessing
+import os
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_data.bench import Bench, make_robot, rss_mib
+
+
+def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Time the tokenizer alone on as many frames, then run the conversion and measure its processes."""
+    from hma_data.conversion.engines import Limits
+    from hma_data.conversion.job import convert
+    from hma_data.conversion.plan import Settings
+
+    workers = settings["workers"]
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / "recording.hdf5"
+        _record(recording, settings)
+        rows = settings["episodes"] * settings["frames"]
+        alone_cpu = _tokenizer_alone(settings, rows)
+        watch = _Watch(workers)
+        summary = convert(
+            make_robot("bench_arm", "hdf5", "actions", "obs/image"),
+            recording,
+            settings["tokenizer"],
+            Path(folder) / "out",
+            settings=Settings(shard_frames=settings["shard_frames"]),
+            workers=workers,
+            limits=Limits(quiet_s=None),
+            on_progress=watch.mark,
+        )
+        watch.stop()
+    after = 1 - watch.start_frames / rows  # share of frames made after the first report
+    used = watch.cpu_s - watch.start_cpu_s
+    return [
+        {
+            "workers": workers,
+            "tokenizer": settings["tokenizer"],
+            "seconds": round(watch.seconds, 2),
+            "start_seconds": round(watch.start_seconds, 2),
+            "frames_per_second": round(rows * after / (watch.seconds - watch.start_seconds), 1),
+            "tokenizer_cpu_seconds": round(alone_cpu * after, 2),
+            "worker_cpu_seconds": round(used, 2),
+            "overhead_cpu_share": round(1 - alone_cpu * after / used, 4) if used else None,
+            **watch.memory(),
+            "episodes": sum(split["episodes"] for split in summary.manifest.splits.values()),
+            "bytes_per_frame": round(summary.manifest.to_json()["totals"]["bytes"] / rows, 1),
+        }
+    ]
+
+
+def _record(path: Path, settings: dict[str, Any]) -> None:
+    """Write episodes of JPEG pictures: crops of a texture, so that they compress as real pictures do."""
+    import cv2
+    import h5py
+
+    rng = np.random.default_rng(0)
+    size, length = settings["pixels"], settings["frames"]
+    texture = cv2.GaussianBlur(rng.integers(0, 256, (3 * size, 3 * size, 3), np.uint8), (0, 0), 3)
+    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
+    pictures = []
+    for _ in range(64):
+        y, x = rng.integers(0, 2 * size, 2)
+        pictures.append(cv2.imencode(".jpg", texture[y : y + size, x : x + size])[1].ravel())
+    with h5py.File(path, "w", libver="latest") as file:
+        for i in range(settings["episodes"]):
+            group = file.create_group(f"data/demo_{i}")
+            group["actions"] = rng.normal(size=(length, 7)).astype(np.float32)
+            kind = h5py.vlen_dtype(np.uint8)
+            images = group.create_dataset("obs/image", (length,), dtype=kind)
+            for t in range(length):
+                images[t] = pictures[(7 * i + t) % len(pictures)]
+
+
+def _tokenizer_alone(settings: dict[str, Any], rows: int) -> float:
+    """Return the CPU seconds for `rows` frames in a worker's batches, measured on a part of them."""
+    from hma_data.conversion.worker import BATCH
+    from hma_data.cpu import usable_cores
+    from hma_data.tokenizers.base import get_tokenizer
+
+    tokenizer = get_tokenizer(settings["tokenizer"])
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(max(1, usable_cores() // max(settings["workers"], 1)))
+    size = tokenizer.spec.image_size
+    frames = np.random.default_rng(1).integers(0, 256, (BATCH, size, size, 3), np.uint8)
+    tokenizer.encode(frames)
+    done, began = 0, time.process_time()
+    while done < min(rows, 4_096):
+        tokenizer.encode(frames)
+        done += BATCH
+    return (time.process_time() - began) * rows / done
+
+
+class _Watch:
+    """Memory of this process and its workers, and CPU time of the workers, sampled while the conversion runs.
+
+    `start_*` are the figures at the first report of finished frames. `samples` hold the share of the frames
+    that are done, and MiB of the largest worker and of this process.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        self.seconds = self.start_seconds = self.cpu_s = self.start_cpu_s = self._share = 0.0
+        self.start_frames = 0
+        self.samples: list[tuple[float, dict[str, float]]] = []
+        self._began, self._stop = time.perf_counter(), threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def mark(self, progress: Any) -> None:
+        """Record the progress of the conversion."""
+        if progress.frames and not self.start_frames:
+            self.start_seconds = time.perf_counter() - self._began
+            self.start_frames, self.start_cpu_s = progress.frames, self.cpu_s
+        self._share = progress.frames / max(progress.total_frames, 1)
+
+    def stop(self) -> None:
+        """End the sampling."""
+        self.seconds = time.perf_counter() - self._began
+        self._stop.set()
+        self._thread.join()
+
+    def memory(self) -> dict[str, float]:
+        """Return the resident MiB of the largest worker and of this process, over the run."""
+        return {
+            f"{role}_rss_mib_at_{name}": round(min(self.samples, key=lambda s: abs(s[0] - at))[1][role], 1)
+            for role in ("worker", "parent")
+            for name, at in {"a_tenth": 0.1, "half": 0.5, "the_end": 1.0}.items()
+            if self.samples
+        }
+
+    def _look(self) -> None:
+        while not self._stop.wait(0.2):
+            children = [child.pid for child in multiprocessing.active_children() if child.pid]
+            pids = children if self.workers else [os.getpid()]
+            if pids:  # none when the workers have ended, and the manifest is being written
+                self.cpu_s = max(self.cpu_s, _cpu_s(pids))
+                memory = {"worker": max(map(rss_mib, pids)), "parent": rss_mib()}
+                self.samples.append((self._share, memory))
+
+
+def _cpu_s(pids: list[int]) -> float:
+    """Return the CPU seconds of processes, including their threads."""
+    ticks = 0
+    for pid in pids:
+        with suppress(OSError):  # it has ended
+            user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+            ticks += int(user) + int(system)
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+BENCH = Bench(
+    "hma convert over many short episodes: overhead beside the tokenizer, memory of its workers over time",
+    {
+        "episodes": 10_000,
+        "frames": 8,  # an episode
+        "pixels": 128,  # height and width of the recorded pictures, JPEG
+        "tokenizer": "fsq-8",
+        "workers": 1,
+        "shard_frames": 4_096,
+    },
+    run,
+)
