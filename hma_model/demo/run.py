@@ -36,6 +36,7 @@ from hma_model.demo.made import TIMINGS, Demo
 from hma_model.demo.report import FINETUNED, SCRATCH, SHOWN, TAU, write_report
 
 if TYPE_CHECKING:
+    from hma_model.evaluation.evaluate import Sampling
     from hma_model.evaluation.rollout_video import RolloutVideo
     from hma_model.training.loop import TrainResult
 
@@ -44,7 +45,8 @@ RECIPES = {FINETUNED: "demo", SCRATCH: "demo_scratch"}
 RESULTS = "results.json"
 OURS = {"recordings", "shards", "run", "scratch", "hub", "pulled", "report.html", TIMINGS, RESULTS}
 WINDOWS = 24  # held-out windows of each robot; the figures are means over them
-LONGEST = 16  # frames of a window of the film
+LONGEST = 10  # frames of a window of the film
+FILM: "Sampling" = {"unmask_steps": 8, "order": "confidence"}  # slower than the figures, and limbs stay whole
 
 
 def demo(out: StrPath, *, episodes: int = 32, steps: int | None = None, seed: int = 0) -> Path:
@@ -216,7 +218,14 @@ def roll_out(made: Demo) -> None:
         length = min(LONGEST, max(lengths) // shards.row_stride)
         window, other = lively_windows(shards, length, prompt, count=SHOWN)
         film = rollout_video(
-            model, tokenizer, shards, window=window, other=other, frames=length - prompt, prompt=prompt
+            model,
+            tokenizer,
+            shards,
+            window=window,
+            other=other,
+            frames=length - prompt,
+            prompt=prompt,
+            **FILM,
         )
         return found, film
 

@@ -44,6 +44,7 @@ class Sampling(TypedDict, total=False):
 
     unmask_steps: int
     temperature: float
+    order: str
     sample_steps: int | None
 
 
