@@ -171,6 +171,7 @@ def _continuous(values: Mapping[str, Any]) -> dict[str, Any]:
         "kind": "continuous",
         "latent_scale": LATENT_SCALE,
         "action_loss": "diffusion",
+        "diffusion_target": "noise",
         "diffusion_sample_steps": sum(int(part) for part in text.split(",")) if text else 1000,
         "diffusion_variance": True,
         **_renamed(values, _SAME_CONTINUOUS),

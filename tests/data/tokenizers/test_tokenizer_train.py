@@ -18,8 +18,9 @@ from hma_data.tokenizers.checkpoints import read_weights
 from hma_data.tokenizers.embedded import FsqAutoencoder, FsqConfig
 from hma_data.tokenizers.training.eval import psnr_db
 from hma_data.tokenizers.training.frames import draw_batch, load_pools
+from hma_data.tokenizers.training.muon import Muon, orthogonal
 from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
-from hma_data.tokenizers.training.train import Muon, orthogonal, train
+from hma_data.tokenizers.training.train import train
 from tests.data.tokenizer_files import draw_scene, drawn_corpus
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"

@@ -28,7 +28,7 @@ from tests.model.network_parts import small_batch, small_config
 RELEASED: dict[str, Any] = {
     "time_position": "learned", "action_alignment": "current", "temporal_norm": False, "final_norm": False,
     "absent_action": "skip", "add_at": "layers", "modulation_out": "embodiment", "base_width": 256,
-    "factored": (6, 6), "action_target": "raw",
+    "factored": (6, 6), "action_target": "raw", "diffusion_target": "noise",
 }  # fmt: skip
 CONTINUOUS = {"kind": "continuous", "action_loss": "diffusion", "latent_scale": 0.18215}
 LAYOUTS: dict[str, dict[str, Any]] = {
@@ -122,7 +122,9 @@ def test_configurations_survive_the_release() -> None:
             if getattr(config, field.name) != getattr(again, field.name)
         }
         unused = {"factored"} if config.kind == "continuous" else {"diffusion_depth", "diffusion_width"}
-        assert changed <= unused | {"diffusion_variance", "diffusion_sample_steps"}, layout
+        assert changed <= unused | {"diffusion_variance", "diffusion_sample_steps", "diffusion_target"}, (
+            layout
+        )
 
 
 @pytest.mark.parametrize("suffix", ["pytorch_model.bin", "nested.bin", "wrapped.safetensors"])

@@ -91,6 +91,7 @@ def test_steps_left_out_are_counted_everywhere_and_go_on_being_counted(tmp_path,
     assert state["skipped"] == whole.skipped
 
 
+@pytest.mark.slow
 def test_two_ranks_leave_out_the_steps_that_one_leaves_out(tmp_path):
     skipping = recipe(make_hurt(tmp_path / "hurt"), nonfinite="skip", batch_size=1, accumulate=4, steps=10)
     train(skipping, out=tmp_path / "alone", show=False)

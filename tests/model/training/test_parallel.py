@@ -125,6 +125,7 @@ def test_a_run_cut_on_one_rank_goes_on_on_two(recipe, alone, tmp_path):
     close(alone.checkpoint, resolve(tmp_path / "run"))
 
 
+@pytest.mark.slow
 def test_a_step_shared_otherwise_goes_on_with_windows_anew_and_says_so(recipe, tmp_path):
     given = recipe(accumulate=1, batch_size=4)
     train_until(given, tmp_path / "run", 3)
@@ -166,6 +167,7 @@ def test_ranks_that_cannot_share_a_step_are_told(recipe, tmp_path):
     assert len(said) == 1 and "3 windows a step cannot be shared evenly by 2 ranks" in said[0]
 
 
+@pytest.mark.slow
 def test_a_full_disk_on_the_first_rank_ends_all(recipe, tmp_path):
     work = partial(train_on_a_full_disk, recipe(), tmp_path / "run")
     said = errors(run_ranks(work, tmp_path / "said.txt", codes=(1, 1)))
@@ -178,13 +180,14 @@ def train_on_a_full_disk(recipe, out: Path, rank: int) -> None:
         train(recipe, out=out)
 
 
-@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("rank", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_fault_that_one_rank_has_is_said_once_however_much_later_the_other_ends(recipe, tmp_path, rank):
     on_step = partial(fail_and_outlast, rank, tmp_path / "pid")
     said = errors(spread(recipe(), tmp_path / "run", on_step, codes=(1, 1)))
     assert len(said) == 1 and "lies on a disk that this rank alone has lost — mount it" in said[0]
 
 
+@pytest.mark.slow
 def test_a_fault_that_all_ranks_have_before_they_meet_is_said_once(tmp_path):
     assert errors(run_ranks(fail, tmp_path / "said.txt", codes=(1, 1, 1))) == ["error: here: is gone"]
 
@@ -212,6 +215,7 @@ def test_one_process_raises_its_own_error():
         raise ShardError("here", "is gone")
 
 
+@pytest.mark.slow
 def test_a_rank_ends_though_an_error_keeps_the_network_past_its_group(tmp_path):
     run_ranks(free_the_error_last, tmp_path / "said.txt")
 

@@ -40,6 +40,7 @@ def train_quietly(recipe, out: Path) -> None:
     train(recipe, out=out, show=False)
 
 
+@pytest.mark.slow
 def test_a_run_killed_while_it_writes_a_checkpoint_goes_on_bit_for_bit(recipe, tmp_path):
     whole = train(recipe(), out=tmp_path / "whole", show=False)
     work = partial(train_quietly, recipe(), tmp_path / "cut")
@@ -106,6 +107,7 @@ def test_a_full_disk_is_one_error_and_leaves_the_last_checkpoint(recipe, tmp_pat
     assert train(recipe(), out=tmp_path / "run", show=False).step == 6
 
 
+@pytest.mark.slow
 def test_a_disk_that_takes_no_more_bytes_is_one_error(recipe, tmp_path):
     said = run(partial(train_on_a_small_disk, recipe(), tmp_path / "run"), tmp_path / "said.txt")
     assert said.startswith("CheckpointError") and "cannot be written" in said

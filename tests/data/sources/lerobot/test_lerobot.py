@@ -378,6 +378,7 @@ def test_a_folder_that_is_none_says_so(tmp_path: Path) -> None:
             open_source("lerobot").index(str(uri))
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_a_cut_or_flipped_file_gives_only_our_errors(
