@@ -1,6 +1,6 @@
 """Record and convert the robots on which the small world model is pre-trained: the made-up family's trunk.
 
-    python recipes/world/record.py OUT [--episodes 150] [--tokenizer fsq-8] [--workers 2]
+    python recipes/world/record.py OUT [--episodes 80] [--tokenizer fsq-lab] [--workers 2]
 
 Each robot is recorded, converted to OUT/shards/<id> and described by OUT/embodiments/<id>.yaml; then its
 recording is deleted. The same command continues where it was: robots whose shards are complete are skipped.
@@ -64,11 +64,11 @@ def main() -> None:
     """Make the shards of all robots asked for, and report each."""
     parser = argparse.ArgumentParser(description="Record and convert the robots of the small world model")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--episodes", type=int, default=150, help="of each robot")
+    parser.add_argument("--episodes", type=int, default=80, help="of each robot")
     parser.add_argument("--robots", nargs="+", default=[*family.TRUNK, *OTHERS], help="the trunk by default")
     parser.add_argument("--workers", type=int, default=2, help="robots at the same time")
-    parser.add_argument("--tokenizer", default="fsq-8")
-    parser.add_argument("--frames", choices=("all", "strided"), default="all", help="rows, as hma convert's")
+    parser.add_argument("--tokenizer", default="fsq-lab")
+    parser.add_argument("--frames", choices=("all", "strided"), default="strided", help="rows, as hma convert's")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     todo = [robot for robot in given.robots if not (given.out / "shards" / robot / MANIFEST).is_file()]

@@ -71,6 +71,7 @@ def test_each_camera_is_a_column_of_what_it_would_be_alone(
         assert ShardSet(alone).manifest.stats == shards.manifest.stats  # actions count once
 
 
+@pytest.mark.slow
 def test_the_cameras_of_a_lerobot_dataset_too(made: Path, tmp_path: Path) -> None:
     folder = write_dataset(tmp_path / "dataset")
     convert(arm("lerobot"), folder, BlockTokenizer(), tmp_path / "set", settings=EVERY)

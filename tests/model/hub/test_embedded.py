@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from hma_data.errors import CheckpointError, HubError
+from hma_data.lab.family import HELD_OUT, TRUNK
+from hma_model.checkpoint import folder
 from hma_model.cli import main
 from hma_model.network.model import HMA
 from tests.model.embedded import embedded, use
@@ -44,3 +46,15 @@ def test_weights_with_a_flipped_byte_are_refused(
     (copy / part).write_bytes(content)
     with pytest.raises((CheckpointError, HubError), match=f"{part}.* is (another trunk|not the file)"):
         HMA.from_pretrained("embedded")
+
+
+def test_the_embedded_trunk_is_the_one_of_the_recipe() -> None:
+    # recipes/world/record.py --episodes 80 (90 of the first seven), then `hma train world steps=4600`
+    own = folder.Checkpoint.open("embedded")
+    own.trunk()
+    assert own.trunk_sha256 == "a96049a2f7e70753682ce82b6a9342a6c11d0c681cd2a274c18e77eea114aacb"
+    assert set(own.embodiments) == {*TRUNK, "pendulum", "planar_arm", "pusht_fast", "pusht_slow"}
+    assert not set(own.embodiments) & set(HELD_OUT)
+    for embodiment in own.embodiments:
+        own.check(embodiment)
+    assert sum(path.stat().st_size for path in own.folder.rglob("*") if path.is_file()) <= 8_000_000

@@ -102,6 +102,7 @@ def test_two_ranks_leave_out_the_steps_that_one_leaves_out(tmp_path):
     assert [v for _, v, _ in two if v] == pytest.approx([v for _, v, _ in one if v], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_two_ranks_stop_with_one_error_that_names_the_window(tmp_path):
     hurt = recipe(make_hurt(tmp_path / "hurt"), batch_size=1, accumulate=4)
     said = errors(spread(hurt, tmp_path / "run", codes=(1, 1)))

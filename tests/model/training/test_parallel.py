@@ -162,6 +162,7 @@ def torchrun(recipe, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_ranks_that_cannot_share_a_step_are_told(recipe, tmp_path):
     said = errors(spread(recipe(batch_size=3, accumulate=1), tmp_path / "run", codes=(1, 1)))
     assert len(said) == 1 and "3 windows a step cannot be shared evenly by 2 ranks" in said[0]
@@ -180,7 +181,8 @@ def train_on_a_full_disk(recipe, out: Path, rank: int) -> None:
         train(recipe, out=out)
 
 
-@pytest.mark.parametrize("rank", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("rank", [0, 1])
 def test_a_fault_that_one_rank_has_is_said_once_however_much_later_the_other_ends(recipe, tmp_path, rank):
     on_step = partial(fail_and_outlast, rank, tmp_path / "pid")
     said = errors(spread(recipe(), tmp_path / "run", on_step, codes=(1, 1)))

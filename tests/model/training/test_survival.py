@@ -181,6 +181,7 @@ def test_shards_of_two_tokenizers_are_refused_with_both_names(recipe, data, tmp_
         train(recipe(data=[*data, str(other)]), out=tmp_path / "run", show=False)
 
 
+@pytest.mark.slow
 def test_a_run_may_go_on_with_other_workers(recipe, tmp_path, quick_workers):
     whole = train(recipe(), out=tmp_path / "whole", show=False)
 
@@ -194,6 +195,7 @@ def test_a_run_may_go_on_with_other_workers(recipe, tmp_path, quick_workers):
     assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_said_and_the_run_goes_on(recipe, tmp_path, quick_workers):
     long = {"steps": 30, "eval_every": 0, "checkpoint_every": 2}
     whole = train(recipe(**long), out=tmp_path / "whole", show=False)
