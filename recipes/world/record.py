@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=[*family.TRUNK, *OTHERS], help="the trunk by default")
     parser.add_argument("--workers", type=int, default=2, help="robots at the same time")
     parser.add_argument("--tokenizer", default="fsq-lab")
-    parser.add_argument("--frames", choices=("all", "strided"), default="strided", help="rows, as hma convert's")
+    parser.add_argument("--frames", choices=("all", "strided"), default="strided", help="as hma convert's")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     todo = [robot for robot in given.robots if not (given.out / "shards" / robot / MANIFEST).is_file()]
