@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from hma_data.errors import UsageError
-from hma_model.network.conditioning import ActionConditioning, Groups, align, condition
+from hma_model.network.conditioning import Groups, align, condition
+from hma_model.network.objectives import Layout
 from hma_model.network.stem import to_digits
-from hma_model.network.trunk import paired_times
 
 if TYPE_CHECKING:
     from hma_data.loading.dataset import Batch
@@ -160,13 +160,11 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     assert batch.tokens is not None
     config, frames = model.config, model.frame_values(batch.tokens)
     count, groups = frames.shape[1], Groups.of(batch.embodiment, len(frames))
-    given = align(config, batch.actions, batch.action_mask, count)
-    both = ActionConditioning(*(torch.cat([x, x[:, 1:]], dim=1) for x in (given.chunks, given.known)))
-    times = paired_times(config, count, count, frames.device)
+    layout = Layout.pairs(model, count, past=count)
+    given = align(config, batch.actions, batch.action_mask, count).frames(layout.frames)
     masked = torch.full_like(frames[:, 1:], config.mask_id)
-    before = [*range(-1, count - 1), *range(count - 1)]
-    x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)), before)
-    features = model.trunk(x, condition(model, both, groups, times.positions), times)
+    x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)), layout.previous)
+    features = model.trunk(x, condition(model, given, groups, layout.times.positions), layout.times)
     scores = model.token_readout(model.video_features(features)[:, count:])
     return groups.unsort(model.token_readout.split(scores)).unflatten(2, config.token_grid)
 

@@ -85,12 +85,8 @@ class ActionConditioning:
     chunks: Tensor
     known: Tensor
 
-    def frames(self, chosen: slice) -> "ActionConditioning":
-        """Return the chunks at those frames, as a view."""
-        return ActionConditioning(self.chunks[:, chosen], self.known[:, chosen])
-
-    def rows(self, chosen: list[int]) -> "ActionConditioning":
-        """Return the chunks at those frames, in that order."""
+    def frames(self, chosen: slice | list[int]) -> "ActionConditioning":
+        """Return the chunks at those frames; of a slice, a view."""
         return ActionConditioning(self.chunks[:, chosen], self.known[:, chosen])
 
 

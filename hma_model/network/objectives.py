@@ -83,11 +83,15 @@ class Layout:
         if model.config.training_pass == "window" or not objective.predicts_video or count < 2:
             order = list(range(count))
             return cls(order, [t - 1 for t in order], count, model.time_positions(count))
-        past = count if objective.readout else count - 1  # the last true frame is there only to be read
-        copies = list(range(1, count))
-        previous = [*range(-1, past - 1), *(t - 1 for t in copies)]
+        # the last true frame is there only to be read
+        return cls.pairs(model, count, past=count if objective.readout else count - 1)
+
+    @classmethod
+    def pairs(cls, model: "HMA", count: int, past: int) -> Self:
+        """Return the first `past` frames of `count`, then a copy of each frame from the second on."""
+        previous = [*range(-1, past - 1), *range(count - 1)]
         times = paired_times(model.config, past, count, model.device)
-        return cls([*range(past), *copies], previous, past, times)
+        return cls([*range(past), *range(1, count)], previous, past, times)
 
     @property
     def predicted(self) -> slice:
@@ -131,7 +135,7 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
     given = None
     if chosen.sees_actions:
         given = align(config, batch.actions, batch.action_mask & ~dropped, count)
-        given = given.rows(order) if paired else given
+        given = given.frames(order) if paired else given
     conditioning = condition(model, given, groups, times.positions)
     x = _embed(model, seen, video, layout, groups, generator)
     features = model.trunk(x, conditioning, times)
