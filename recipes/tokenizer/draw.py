@@ -1,22 +1,25 @@
 """Make the pictures of the tokenizers' corpus that no package has: gym-pusht, drawn scenes, the laboratory.
 
-    python recipes/tokenizer/draw.py OUT [--pusht 200] [--drawn 300] [--lab 0] [--seed 20]
+    python recipes/tokenizer/draw.py OUT [--pusht 200] [--drawn 300] [--lab 0] [--looks 0] [--seed 20]
 
 They are written to OUT/pusht/00000.png … and OUT/drawn/00000.png …, where the recipes expect them. With
 --lab, OUT/lab/ gets that many pictures of each laboratory robot of the embedded world model, each a
-mosaic of four frames, so that a crop of half its side shows the robot as large as a recording does.
+mosaic of four frames, so that a crop of half its side shows the robot as large as a recording does. With
+--looks, OUT/looks/ gets eight such mosaics of each of that many further robots of the family.
 """
 
 import argparse
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]
+EACH = 8  # mosaics of a further look
 LAB = ("pendulum", "planar_arm", "pusht_fast", "pusht_slow")  # beside the family's robots
 
 
@@ -95,29 +98,38 @@ def _draw_shape(canvas: Picture, rng: np.random.Generator, colour: tuple[float, 
         cv2.fillPoly(canvas, [np.asarray(box, np.int32)], colour, cv2.LINE_AA)
 
 
-def lab_pictures(count: int, seed: int) -> Iterator[Picture]:
-    """Yield `count` mosaics (256, 256, 3) of each laboratory robot of the embedded world model."""
+def lab_pictures(robots: Sequence[str], count: int, seed: int, episodes: int) -> Iterator[Picture]:
+    """Yield `count` mosaics (256, 256, 3) of each robot, of frames of `episodes` episodes."""
     from hma_data import lab
     from hma_data.lab import family
     from hma_data.registry.embodiment import find
     from hma_data.tokenizers.base import get_tokenizer
-    from hma_data.tokenizers.training.frames import EPISODES, recording_frames
+    from hma_data.tokenizers.training.frames import recording_frames
 
     spec = get_tokenizer("fsq-8").spec
     rng = np.random.default_rng([seed, 3])
-    each = -(-4 * count // EPISODES)
-    for robot in (*family.TRUNK, *LAB):
+    each = -(-4 * count // episodes)
+    for robot in robots:
         if robot in LAB:
             with tempfile.TemporaryDirectory() as folder:
-                recording = lab.record(robot, folder, EPISODES, seed)
+                recording = lab.record(robot, folder, episodes, seed)
                 frames = np.stack(list(recording_frames(find(robot), recording, spec, frames=each)))
         else:
             body = family.Body.of(robot)
-            films = [family.episode(body, seed, n).observations["image"] for n in range(EPISODES)]
+            films = [family.episode(body, seed, n).observations["image"] for n in range(episodes)]
             frames = np.concatenate([film[:: max(1, len(film) // each)][:each] for film in films])
         for four in rng.permutation(len(frames))[: 4 * count].reshape(-1, 4):
             top, bottom = (np.hstack(list(frames[pair])) for pair in (four[:2], four[2:]))
             yield np.vstack([top, bottom])
+
+
+def further_looks(count: int) -> list[str]:
+    """Return the names of `count` robots of the family that are neither the trunk's nor held out."""
+    from hma_data.lab import family
+    from hma_data.lab.family.bodies import MAKERS
+
+    names = (f"{kind}_{number}" for number in range(60, 1000) for kind in MAKERS)
+    return list(islice((name for name in names if name not in (*family.TRUNK, *family.HELD_OUT)), count))
 
 
 def write_pictures(folder: Path, pictures: Iterator[Picture]) -> None:
@@ -136,13 +148,22 @@ def main() -> None:
     parser.add_argument("--pusht", type=int, default=200, help="pictures of gym-pusht")
     parser.add_argument("--drawn", type=int, default=300, help="drawn scenes")
     parser.add_argument("--lab", type=int, default=0, help="mosaics of each laboratory robot")
+    parser.add_argument("--looks", type=int, default=0, help="further robots of the laboratory's family")
     parser.add_argument("--seed", type=int, default=20)
     arguments = parser.parse_args()
     write_pictures(arguments.out / "pusht", push_pictures(arguments.pusht, arguments.seed))
     rng = np.random.default_rng([arguments.seed, 2])
     write_pictures(arguments.out / "drawn", (draw_scene(rng) for _ in range(arguments.drawn)))
+    from hma_data.lab import family
+    from hma_data.tokenizers.training.frames import EPISODES
+
+    seed = arguments.seed
     if arguments.lab:
-        write_pictures(arguments.out / "lab", lab_pictures(arguments.lab, arguments.seed))
+        robots = (*family.TRUNK, *LAB)
+        write_pictures(arguments.out / "lab", lab_pictures(robots, arguments.lab, seed, EPISODES))
+    if arguments.looks:
+        pictures = lab_pictures(further_looks(arguments.looks), EACH, seed, 2)
+        write_pictures(arguments.out / "looks", pictures)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from torch.nn import functional
 from hma_data.errors import RecipeError
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.tokenizers.checkpoints import save_weights
+from hma_data.tokenizers.checkpoints import fill, read_weights, save_weights
 from hma_data.tokenizers.embedded import Autoencoder, FsqAutoencoder, FsqConfig, VaeAutoencoder, VaeConfig
 from hma_data.tokenizers.network import open_device
 from hma_data.tokenizers.training.eval import GREY, ssim_map
@@ -40,14 +40,18 @@ from hma_data.tokenizers.training.recipe import LossRecipe, TokenizerRecipe, Tra
 
 START, END = 2**32 - 1, 2**32 - 2  # step numbers of the batches that initialise and measure a network
 
+EDGE_REACH, EDGE_CONTRAST = 4, 0.12  # pixels; difference of grey values in [0, 1]
+
 
 def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tuple[Tensor, Tensor]:
     """Return the loss of (B, 3, S, S) pictures in [-1, 1], and the mean squared error in [0, 1] units."""
     made, true = (made + 1) / 2, (true + 1) / 2
-    squared = functional.mse_loss(made, true)
-    loss = weights.l2 * squared
+    error = made - true
+    squared = error.square().mean()
+    share = _edge_weights(true, weights.edges) if weights.edges else true.new_ones(())
+    loss = weights.l2 * (share * error.square()).mean()
     if weights.l1:
-        loss = loss + weights.l1 * functional.l1_loss(made, true)
+        loss = loss + weights.l1 * (share * error.abs()).mean()
     if weights.gradient:
         loss = loss + weights.gradient * _gradient_loss(made, true)
     if weights.ssim:
@@ -55,6 +59,16 @@ def reconstruction_loss(made: Tensor, true: Tensor, weights: LossRecipe) -> tupl
         grey = [(pictures * shares).sum(1, keepdim=True) for pictures in (made, true)]
         loss = loss + weights.ssim * (1 - ssim_map(*grey).mean())
     return loss, squared.detach()
+
+
+def _edge_weights(true: Tensor, edges: float) -> Tensor:
+    """Return weights (B, 1, S, S) of mean 1: pixels within EDGE_REACH of an edge count 1 + `edges` times."""
+    grey = true.mean(1, keepdim=True)
+    side = 2 * EDGE_REACH + 1
+    highest = functional.max_pool2d(grey, side, 1, EDGE_REACH)
+    lowest = -functional.max_pool2d(-grey, side, 1, EDGE_REACH)
+    counts = 1 + edges * (highest - lowest > EDGE_CONTRAST).to(true.dtype)
+    return counts / counts.mean()
 
 
 def _gradient_loss(made: Tensor, true: Tensor) -> Tensor:
@@ -93,6 +107,16 @@ def start_linear(network: Autoencoder, crops: Tensor) -> None:
         decoder.head.weight.mul_(0.1)
 
 
+def start_from(network: Autoencoder, source: str) -> None:
+    """Set a network's weights to those of a file that a training wrote.
+
+    Raises:
+        TokenizerError: there is no such file, or its weights are of another network.
+    """
+    path = Path(source).expanduser()
+    fill(network, read_weights(path, network.format, network.shape)[1], path)
+
+
 class Run:
     """A training in progress: network, averaged weights, optimizers, and the step it has reached."""
 
@@ -101,7 +125,10 @@ class Run:
         torch.manual_seed(recipe.seed)
         config = recipe.network
         network = FsqAutoencoder(config) if isinstance(config, FsqConfig) else VaeAutoencoder(config)
-        start_linear(network, self.batch(START, 256))
+        if recipe.start is None:
+            start_linear(network, self.batch(START, 256))
+        else:
+            start_from(network, recipe.start)
         self.device = device
         self.network: Autoencoder = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = {name: p.detach().clone() for name, p in self.network.named_parameters()}
