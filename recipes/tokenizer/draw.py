@@ -12,7 +12,6 @@ import argparse
 import math
 import tempfile
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -123,15 +122,6 @@ def lab_pictures(robots: Sequence[str], count: int, seed: int, episodes: int) ->
             yield np.vstack([top, bottom])
 
 
-def further_looks(count: int) -> list[str]:
-    """Return the names of `count` robots of the family that are neither the trunk's nor held out."""
-    from hma_data.lab import family
-    from hma_data.lab.family.bodies import MAKERS
-
-    names = (f"{kind}_{number}" for number in range(60, 1000) for kind in MAKERS)
-    return list(islice((name for name in names if name not in (*family.TRUNK, *family.HELD_OUT)), count))
-
-
 def write_pictures(folder: Path, pictures: Iterator[Picture]) -> None:
     """Write folder/00000.png and the pictures that follow."""
     import cv2
@@ -162,7 +152,7 @@ def main() -> None:
         robots = (*family.TRUNK, *LAB)
         write_pictures(arguments.out / "lab", lab_pictures(robots, arguments.lab, seed, EPISODES))
     if arguments.looks:
-        pictures = lab_pictures(further_looks(arguments.looks), EACH, seed, 2)
+        pictures = lab_pictures(family.further(arguments.looks), EACH, seed, 2)
         write_pictures(arguments.out / "looks", pictures)
 
 

@@ -1,10 +1,11 @@
 """Record and convert the robots on which the small world model is pre-trained: the made-up family's trunk.
 
-    python recipes/world/record.py OUT [--episodes 80] [--tokenizer fsq-lab] [--workers 2]
+    python recipes/world/record.py OUT [--episodes 80] [--further 28] [--tokenizer fsq-lab] [--workers 2]
 
 Each robot is recorded, converted to OUT/shards/<id> and described by OUT/embodiments/<id>.yaml; then its
-recording is deleted. The same command continues where it was: robots whose shards are complete are skipped.
-Two robots of the family are for the demo and never among these: `hma_data.lab.family.HELD_OUT`.
+recording is deleted. With --further, that many more robots of the family are recorded; they widen the
+trunk's experience and are not published. The same command continues where it was: robots whose shards are complete
+are skipped. Two robots of the family are for the demo and never among these: `hma_data.lab.family.HELD_OUT`.
 """
 
 import argparse
@@ -66,13 +67,15 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--episodes", type=int, default=80, help="of each robot")
     parser.add_argument("--robots", nargs="+", default=[*family.TRUNK, *OTHERS], help="the trunk by default")
+    parser.add_argument("--further", type=int, default=0, help="more robots of the family")
     parser.add_argument("--workers", type=int, default=2, help="robots at the same time")
     parser.add_argument("--tokenizer", default="fsq-lab")
     parser.add_argument("--frames", choices=("all", "strided"), default="strided", help="as hma convert's")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    todo = [robot for robot in given.robots if not (given.out / "shards" / robot / MANIFEST).is_file()]
-    print(f"{len(given.robots)} robots, {len(given.robots) - len(todo)} of them done already", flush=True)
+    robots = [*given.robots, *family.further(given.further)]
+    todo = [robot for robot in robots if not (given.out / "shards" / robot / MANIFEST).is_file()]
+    print(f"{len(robots)} robots, {len(robots) - len(todo)} of them done already", flush=True)
     settings = Settings(val_fraction=0.05, frames=given.frames)
     work = partial(make_work, given.out, given.episodes, given.seed, given.tokenizer, settings)
     for done, line in enumerate(run(todo, work, given.workers, _ignore), start=1):

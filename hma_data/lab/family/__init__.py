@@ -9,6 +9,7 @@ The reward is the distance that the blocks moved, in px. An episode is a success
 or more from its first place. T frames, A commands, Q axes, B blocks.
 """
 
+import itertools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import numpy as np
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver
 from hma_data.lab.family.look import SIZE, Floats
-from hma_data.lab.family.mechanisms import Axis
+from hma_data.lab.family.mechanisms import MAKERS, Axis
 from hma_data.lab.family.world import start
 from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
 from hma_data.registry.embodiment import Embodiment
@@ -30,6 +31,7 @@ TRUNK: tuple[str, ...] = (
     "mover_59", "gantry_04", "gantry_05", "rails_03", "rails_09", "crane_01", "crane_04", "crane_08",
 )  # fmt: skip
 HELD_OUT = ("arm3_55", "mover_52")  # not for pre-training: the demo's new robots
+FIRST_FURTHER = 60  # number of the first robots beside these
 PROVENANCE = {
     "recording": "made by hma_data.lab.family; everything about the robot is drawn from its name",
     "frequency_hz": "the simulator's control rate",
@@ -50,6 +52,12 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
     part.mkdir()
     for number in episodes:
         _write_bag(part / f"episode_{number:04d}.mcap", body, seed, number)
+
+
+def further(count: int) -> list[str]:
+    """Return the names of `count` robots, of all kinds in turn, that are neither in TRUNK nor in HELD_OUT."""
+    names = (f"{kind}_{number}" for number in itertools.count(FIRST_FURTHER) for kind in MAKERS)
+    return list(itertools.islice(names, count))
 
 
 def embodiment(robot: str) -> Embodiment:
