@@ -4,8 +4,9 @@
 
 Each robot is recorded, converted to OUT/shards/<id> and described by OUT/embodiments/<id>.yaml; then its
 recording is deleted. With --further, that many more robots of the family are recorded; they widen the
-trunk's experience and are not published. The same command continues where it was: robots whose shards are complete
-are skipped. Two robots of the family are for the demo and never among these: `hma_data.lab.family.HELD_OUT`.
+trunk's experience and are not published. The same command continues where it was: robots whose shards are
+complete are skipped. Two robots of the family are for the demo and never among these:
+`hma_data.lab.family.HELD_OUT`.
 """
 
 import argparse
