@@ -162,6 +162,7 @@ class HMAConfig:
     # continuous: the standard deviation of the noise in a visible frame, in units of its corruption, which is
     # drawn as that of digits, so corrupt_max and the history below count here too
     latent_noise: float = 0.0
+    told_noise: bool = False  # tell the model each frame's corruption; 0 for what it is shown after training
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
     history_frames: int = 4  # the shortest such history

@@ -186,12 +186,16 @@ def _embed(
     """Mask, corrupt and embed the frames; return the samples sorted by embodiment."""
     if model.config.kind == "discrete":
         corrupted = corrupt_tokens(model.config, frames, video, generator)
-        return model.embed_tokens(groups.sort(corrupted), layout.previous)
-    masked = video.masked.to(frames.device).unsqueeze(-1)
-    if spread := model.config.latent_noise:
-        rate = spread * video.corruption.to(frames.device)[..., None, None]
-        frames = frames + rate * randn(frames.shape, generator, frames.device)
-    return model.embed_patches(groups.sort(frames), groups.sort(masked), layout.previous)
+        x = model.embed_tokens(groups.sort(corrupted), layout.previous)
+    else:
+        masked = video.masked.to(frames.device).unsqueeze(-1)
+        if spread := model.config.latent_noise:
+            rate = spread * video.corruption.to(frames.device)[..., None, None]
+            frames = frames + rate * randn(frames.shape, generator, frames.device)
+        x = model.embed_patches(groups.sort(frames), groups.sort(masked), layout.previous)
+    if model.trunk.noise is not None:
+        x = x + model.trunk.noise(groups.sort(video.corruption.to(x.device)))
+    return x
 
 
 def _video_loss(

@@ -147,6 +147,25 @@ class LatentEmbedding(nn.Module):
         return self.linear(filled.to(self.linear.weight.dtype))
 
 
+class NoiseEmbedding(nn.Module):
+    """The embedding of a frame's corruption, which is added to its tokens; that of a clean frame is zero.
+
+    The projection begins at zero, so it can be added to a trained trunk.
+    """
+
+    WAVES = 16
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(self.WAVES, config.width))
+
+    def forward(self, corruption: Tensor) -> Tensor:
+        """Embed shares (B, T) from 0 to 1 as (B, T, 1, D)."""
+        rates = torch.arange(1, self.WAVES + 1, device=corruption.device) * (math.pi / 2)
+        waves = (corruption.unsqueeze(-1) * rates).sin()  # all of them zero at 0
+        return (waves.to(self.weight.dtype) @ self.weight).unsqueeze(2)
+
+
 # -- actions
 
 

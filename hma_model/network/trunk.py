@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
-from hma_model.network.stem import LatentEmbedding, Modulation, TokenEmbedding
+from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
 
 
 @dataclass
@@ -361,6 +361,7 @@ class Trunk(nn.Module):
         positions = config.frames if config.time_position == "learned" else 1
         tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
         self.embed = LatentEmbedding(config) if continuous else TokenEmbedding(config)
+        self.noise = NoiseEmbedding(config) if config.told_noise else None
         self.position = nn.Parameter(torch.randn(positions, tokens, config.width) * 0.02)
         if config.position_init == "sinusoid":
             with torch.no_grad():

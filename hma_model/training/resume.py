@@ -62,6 +62,8 @@ TRAINED_BY = {
     *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
     *("training_pass", "whole_share", "position_init", "latent_noise"),
 }
+# switches that a run may turn on for a checkpoint without them, and their parameters, which begin at zero
+ADDED = {"told_noise": "trunk.noise."}
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ class Start:
         config = self.checkpoint.config
         changes: dict[str, Any] = {"objectives": recipe.objectives}
         for key, value in recipe.model.items():
-            if key in TRAINED_BY:
+            if key in TRAINED_BY or (key in ADDED and value and not self.frozen):
                 changes[key] = value
             elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
                 fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"
@@ -158,7 +160,9 @@ class Start:
 
     def fill(self, model: HMA) -> None:
         """Load the checkpoint's weights for the model's embodiments; freeze trunk and readout if required."""
-        model.load_trunk(stored.trunk(self.checkpoint))
+        kept = stored.trunk(self.checkpoint)
+        added = tuple(begin for key, begin in ADDED.items() if not getattr(self.checkpoint.config, key))
+        model.load_trunk({n: t for n, t in model.trunk_state().items() if n.startswith(added)} | kept)
         for name in model.embodiments:
             if name in self.checkpoint.embodiments:
                 checkpoints.add_embodiment(model, self.checkpoint, name)

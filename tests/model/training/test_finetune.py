@@ -93,6 +93,18 @@ def test_the_network_and_the_window_are_the_checkpoints(base, leg, tmp_path):
     assert (config.width, config.mup, config.frames) == (16, True, TINY["frames"])
 
 
+def test_told_noise_can_be_turned_on_for_a_tuned_trunk_and_changes_nothing_at_first(base, leg, tmp_path):
+    still = ["steps=1", "lr=1e-12", "model.corrupt_max=0.2"]
+    told = [*still, "model.told_noise=true"]
+    a, b = (tune(base.out, leg, tmp_path / str(len(more)), *more, freeze=False) for more in (still, told))
+    assert b.losses == a.losses
+    assert Checkpoint.open(b.checkpoint).config.told_noise
+    again = finetune(b.out, [leg], out=tmp_path / "again", overrides=[*SHORT, *still], show=False)
+    assert Checkpoint.open(again.checkpoint).config.told_noise
+    with pytest.raises(RecipeError, match="model.told_noise: is True, the checkpoint .* has False"):
+        tune(base.out, leg, tmp_path / "frozen", *told)
+
+
 def test_from_a_hub_and_back_into_it(base, leg, tmp_path):
     hub.push(base.checkpoint, tmp_path / "hub" / "team" / "model")
     result = tune(tmp_path / "hub" / "team" / "model", leg, tmp_path / "run")
