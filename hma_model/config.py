@@ -78,6 +78,7 @@ _CHOICES = {
     "kind": ("discrete", "continuous"),
     "training_pass": ("window", "pairs"),
     "masked_input": ("learned", "previous"),
+    "digit_order": ("together", "chain"),
     "position_init": ("random", "sinusoid"),
     "time_position": ("rotary", "learned"),
     "action_alignment": ("previous", "current"),
@@ -175,6 +176,9 @@ class HMAConfig:
     # the embedding of the frame before at its place.
     masked_input: str = "learned"
     position_init: str = "random"  # of places in a frame; "sinusoid": 2-D sinusoids
+    # discrete: how a token's digits are predicted. "together": independently of one another (paper).
+    # "chain": one after the other, the low one first, each given those before it.
+    digit_order: str = "together"
 
     diffusion_target: str = "velocity"  # what the head predicts: defined at full noise too; "noise" (paper)
     diffusion_depth: int = 3

@@ -149,7 +149,7 @@ def teacher_forced(model: "HMA", batch: "Batch") -> tuple[Tensor, Tensor]:
         assert own.tokens is not None
         seen = own.tokens.clone()
         seen[:, -1] = config.vocab_size
-        logits = model.video_logits(seen, own.actions, own.embodiment, own.action_mask)
+        logits = model.video_logits(seen, own.actions, own.embodiment, own.action_mask, own.tokens)
         parts.append(_scored(model, own, logits[:, -1:]))
     nats, hits = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
     return nats, hits
@@ -165,7 +165,8 @@ def _at_once(model: "HMA", batch: "Batch") -> Tensor:
     masked = torch.full_like(frames[:, 1:], config.mask_id)
     x = model.embed_tokens(groups.sort(torch.cat([frames, masked], dim=1)), layout.previous)
     features = model.trunk(x, condition(model, given, groups, layout.times.positions), layout.times)
-    scores = model.token_readout(model.video_features(features)[:, count:])
+    true = to_digits(groups.sort(frames[:, 1:]), config.digits)
+    scores = model.token_readout(model.video_features(features)[:, count:], true)
     return groups.unsort(model.token_readout.split(scores)).unflatten(2, config.token_grid)
 
 

@@ -126,8 +126,9 @@ class TokenFrame:
 
     def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return token ids (B, k) and the sums (B, k) of the log probabilities of their digits."""
-        digits, confidence = [], torch.zeros(features.shape[:2], device=features.device)
-        for scores in readout(features).split(list(readout.factored), dim=-1):
+        digits: list[Tensor] = []
+        confidence = torch.zeros(features.shape[:2], device=features.device)
+        for scores in readout.one_by_one(features, digits):
             drawn = scores
             if self.decoding.temperature > 0:  # the largest of these sums is a sample from the softmax
                 noise = uniform(scores.shape, self.decoding.generator, scores.device).clamp(min=1e-20)

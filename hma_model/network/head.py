@@ -7,7 +7,7 @@ M rows, C values of a sample, W width of the diffusion head.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -36,8 +36,47 @@ def device_of(generator: torch.Generator | None) -> torch.device | str:
     return "cpu" if generator is None else generator.device
 
 
+class DigitChain(nn.Module):
+    """What a digit's scores gain from the digits before it: an MLP of the features and of their embeddings.
+
+    The output begins at zero, so it can be added to a trained readout.
+    """
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        width, digits = config.width, config.digits
+        self.multiplier = config.base_width / config.width if config.mup else 1.0
+        self.input = nn.Linear(width, width, bias=False)
+        nn.init.normal_(self.input.weight, std=width**-0.5)
+        self.place = nn.Parameter(torch.randn(len(digits), width) * 0.5)
+        self.digits = nn.ParameterList(torch.randn(values, width) * 0.5 for values in digits[:-1])
+        self.output = nn.ParameterList(torch.zeros(values, width) for values in digits)
+
+    def start(self, features: Tensor) -> Tensor:
+        """Return the sum (..., D) from which the first digit is predicted, of features (..., D)."""
+        return self.input(features)
+
+    def take(self, so_far: Tensor, index: int, digit: Tensor) -> Tensor:
+        """Add digit `index` (...) to the sum (..., D)."""
+        return so_far + F.embedding(digit, self.digits[index])
+
+    def scores(self, so_far: Tensor, index: int) -> Tensor:
+        """Return what the scores (..., V) of digit `index` gain by the sum (..., D) before it."""
+        return F.linear(F.gelu(so_far + self.place[index]) * self.multiplier, self.output[index])
+
+    def forward(self, features: Tensor, digits: Tensor) -> Tensor:
+        """Return the gains (..., sum of V) of all digits, given the true digits (..., F) before each."""
+        embedded = [F.embedding(digits[..., i], weight) for i, weight in enumerate(self.digits)]
+        before = torch.stack([self.start(features), *embedded], dim=-2).cumsum(-2)
+        hidden = F.gelu(before + self.place) * self.multiplier
+        return torch.cat([F.linear(x, w) for x, w in zip(hidden.unbind(-2), self.output)], dim=-1)
+
+
 class TokenReadout(nn.Module):
-    """The readout of the discrete model: scores of every digit's values, and their cross-entropy."""
+    """The readout of the discrete model: scores of every digit's values, and their cross-entropy.
+
+    With `digit_order == "chain"`, a digit's scores also depend on the digits before it.
+    """
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
@@ -46,9 +85,36 @@ class TokenReadout(nn.Module):
         self.linear = nn.Linear(config.width, sum(config.digits))
         nn.init.normal_(self.linear.weight, std=0.02)
         nn.init.zeros_(self.linear.bias)
+        self.chain = DigitChain(config) if config.digit_order == "chain" else None
 
-    def forward(self, features: Tensor) -> Tensor:
-        """Map features (..., D) to scores (..., sum of V) float32, digit after digit, low digit first."""
+    def forward(self, features: Tensor, digits: Tensor | None = None) -> Tensor:
+        """Map features (..., D) to scores (..., sum of V) float32, digit after digit, low digit first.
+
+        `digits` (..., F) are those that a chain's later digits are given; by default the likeliest.
+        """
+        if self.chain is None:
+            return self._alone(features)
+        if digits is not None:
+            return self._alone(features) + self.chain(features, digits).float()
+        chosen: list[Tensor] = []
+        scores = []
+        for part in self.one_by_one(features, chosen):
+            scores.append(part)
+            chosen.append(part.argmax(-1))
+        return torch.cat(scores, dim=-1)
+
+    def one_by_one(self, features: Tensor, chosen: Sequence[Tensor]) -> Iterator[Tensor]:
+        """Yield each digit's scores (..., V); the caller appends the digit (...) it chose to `chosen`."""
+        parts = self._alone(features).split(list(self.factored), dim=-1)
+        if self.chain is None:
+            yield from parts
+            return
+        so_far = self.chain.start(features)
+        for index, part in enumerate(parts):
+            so_far = self.chain.take(so_far, index - 1, chosen[-1]) if index else so_far
+            yield part + self.chain.scores(so_far, index).float()
+
+    def _alone(self, features: Tensor) -> Tensor:
         return self.linear(features * self.multiplier if self.multiplier != 1 else features).float()
 
     def split(self, scores: Tensor) -> Tensor:
@@ -64,12 +130,12 @@ class TokenReadout(nn.Module):
     def loss(self, features: Tensor, digits: Tensor) -> Tensor:
         """Return the cross-entropy (M,), summed over digits, of features (M, D) and digits (M, F)."""
         if len(set(self.factored)) == 1:
-            scores = self.split(self(features)).flatten(0, 1)
+            scores = self.split(self(features, digits)).flatten(0, 1)
             losses = F.cross_entropy(
                 scores, digits.flatten(), reduction="none", label_smoothing=self.smoothing
             )
             return losses.view(digits.shape).sum(1)
-        parts = self(features).split(list(self.factored), dim=-1)
+        parts = self(features, digits).split(list(self.factored), dim=-1)
         each = [
             F.cross_entropy(part, digits[:, i], reduction="none", label_smoothing=self.smoothing)
             for i, part in enumerate(parts)

@@ -20,7 +20,14 @@ from hma_data.storage.paths import StrPath
 from hma_model.config import POLICY, READOUTS, ActionSpace, HMAConfig, Readout
 from hma_model.network.conditioning import Groups, align, condition, unknown
 from hma_model.network.head import ActionHead, LatentReadout, TokenReadout
-from hma_model.network.stem import LatentEmbedding, Stem, TokenEmbedding, merge_tokens, patchify
+from hma_model.network.stem import (
+    LatentEmbedding,
+    Stem,
+    TokenEmbedding,
+    merge_tokens,
+    patchify,
+    to_digits,
+)
 from hma_model.network.trunk import Conditioning, TimePositions, Trunk, window_times
 
 if TYPE_CHECKING:
@@ -186,6 +193,7 @@ class HMA(nn.Module):
         actions: Tensor | None,
         embodiment: str | Sequence[str],
         action_mask: Tensor | None = None,
+        true: Tensor | None = None,
     ) -> Tensor:
         """Compute the scores of every token of a window.
 
@@ -194,6 +202,8 @@ class HMA(nn.Module):
             actions: (B, T, K) raw chunks; None for no actions.
             embodiment: one id for all, or one a sample.
             action_mask: (B, T) bool, True where a chunk is known; by default all are.
+            true: (B, T, h, w) int64 tokens whose digits a chain's later digits are given; by default those
+                are the likeliest.
 
         Returns:
             (B, T, h, w, F, V) float32, low digit first; with `merge`, of the trunk's tokens and their digits.
@@ -202,7 +212,8 @@ class HMA(nn.Module):
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
         conditioning = self._condition(actions, action_mask, groups, times)
         x = self.embed_tokens(groups.sort(self.frame_values(tokens)))
-        scores = self.token_readout(self.video_features(self.trunk(x, conditioning, times)))
+        given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
+        scores = self.token_readout(self.video_features(self.trunk(x, conditioning, times)), given)
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
 
     def video_conditions(

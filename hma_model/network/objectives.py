@@ -36,7 +36,8 @@ class Output:
         per_sample: (B,) detached, each sample's video loss, or its action loss if there is no video loss.
         masked: (B, T, h, w) bool, the tokens of the video loss.
         objective: the objective of the pass.
-        video_logits: (B, T, h, w, F, V) float32 of the discrete model outside training, else None.
+        video_logits: (B, T, h, w, F, V) float32 of the discrete model outside training, else None; with a
+            chain of digits each given the true digits before it.
     """
 
     loss: Tensor
@@ -154,7 +155,8 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
         video_loss, per_sample = _video_loss(model, predictors, frames, video.masked, groups, generator)
         if config.kind == "discrete" and not model.training:
             every = torch.cat([model.video_features(features)[:, :1], own], dim=1) if paired else own
-            scores = model.token_readout.split(model.token_readout(every.detach()))
+            true = to_digits(groups.sort(model.frame_values(stored)), config.digits)
+            scores = model.token_readout.split(model.token_readout(every.detach(), true))
             logits = groups.unsort(scores).unflatten(2, config.token_grid)
         if paired:
             video.masked = F.pad(video.masked, (0, 0, 1, 0))

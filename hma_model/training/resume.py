@@ -62,8 +62,8 @@ TRAINED_BY = {
     *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
     *("training_pass", "whole_share", "position_init", "latent_noise"),
 }
-# switches that a run may turn on for a checkpoint without them, and their parameters, which begin at zero
-ADDED = {"told_noise": "trunk.noise."}
+# fields that a run may turn on for a checkpoint, and their parameters, which change nothing at first
+ADDED = {"told_noise": "trunk.noise.", "digit_order": "readout.chain."}
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Start:
         config = self.checkpoint.config
         changes: dict[str, Any] = {"objectives": recipe.objectives}
         for key, value in recipe.model.items():
-            if key in TRAINED_BY or (key in ADDED and value and not self.frozen):
+            if key in TRAINED_BY or (key in self._off() and not self.frozen):
                 changes[key] = value
             elif getattr(config.replace(**{key: value}), key) != getattr(config, key):
                 fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"
@@ -161,7 +161,7 @@ class Start:
     def fill(self, model: HMA) -> None:
         """Load the checkpoint's weights for the model's embodiments; freeze trunk and readout if required."""
         kept = stored.trunk(self.checkpoint)
-        added = tuple(begin for key, begin in ADDED.items() if not getattr(self.checkpoint.config, key))
+        added = tuple(self._off().values())
         model.load_trunk({n: t for n, t in model.trunk_state().items() if n.startswith(added)} | kept)
         for name in model.embodiments:
             if name in self.checkpoint.embodiments:
@@ -169,6 +169,11 @@ class Start:
         if self.frozen:
             model.trunk.requires_grad_(False)
             model.readout.requires_grad_(False)
+
+    def _off(self) -> dict[str, str]:
+        """Return the fields of ADDED that the checkpoint's network is without, and their parameters."""
+        config = self.checkpoint.config
+        return {key: begin for key, begin in ADDED.items() if getattr(config, key) == getattr(HMAConfig, key)}
 
     def remarks(self, names: Iterable[str]) -> list[str]:
         """Return notes on the trunk, and on which robots continue and which get a fresh stem and head."""
@@ -222,6 +227,7 @@ class State:
     sampler: dict[str, Any]  # `TrainData.state`
     skipped: int = 0  # number of steps skipped because of a bad loss or gradient
     seconds: float = 0.0  # time spent in steps so far
+    cpu_seconds: float = 0.0  # and CPU time, the mean over the ranks
     evaluation: dict[str, Any] = field(default_factory=dict)  # the figures of the last evaluation
     norms: list[float] = field(default_factory=list)  # running mean of the gradients' norms, and their number
 

@@ -28,7 +28,7 @@ def _embedded_level(model, batch, monkeypatch, objective="forward"):
 def test_the_level_that_is_told_is_the_share_of_digits_that_were_replaced(
     training_pass, objective, monkeypatch
 ):
-    values = {"grid": (32, 32), "factored": (64, 64), "corrupt_max": 0.3, "history_probability": 0.5}
+    values = {"grid": (16, 16), "factored": (64, 64), "corrupt_max": 0.3, "history_probability": 0.5}
     model = small_model(told_noise=True, training_pass=training_pass, **values)
     batch = small_batch(model.config, NAMES)
     told, tokens = _embedded_level(model, batch, monkeypatch, objective)
@@ -38,9 +38,9 @@ def test_the_level_that_is_told_is_the_share_of_digits_that_were_replaced(
     masked = tokens == model.config.mask_id
     both = torch.stack([tokens % 64 != true % 64, tokens // 64 != true // 64])
     replaced = (both & ~masked).sum((0, 3)) / (2 * (~masked).sum(2)).clamp(min=1)
-    seen = (~masked).sum(2) > 300
+    seen = (~masked).sum(2) > 100
     assert seen.sum() > 8 and told.std() > 0.05
-    assert (replaced - told * 63 / 64)[seen].abs().max() < 0.08
+    assert (replaced - told * 63 / 64)[seen].abs().max() < 0.15
 
 
 def test_a_clean_frame_is_as_without_the_embedding():

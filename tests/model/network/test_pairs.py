@@ -30,7 +30,9 @@ def _batch(model: HMA) -> Batch:
     return Batch(NAMES, made.actions, made.action_mask, tokens=made.tokens, latents=made.latents)
 
 
-@pytest.mark.parametrize("changes", [{}, {"masked_input": "previous"}, {"merge": 2}], ids=str)
+@pytest.mark.parametrize(
+    "changes", [{}, {"masked_input": "previous"}, {"merge": 2}, {"digit_order": "chain"}], ids=str
+)
 @pytest.mark.parametrize("objective", ["forward", "full"])
 def test_whole_copies_have_the_loss_of_each_frame_after_its_true_past(changes, objective):
     model = small_model(**changes, **WHOLE)

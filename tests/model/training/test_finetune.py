@@ -93,16 +93,17 @@ def test_the_network_and_the_window_are_the_checkpoints(base, leg, tmp_path):
     assert (config.width, config.mup, config.frames) == (16, True, TINY["frames"])
 
 
-def test_told_noise_can_be_turned_on_for_a_tuned_trunk_and_changes_nothing_at_first(base, leg, tmp_path):
-    still = ["steps=1", "lr=1e-12", "model.corrupt_max=0.2"]
-    told = [*still, "model.told_noise=true"]
-    a, b = (tune(base.out, leg, tmp_path / str(len(more)), *more, freeze=False) for more in (still, told))
+@pytest.mark.parametrize(("key", "value"), [("told_noise", True), ("digit_order", "chain")])
+def test_what_begins_at_nothing_can_be_turned_on_for_a_tuned_trunk(base, tmp_path, key, value):
+    arm, still = make_shards(tmp_path / "arm", "arm"), ["steps=1", "lr=1e-12", "model.corrupt_max=0.2"]
+    more = [*still, f"model.{key}={value}"]
+    a, b = (tune(base.out, arm, tmp_path / str(len(given)), *given, freeze=False) for given in (still, more))
     assert b.losses == a.losses
-    assert Checkpoint.open(b.checkpoint).config.told_noise
-    again = finetune(b.out, [leg], out=tmp_path / "again", overrides=[*SHORT, *still], show=False)
-    assert Checkpoint.open(again.checkpoint).config.told_noise
-    with pytest.raises(RecipeError, match="model.told_noise: is True, the checkpoint .* has False"):
-        tune(base.out, leg, tmp_path / "frozen", *told)
+    again = tune(b.out, arm, tmp_path / "again", *still, freeze=False)
+    for result in (b, again):
+        assert getattr(Checkpoint.open(result.checkpoint).config, key) == value
+    with pytest.raises(RecipeError, match=f"model.{key}: is {value!r}, the checkpoint .* has "):
+        tune(base.out, arm, tmp_path / "frozen", *more)
 
 
 def test_from_a_hub_and_back_into_it(base, leg, tmp_path):
