@@ -37,12 +37,14 @@ class Pass:
 
     Attributes:
         past: (rows, T - 1, S) the frames before the new one that the first pass computes.
+        levels: (rows, T - 1) the noise that the model is told of them; None for none.
         times, conditioning: of the T frames.
         among: numbers of the pass's rows among those of the step; None if they are the same.
         lanes: numbers of the step's rows among those of the pass; None if they are the same.
     """
 
     past: Tensor
+    levels: Tensor | None
     times: TimePositions
     conditioning: Conditioning
     among: Tensor | None = None
@@ -70,7 +72,8 @@ class Rollout:
         model: any model; it is used as it is, so call `eval()` on it before.
         embodiment: one id for all, or one a row.
         batch: B.
-        unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
+        unmask_steps, temperature, order, sample_steps, guidance, noise_level: as in `HMA.generate`. With
+            guidance other than 1, each row has a twin without commands, row B + its number of the state.
         generator: of the seeds of rows that get none.
         cache: keep keys and values of past frames.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
@@ -91,18 +94,20 @@ class Rollout:
         temperature: float = 0.0,
         order: str = "random",
         sample_steps: int | None = None,
+        guidance: float = 1.0,
+        noise_level: float = 0.0,
         generator: torch.Generator | None = None,
         cache: bool = True,
         compile: bool = False,
     ) -> None:
         self.model, self.config = model, model.config
-        self.decoding = Decoding(unmask_steps, temperature, order, sample_steps)
-        check(self.decoding, self.config.kind)
-        self.batch, self.caching = batch, cache
+        self.decoding = Decoding(unmask_steps, temperature, order, sample_steps, guidance, noise_level)
+        check(self.decoding, self.config)
+        self.batch, self.caching, self.twins = batch, cache, guidance != 1
         self.compiled = _compiled(model.trunk) if compile and cache else None
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
-        names = [embodiment] * batch if isinstance(embodiment, str) else embodiment
-        self.state = RowState(model, names, generator, cache)
+        names = [embodiment] * batch if isinstance(embodiment, str) else list(embodiment)
+        self.state = RowState(model, names * (1 + self.twins), generator, cache)
         self.passive: bool | None = None  # no actions at all; known from the first step on
         self.told = False  # some prompt had actions
 
@@ -150,10 +155,13 @@ class Rollout:
         values = self.model.frame_values(frames).to(self.model.device)
         if len(values) != len(chosen):
             raise HMAError("prompt", f"has {len(values)} samples", f"give {len(chosen)}, one for each row")
-        names = embodiments or [self.state.embodiments[row] for row in chosen]
+        names = list(embodiments or [self.state.embodiments[row] for row in chosen])
         given = self._condition_on(names, actions, known, values.shape[1])
         last = slice(max(values.shape[1] - self.config.frames, 0), None)
         self.state.begin(chosen, names, values[:, last], given.frames(last), seeds)
+        if self.twins:
+            free = replace(given, known=torch.zeros_like(given.known))
+            self.state.begin(self._twins(chosen), names, values[:, last], free.frames(last), seeds)
         self.told = self.told or actions is not None
 
     def fork(self, n: int) -> "Rollout":
@@ -161,20 +169,22 @@ class Rollout:
         rows = [row for row in range(self.batch) for _ in range(n)]
         names = [self.state.embodiments[row] for row in rows]
         other = Rollout(
-            self.model, names, len(rows), generator=self.state.shared, cache=self.caching,
-            compile=self.compiled is not None,
+            self.model, names, len(rows), guidance=self.decoding.guidance if self.twins else 1.0,
+            generator=self.state.shared, cache=self.caching, compile=self.compiled is not None,
         )  # fmt: skip
         other.decoding = self.decoding
-        other.restore(range(len(rows)), self.snapshot().take(rows))
+        other.restore(range(len(rows)), self.snapshot().take([*rows, *self._twins(rows)]))
         return other
 
     def snapshot(self, rows: Sequence[int] | None = None) -> Snapshot:
         """Return a copy of the state of some rows, by default all."""
-        return replace(self.state.snapshot(self._chosen(rows)), passive=self.passive)
+        chosen = self._chosen(rows)
+        return replace(self.state.snapshot([*chosen, *self._twins(chosen)]), passive=self.passive)
 
     def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
         """Put rows into the state of a snapshot of as many rows, from any rollout of the same model."""
         chosen = self._chosen(rows)
+        chosen += self._twins(chosen)
         if len(snapshot.times) != len(chosen):
             raise HMAError("snapshot", f"has {len(snapshot.times)} rows", f"give one of {len(chosen)}")
         if self._clashes(snapshot.passive):
@@ -190,6 +200,10 @@ class Rollout:
         if not chosen or len(set(chosen)) < len(chosen) or not 0 <= min(chosen) <= max(chosen) < self.batch:
             raise HMAError("rows", f"{chosen} are not rows", f"give some of 0 to {self.batch - 1}, each once")
         return chosen
+
+    def _twins(self, rows: list[int]) -> list[int]:
+        """Return the twins of rows; none without guidance."""
+        return [self.batch + row for row in rows] if self.twins else []
 
     def _clashes(self, passive: bool | None) -> bool:
         """Check whether rows with and without actions meet where their frames differ in tokens."""
@@ -220,35 +234,39 @@ class Rollout:
         Returns:
             (n, h, w) int64 tokens, or (n, c, H, W) float32 latents as stored.
         """
-        chosen = self._chosen(rows)
-        for row in chosen:
+        own = self._chosen(rows)
+        for row in own:
             if not self.state.times[row]:
                 raise HMAError("step", f"row {row} has no prompt", "reset the row first")
+        chosen = [*own, *self._twins(own)]
         if self.config.time_position == "learned":
             self.state.slide(chosen)
         if not self.caching:
             self.state.grow(chosen)
-        self._take(chosen, chunk, following, known)
+        self._take(own, chunk, following, known)
+        if self.twins:
+            self.state.put_chunk(self._twins(own), 0, None, None)
         frame, passes = self._blank(chosen), self._passes(chosen)
         left = tokens = self.config.tokens_per_frame
         for step in range(self.decoding.steps):
             count = left - masked_after(step, self.decoding.steps, tokens)
             if count > 0:
                 features, position = self._features(frame, passes, first=left == tokens)
-                own = features[:, :tokens]
-                frame.unmask(self.model.readout, own, position, count)  # type: ignore[arg-type]
+                seen = features[:, :tokens]
+                frame.unmask(self.model.readout, seen, position, count)  # type: ignore[arg-type]
                 left -= count
         self.state.put_frame(chosen, frame.values)
-        return self._show(frame.values)
+        return self._show(frame.values[: len(own)])
 
     def _passes(self, rows: list[int]) -> list[Pass]:
         """Return the pass that all rows share; without a cache, one for the rows of each time."""
         if self.caching:
             self._catch_up(rows)
-            if self.compiled is None or len(rows) == self.batch:
+            every = list(range(len(self.state.times)))
+            if self.compiled is None or len(rows) == len(every):
                 return [self._newest(rows)]
             # Compiled code has one shape, so idle rows compute too. Their next step writes the slots again.
-            return [replace(self._newest(list(range(self.batch))), lanes=self.state.tensor(rows))]
+            return [replace(self._newest(every), lanes=self.state.tensor(rows))]
         times = self.state.times
         ages = dict.fromkeys(times[row] for row in rows)
         return [self._whole(rows, [i for i, row in enumerate(rows) if times[row] == age]) for age in ages]
@@ -262,7 +280,8 @@ class Rollout:
             past = state.past(late, times.positions)
             masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
             conditioning = self._condition(late, times.positions)
-            self.model.trunk(self._embed(past, masked), conditioning, times, self._cache())
+            x = self._tell(self._embed(past, masked), self._levels(late, times.positions))
+            self.model.trunk(x, conditioning, times, self._cache())
             for row in late:
                 state.pending[row] = 1
 
@@ -271,16 +290,18 @@ class Rollout:
         last = self.config.frames - 1 if self.config.time_position == "learned" else max(self.state.times)
         begin = [max(min(self.state.times[row], last) - 1, 0) for row in rows]  # of idle rows any will do
         times = self.state.cached_times(rows, begin, 2)
-        past = self.state.past(rows, times.positions[:, :1])
-        return Pass(past, times, self._condition(rows, times.positions))
+        before = times.positions[:, :1]
+        past, levels = self.state.past(rows, before), self._levels(rows, before)
+        return Pass(past, levels, times, self._condition(rows, times.positions))
 
     def _whole(self, rows: list[int], members: list[int]) -> Pass:
         """Return the pass over all frames and the next one of those rows of a step that are at one time."""
         chosen = [rows[i] for i in members]
         times = window_times(self.config, self.state.times[chosen[0]] + 1, self.model.device)
-        past = self.state.past(chosen, times.positions[:-1].unsqueeze(0))
+        before = times.positions[:-1].unsqueeze(0)
+        past, levels = self.state.past(chosen, before), self._levels(chosen, before)
         conditioning = self._condition(chosen, times.positions.unsqueeze(0))
-        return Pass(past, times, conditioning, among=self.state.tensor(members))
+        return Pass(past, levels, times, conditioning, among=self.state.tensor(members))
 
     def _features(
         self, frame: TokenFrame | PatchFrame, passes: list[Pass], first: bool
@@ -301,6 +322,8 @@ class Rollout:
         masked = torch.zeros(values.shape[:3], dtype=torch.bool, device=values.device)
         masked[:, -1] = part.lay_out(frame.masked)
         x = self._embed(values, masked)
+        if whole and part.levels is not None:
+            x = self._tell(x, torch.nn.functional.pad(part.levels, (0, 1)))  # nothing of the new frame
         if not self.caching:
             features = self.model.trunk(x, part.conditioning, part.times)
             return features[:, -1], part.times.positions[-1:].unsqueeze(0)
@@ -318,6 +341,14 @@ class Rollout:
         if self.config.kind == "discrete":
             return self.model.embed_tokens(values)  # a masked token says so by itself
         return self.model.embed_patches(values, masked.unsqueeze(-1))
+
+    def _levels(self, rows: list[int], positions: Tensor) -> Tensor | None:
+        """Return the noise (n, T) that the model is told of the frames at times (1 or n, T)."""
+        level = self.decoding.noise_level
+        return self.state.made(rows, positions) * level if level else None
+
+    def _tell(self, x: Tensor, levels: Tensor | None) -> Tensor:
+        return x if levels is None or self.model.trunk.noise is None else x + self.model.trunk.noise(levels)
 
     def _cache(self) -> list[LayerCache]:
         appended = self.config.absent_tokens if self.passive else self.config.appended_tokens
@@ -394,8 +425,9 @@ class Rollout:
     # -- in and out ---------------------------------------------------------------------------------------
 
     def _blank(self, rows: list[int]) -> TokenFrame | PatchFrame:
-        """Return new frames (n, S), wholly masked."""
-        values, generators = self.state.blank(len(rows)), self.state.drawing(rows)
+        """Return new frames (n, S) of rows, with all their twins last, wholly masked."""
+        values = self.state.blank(len(rows))
+        generators = self.state.drawing(rows[: len(rows) // (1 + self.twins)])
         if self.config.kind == "discrete":
             return TokenFrame(values, self.config.mask_id, self.decoding, generators)
         return PatchFrame(values, self.decoding, generators)

@@ -293,14 +293,16 @@ class DiffusionHead(nn.Module):
         steps: int | None = None,
         temperature: float = 0.0,
         generator: Generators = None,
+        guidance: float | None = None,
     ) -> Tensor:
         """Draw samples by DDIM.
 
         Args:
-            condition: (M, D).
+            condition: (M, D); with guidance (2 M, D), the second half without commands.
             steps: evaluations of the network, by default the configuration's, at most its training steps.
             temperature: share of fresh noise in a step; 0 is deterministic given the first noise.
             generator: of the first noise and the fresh noise.
+            guidance: how far each prediction goes from that without commands to that with them.
 
         Returns:
             (M, C) float32.
@@ -310,9 +312,14 @@ class DiffusionHead(nn.Module):
         levels = torch.linspace(total - 1, 0, count).round().long().tolist() if count > 1 else [total - 1]
         shares = [*self.levels.double()[levels].tolist(), 1.0]
         embedded = self.condition(condition)
-        x = randn((condition.shape[0], self.values), generator, condition.device)
+        copies = 1 if guidance is None else 2
+        x = randn((len(condition) // copies, self.values), generator, condition.device)
         for index, level in enumerate(levels):
-            predicted = self._predict(x, self._level(torch.tensor([level], device=x.device)), embedded)
+            embedded_level = self._level(torch.tensor([level], device=x.device))
+            predicted = self._predict(x.repeat(copies, 1), embedded_level, embedded)
+            if guidance is not None:
+                commanded, free = predicted.chunk(2)
+                predicted = torch.lerp(free, commanded, guidance)
             x = self._step(x, predicted, shares[index], shares[index + 1], temperature, generator)
         return x
 

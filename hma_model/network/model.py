@@ -324,6 +324,8 @@ class HMA(nn.Module):
         cache: bool = True,
         sample_steps: int | None = None,
         known: Tensor | None = None,
+        guidance: float = 1.0,
+        noise_level: float = 0.0,
     ) -> Tensor:
         """Continue a prompt, frame by frame.
 
@@ -340,6 +342,10 @@ class HMA(nn.Module):
             sample_steps: sampling steps of the diffusion head.
             known: (B, P + frames) bool, False where a chunk is unknown, as `action_mask` in training; by
                 default all are known.
+            guidance: exaggerates what the commands change: scores are u + guidance (c - u), u without and c
+                with commands. Each pass then costs two. For models trained with `drop_commands`.
+            noise_level: how corrupted the model is to take its own frames for, 0 to 1. For models trained
+                with `told_noise`.
 
         Returns:
             (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
@@ -349,6 +355,7 @@ class HMA(nn.Module):
         return generate(
             self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
             temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
+            guidance=guidance, noise_level=noise_level,
         )  # fmt: skip
 
     # -- parts that training and decoding share -----------------------------------------------------------
