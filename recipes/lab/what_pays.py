@@ -48,12 +48,21 @@ ROWS: dict[str, list[str]] = {
     "digits of 512 and 64": ["digits=512"],
     "digit after digit": ["model.digit_order=chain"],
     "16×16 tokens": ["model.merge=1"],
+    "a tenth of the windows without commands": ["model.drop_commands=0.1"],
 }
-FIGURES = ("loss", "psnr_last", "copy", "shuffled")
+# Rollouts of the same trained model by other means: a row, and the options of the rollouts.
+ROLLOUTS: dict[str, dict[str, dict[str, Any]]] = {
+    "told noise": {"told noise, and of its own frames 0.1": {"noise_level": 0.1}},
+    "a tenth of the windows without commands": {
+        "the same, guidance 1.5": {"guidance": 1.5},
+        "the same, guidance 2.5": {"guidance": 2.5},
+    },
+}
+FIGURES = ("loss", "shuffled_loss", "psnr_last", "copy", "shuffled")
 
 
-def measure(data: Path, row: str, changes: list[str], seed: int) -> dict[str, Any]:
-    """Train one row on the shard set, and return its line of the CSV."""
+def measure(data: Path, row: str, changes: list[str], seed: int) -> list[dict[str, Any]]:
+    """Train one row on the shard set, and return its line of the CSV and those of its other rollouts."""
     from hma_model.evaluation.evaluate import evaluate
     from hma_model.network.model import HMA
     from hma_model.training.loop import train
@@ -63,21 +72,26 @@ def measure(data: Path, row: str, changes: list[str], seed: int) -> dict[str, An
     shards = ShardSet(data)
     tokenizer = get_tokenizer(shards.spec.name)
     given: dict[str, Any] = {"count": WINDOWS, "frames": FRAMES, "prompt": PROMPT, "draws": DRAWS}
+    ways: dict[str, dict[str, Any]] = {row: {}, **ROLLOUTS.get(row, {})}
     with tempfile.TemporaryDirectory() as folder:
         result = train(recipe, out=Path(folder) / "run", show=False)
         model = HMA.from_pretrained(result.checkpoint)
-        found = evaluate(model, tokenizer, shards, **given)
-    last = {name: found[name]["psnr_last"] for name in ("true", "copy", "shuffled")}
-    return {
-        "row": row,
-        "seed": seed,
-        "steps": result.step,
-        "loss": found["loss"] * (2 / model.config.merge) ** 2,
-        "psnr_last": last["true"],
-        "copy": last["copy"],
-        "shuffled": last["shuffled"],
-        "cpu_seconds": recipe.cpu_seconds,
-    }
+        found = {way: evaluate(model, tokenizer, shards, **given, **how) for way, how in ways.items()}
+    square = (2 / model.config.merge) ** 2
+    return [
+        {
+            "row": way,
+            "seed": seed,
+            "steps": result.step,
+            "loss": figures["loss"] * square,
+            "shuffled_loss": figures["shuffled_loss"] * square,
+            "psnr_last": figures["true"]["psnr_last"],
+            "copy": figures["copy"]["psnr_last"],
+            "shuffled": figures["shuffled"]["psnr_last"],
+            "cpu_seconds": recipe.cpu_seconds,
+        }
+        for way, figures in found.items()
+    ]
 
 
 def append(path: Path, line: dict[str, Any]) -> None:
@@ -100,13 +114,14 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 def table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table of the rows: means over the seeds ± their standard deviation."""
-    head = "| trained by | seeds | steps | loss | PSNR, last frame | less copy | true less shuffled |"
-    rows = [head, "|" + "---|" * 7]
+    head = "trained by | seeds | steps | loss | more with shuffled commands | PSNR, last frame | less copy"
+    rows = [f"| {head} | true less shuffled |", "|" + "---|" * 8]
     for row in dict.fromkeys(line["row"] for line in lines):
         own = [{key: float(line[key]) for key in FIGURES} for line in lines if line["row"] == row]
         steps = statistics.mean(int(line["steps"]) for line in lines if line["row"] == row)
         cells = [
             spread([line["loss"] for line in own], 3),
+            spread([line["shuffled_loss"] - line["loss"] for line in own], 3),
             spread([line["psnr_last"] for line in own], 2),
             spread([line["psnr_last"] - line["copy"] for line in own], 2),
             spread([line["psnr_last"] - line["shuffled"] for line in own], 2),
@@ -139,9 +154,9 @@ def main() -> None:
         for seed in range(given.seeds):
             for row in names:
                 if not any(line["row"] == row and int(line["seed"]) == seed for line in read(given.csv)):
-                    line = measure(given.data, row, [*ROWS[row], *given.set], seed)
-                    append(given.csv, line)
-                    print(line, flush=True)
+                    for line in measure(given.data, row, [*ROWS[row], *given.set], seed):
+                        append(given.csv, line)
+                        print(line, flush=True)
     print(table(read(given.csv)))
 
 
