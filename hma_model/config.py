@@ -101,6 +101,7 @@ _SHARES = (
     "history_probability",
     "mask_ratio_min",
     "dropout",
+    "drop_commands",
     "whole_share",
 )
 
@@ -168,6 +169,7 @@ class HMAConfig:
     history_probability: float = 0.2
     history_frames: int = 4  # the shortest such history
     mask_ratio_min: float = 0.0  # a masked frame's smallest mask probability
+    drop_commands: float = 0.0  # the share of windows that predict video without any command, for guidance
     # The frames of a training pass that predicts video. "window": the window's, masked (paper). "pairs": the
     # true frames, and a masked copy of each from the second on, which sees the true frames before it.
     training_pass: str = "window"

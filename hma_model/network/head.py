@@ -7,7 +7,7 @@ M rows, C values of a sample, W width of the diffusion head.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -19,16 +19,26 @@ from hma_model.network.trunk import rows_at
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
 
 
-def uniform(
-    shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
-) -> Tensor:
+type Generators = torch.Generator | Sequence[torch.Generator] | None  # several draw equal parts of axis 0
+
+
+def uniform(shape: Sequence[int], generator: Generators, device: torch.device | str = "cpu") -> Tensor:
     """Return float32 numbers in [0, 1), drawn on the generator's device and moved to `device`."""
-    return torch.rand(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+    return _draw(torch.rand, shape, generator, device)
 
 
-def randn(shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str) -> Tensor:
+def randn(shape: Sequence[int], generator: Generators, device: torch.device | str) -> Tensor:
     """Return standard normal float32 numbers, drawn on the generator's device and moved to `device`."""
-    return torch.randn(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+    return _draw(torch.randn, shape, generator, device)
+
+
+def _draw(
+    draw: Callable[..., Tensor], shape: Sequence[int], generator: Generators, device: torch.device | str
+) -> Tensor:
+    if generator is None or isinstance(generator, torch.Generator):
+        return draw(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+    part = (shape[0] // len(generator), *shape[1:])
+    return torch.cat([draw(part, generator=one, device=one.device) for one in generator]).to(device)
 
 
 def device_of(generator: torch.Generator | None) -> torch.device | str:
@@ -282,15 +292,17 @@ class DiffusionHead(nn.Module):
         condition: Tensor,
         steps: int | None = None,
         temperature: float = 0.0,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
+        guidance: float | None = None,
     ) -> Tensor:
         """Draw samples by DDIM.
 
         Args:
-            condition: (M, D).
+            condition: (M, D); with guidance (2 M, D), the second half without commands.
             steps: evaluations of the network, by default the configuration's, at most its training steps.
             temperature: share of fresh noise in a step; 0 is deterministic given the first noise.
             generator: of the first noise and the fresh noise.
+            guidance: how far each prediction goes from that without commands to that with them.
 
         Returns:
             (M, C) float32.
@@ -300,9 +312,14 @@ class DiffusionHead(nn.Module):
         levels = torch.linspace(total - 1, 0, count).round().long().tolist() if count > 1 else [total - 1]
         shares = [*self.levels.double()[levels].tolist(), 1.0]
         embedded = self.condition(condition)
-        x = randn((condition.shape[0], self.values), generator, condition.device)
+        copies = 1 if guidance is None else 2
+        x = randn((len(condition) // copies, self.values), generator, condition.device)
         for index, level in enumerate(levels):
-            predicted = self._predict(x, self._level(torch.tensor([level], device=x.device)), embedded)
+            embedded_level = self._level(torch.tensor([level], device=x.device))
+            predicted = self._predict(x.repeat(copies, 1), embedded_level, embedded)
+            if guidance is not None:
+                commanded, free = predicted.chunk(2)
+                predicted = torch.lerp(free, commanded, guidance)
             x = self._step(x, predicted, shares[index], shares[index + 1], temperature, generator)
         return x
 
@@ -313,7 +330,7 @@ class DiffusionHead(nn.Module):
         share: float,
         after: float,
         eta: float,
-        generator: torch.Generator | None,
+        generator: Generators,
     ) -> Tensor:
         """Make one DDIM step from a level whose signal share is `share` to one where it is `after`."""
         signal, spread = math.sqrt(share), math.sqrt(1 - share)

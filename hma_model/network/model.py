@@ -323,6 +323,9 @@ class HMA(nn.Module):
         order: str = "random",
         cache: bool = True,
         sample_steps: int | None = None,
+        known: Tensor | None = None,
+        guidance: float = 1.0,
+        noise_level: float = 0.0,
     ) -> Tensor:
         """Continue a prompt, frame by frame.
 
@@ -337,6 +340,12 @@ class HMA(nn.Module):
             order: the order in which tokens are unmasked, "random" or "confidence".
             cache: keep keys and values of past frames; False recomputes everything, with the same result.
             sample_steps: sampling steps of the diffusion head.
+            known: (B, P + frames) bool, False where a chunk is unknown, as `action_mask` in training; by
+                default all are known.
+            guidance: exaggerates what the commands change: scores are u + guidance (c - u), u without and c
+                with commands. Each pass then costs two. For models trained with `drop_commands`.
+            noise_level: how corrupted the model is to take its own frames for, 0 to 1. For models trained
+                with `told_noise`.
 
         Returns:
             (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
@@ -344,8 +353,9 @@ class HMA(nn.Module):
         from hma_model.generation.rollout import generate
 
         return generate(
-            self, prompt, actions, embodiment, frames, unmask_steps=unmask_steps, temperature=temperature,
-            generator=generator, order=order, cache=cache, sample_steps=sample_steps,
+            self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
+            temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
+            guidance=guidance, noise_level=noise_level,
         )  # fmt: skip
 
     # -- parts that training and decoding share -----------------------------------------------------------

@@ -135,7 +135,10 @@ def compute(model: "HMA", batch: "Batch", objective: str | None, generator: torc
 
     given = None
     if chosen.sees_actions:
-        given = align(config, batch.actions, batch.action_mask & ~dropped, count)
+        known = batch.action_mask & ~dropped
+        if config.drop_commands and model.training and chosen.predicts_video:
+            known &= uniform((size, 1), generator, known.device) >= config.drop_commands
+        given = align(config, batch.actions, known, count)
         given = given.frames(order) if paired else given
     conditioning = condition(model, given, groups, times.positions)
     x = _embed(model, seen, video, layout, groups, generator)

@@ -144,14 +144,14 @@ def _loop(
 ) -> None:
     recipe, stopped = run.recipe, False
     _show_notes(run, log)
-    while run.step < recipe.steps and not stopped:
+    while run.done < 1 and not stopped:
         facts = run.advance()
         log.step(facts)
         if on_progress:
             on_progress(facts)
         asked = run.world.sum(torch.tensor([float(stop.is_set())]))  # all ranks stop after the same step
         stopped = bool(asked[0])
-        last = run.step == recipe.steps
+        last = run.done >= 1
         if run.held_out and (last or _due(run.step, recipe.eval_every)):
             log.evaluation({**run.evaluate(), "mixture": run.train_data.realised()})
             log.pictures(run.out, run.step)
@@ -187,7 +187,7 @@ def _result(run: Run) -> TrainResult:
         evaluations=[line for line in lines if line["kind"] == "eval"],
         masked_val_loss=run.evaluation.get("loss"),
         baseline=run.evaluation.get("baseline"),
-        interrupted=run.step < run.recipe.steps,
+        interrupted=run.done < 1,
         skipped=run.skipped,
         seconds=run.seconds,
     )

@@ -138,12 +138,14 @@ class Recipe(_Settings):
 
     start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="what keeps the checkpoint's weights")
-    # a token's digits: the tokenizer's, or each split further, such as 512 into 8 · 8 · 8 (FSQ's levels)
-    digits: Count = Field(0, ge=0, description="0 takes the tokenizer's; 8 splits 512 into 8 · 8 · 8")
+    # a token's digits: the tokenizer's, or split into this many values (FSQ's levels) or joined up to them
+    digits: Count = Field(0, ge=0, description="0: the tokenizer's; 8 splits 512 into 8 · 8 · 8; 512 joins")
     # what the bias of the token readout starts with: the log frequencies of the training tokens
     readout_bias: Literal["frequencies", "zero"] = "frequencies"
 
     steps: Count = Field(1000, ge=1, le=10**12)
+    # an end by time: of a rank's process in steps, all its threads; lr then falls by the share that is spent
+    cpu_seconds: Number = Field(0.0, ge=0, description="CPU seconds of steps at most; 0 has no limit")
     lr: Number = Field(3e-4, gt=0, le=1e6)
     optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: of the blocks' matrices")
     muon_lr: Number = Field(0.02, gt=0, le=1e3, description="muon: the spectral norm of a step at most")
@@ -197,7 +199,8 @@ class Recipe(_Settings):
     def factored(self, spec: "TokenizerSpec") -> tuple[int, ...]:
         """Return the values of each digit of a token of this tokenizer, low digit first.
 
-        With `digits`, each of the tokenizer's digits is split into as many of that many values as divide it.
+        With `digits`, each of the tokenizer's digits is split into as many of that many values as divide it,
+        and neighbours are joined as long as they have no more values than that.
         """
         stated = spec.factored or (spec.vocab_size or 1,)
         if self.digits < 2:
@@ -208,7 +211,13 @@ class Recipe(_Settings):
                 split.append(self.digits)
                 values //= self.digits
             split += [values] if values > 1 else []
-        return tuple(split)
+        joined = split[:1]
+        for values in split[1:]:
+            if joined[-1] * values <= self.digits:
+                joined[-1] *= values
+            else:
+                joined.append(values)
+        return tuple(joined)
 
     def network(self, spec: "TokenizerSpec") -> HMAConfig:
         """Return the network's config for tokens of this tokenizer.

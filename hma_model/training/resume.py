@@ -60,7 +60,7 @@ VERSION = 1  # of `training/`; any change in the meaning of its files raises it
 TRAINED_BY = {
     *("dropout", "action_loss_weight", "label_smoothing", "corrupt_max", "history_probability"),
     *("history_frames", "mask_ratio_min", "diffusion_repeats", "diffusion_sample_steps"),
-    *("training_pass", "whole_share", "position_init", "latent_noise"),
+    *("training_pass", "whole_share", "position_init", "latent_noise", "drop_commands"),
 }
 # fields that a run may turn on for a checkpoint, and their parameters, which change nothing at first
 ADDED = {"told_noise": "trunk.noise.", "digit_order": "readout.chain."}

@@ -88,6 +88,7 @@ class Run:
         )
         self.held_out = {name: shards for name, shards, dataset in held_out if len(dataset)}
         self.step, self.skipped, self.seconds = 0, 0, 0.0  # finished steps, and the time they took
+        self.cpu_seconds = 0.0  # of the steps, the mean over the ranks
         self.spike_detector = guards.GradientSpikeDetector(recipe.spike)
         self.evaluation: dict[str, Any] = {}  # the figures of the last one
         self.notes: list[str] = []  # texts for the user that nobody has shown yet
@@ -113,6 +114,12 @@ class Run:
         model.to(self.device).train()
         model.trunk.checkpointing = self.recipe.checkpointing
         return model
+
+    @property
+    def done(self) -> float:
+        """Return the share of the run that is done: of its steps or its CPU seconds, whichever is larger."""
+        limit = self.recipe.cpu_seconds
+        return max(self.step / self.recipe.steps, self.cpu_seconds / limit if limit else 0.0)
 
     @property
     def nats(self) -> bool:
@@ -164,8 +171,8 @@ class Run:
 
     def advance(self) -> dict[str, Any]:
         """Update the weights once, and return the step's line of metrics.jsonl."""
-        recipe, begun = self.recipe, time.monotonic()
-        lr = optim.set_lr(self.optimizer, optim.lr_scale(self.step, recipe))
+        recipe, begun, cpu_begun = self.recipe, time.monotonic(), time.process_time()
+        lr = optim.set_lr(self.optimizer, optim.lr_scale(self.step, recipe, self.done))
         self.optimizer.zero_grad(set_to_none=True)
         metrics, seen, waited = guards.StepMetrics(list(self.sets), self.device), [], 0.0
         batches = self.train_data.step()
@@ -190,6 +197,9 @@ class Run:
                 self.average.update(self.step)
         spent = time.monotonic() - begun
         self.seconds += spent
+        if recipe.cpu_seconds:  # all ranks end after the same step
+            spent_cpu = torch.tensor([time.process_time() - cpu_begun])
+            self.cpu_seconds += float(self.world.sum(spent_cpu)[0]) / self.world.size
         return {
             "step": self.step,
             "loss": loss,
@@ -299,7 +309,7 @@ class Run:
         """Write pictures of rollouts: after the last step always, after others if the time allows."""
         recipe, begun = self.recipe, time.monotonic()
         spare = recipe.pictures_share * self.seconds - sum(self._sheet_seconds) - self._sheet_seconds[-1]
-        if not recipe.pictures or (self.step < recipe.steps and spare <= 0):
+        if not recipe.pictures or (self.done < 1 and spare <= 0):
             return
         facts = {"frames": recipe.frames, "count": recipe.pictures, "seed": recipe.seed}
         fault = write_sheets(model, self.held_out, self.out, self.step, cameras=recipe.cameras, **facts)
@@ -319,6 +329,7 @@ class Run:
             sampler=sampler,
             skipped=self.skipped,
             seconds=self.seconds,
+            cpu_seconds=self.cpu_seconds,
             evaluation=self.evaluation,
             norms=[self.spike_detector.mean, float(self.spike_detector.count)],
         )
@@ -394,6 +405,7 @@ class Run:
         notes = self._adopt(checkpoint)
         kept.fill(self.model)
         self.step, self.skipped, self.seconds = state.step, state.skipped, state.seconds
+        self.cpu_seconds = state.cpu_seconds
         self.evaluation = state.evaluation
         if state.norms:
             self.spike_detector.mean, self.spike_detector.count = state.norms[0], int(state.norms[1])

@@ -1,5 +1,6 @@
 """Recipes: what is accepted, merged and refused, and what follows from the shards."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -179,6 +180,20 @@ def test_the_network_follows_the_shards_tokenizer():
         5,
         SPEC.to_json(),
     )
+
+
+@pytest.mark.parametrize(
+    ("stated", "digits", "expected"),
+    [
+        ((512, 512), 8, (8,) * 6),
+        ((512, 512), 0, (512, 512)),
+        ((8,) * 5, 512, (512, 64)),
+        ((6, 4), 24, (24,)),
+    ],
+)
+def test_digits_are_split_and_joined_without_changing_the_ids(stated, digits, expected):
+    spec = TokenizerSpec("x", 1, "discrete", 128, (8, 8), vocab_size=math.prod(stated), factored=stated)
+    assert load_recipe("discrete_tiny", [f"digits={digits}"]).factored(spec) == expected
 
 
 def test_what_only_says_where_and_how_often_may_change_in_a_run():

@@ -1,9 +1,12 @@
 """The training loop: it learns, survives kills, refuses what has changed, and names what is broken."""
 
+import itertools
 import json
+import math
 import os
 import shutil
 import signal
+import time
 from functools import partial
 from pathlib import Path
 
@@ -242,6 +245,20 @@ def test_a_loss_that_is_no_number_can_be_skipped_and_is_counted(recipe, tmp_path
     assert all(
         torch.isfinite(value).all() for value in checkpoint.load(result.checkpoint).state_dict().values()
     )
+
+
+def test_a_budget_of_cpu_seconds_ends_the_run_and_bends_the_rate(recipe, tmp_path, monkeypatch):
+    clock = itertools.count()  # every step takes one second of it
+    monkeypatch.setattr(time, "process_time", lambda: float(next(clock)))
+    given = {"steps": 1000, "cpu_seconds": 5.0, "warmup": 0, "schedule": "cosine", "lr_end": 0.0}
+    made = recipe(**given, checkpoint_every=2, eval_every=0)
+
+    with pytest.raises(StopAt):
+        train(made, out=tmp_path / "run", show=False, on_progress=kill_at(3))
+    result = train(made, out=tmp_path / "run", show=False)
+    assert (result.step, result.interrupted) == (5, False)
+    rates = [line["lr"] for line in read_metrics(result.out) if line["kind"] == "train"]
+    assert rates == pytest.approx([made.lr * 0.5 * (1 + math.cos(math.pi * k / 5)) for k in range(5)])
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
