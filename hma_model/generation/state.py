@@ -155,6 +155,10 @@ class RowState:
         for row in rows:
             self.times[row], self.pending[row] = self.times[row] + 1, 1
 
+    def newest(self, rows: Sequence[int]) -> Tensor:
+        """Return the newest frame (n, S) of each row."""
+        return self.frames[self.tensor(rows), self._slot(rows, 1)]
+
     def given(self, rows: Sequence[int], positions: Tensor) -> ActionConditioning:
         """Return the chunks (n, T, K) at times (n or 1, T)."""
         index, slots = self.tensor(rows).unsqueeze(1), positions % self.slots
