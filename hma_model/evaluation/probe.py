@@ -33,11 +33,6 @@ CHANNELS, SHARPNESS = 16, 4.0
 STEPS, BATCH, RATE, NOISE = 400, 32, 1e-2, 0.03  # noise in pictures of -1 to 1
 EPISODES, HELD_OUT = 40, 8  # simulated, and of them those that the probe's error is measured on
 FRAMES, EVERY = 60, 2  # of an episode; one in so many is kept
-    40,
-    8,
-    60,
-    2,
-)  # simulated; of them held out; frames each; one in so many kept
 FIRST = 1_000_000  # the number of the first episode of a probe; those that are measured count from 0
 STILL = 1.0  # px; a part that moves less is no part of the state
 UNREADABLE = 0.5  # share of a part's spread; a probe with a larger error does not read it
@@ -171,7 +166,9 @@ def train_probe(robot: str, tokenizer: "Tokenizer", stride: int, seed: int = 0) 
     return fit(as_shown(robot, tokenizer, pictures), parts, made[0].driven, HELD_OUT / EPISODES, seed)
 
 
-def fit(pictures: Images, parts: Floats, driven: int, held_out: float = 0.2, seed: int = 0, steps: int = STEPS) -> Probe:
+def fit(
+    pictures: Images, parts: Floats, driven: int, held_out: float = 0.2, seed: int = 0, steps: int = STEPS
+) -> Probe:
     """Train a probe on pictures whose state is known.
 
     Args:
