@@ -9,7 +9,7 @@ last frame, repeated ("copy"). A figure at a frame is the mean over the five fra
     median_px    the median over rollouts; low_px and high_px: 95 % interval of the mean, by bootstrap
     share        error_px as a share of the spread; what knows nothing of the commands has 1 to 1.4
     motion       correlation of the parts' motion from frame to frame with the true one: 1 obeys, 0 does not
-    whole        share of the true picture's colours that the picture has; lower than the copy's: it dissolves
+    whole        how much of the robot the picture shows, by the colours of its parts; the copy shows it all
     loose_px     as error_px, of what lies about
     probe_px     the probe's own error on held-out true pictures
 
@@ -262,7 +262,7 @@ def _interval(errors: NDArray[np.float64], seed: int) -> tuple[float, float]:
 
 def _correlation(one: NDArray[np.float64], other: NDArray[np.float64]) -> float | None:
     """Return the correlation of two motions; None if one of them stands still."""
-    if min(one.std(), other.std()) < 1e-9:
+    if min(one.std(), other.std()) < 1e-3:
         return None
     return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
 

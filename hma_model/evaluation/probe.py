@@ -5,13 +5,13 @@ the picture, and its mean is the part's place (Sun et al. 2018, integral regress
 the identity, corrects the places from one another. It learns from true pictures as the tokenizer shows them,
 with slight noise, and from episodes that nothing is measured on. Its own error is that on other episodes.
 
-A picture may lose a limb and still have a small error of the pixels. `wholeness` compares how much of each
-colour stands out from the background, wherever it is. A true picture of another time has some 0.9.
+A picture may lose a limb and still have small errors of its pixels. `wholeness` therefore counts the pixels
+of each part's colour, wherever they are. A true picture of another time has some 0.9.
 
 N pictures of S pixels a side, P parts. Places are px of a picture of 128 by 128.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,11 +36,11 @@ FRAMES, EVERY = 60, 2  # of an episode; one in so many is kept
 FIRST = 1_000_000  # the number of the first episode of a probe; those that are measured count from 0
 STILL = 1.0  # px; a part that moves less is no part of the state
 UNREADABLE = 0.5  # share of a part's spread; a probe with a larger error does not read it
-COLORS, DISTANCE = 8, 45.0  # of a palette; distance of RGB up to which two colours are one
+DISTANCE, SEEN = 45.0, 3  # of RGB, up to which two colours are one; least pixels of a part that is seen
 
 
 class PlaceNetwork(nn.Module):
-    """A network that finds P parts in pictures (N, 3, SIDE, SIDE) of -1 to 1; it gives (N, P, 2) in -1 to 1."""
+    """A network that finds parts in pictures (N, 3, SIDE, SIDE); pixels and places (N, P, 2) are -1 to 1."""
 
     def __init__(self, parts: int) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ class Probe:
         error: (P,) mean distance in px from the true places on held-out true pictures.
         spread: (P,) mean distance in px of the true places from their median.
         background: (SIDE, SIDE, 3), the median of the true pictures.
-        palette: (COLORS, 3), what stands out from it.
+        colors: (P, 3), of the parts.
     """
 
     network: nn.Module
@@ -81,7 +81,7 @@ class Probe:
     error: Floats
     spread: Floats
     background: Floats
-    palette: Floats
+    colors: Floats
 
     @property
     def readable(self) -> NDArray[np.bool_]:
@@ -106,22 +106,23 @@ class Probe:
         places: Floats = (found.double().numpy() + 1) * (truth.SIZE / 2)
         return places.reshape(*pictures.shape[:-3], *places.shape[1:])
 
-    def colors(self, pictures: Images) -> NDArray[np.int64]:
-        """Return (…, COLORS), how many pixels of pictures (…, S, S, 3) stand out in each colour."""
+    def areas(self, pictures: Images) -> Floats:
+        """Return (…, P), how many pixels of (…, S, S, 3) have a part's colour and not the background's."""
         flat = _small(pictures.reshape(-1, *pictures.shape[-3:])).astype(np.float32)
         stands = np.linalg.norm(flat - self.background, axis=-1) > DISTANCE
-        far = np.linalg.norm(flat[..., None, :] - self.palette, axis=-1)
-        nearest = np.where(stands & (far.min(axis=-1) <= DISTANCE), far.argmin(axis=-1), COLORS)
-        counts = np.stack([(nearest == color).sum(axis=(1, 2)) for color in range(COLORS)], axis=-1)
-        return counts.reshape(*pictures.shape[:-3], COLORS)
+        near = [np.linalg.norm(flat - color, axis=-1) <= DISTANCE for color in self.colors]
+        counts = np.stack([(stands & part).sum(axis=(1, 2), dtype=np.float64) for part in near], axis=-1)
+        return counts.reshape(*pictures.shape[:-3], len(near))
 
     def wholeness(self, pictures: Images, true: Images) -> Floats:
-        """Return (…), the share of what stands out of true pictures (…, S, S, 3) that others have too."""
-        wanted = self.colors(true)
-        kept: Floats = np.minimum(self.colors(pictures), wanted).sum(axis=-1) / np.maximum(
-            wanted.sum(axis=-1), 1
-        )
-        return kept
+        """Return how much of the robot of true pictures (…, S, S, 3) others show; 1 is all of it.
+
+        It is the mean over the robot's readable parts that the true picture shows.
+        """
+        wanted, given = (self.areas(some)[..., self.own] for some in (true, pictures))
+        seen = wanted >= SEEN
+        kept: Floats = np.where(seen, np.minimum(given / np.maximum(wanted, 1), 1), 0).sum(axis=-1)
+        return kept / np.maximum(seen.sum(axis=-1), 1)
 
 
 def state_errors(probe: Probe, pictures: Images, parts: Floats) -> Floats:
@@ -184,9 +185,10 @@ def fit(
     network = _trained(small[:used], parts[:used], seed, steps)
     spread = np.linalg.norm(parts - np.median(parts, axis=0), axis=-1).mean(axis=0)
     background = np.median(small[:used], axis=0).astype(np.float32)
-    untested = Probe(network, driven, spread, spread, background, _palette(small[:used], background, seed))
+    colors = _colors(small[:used], parts[:used])
+    untested = Probe(network, driven, spread, spread, background, colors)
     error = state_errors(untested, pictures[used:], parts[used:]).mean(axis=0)
-    return Probe(network, driven, error, spread, background, untested.palette)
+    return replace(untested, error=error)
 
 
 def _trained(small: Images, parts: Floats, seed: int, steps: int) -> nn.Module:
@@ -208,16 +210,11 @@ def _trained(small: Images, parts: Floats, seed: int, steps: int) -> nn.Module:
     return network.eval()
 
 
-def _palette(small: Images, background: Floats, seed: int) -> Floats:
-    """Return the (COLORS, 3) centres of the colours that stand out from the background."""
-    cv2 = opencv()
-    stands = np.linalg.norm(small.astype(np.float32) - background, axis=-1) > DISTANCE
-    pixels = small[stands].astype(np.float32)
-    chosen = np.random.default_rng(seed).choice(len(pixels), min(len(pixels), 20_000), replace=False)
-    cv2.setRNGSeed(seed)
-    end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 1.0)
-    _, _, centers = cv2.kmeans(pixels[chosen], COLORS, None, end, 2, cv2.KMEANS_PP_CENTERS)
-    return np.asarray(centers)
+def _colors(small: Images, parts: Floats) -> Floats:
+    """Return the (P, 3) median colours of pictures at the true places of the parts."""
+    x, y = np.clip(parts * (SIDE / truth.SIZE), 0, SIDE - 1).astype(int).transpose(2, 0, 1)
+    found: Floats = np.median(small[np.arange(len(small))[:, None], y, x], axis=0).astype(np.float32)
+    return found
 
 
 def _small(pictures: Images) -> Images:
