@@ -9,6 +9,7 @@ Angles are radians from upright, speeds rad/s, torques N·m. T frames.
 """
 
 from collections.abc import Callable, Iterable
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +128,7 @@ def _upward(rng: np.random.Generator) -> Driver:
 def _smooth(rng: np.random.Generator) -> Driver:
     hz, phase = rng.uniform(0.1, 1.5, 3), rng.uniform(0, 2 * np.pi, 3)
     strength = rng.uniform(0.4, 1.6, 3)
-    seconds = iter(np.arange(STEPS) * PERIOD_S)
+    seconds = (step * PERIOD_S for step in count())
     return lambda angle, speed: float(strength @ np.sin(2 * np.pi * hz * next(seconds) + phase))
 
 

@@ -194,7 +194,7 @@ def start(seed: int, episode: int) -> tuple[Arm, np.random.Generator]:
 
 def _demo(seed: int, episode: int) -> Demo:
     arm, rng = start(seed, episode)
-    drive = _driver(rng)
+    drive = driver(rng)
     lay = arm.blocks
     rows: list[tuple[Any, ...]] = []
     for _ in range(STEPS):
@@ -238,7 +238,7 @@ def _draw_link(image: NDArray[np.uint8], here: Floats, there: Floats, color: tup
 # -- driver
 
 
-def _driver(rng: np.random.Generator) -> Manoeuvre:
+def driver(rng: np.random.Generator) -> Manoeuvre:
     """Return a driver that runs manoeuvres of 0.3 to 1.5 s and turns the elbow back before its stops."""
     left = 0
     manoeuvre: Manoeuvre = _rest

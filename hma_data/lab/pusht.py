@@ -138,9 +138,10 @@ class Arena:
         self.success = self.success or bool(info["is_success"])
 
 
-def _begin(
+def begin(
     look: Look, robot: int, seed: int, episode: int, fly: bool
 ) -> tuple[Arena, Planned | Wandering, np.random.Generator]:
+    """Return the arena at the start of an episode, what drives the pusher, and the generator of both."""
     rng = np.random.default_rng((seed, robot, episode))
     start = STARTS[episode % len(STARTS)]
     arena = Arena(look, start, rng)
@@ -149,24 +150,30 @@ def _begin(
     return arena, Planned(arena.tee, arena.goal, arena.agent, SPEED, fly, rng), rng
 
 
-def _within(target: Floats) -> Floats:
+def within(target: Floats) -> Floats:
+    """Return a target inside the walls."""
     return np.clip(target, 15.0, 497.0)
 
 
 # -- pusht_fast
 
 
+def fast_command(setpoint: Floats, ahead: Floats, period: float) -> NDArray[np.float32]:
+    """Return the target (2,) with which the pusher is at `ahead` in `period` seconds, in spite of its lag."""
+    return within(ahead + (ahead - setpoint) * ((LAG_S - period / 2) / period)).astype(np.float32)
+
+
 def _fast_demo(seed: int, episode: int) -> Demo:
-    arena, policy, _ = _begin(FAST_LOOK, 0, seed, episode, fly=False)
+    arena, policy, _ = begin(FAST_LOOK, 0, seed, episode, fly=False)
     period, setpoint, stop = 0.1, arena.agent, FAST_STEPS
     rows: list[tuple[Any, ...]] = []
     while len(rows) < stop:
         seen = arena.picture(), arena.agent, arena.state
         if arena.success:
-            action = _within(setpoint).astype(np.float32)
+            action = within(setpoint).astype(np.float32)
         else:
             ahead, _ = policy.act(arena.pose, arena.agent, period)
-            action = _within(ahead + (ahead - setpoint) * ((LAG_S - period / 2) / period)).astype(np.float32)
+            action = fast_command(setpoint, ahead, period)
             setpoint = ahead
         before = arena.success
         arena.advance(action.astype(np.float64), 10)
@@ -198,7 +205,7 @@ def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
 def _slow_bag(path: Path, seed: int, episode: int) -> None:
     import cv2
 
-    arena, policy, rng = _begin(SLOW_LOOK, 1, seed, episode, fly=True)
+    arena, policy, rng = begin(SLOW_LOOK, 1, seed, episode, fly=True)
     setpoint, stop = arena.agent, SLOW_TICKS
     velocity: Floats = np.zeros(2)
     messages: list[Message] = []
@@ -208,8 +215,8 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
             break
         if ticks := tick - arena.ticks:
             before = arena.success
-            setpoint = _within(setpoint + velocity * ticks * TICK_S)
-            arena.advance(_within(setpoint + velocity * (LAG_S - ticks * TICK_S / 2)), ticks)
+            setpoint = within(setpoint + velocity * ticks * TICK_S)
+            arena.advance(within(setpoint + velocity * (LAG_S - ticks * TICK_S / 2)), ticks)
             if arena.success and not before:
                 stop = min(stop, max(round(LEAST_S / TICK_S), tick + round(REST_S / TICK_S)))
         fields: dict[str, Any]

@@ -1,1 +1,1 @@
-"""Benchmark the model: `hma bench generate`, `train`, `mup`, `waiting`."""
+"""Benchmark the model: `hma bench generate`, `train`, `mup`, `waiting`, `drift`."""

@@ -293,5 +293,6 @@ def _require_checkpoint(checkpoint: str) -> None:
 
 
 BENCHES["mup"] = "hma_model.bench.mup:BENCH"
+BENCHES["drift"] = "hma_model.bench.drift:BENCH"
 BENCHES |= {name: f"hma_model.bench.speed:{name.upper()}" for name in ("generate", "train", "waiting")}
 app.add_typer(hub_app, name="hub", rich_help_panel=MODELS)

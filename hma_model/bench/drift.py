@@ -1,0 +1,316 @@
+"""Measure whether robots still follow their commands late in long rollouts (`hma bench drift`).
+
+The simulator makes true episodes with states. The model continues each from a prompt of a window under its
+commands, and a probe reads where the robot's parts are in its pictures (`hma_model.evaluation.probe`). For
+comparison the same is read off rollouts under another episode's commands ("shuffled") and off the prompt's
+last frame, repeated ("copy"). A figure at a frame is the mean over the five frames up to it:
+
+    error_px     distance of the robot's parts from the truth, mean over rollouts; a picture has 128 px
+    median_px    the median over rollouts; low_px and high_px: 95 % interval of the mean, by bootstrap
+    share        error_px as a share of the spread; what knows nothing of the commands has 1 to 1.4
+    motion       correlation of the parts' motion from frame to frame with the true one: 1 obeys, 0 does not
+    whole        how much of the robot the picture shows, by the colours of its parts; the copy shows it all
+    loose_px     as error_px, of what lies about
+    probe_px     the probe's own error on held-out true pictures
+
+The verdict compares the last frame with frame 10. `sampling` gives options of `HMA.generate`, such as
+`unmask_steps=8,order=confidence`; several, with / between them, are compared, and only the first is shuffled.
+
+B rollouts, T frames, W frames that are looked at, S pixels a side, K = stride * action dim, P parts.
+"""
+
+import inspect
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.bench import Bench
+from hma_data.errors import UsageError
+from hma_data.lab import truth
+from hma_data.storage.yaml_io import parse_yaml
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.evaluation.probe import Probe
+    from hma_model.network.model import HMA
+
+Images = NDArray[np.uint8]
+MARKS = (10, 25, 50, 100, 300, 1000, 3000)  # frames at which figures are given, and the last
+SPAN = 5  # frames up to a mark over which a figure is the mean
+SHOWN = (1, 10, 25, 50, 100, 200, 300)  # frames of a sheet
+SHEETS = 2  # rollouts of a robot on it
+LIMIT = 2.0  # of the error at the end over that at the first mark
+LOST = 0.5  # share of the spread from which a robot is somewhere else
+WHOLE = 0.8  # of the wholeness at the end over the copy's
+RESAMPLES = 1000
+OWN = ("model", "embodiment", "batch", "generator", "self")  # arguments of a rollout that are no options
+
+
+@dataclass(frozen=True)
+class Case:
+    """Rollouts of one kind: `pictures` (B, W, S, S, 3); `judged` tells the model with the true commands."""
+
+    name: str
+    pictures: Images
+    judged: bool = False
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was measured on a robot.
+
+    Attributes:
+        frames: the W numbers of the predicted frames that were looked at, from 1.
+        truth: (B, W, S, S, 3), the true pictures as the tokenizer shows them.
+        parts: (B, W, P, 2) true places.
+        cases: the rollouts.
+    """
+
+    robot: str
+    probe: "Probe"
+    frames: tuple[int, ...]
+    truth: Images
+    parts: NDArray[np.float64]
+    cases: tuple[Case, ...]
+
+
+def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a row for each robot, kind of rollout and mark; raise UsageError for a wrong setting."""
+    samplings = _samplings(settings["sampling"])
+    robots = [name.strip() for name in settings["robots"].split(",")]
+    for robot in robots:
+        truth.embodiment(robot)
+    for key in ("frames", "rollouts"):
+        if settings[key] < (MARKS[0] if key == "frames" else 2):
+            least = MARKS[0] if key == "frames" else 2
+            raise UsageError("bench drift", f"{key}={settings[key]} is not allowed", f"give at least {least}")
+    from hma_data.tokenizers.base import get_tokenizer
+    from hma_data.tokenizers.network import single_threads
+    from hma_model.checkpoint.folder import require_tokenizer
+    from hma_model.network.model import HMA
+
+    model = HMA.from_pretrained(settings["checkpoint"], embodiments=robots).eval()
+    tokenizer = get_tokenizer(str(model.config.tokenizer["name"]))
+    require_tokenizer(model.config, tokenizer.spec, settings["checkpoint"])
+    work = partial(measure, model, tokenizer, samplings=samplings, settings=settings)
+    with single_threads(len(robots)) as pool:
+        found = list(pool.map(work, robots))
+    if settings["sheet"]:
+        draw(found, Path(settings["sheet"]))
+    return [row for one in found for row in rows(one, settings["seed"])]
+
+
+def _samplings(text: str) -> dict[str, dict[str, Any]]:
+    """Return the options of each way of sampling by the words that name it."""
+    from hma_model.generation.rollout import Rollout
+
+    known = [name for name in inspect.signature(Rollout.__init__).parameters if name not in OWN]
+    ways: dict[str, dict[str, Any]] = {}
+    for way in text.split("/"):
+        ways[way.strip()] = options = {}
+        for word in way.split(","):
+            key, given, value = word.strip().partition("=")
+            if key not in known or not given:
+                fault = f"{word.strip()!r} is no option of a rollout"
+                raise UsageError("bench drift", fault, f"write key=value; keys: {', '.join(known)}")
+            options[key] = parse_yaml(value, f"bench drift: {key}", UsageError)
+    return ways
+
+
+def looked_at(frames: int, sheet: bool) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the marks of rollouts of so many frames, and all frames that are looked at."""
+    marks = sorted({mark for mark in (*MARKS, frames) if mark <= frames})
+    near = {frame for mark in marks for frame in range(mark - SPAN + 1, mark + 1)}
+    shown = {frame for frame in SHOWN if frame <= frames} if sheet else set()
+    return tuple(marks), tuple(sorted(near | shown))
+
+
+def measure(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    robot: str,
+    *,
+    samplings: dict[str, dict[str, Any]],
+    settings: dict[str, Any],
+) -> Found:
+    """Roll out a robot in every way of sampling."""
+    from hma_model.evaluation.probe import as_seen, as_shown, train_probe
+
+    begun = time.monotonic()
+    batch, seed, prompt = settings["rollouts"], settings["seed"], settings["prompt"] or model.config.frames
+    stride = model.stem(robot).input.in_features // model.embodiments[robot].action_dim
+    probe = train_probe(robot, tokenizer, stride, seed)
+    length = prompt + settings["frames"]
+    episodes = [truth.episode(robot, length, stride, seed, number) for number in range(batch)]
+    _, frames = looked_at(settings["frames"], bool(settings["sheet"]))
+    indices = np.array(frames) + prompt - 1
+    stored = [tokenizer.encode(as_seen(robot, tokenizer, one.pictures[:prompt])) for one in episodes]
+    true = np.stack([as_shown(robot, tokenizer, one.pictures[indices]) for one in episodes])
+    chunks = np.stack([one.chunks for one in episodes])
+    other = np.concatenate([chunks[:, : prompt - 1], np.roll(chunks, 1, axis=0)[:, prompt - 1 :]], axis=1)
+    roll = partial(_rolled, model, tokenizer, robot, frames=frames, seed=seed)
+    cases, given = [], np.stack(stored)
+    for number, (name, options) in enumerate(samplings.items()):
+        twice = number == 0
+        made = roll(
+            np.concatenate([given, given]) if twice else given,
+            np.concatenate([chunks, other]) if twice else chunks,
+            options=options,
+        )
+        cases.append(Case(name, made[:batch], judged=True))
+        if twice:
+            cases.append(Case(f"{name}, shuffled", made[batch:]))
+    last = tokenizer.decode(given[:, -1])
+    cases.append(Case("copy", np.repeat(last[:, None], len(frames), axis=1)))
+    print(f"{robot}: {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
+    parts = np.stack([one.parts[indices] for one in episodes])
+    return Found(robot, probe, frames, true, parts, tuple(cases))
+
+
+def _rolled(
+    model: "HMA",
+    tokenizer: "Tokenizer",
+    robot: str,
+    stored: NDArray[Any],
+    chunks: NDArray[np.float32],
+    *,
+    options: dict[str, Any],
+    frames: Sequence[int],
+    seed: int,
+) -> Images:
+    """Continue prompts (B, P, …) under chunks (B, T, K); return the pictures (B, W, S, S, 3) of frames."""
+    import torch
+
+    from hma_model.evaluation.evaluate import decode
+    from hma_model.generation.rollout import Rollout
+
+    discrete, begin = model.config.kind == "discrete", stored.shape[1] - 1
+    known = torch.from_numpy(stored.astype(np.int64 if discrete else np.float32)).to(model.device)
+    commands = torch.from_numpy(chunks).to(model.device)
+    generator = torch.Generator().manual_seed(seed)
+    rollout = Rollout(model, robot, len(known), generator=generator, **options)
+    rollout.prompt(known, commands)
+    kept = []
+    for frame in range(1, frames[-1] + 1):
+        made = rollout.step(commands[:, begin + frame - 1])
+        if frame in frames:
+            kept.append(made.cpu())
+    return decode(tokenizer, torch.stack(kept, dim=1))
+
+
+# -- figures
+
+
+def rows(found: Found, seed: int) -> list[dict[str, Any]]:
+    """Return the figures of each kind of rollout at each mark."""
+    marks, _ = looked_at(found.frames[-1], False)
+    table = [_row(found, case, mark, seed) for case in found.cases for mark in marks]
+    copy = table[-1]
+    for i, case in enumerate(found.cases):
+        if case.judged:
+            first, *_, last = table[i * len(marks) : (i + 1) * len(marks)]
+            last["verdict"] = verdict(first, last, copy)
+    return table
+
+
+def _row(found: Found, case: Case, mark: int, seed: int) -> dict[str, Any]:
+    from hma_model.evaluation.evaluate import PSNR_LIMIT
+    from hma_model.evaluation.metrics import psnr
+
+    window = [found.frames.index(frame) for frame in range(mark - SPAN + 1, mark + 1)]
+    made, true, parts = case.pictures[:, window], found.truth[:, window], found.parts[:, window]
+    probe = found.probe
+    own, loose = probe.own, probe.loose
+    row: dict[str, Any] = {"robot": found.robot, "rollout": case.name, "frame": mark}
+    read = probe.read(made)
+    far = np.linalg.norm(read - parts, axis=-1)
+    if len(own):
+        errors = far[..., own].mean(axis=(1, 2))
+        low, high = _interval(errors, seed)
+        motion = _correlation(np.diff(read[:, :, own], axis=1), np.diff(parts[:, :, own], axis=1))
+        row |= {
+            "error_px": round(float(errors.mean()), 2),
+            "median_px": round(float(np.median(errors)), 2),
+            "low_px": round(low, 2),
+            "high_px": round(high, 2),
+            "share": round(float(errors.mean() / probe.spread[own].mean()), 3),
+            "motion": None if motion is None else round(motion, 2),
+        }
+    flat = (-1, *true.shape[2:])
+    signal = np.minimum(psnr(true.reshape(flat), made.reshape(flat)), PSNR_LIMIT)
+    return row | {
+        "whole": round(float(probe.wholeness(made, true).mean()), 3),
+        "loose_px": round(float(far[..., loose].mean()), 2) if len(loose) else None,
+        "psnr_db": round(float(signal.mean()), 2),
+        "probe_px": round(float(probe.error[own].mean()), 2) if len(own) else None,
+    }
+
+
+def _interval(errors: NDArray[np.float64], seed: int) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of errors (B,), by bootstrap."""
+    chosen = np.random.default_rng(seed).integers(len(errors), size=(RESAMPLES, len(errors)))
+    low, high = np.percentile(errors[chosen].mean(axis=1), (2.5, 97.5))
+    return float(low), float(high)
+
+
+def _correlation(one: NDArray[np.float64], other: NDArray[np.float64]) -> float | None:
+    """Return the correlation of two motions; None if one of them stands still."""
+    if min(one.std(), other.std()) < 1e-3:
+        return None
+    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
+
+
+def verdict(first: dict[str, Any], last: dict[str, Any], copy: dict[str, Any]) -> str:
+    """Return a sentence on the end of a rollout: whether it follows its commands, and whether it is whole."""
+    if "error_px" not in last:
+        return "none: no part of the robot can be read"
+    times, whole = last["error_px"] / max(first["error_px"], 1e-9), last["whole"] / max(copy["whole"], 1e-9)
+    if first["share"] > LOST:
+        follows = "lost by the first mark"
+    else:
+        follows = "holds" if times <= LIMIT and last["share"] <= LOST else "drifts"
+    return f"{follows}, error ×{times:.1f}; {'whole' if whole >= WHOLE else 'dissolved'}, ×{whole:.2f}"
+
+
+# -- sheet
+
+
+def draw(found: Sequence[Found], path: Path) -> None:
+    """Write a PNG: for two rollouts a robot the truth, and below it the model, at the frames of SHOWN."""
+    from hma_data.episodes.sheets import grid, write_png
+
+    lines, labels = [], []
+    for one in found:
+        columns = [one.frames.index(frame) for frame in SHOWN if frame in one.frames]
+        told = ", ".join(str(one.frames[column]) for column in columns)
+        for number in range(min(SHEETS, len(one.truth))):
+            lines.append(list(one.truth[number, columns]))
+            labels.append(f"{one.robot}, truth at frames {told}")
+            for case in one.cases:
+                if case.judged:
+                    lines.append(list(case.pictures[number, columns]))
+                    labels.append(f"{one.robot}, {case.name}")
+    write_png(path, grid(lines, labels))
+
+
+BENCH = Bench(
+    "long rollouts: how far the robot is from where its commands took it, read off the picture",
+    {
+        "checkpoint": "embedded",
+        "robots": "arm2_07,mover_10,pusht_fast",
+        "frames": 300,
+        "rollouts": 8,  # of each robot
+        "sampling": "unmask_steps=2",
+        "prompt": 0,  # true frames; 0: the model's window
+        "seed": 1818,
+        "sheet": "",  # a PNG to write
+    },
+    run,
+)

@@ -1,0 +1,227 @@
+"""Read the state of a laboratory robot off pictures, and measure how whole they are.
+
+A probe has about 3,600 weights: convolutions make one map a part, the softmax of a map is a distribution over
+the picture, and its mean is the part's place (Sun et al. 2018, integral regression). A linear layer, at first
+the identity, corrects the places from one another. It learns from true pictures as the tokenizer shows them,
+with slight noise, and from episodes that nothing is measured on. Its own error is that on other episodes.
+
+A picture may lose a limb and still have small errors of its pixels. `wholeness` therefore counts the pixels
+of each part's colour, wherever they are. A true picture of another time has some 0.9.
+
+N pictures of S pixels a side, P parts. Places are px of a picture of 128 by 128.
+"""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from hma_data.episodes.images import opencv, prepare
+from hma_data.lab import truth
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+
+Floats = NDArray[np.float64]
+Images = NDArray[np.uint8]
+
+SIDE, MAPS = 64, 32  # of the pictures that a probe sees, and of its maps
+CHANNELS, SHARPNESS = 16, 4.0
+STEPS, BATCH, RATE, NOISE = 400, 32, 1e-2, 0.03  # noise in pictures of -1 to 1
+EPISODES, HELD_OUT = 40, 8  # simulated, and of them those that the probe's error is measured on
+FRAMES, EVERY = 60, 2  # of an episode; one in so many is kept
+FIRST = 1_000_000  # the number of the first episode of a probe; those that are measured count from 0
+STILL = 1.0  # px; a part that moves less is no part of the state
+UNREADABLE = 0.5  # share of a part's spread; a probe with a larger error does not read it
+DISTANCE, SEEN = 45.0, 3  # of RGB, up to which two colours are one; least pixels of a part that is seen
+
+
+class PlaceNetwork(nn.Module):
+    """A network that finds parts in pictures (N, 3, SIDE, SIDE); pixels and places (N, P, 2) are -1 to 1."""
+
+    def __init__(self, parts: int) -> None:
+        super().__init__()
+        self.maps = nn.Sequential(
+            nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2),
+            nn.GELU(),
+            nn.Conv2d(CHANNELS, CHANNELS, 3, padding=2, dilation=2),
+            nn.GELU(),
+            nn.Conv2d(CHANNELS, parts, 1),
+        )
+        self.correct = nn.Linear(2 * parts, 2 * parts)
+        nn.init.eye_(self.correct.weight)
+        nn.init.zeros_(self.correct.bias)
+        line = (torch.arange(MAPS) + 0.5) * (2 / MAPS) - 1
+        self.register_buffer("grid", torch.stack(torch.meshgrid(line, line, indexing="xy"), -1).view(-1, 2))
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        chance = (self.maps(pictures).flatten(2) * SHARPNESS).softmax(-1)
+        places = chance @ self.grid
+        return self.correct(places.flatten(1)).view_as(places)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A probe of one robot's pictures.
+
+    Attributes:
+        network: a trained `PlaceNetwork`.
+        driven: how many of the parts are the robot's own.
+        error: (P,) mean distance in px from the true places on held-out true pictures.
+        spread: (P,) mean distance in px of the true places from their median.
+        background: (SIDE, SIDE, 3), the median of the true pictures.
+        colors: (P, 3), of the parts.
+    """
+
+    network: nn.Module
+    driven: int
+    error: Floats
+    spread: Floats
+    background: Floats
+    colors: Floats
+
+    @property
+    def readable(self) -> NDArray[np.bool_]:
+        """Return (P,) whether a part moves and the probe reads its place."""
+        return (self.spread > STILL) & (self.error <= UNREADABLE * self.spread)
+
+    @property
+    def own(self) -> NDArray[np.int64]:
+        """Return the numbers of the readable parts that are the robot's own."""
+        return np.flatnonzero(self.readable[: self.driven])
+
+    @property
+    def loose(self) -> NDArray[np.int64]:
+        """Return the numbers of the readable parts that lie loose."""
+        return self.driven + np.flatnonzero(self.readable[self.driven :])
+
+    @torch.no_grad()
+    def read(self, pictures: Images) -> Floats:
+        """Return the places (…, P, 2) of the parts in pictures (…, S, S, 3)."""
+        flat = _small(pictures.reshape(-1, *pictures.shape[-3:]))
+        found = torch.cat([self.network(_pixels(part)) for part in np.array_split(flat, len(flat) // 64 + 1)])
+        places: Floats = (found.double().numpy() + 1) * (truth.SIZE / 2)
+        return places.reshape(*pictures.shape[:-3], *places.shape[1:])
+
+    def areas(self, pictures: Images) -> Floats:
+        """Return (…, P), how many pixels of (…, S, S, 3) have a part's colour and not the background's."""
+        flat = _small(pictures.reshape(-1, *pictures.shape[-3:])).astype(np.float32)
+        stands = np.linalg.norm(flat - self.background, axis=-1) > DISTANCE
+        near = [np.linalg.norm(flat - color, axis=-1) <= DISTANCE for color in self.colors]
+        counts = np.stack([(stands & part).sum(axis=(1, 2), dtype=np.float64) for part in near], axis=-1)
+        return counts.reshape(*pictures.shape[:-3], len(near))
+
+    def wholeness(self, pictures: Images, true: Images) -> Floats:
+        """Return how much of the robot of true pictures (…, S, S, 3) others show; 1 is all of it.
+
+        It is the mean over the robot's readable parts that the true picture shows.
+        """
+        wanted, given = (self.areas(some)[..., self.own] for some in (true, pictures))
+        seen = wanted >= SEEN
+        kept: Floats = np.where(seen, np.minimum(given / np.maximum(wanted, 1), 1), 0).sum(axis=-1)
+        return kept / np.maximum(seen.sum(axis=-1), 1)
+
+
+def state_errors(probe: Probe, pictures: Images, parts: Floats) -> Floats:
+    """Return how far each part is from its true place, as a probe reads it off pictures.
+
+    Args:
+        probe: of the robot and the tokenizer of the pictures.
+        pictures: (…, S, S, 3) uint8.
+        parts: (…, P, 2) true places in px of 128.
+
+    Returns:
+        (…, P) in px of 128.
+    """
+    errors: Floats = np.linalg.norm(probe.read(pictures) - parts, axis=-1)
+    return errors
+
+
+def as_shown(robot: str, tokenizer: "Tokenizer", pictures: Images) -> Images:
+    """Return a recorder's pictures (N, …) as the tokenizer shows them (N, S, S, 3)."""
+    return tokenizer.decode(tokenizer.encode(as_seen(robot, tokenizer, pictures)))
+
+
+def as_seen(robot: str, tokenizer: "Tokenizer", pictures: Images) -> Images:
+    """Return a recorder's pictures (N, …) as the tokenizer takes them (N, S, S, 3)."""
+    spec, (camera, *_) = tokenizer.spec, truth.embodiment(robot).cameras
+    return prepare(pictures, camera, spec.image_size, spec.resize_filter)
+
+
+def train_probe(robot: str, tokenizer: "Tokenizer", stride: int, seed: int = 0) -> Probe:
+    """Train a probe on simulated episodes of a laboratory robot; it takes some 15 CPU seconds.
+
+    Args:
+        robot: a laboratory robot.
+        tokenizer: whose pictures the probe is to read.
+        stride: control steps a frame.
+        seed: of the episodes and the training; the same seed gives the same probe.
+    """
+    numbers = range(FIRST, FIRST + EPISODES)
+    made = [truth.episode(robot, FRAMES, stride, seed, number) for number in numbers]
+    pictures = np.concatenate([episode.pictures[::EVERY] for episode in made])
+    parts = np.concatenate([episode.parts[::EVERY] for episode in made])
+    return fit(as_shown(robot, tokenizer, pictures), parts, made[0].driven, HELD_OUT / EPISODES, seed)
+
+
+def fit(
+    pictures: Images, parts: Floats, driven: int, held_out: float = 0.2, seed: int = 0, steps: int = STEPS
+) -> Probe:
+    """Train a probe on pictures whose state is known.
+
+    Args:
+        pictures: (N, S, S, 3), by episode.
+        parts: (N, P, 2) true places in px of 128.
+        driven: how many of the parts are the robot's own.
+        held_out: share of the pictures, the last ones, on which the error is measured.
+        seed: of the training.
+        steps: of the training.
+    """
+    used = round(len(pictures) * (1 - held_out))
+    small = _small(pictures)
+    network = _trained(small[:used], parts[:used], seed, steps)
+    spread = np.linalg.norm(parts - np.median(parts, axis=0), axis=-1).mean(axis=0)
+    background = np.median(small[:used], axis=0).astype(np.float32)
+    colors = _colors(small[:used], parts[:used])
+    untested = Probe(network, driven, spread, spread, background, colors)
+    error = state_errors(untested, pictures[used:], parts[used:]).mean(axis=0)
+    return replace(untested, error=error)
+
+
+def _trained(small: Images, parts: Floats, seed: int, steps: int) -> nn.Module:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = PlaceNetwork(parts.shape[1])
+    generator = torch.Generator().manual_seed(seed)
+    inputs, targets = _pixels(small), torch.tensor(parts / (truth.SIZE / 2) - 1, dtype=torch.float32)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
+    for _ in range(steps):
+        chosen = torch.randint(0, len(inputs), (BATCH,), generator=generator)
+        noisy = inputs[chosen] + NOISE * torch.randn(BATCH, 3, SIDE, SIDE, generator=generator)
+        loss = nn.functional.smooth_l1_loss(network(noisy), targets[chosen], beta=0.02)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    return network.eval()
+
+
+def _colors(small: Images, parts: Floats) -> Floats:
+    """Return the (P, 3) median colours of pictures at the true places of the parts."""
+    x, y = np.clip(parts * (SIDE / truth.SIZE), 0, SIDE - 1).astype(int).transpose(2, 0, 1)
+    found: Floats = np.median(small[np.arange(len(small))[:, None], y, x], axis=0).astype(np.float32)
+    return found
+
+
+def _small(pictures: Images) -> Images:
+    """Return pictures (N, SIDE, SIDE, 3)."""
+    cv2 = opencv()
+    return np.stack([cv2.resize(one, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for one in pictures])
+
+
+def _pixels(small: Images) -> Tensor:
+    return torch.from_numpy(small).permute(0, 3, 1, 2).float() / 127.5 - 1

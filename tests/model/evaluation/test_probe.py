@@ -1,0 +1,69 @@
+"""The probe reads places off pictures whose state is known, and wholeness tells what is missing."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from hma_data.lab.family.look import SIZE
+from hma_model.evaluation.probe import Probe, fit, state_errors
+
+RED, BLUE, PAPER = (200, 30, 40), (40, 60, 200), (225, 225, 215)
+
+
+def scene(places, colors=(RED, BLUE)):
+    """Draw a disc of each colour at places (2, 2)."""
+    picture = np.full((SIZE, SIZE, 3), PAPER, np.uint8)
+    for (x, y), color in zip(places, colors, strict=False):
+        cv2.circle(picture, (round(x), round(y)), 9, color, -1, cv2.LINE_AA)
+    return picture
+
+
+def scenes(count, seed):
+    """Draw scenes of two discs that do not touch; return pictures and places (N, 2, 2)."""
+    parts = np.random.default_rng(seed).uniform(12, SIZE - 12, (4 * count, 2, 2))
+    parts = parts[np.linalg.norm(parts[:, 0] - parts[:, 1], axis=-1) > 20][:count]
+    return np.stack([scene(places) for places in parts]), parts
+
+
+@pytest.fixture(scope="module")
+def probe() -> Probe:
+    return fit(*scenes(300, 0), driven=2, steps=120)
+
+
+def test_places_are_read_to_a_pixel_or_two_off_other_pictures(probe):
+    pictures, parts = scenes(40, 1)
+    errors = state_errors(probe, pictures, parts)
+    assert errors.mean() < 2.0
+    assert probe.error.mean() == pytest.approx(errors.mean(), abs=1.5)
+    assert list(probe.own) == [0, 1] and list(replace(probe, driven=1).loose) == [1]
+
+
+def test_an_error_is_the_distance_from_the_true_place(probe):
+    pictures, parts = scenes(8, 2)
+    moved = parts.reshape(2, 4, 2, 2) + np.array([30, 40])
+    errors = state_errors(probe, pictures.reshape(2, 4, *pictures.shape[1:]), moved)
+    assert errors.shape == (2, 4, 2)
+    assert errors.mean() == pytest.approx(50, abs=3)
+
+
+def test_what_does_not_move_or_cannot_be_read_is_no_part_of_the_state():
+    pictures, parts = scenes(100, 3)
+    parts[:, 0] = (20, 30)  # as of a disc that stands still
+    parts[:, 1] = np.random.default_rng(4).uniform(0, SIZE, (100, 2))  # as of one that is not in the picture
+    found = fit(pictures, parts, driven=1, steps=20)
+    assert not found.readable.any()
+
+
+def test_wholeness_falls_with_what_is_lost_and_not_with_what_moves(probe):
+    here, there = np.array([[30.0, 30], [90, 90]]), np.array([[90.0, 40], [30, 100]])
+    truth = np.stack([scene(here)] * 3)
+    found = probe.wholeness(np.stack([scene(here), scene(there), scene(here[:1])]), truth)
+    np.testing.assert_allclose(found, [1.0, 1.0, 0.5], atol=0.07)
+
+
+def test_the_same_seed_gives_the_same_probe():
+    pictures, parts = scenes(60, 5)
+    one, other = (fit(pictures, parts, driven=2, steps=3, seed=7).read(pictures[:4]) for _ in range(2))
+    np.testing.assert_array_equal(one, other)
