@@ -183,7 +183,7 @@ class World:
 
     def _decoding(self) -> Decoding:
         decoding = Decoding(self.unmask_steps, self.temperature, self.order, self.sample_steps)
-        check(decoding, self.model.config.kind)
+        check(decoding, self.model.config)
         return decoding
 
     def _reserve(self, row: int, embodiment: str) -> None:
