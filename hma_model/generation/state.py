@@ -10,7 +10,7 @@ frame with its action tokens, T frames of a pass.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -52,12 +52,18 @@ class Snapshot:
             LayerCache(part.time[:, :, index], None if part.action is None else part.action[:, :, index])
             for part in self.layers
         ]
-        lists = {
-            name: tuple(getattr(self, name)[row] for row in rows)
-            for name in ("embodiments", "times", "pending", "prompts", "generators")
-        }
-        buffers = {name: getattr(self, name)[index] for name in ("frames", "chunks", "known")}
-        return replace(self, **lists, **buffers, layers=tuple(layers))
+        return replace(
+            self,
+            embodiments=tuple(self.embodiments[row] for row in rows),
+            times=tuple(self.times[row] for row in rows),
+            pending=tuple(self.pending[row] for row in rows),
+            prompts=tuple(self.prompts[row] for row in rows),
+            generators=tuple(self.generators[row] for row in rows),
+            frames=self.frames[index],
+            chunks=self.chunks[index],
+            known=self.known[index],
+            layers=tuple(layers),
+        )
 
 
 class RowState:
