@@ -29,6 +29,7 @@ _LAYOUT: dict[str, Any] = {
     "add_at": "layers",
 }
 _EXPORTED = ("time_position", "action_alignment", "temporal_norm", "final_norm")  # what an export needs
+_OURS = ("merge", "masked_input", "told_noise", "digit_order")  # and what must be off
 _CONTINUOUS_NEEDS: dict[str, Any] = {
     "action_loss": "diffusion", "latent_scale": LATENT_SCALE, "diffusion_train_steps": 1000,
     "diffusion_target": "noise",
@@ -206,7 +207,7 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
 def _inexpressible(config: HMAConfig) -> list[str]:
     """Return each field and value that the released code cannot express."""
     continuous, tokens = config.kind == "continuous", math.prod(config.grid)
-    needed = {name: _LAYOUT[name] for name in _EXPORTED}
+    needed = {name: _LAYOUT[name] for name in _EXPORTED} | {name: getattr(HMAConfig, name) for name in _OURS}
     needed |= _CONTINUOUS_NEEDS if continuous else {"action_loss": "mse"}
     needed |= {"base_width": 256} if config.mup else {}
     faults = [f"{name} {getattr(config, name)!r}" for name in needed if getattr(config, name) != needed[name]]

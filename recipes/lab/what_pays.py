@@ -75,6 +75,8 @@ def measure(data: Path, row: str, changes: list[str], seed: int) -> list[dict[st
     ways: dict[str, dict[str, Any]] = {row: {}, **ROLLOUTS.get(row, {})}
     with tempfile.TemporaryDirectory() as folder:
         result = train(recipe, out=Path(folder) / "run", show=False)
+        if result.interrupted:
+            raise SystemExit(f"{row}, seed {seed}: stopped by a signal; the run does not count")
         model = HMA.from_pretrained(result.checkpoint)
         found = {way: evaluate(model, tokenizer, shards, **given, **how) for way, how in ways.items()}
     square = (2 / model.config.merge) ** 2
