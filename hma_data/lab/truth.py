@@ -10,7 +10,7 @@ it does not tell a hoist, a lift and a magnet.
 T frames a chunk apart, S pixels a side, K = stride * action dim, P parts.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from itertools import islice
 
@@ -38,7 +38,7 @@ class Episode:
     """An episode and its state.
 
     Attributes:
-        pictures: (T, S, S, 3) uint8, as the recorder draws them.
+        pictures: (T, S, S, 3) uint8, as the recorder draws them, or only those asked for.
         chunks: (T, K) float32, the commands from each picture to the next.
         parts: (T, P, 2) x, y of the parts in px of a picture of 128 by 128.
         driven: how many of the parts, the first ones, are the robot's own; the others lie loose.
@@ -62,7 +62,9 @@ def embodiment(robot: str) -> Embodiment:
     return find(robot) if robot in SIMPLE else family.embodiment(robot)
 
 
-def episode(robot: str, frames: int, stride: int, seed: int, number: int) -> Episode:
+def episode(
+    robot: str, frames: int, stride: int, seed: int, number: int, drawn: Collection[int] | None = None
+) -> Episode:
     """Simulate an episode; the same seed and number give the same one, and a longer one begins like it.
 
     Args:
@@ -70,13 +72,15 @@ def episode(robot: str, frames: int, stride: int, seed: int, number: int) -> Epi
         frames: T.
         stride: control steps a frame.
         seed, number: as the recorders take them.
+        drawn: frames of which the picture is drawn; by default all.
     """
     pictures, parts, commands, driven = [], [], [], 0
     steps = islice(_steps(robot, seed, number), frames * stride)
     for step, (picture, places, driven, command) in enumerate(steps):  # noqa: B007
         if step % stride == 0:
-            pictures.append(picture())
             parts.append(places)
+            if drawn is None or step // stride in drawn:
+                pictures.append(picture())
         commands.append(command)
     chunks = np.stack(commands).reshape(frames, -1)
     return Episode(np.stack(pictures), chunks, np.stack(parts), driven)

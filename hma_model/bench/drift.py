@@ -145,28 +145,26 @@ def measure(
 
     begun = time.monotonic()
     batch, seed, prompt = settings["rollouts"], settings["seed"], settings["prompt"] or model.config.frames
-    stride = model.stem(robot).input.in_features // model.embodiments[robot].action_dim
+    stride = model.embodiments[robot].stride
     probe = train_probe(robot, tokenizer, stride, seed)
-    length = prompt + settings["frames"]
-    episodes = [truth.episode(robot, length, stride, seed, number) for number in range(batch)]
     _, frames = looked_at(settings["frames"], bool(settings["sheet"]))
-    indices = np.array(frames) + prompt - 1
-    stored = [tokenizer.encode(as_seen(robot, tokenizer, one.pictures[:prompt])) for one in episodes]
-    true = np.stack([as_shown(robot, tokenizer, one.pictures[indices]) for one in episodes])
+    indices = [prompt - 1 + frame for frame in frames]
+    drawn, length = {*range(prompt), *indices}, prompt + settings["frames"]
+    episodes = [truth.episode(robot, length, stride, seed, number, drawn) for number in range(batch)]
+    shown = [as_seen(robot, tokenizer, one.pictures) for one in episodes]
+    given = np.stack([tokenizer.encode(pictures[:prompt]) for pictures in shown])
+    true = np.stack([as_shown(tokenizer, pictures[prompt:]) for pictures in shown])
     chunks = np.stack([one.chunks for one in episodes])
-    other = np.concatenate([chunks[:, : prompt - 1], np.roll(chunks, 1, axis=0)[:, prompt - 1 :]], axis=1)
     roll = partial(_rolled, model, tokenizer, robot, frames=frames, seed=seed)
-    cases, given = [], np.stack(stored)
-    for number, (name, options) in enumerate(samplings.items()):
-        twice = number == 0
-        made = roll(
-            np.concatenate([given, given]) if twice else given,
-            np.concatenate([chunks, other]) if twice else chunks,
-            options=options,
-        )
-        cases.append(Case(name, made[:batch], judged=True))
-        if twice:
-            cases.append(Case(f"{name}, shuffled", made[batch:]))
+    cases: list[Case] = []
+    for name, options in samplings.items():
+        if cases:
+            cases.append(Case(name, roll(given, chunks, options=options), judged=True))
+            continue
+        other = np.roll(chunks, 1, axis=0)
+        other[:, : prompt - 1] = chunks[:, : prompt - 1]
+        both = roll(np.concatenate([given, given]), np.concatenate([chunks, other]), options=options)
+        cases = [Case(name, both[:batch], judged=True), Case(f"{name}, shuffled", both[batch:])]
     last = tokenizer.decode(given[:, -1])
     cases.append(Case("copy", np.repeat(last[:, None], len(frames), axis=1)))
     print(f"{robot}: {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)

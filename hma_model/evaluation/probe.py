@@ -140,15 +140,15 @@ def state_errors(probe: Probe, pictures: Images, parts: Floats) -> Floats:
     return errors
 
 
-def as_shown(robot: str, tokenizer: "Tokenizer", pictures: Images) -> Images:
-    """Return a recorder's pictures (N, …) as the tokenizer shows them (N, S, S, 3)."""
-    return tokenizer.decode(tokenizer.encode(as_seen(robot, tokenizer, pictures)))
-
-
 def as_seen(robot: str, tokenizer: "Tokenizer", pictures: Images) -> Images:
     """Return a recorder's pictures (N, …) as the tokenizer takes them (N, S, S, 3)."""
     spec, (camera, *_) = tokenizer.spec, truth.embodiment(robot).cameras
     return prepare(pictures, camera, spec.image_size, spec.resize_filter)
+
+
+def as_shown(tokenizer: "Tokenizer", pictures: Images) -> Images:
+    """Return pictures (N, S, S, 3) as the tokenizer reconstructs them."""
+    return tokenizer.decode(tokenizer.encode(pictures))
 
 
 def train_probe(robot: str, tokenizer: "Tokenizer", stride: int, seed: int = 0) -> Probe:
@@ -161,10 +161,12 @@ def train_probe(robot: str, tokenizer: "Tokenizer", stride: int, seed: int = 0) 
         seed: of the episodes and the training; the same seed gives the same probe.
     """
     numbers = range(FIRST, FIRST + EPISODES)
-    made = [truth.episode(robot, FRAMES, stride, seed, number) for number in numbers]
-    pictures = np.concatenate([episode.pictures[::EVERY] for episode in made])
-    parts = np.concatenate([episode.parts[::EVERY] for episode in made])
-    return fit(as_shown(robot, tokenizer, pictures), parts, made[0].driven, HELD_OUT / EPISODES, seed)
+    kept = range(0, FRAMES, EVERY)
+    made = [truth.episode(robot, FRAMES, stride, seed, number, kept) for number in numbers]
+    pictures = np.concatenate([episode.pictures for episode in made])
+    parts = np.concatenate([episode.parts[kept] for episode in made])
+    shown = as_shown(tokenizer, as_seen(robot, tokenizer, pictures))
+    return fit(shown, parts, made[0].driven, HELD_OUT / EPISODES, seed)
 
 
 def fit(

@@ -30,6 +30,8 @@ def test_episodes_are_repeatable_and_of_any_length(robot: str) -> None:
     short, long = (truth.episode(robot, frames, own.stride, 2, 3) for frames in (4, 30))
     np.testing.assert_array_equal(short.pictures, long.pictures[:4])
     np.testing.assert_array_equal(short.parts, long.parts[:4])
+    some = truth.episode(robot, 4, own.stride, 2, 3, drawn={1, 3})
+    np.testing.assert_array_equal(some.pictures, short.pictures[[1, 3]])
     assert long.chunks.shape == (30, own.chunk_dim) and long.chunks.dtype == np.float32
     assert long.pictures.shape[:2] == (30, long.pictures.shape[2]) and 1 <= long.driven <= long.parts.shape[1]
     moved = np.ptp(long.parts[:, : long.driven], axis=0).max()
