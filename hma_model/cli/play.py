@@ -1,0 +1,72 @@
+"""Define the verb `hma play`: a page to drive robots in."""
+
+import os
+import secrets
+import socket
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hma_data.console import interruptible
+from hma_data.errors import UsageError
+
+
+def play(
+    checkpoint: Annotated[
+        str, typer.Argument(help="A checkpoint, or a run's folder; by default the one that comes along.")
+    ] = "embedded",
+    data: Annotated[
+        list[Path] | None, typer.Argument(help="Shard sets, whose held-out episodes give more scenes.")
+    ] = None,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to listen on; any but loopback needs a token.")
+    ] = "127.0.0.1",
+    token: Annotated[
+        str | None, typer.Option("--token", help="What the address must carry; made up with --host.")
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
+    ] = True,
+) -> None:
+    """Drive robots in a world model, in the browser, beside their true simulators.
+
+    Example: hma play
+    """
+    import asyncio
+
+    from hma_model.checkpoint.folder import Checkpoint
+    from hma_model.simulate.server import LOOPBACK, serve
+
+    opened = Checkpoint.open(checkpoint)  # a wrong path is refused before torch is imported
+    listener = _listen(host, port)
+    if token is None and host not in LOOPBACK:
+        token = secrets.token_urlsafe(18)
+    shown = f"[{host}]" if ":" in host else host
+    address = f"http://{shown}:{listener.getsockname()[1]}/" + (f"?token={token}" if token else "")
+
+    def ready() -> None:
+        print(f"drive at {address} (Ctrl-C ends)", flush=True)
+        if browser and _display():
+            webbrowser.open(address)
+
+    with interruptible(lambda: "what was not saved is lost"):
+        asyncio.run(serve(opened, data or (), listener, host, token, ready))
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except (OSError, OverflowError) as fault:
+        raise UsageError(
+            f"{host}:{port}", f"cannot be listened on: {fault}", "choose another --port"
+        ) from fault
+
+
+def _display() -> bool:
+    """Check whether there is a screen to open a browser on."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
