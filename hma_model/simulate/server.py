@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
 from importlib.resources import files
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
 import anyio
@@ -35,6 +35,9 @@ from hma_model.simulate.engine import Engine
 from hma_model.simulate.films import KINDS, film
 from hma_model.simulate.scenes import describe, drivable
 from hma_model.simulate.session import Frame, Sampling, Session
+
+if TYPE_CHECKING:
+    import uvicorn
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -364,8 +367,6 @@ async def serve(
         UsageError: no robot of the checkpoint can be driven.
         CheckpointError: the checkpoint is damaged.
     """
-    import uvicorn
-
     from hma_data.tokenizers.base import get_tokenizer
     from hma_model.checkpoint.io import load
     from hma_model.simulate.world import World
@@ -377,8 +378,19 @@ async def serve(
     confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()
     engine = Engine(World(model, tokenizer), robots, orders=("random", *confidence))
     name = "the embedded model" if checkpoint.folder == EMBEDDED else checkpoint.folder.name
+    engine.start()
+    try:
+        await run(Server(engine, name, host, token).app, listener, lambda server: ready())
+    finally:
+        engine.stop()
+
+
+async def run(app: ASGIApp, listener: socket.socket, ready: Callable[["uvicorn.Server"], None]) -> None:
+    """Serve an application at a socket that listens, until a signal or until `should_exit` is set."""
+    import uvicorn
+
     settings = uvicorn.Config(
-        Server(engine, name, host, token).app,
+        app,
         log_level="warning",
         access_log=False,
         lifespan="off",
@@ -388,12 +400,8 @@ async def serve(
         timeout_graceful_shutdown=2,
     )
     server = uvicorn.Server(settings)
-    engine.start()
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.02)
-    ready()
-    try:
-        await serving
-    finally:
-        engine.stop()
+    ready(server)
+    await serving
