@@ -1,5 +1,23 @@
-"""Drive robots inside a world model.
+"""Drive a world model: sessions in pictures and commands, as gymnasium environments, and in a browser.
 
-In: a checkpoint, and scenes to begin in, from the laboratory's simulators or from shard sets. Out: pictures
-under given commands; `hma play` shows them in a browser.
+In come a checkpoint, a prompt and commands, out come pictures. Next: `hma_model.training`.
+`import hma_model.simulate` registers the environment `hma/WorldModel-v0`.
 """
+
+from typing import TYPE_CHECKING
+
+from hma_data import lazy
+
+if TYPE_CHECKING:
+    from hma_model.simulate.prompts import read_prompt as read_prompt
+    from hma_model.simulate.prompts import starting_window as starting_window
+    from hma_model.simulate.world import World as World
+    from hma_model.simulate.world import load_world as load_world
+
+__getattr__ = lazy(
+    __name__,
+    {
+        **dict.fromkeys(("World", "load_world"), "hma_model.simulate.world"),
+        **dict.fromkeys(("read_prompt", "starting_window"), "hma_model.simulate.prompts"),
+    },
+)
