@@ -264,7 +264,8 @@ class SlowPusher:
 
     def driver(self, episode: int) -> Callable[[], NDArray[np.float32]]:
         """Return a driver that returns (3,) the command in force at each picture, as it is recorded."""
-        commander, due, held = self.commander(episode), self.arena.ticks, np.zeros(3)
+        commander, due = self.commander(episode), self.arena.ticks
+        held: Floats = np.zeros(3)
 
         def drive() -> NDArray[np.float32]:
             nonlocal due, held

@@ -70,6 +70,8 @@ class Engine:
             try:
                 future.set_result(function())
             except Exception as fault:
+                if not isinstance(fault, HMAError):
+                    _log.exception("a call failed")
                 future.set_exception(fault)
 
         self._jobs.put(job)

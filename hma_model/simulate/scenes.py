@@ -175,19 +175,20 @@ class RecordedRobot:
         splits = self._shards.manifest.splits
         split = "val" if splits.get("val", {}).get("episodes") else "train"
         rows = [row for row in self._shards.episodes.to_pylist() if row["split"] == split]
-        longest = max((row["length"] for row in rows), default=0) // self._shards.row_stride
-        if longest <= PROMPT:
+        lengths = sorted(row["length"] // self._shards.row_stride for row in rows)
+        length = min(LONGEST, lengths[len(lengths) // 2]) if lengths else 0
+        if length <= PROMPT:
             raise UsageError(
-                self._shards.folder, f"has no episode of more than {PROMPT} frames", "give other shards"
+                self._shards.folder, f"its episodes are not longer than {PROMPT} frames", "give other shards"
             )
-        return WindowDataset(self._shards, split, min(LONGEST, longest), cameras=self._cameras)
+        return WindowDataset(self._shards, split, length, cameras=self._cameras)
 
     def scene(self, number: int) -> "RecordedScene":
-        """Return one of the windows; scenes that follow one another lie apart."""
+        """Return one of the windows; those of numbers that follow one another lie apart."""
         from hma_model.evaluation.evaluate import decode
 
         windows = self._windows
-        batch = windows.batch([number * windows.index.span % len(windows)])
+        batch = windows.batch([number * (1 + round(0.382 * len(windows))) % len(windows)])
         stored = batch.latents if batch.tokens is None else batch.tokens
         assert stored is not None
         frames = decode(self._tokenizer, stored)[0]

@@ -332,7 +332,7 @@ class Connection:
                 case messages.Clock():
                     session.fast, session.due = message.fast, session.touched
                 case messages.Replay():
-                    session.replays = message.on
+                    session.replays, session.ended = message.on, False
                 case messages.Sample():
                     way = Sampling(message.passes, round(message.temperature, 1), message.order)
                     self.engine.change(session, way)

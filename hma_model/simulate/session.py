@@ -20,7 +20,10 @@ from hma_model.simulate.scenes import Drivable, Floats, LabScene, Picture, descr
 
 WINDOW = 8  # frames that a restart of the model is given
 KEPT = 3000  # frames to save
-DROP, ROW = 6.0, 3  # dB below the first frames, and frames in a row: from then on model and truth have parted
+DROP, ROW = (
+    4.0,
+    3,
+)  # dB below what the tokenizer alone gives, and frames in a row: model and truth have parted
 QUALITY = 92  # of JPEG
 
 
@@ -38,6 +41,7 @@ class World(Protocol):
         self, session: int, frames: Picture, chunks: Floats | None = None, *, seed: int | None = None
     ) -> None: ...
     def step(self, commands: Mapping[int, Floats]) -> Mapping[int, Picture]: ...
+    def picture(self, session: int) -> Picture: ...
     def close(self, session: int) -> None: ...
 
 
@@ -105,28 +109,34 @@ class Session:
         self.input = 0  # number of the newest input, by which the page measures latency
         self._times: deque[float] = deque(maxlen=40)
         self._begin(number)
-        self.row = world.open(robot.embodiment.id, *self._history(self._seen))
+        self.row = world.open(robot.embodiment.id, *self._history())
+        self._set_start()
 
     # -- scene and model
 
     def begin(self, number: int) -> None:
         """Begin another scene, or the same anew."""
         self._begin(number)
-        self._world.reset(self.row, *self._history(self._seen))
+        self._world.reset(self.row, *self._history())
+        self._set_start()
 
     def _begin(self, number: int) -> None:
         self.number, self.scene = number, self.robot.scene(number)
         prompt = self.scene.prompt
-        self._seen, self._true = (deque(prompt.frames, maxlen=WINDOW) for _ in range(2))
+        self._true: deque[Picture] = deque(prompt.frames, maxlen=WINDOW)
         self._chunks: deque[Floats] = deque(prompt.chunks, maxlen=WINDOW - 1)
         self.held = self.scene.command.copy()
         self.frames: deque[Frame] = deque(maxlen=KEPT)
         self.count, self.ended, self.steps = 0, False, 0
         self.parted: int | None = None
         self._low = 0  # frames in a row below the threshold
-        self._scores: list[float] = []
-        first = jpeg(prompt.frames[-1])
-        self.start = Frame(0, first, first, np.zeros((0, 0), np.float32), self._state, None)
+
+    def _set_start(self) -> None:
+        """Take the prompt's last frame as the tokenizer shows it, which the model cannot surpass."""
+        true, shown = self._true[-1], self._world.picture(self.row)
+        self._best = psnr(shown, true)
+        none = np.zeros((0, 0), np.float32)
+        self.start = Frame(0, jpeg(shown), jpeg(true), none, self._state, self._best)
 
     def sync(self) -> None:
         """Restart the model from the true last frames.
@@ -136,16 +146,14 @@ class Session:
         """
         if not self._true:
             raise UsageError("sync", "the true frames are unknown here", "reset first, or drive a simulator")
-        self._seen = deque(self._true, maxlen=WINDOW)
-        self._world.reset(self.row, *self._history(self._seen))
+        self._world.reset(self.row, *self._history())
+        self._best = psnr(self._world.picture(self.row), self._true[-1])
         self.parted, self._low = None, 0
-        self._scores.clear()
 
-    def _history(self, frames: "deque[Picture]") -> tuple[Picture, Floats]:
-        count = len(frames)
-        chunks = list(self._chunks)[len(self._chunks) - (count - 1) :]
-        width = self.robot.embodiment.chunk_dim
-        return np.stack(list(frames)), np.stack(chunks) if chunks else np.zeros((0, width), np.float32)
+    def _history(self) -> tuple[Picture, Floats]:
+        """Return the true last frames, and the chunks between them."""
+        frames, chunks = list(self._true), list(self._chunks)
+        return np.stack(frames), np.stack(chunks[len(chunks) - len(frames) + 1 :])
 
     # -- one step
 
@@ -177,7 +185,6 @@ class Session:
         period = self.robot.embodiment.stride / self.robot.embodiment.rate_hz
         self.due = now if self.fast else max(self.due + period, now)
         self._times.append(now)
-        self._seen.append(picture)
         if self._truth is None:
             self._true.clear()
         else:
@@ -202,12 +209,10 @@ class Session:
         return self.scene.simulator.state if isinstance(self.scene, LabScene) else None
 
     def _judge(self, score: float | None) -> None:
-        """Note the moment from which on the model is worse than it was at first."""
+        """Note the moment from which on the model's pictures are much worse than the tokenizer's."""
         if score is None or self.parted is not None:
             return
-        self._scores.append(score)
-        low = score < float(np.mean(self._scores[:ROW])) - DROP
-        self._low = self._low + 1 if low else 0
+        self._low = self._low + 1 if score < self._best - DROP else 0
         if self._low == ROW:
             self.parted = self.count - ROW + 1
 

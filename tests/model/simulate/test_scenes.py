@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.episodes.align import to_clip
 from hma_data.errors import UsageError
 from hma_data.registry.embodiment import Embodiment
@@ -54,7 +55,7 @@ def test_a_scene_begins_with_a_prompt_and_a_command_that_leaves_the_robot_there(
     assert scene.prompt.frames.shape == (PROMPT, 128, 128, 3)
     assert scene.prompt.chunks.shape == (PROMPT - 1, robot.embodiment.chunk_dim)
     chunk = np.tile(scene.command, robot.embodiment.stride)
-    for _ in range(6):  # a target is reached
+    for _ in range(25):  # a target is reached
         still = scene.advance(chunk)
     again = scene.advance(chunk)
     assert still and again and still[1] is not None and again[1] is not None
@@ -66,7 +67,7 @@ def test_a_scene_begins_with_a_prompt_and_a_command_that_leaves_the_robot_there(
 def shards(
     toy_arm: Embodiment, toy_recording: Path, block_tokenizer: BlockTokenizer, tmp_path: Path
 ) -> ShardSet:
-    convert(toy_arm, toy_recording, block_tokenizer, tmp_path / "shards")
+    convert(toy_arm, toy_recording, block_tokenizer, tmp_path / "shards", settings=Settings(val_fraction=0.5))
     return ShardSet(tmp_path / "shards")
 
 

@@ -56,6 +56,9 @@ class TrueWorld:
         pictures = {row: self.rows[row].picture() for row in commands}
         return {row: one * 0 if row in self.blind else one for row, one in pictures.items()}
 
+    def picture(self, session: int) -> NDArray[np.uint8]:
+        return self.rows[session].picture()
+
     def close(self, session: int) -> None:
         del self.rows[session]
 
