@@ -74,16 +74,33 @@ class Commands:
         values = np.asarray(commands, np.float32)
         shape = (self.stride, len(self.names))
         if values.shape not in (shape, (shape[0] * shape[1],)):
-            fault = f"commands of {self.embodiment} have the shape {values.shape}"
+            fault = f"of {self.embodiment} have the shape {values.shape}"
             raise HMAError("commands", fault, f"give ({shape[0] * shape[1]},) or {shape}")
         rows = values.reshape(shape)
-        unknown = np.isnan(rows).all(axis=1)
+        if self.unknown(rows).any():
+            return np.zeros(values.size, np.float32), False
+        return rows.reshape(-1), True
+
+    def one(self, command: ArrayLike) -> Floats:
+        """Return one command (A,), checked; of NaN if it is unknown.
+
+        Raises:
+            HMAError: the shape is another one, or values are infinite or partly NaN.
+        """
+        values = np.asarray(command, np.float32)
+        if values.shape != (len(self.names),):
+            fault = f"of {self.embodiment} has the shape {values.shape}"
+            raise HMAError("command", fault, f"give ({len(self.names)},): {', '.join(self.names)}")
+        self.unknown(values[None])
+        return values
+
+    def unknown(self, rows: Floats) -> NDArray[np.bool_]:
+        """Return which commands (n, A) are unknown; raise HMAError for values that mean nothing."""
+        unknown: NDArray[np.bool_] = np.isnan(rows).all(axis=1)
         if not np.isfinite(rows[~unknown]).all():
             fault = f"of {self.embodiment} hold values that are not finite"
             raise HMAError("commands", fault, "give numbers; a command of NaN alone is unknown")
-        if unknown.any():
-            return np.zeros(values.size, np.float32), False
-        return rows.reshape(-1), True
+        return unknown
 
     def outside(self, commands: Floats) -> str:
         """Return in words which commands (..., A) leave the range seen in training, and the range."""

@@ -187,7 +187,7 @@ def _of_lerobot(
 
 def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
     """Return an embodiment that finds its action and its cameras, in their order, in a LeRobotDataset."""
-    keys = [key.name for key in open_source("lerobot").inspect(folder, 1).keys if key.kind == "camera"]
+    keys = [key.key for key in open_source("lerobot").inspect(folder, 1).keys if key.kind == "camera"]
     if len(keys) < len(robot.cameras):
         raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", WAYS)
     values, at, parts = robot.to_dict(), 0, []

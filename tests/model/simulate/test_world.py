@@ -137,7 +137,7 @@ def test_pictures_of_another_size_are_resized_as_in_a_conversion(model: HMA, win
 @pytest.mark.parametrize(
     ("commands", "message"),
     [
-        (np.zeros(7), r"commands of pusht_fast have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
+        (np.zeros(7), r"commands: of pusht_fast have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
         (np.full(8, np.inf), "not finite"),
         (np.array([[0, np.nan]] * 4), "not finite"),
     ],
@@ -171,7 +171,7 @@ def test_what_is_not_there_is_said(model: HMA, windows: dict[str, Any]) -> None:
         world.open("ur5", windows[PUSH][0])
     session = world.open(PUSH, *windows[PUSH])
     world.close(session)
-    with pytest.raises(HMAError, match=f"session {session} is not open; open are: none"):
+    with pytest.raises(HMAError, match=f"session {session}: is not open; open are: none"):
         world.step({session: np.zeros(8)})
 
 
