@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 from hma_data.errors import HMAError, UsageError
@@ -198,7 +199,7 @@ class Engine:
             return
         now = time.monotonic()
         for row, session in rows.items():
-            self._guarded(session, lambda s=session, p=pictures[row]: s.take(p, now, now - begun))
+            self._guarded(session, partial(session.take, pictures[row], now, now - begun))
 
     def _guarded(self, session: Session, function: Callable[[], Any]) -> Any:
         """Call a function of a session; if it fails, close that session and no other."""

@@ -199,7 +199,11 @@ class Session:
         if self.replays:
             self.touched, self.held = now, commands[-1].copy()
         if self.viewer:
-            facts = {"ms": round(1000 * took, 1), "rate": self._rate(now), "input": self.input}
+            facts: dict[str, Any] = {
+                "ms": round(1000 * took, 1),
+                "rate": self._rate(now),
+                "input": self.input,
+            }
             facts |= {"command": commands[-1].tolist(), "parted": self.parted}
             self.viewer.show(frame, facts)
 
