@@ -7,6 +7,7 @@ import sys
 import webbrowser
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import quote
 
 import typer
 
@@ -46,7 +47,9 @@ def play(
     if token is None and host not in LOOPBACK:
         token = secrets.token_urlsafe(18)
     shown = f"[{host}]" if ":" in host else host
-    address = f"http://{shown}:{listener.getsockname()[1]}/" + (f"?token={token}" if token else "")
+    address = f"http://{shown}:{listener.getsockname()[1]}/" + (
+        f"?token={quote(token, safe='')}" if token else ""
+    )
 
     def ready() -> None:
         print(f"drive at {address} (Ctrl-C ends)", flush=True)

@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, TypeVar
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import anyio
 import numpy as np
@@ -65,14 +65,18 @@ class Guard:
 
     def _fault(self, scope: Scope) -> str:
         headers = {name.decode().lower(): value.decode("latin-1") for name, value in scope["headers"]}
-        host = headers.get("host", "")
-        if not self._known(urlsplit(f"//{host}").hostname or ""):
+        host, origin = headers.get("host", ""), headers.get("origin")
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+            own = origin is None or urlsplit(origin).netloc == host
+        except ValueError:
+            return "refused: the host or the origin cannot be read"
+        if not self._known(name):
             return f"refused: the host {host[:80]!r} is not this server's"
-        origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return f"refused: a page of {origin[:80]} may not connect here"
-        given = dict(part.partition("=")[::2] for part in scope["query_string"].decode("latin-1").split("&"))
-        if self.token and not secrets.compare_digest(given.get("token", ""), self.token):
+        if not own:
+            return f"refused: a page of {origin!r:.80} may not connect here"
+        given = parse_qs(scope["query_string"]).get(b"token", [b""])[0]
+        if self.token and not secrets.compare_digest(given, self.token.encode()):
             return "refused: the token is missing or wrong; use the address that hma play printed"
         return ""
 

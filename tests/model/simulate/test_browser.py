@@ -171,6 +171,27 @@ def test_touch_sets_the_target_of_a_robot_that_follows_one(
     context.close()
 
 
+GAMEPAD = """
+window.pad = {axes: [0, 0, 0, 0], buttons: [{pressed: false}]};
+navigator.getGamepads = () => [window.pad];
+"""
+
+
+def test_a_gamepad_drives_and_its_button_switches(browser: "Browser", address: str, engine: Engine) -> None:
+    context = browser.new_context()
+    page = context.new_page()
+    page.add_init_script(GAMEPAD)
+    opened(page, address, "arm4_04").wait_for_selector("#dim-4")
+    session = session_of(engine, page)
+    before = session.held.copy()
+    page.evaluate("() => { pad.axes[0] = 0.5; pad.buttons[0].pressed = true; }")
+    frames(page, 4)
+    page.evaluate("() => { pad.axes[0] = 0; }")
+    page.wait_for_timeout(300)
+    assert session.held[0] > before[0] and session.held[4] != before[4]
+    context.close()
+
+
 def test_every_control_is_reached_and_used_by_the_keyboard_alone(page: "Page", engine: Engine) -> None:
     page.select_option("#robot", "arm4_04")
     page.wait_for_selector("#dim-4")

@@ -191,7 +191,8 @@ def test_wrong_values_are_told_and_the_session_goes_on(client: TestClient) -> No
 
 
 @pytest.mark.parametrize(
-    "headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Origin": "null"}]
+    "headers",
+    [{"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "[::1"}],
 )
 def test_foreign_hosts_and_origins_are_refused(client: TestClient, headers: dict[str, str]) -> None:
     assert client.get("/", headers=headers).status_code == 403
@@ -210,14 +211,15 @@ def test_its_own_origin_is_let_in(client: TestClient) -> None:
 
 
 def test_a_token_is_needed_where_one_is_set(engine: Engine) -> None:
-    app = Server(engine, "a model", "0.0.0.0", "secret").app
+    app = Server(engine, "a model", "0.0.0.0", "a&b é").app
+    page = "/?token=a%26b%20%C3%A9"
     with TestClient(app, "http://192.168.1.7:8000") as client:
-        assert [client.get(path).status_code for path in ("/", "/?token=wrong", "/?token=secret")] == [
+        assert [client.get(path).status_code for path in ("/", "/?token=wr\xf6ng", page)] == [
             403, 403, 200,
         ]  # fmt: skip
         with pytest.raises(WebSocketDisconnect), client.websocket_connect(DRIVE):
             pass
-        assert client.get("/?token=secret", headers={"Host": "evil.example"}).status_code == 403
+        assert client.get(page, headers={"Host": "evil.example"}).status_code == 403
 
 
 def test_what_was_driven_is_saved(client: TestClient) -> None:
