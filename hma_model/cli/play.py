@@ -5,8 +5,9 @@ import secrets
 import socket
 import sys
 import webbrowser
+from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import typer
@@ -39,10 +40,21 @@ def play(
     """
     import asyncio
 
+    from hma_data.shards.reader import ShardSet
     from hma_model.checkpoint.folder import Checkpoint
+    from hma_model.simulate.scenes import drivable
+
+    opened = Checkpoint.open(checkpoint)  # what is wrong with it or the data is said before torch is imported
+
+    @cache
+    def tokenizer() -> Any:
+        from hma_data.tokenizers.base import get_tokenizer
+
+        return get_tokenizer(opened.config.tokenizer["name"])
+
+    robots = drivable(opened, map(ShardSet, data or ()), tokenizer)
     from hma_model.simulate.server import LOOPBACK, serve
 
-    opened = Checkpoint.open(checkpoint)  # a wrong path is refused before torch is imported
     listener = _listen(host, port)
     if token is None and host not in LOOPBACK:
         token = secrets.token_urlsafe(18)
@@ -57,7 +69,7 @@ def play(
             webbrowser.open(address)
 
     with interruptible(lambda: "what was not saved is lost"):
-        asyncio.run(serve(opened, data or (), listener, host, token, ready))
+        asyncio.run(serve(opened, robots, tokenizer(), listener, host, token, ready))
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -66,7 +78,7 @@ def _listen(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as fault:
         raise UsageError(
-            f"{host}:{port}", f"cannot be listened on: {fault}", "choose another --port"
+            f"{host}:{port}", f"cannot be listened on: {fault}", "choose another --host or --port"
         ) from fault
 
 

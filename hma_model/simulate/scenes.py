@@ -7,7 +7,7 @@ P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chu
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
@@ -21,7 +21,6 @@ from hma_data.lab.simulator import SIZE, LabSimulator, simulated
 from hma_data.registry.components import Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 
 if TYPE_CHECKING:
@@ -161,7 +160,7 @@ class RecordedRobot:
     source = "recordings"
 
     def __init__(
-        self, shards: ShardSet, tokenizer: "Tokenizer", stats: Mapping[str, Any], cameras: Any
+        self, shards: ShardSet, tokenizer: Callable[[], "Tokenizer"], stats: Mapping[str, Any], cameras: Any
     ) -> None:
         self.embodiment = shards.embodiment
         self.key = f"{self.embodiment.id}:recordings"
@@ -191,7 +190,7 @@ class RecordedRobot:
         batch = windows.batch([number * (1 + round(0.382 * len(windows))) % len(windows)])
         stored = batch.latents if batch.tokens is None else batch.tokens
         assert stored is not None
-        frames = decode(self._tokenizer, stored)[0]
+        frames = decode(self._tokenizer(), stored)[0]
         return RecordedScene(self.dimensions, frames, batch.actions[0].numpy().astype(np.float32))
 
 
@@ -219,27 +218,27 @@ class RecordedScene:
 
 
 def drivable(
-    checkpoint: Checkpoint, data: Iterable[StrPath] = (), tokenizer: "Tokenizer | None" = None
+    checkpoint: Checkpoint, sets: Iterable[ShardSet], tokenizer: Callable[[], "Tokenizer"]
 ) -> dict[str, Drivable]:
     """Return the robots of a checkpoint that can be driven, by key.
 
     Args:
-        data: str or path of shard sets of its robots.
-        tokenizer: the checkpoint's, which decodes the shard sets.
+        sets: shard sets of its robots.
+        tokenizer: returns the checkpoint's, which decodes them.
 
     Raises:
         UsageError: there is none, or the checkpoint lacks the robot of a shard set.
         CheckpointError: the shard set has other tokens than the checkpoint was trained on.
     """
     found: dict[str, Drivable] = {}
-    for folder in data:
-        shards = ShardSet(folder)
+    for shards in sets:
         name = shards.embodiment.id
         if name not in checkpoint.embodiments:
             known = ", ".join(checkpoint.embodiments)
-            raise UsageError(folder, f"{checkpoint.folder} does not know the robot {name}", f"known: {known}")
+            raise UsageError(
+                shards.folder, f"{checkpoint.folder} does not know the robot {name}", f"known: {known}"
+            )
         require_tokenizer(checkpoint.config, shards.spec, shards.folder)
-        assert tokenizer is not None
         cameras = checkpoint.card(name).get("data", {}).get("cameras") or "first"
         robot = RecordedRobot(shards, tokenizer, checkpoint.stats(name), cameras)
         found[robot.key] = robot

@@ -12,7 +12,7 @@ import secrets
 import socket
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -28,16 +28,17 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hma_data.errors import HMAError, UsageError
-from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.simulate import messages
 from hma_model.simulate.engine import Engine
 from hma_model.simulate.films import KINDS, film
-from hma_model.simulate.scenes import describe, drivable
+from hma_model.simulate.scenes import Drivable, describe
 from hma_model.simulate.session import Frame, Sampling, Session
 
 if TYPE_CHECKING:
     import uvicorn
+
+    from hma_data.tokenizers.base import Tokenizer
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -354,7 +355,8 @@ class Connection:
 
 async def serve(
     checkpoint: Checkpoint,
-    data: Iterable[StrPath],
+    robots: Mapping[str, Drivable],
+    tokenizer: "Tokenizer",
     listener: socket.socket,
     host: str,
     token: str | None,
@@ -363,20 +365,17 @@ async def serve(
     """Serve a checkpoint until the process is interrupted.
 
     Args:
-        data: str or path of shard sets.
+        robots: those that can be driven.
+        tokenizer: the checkpoint's.
         listener: a socket that listens.
         ready: called when the page can be opened.
 
     Raises:
-        UsageError: no robot of the checkpoint can be driven.
         CheckpointError: the checkpoint is damaged.
     """
-    from hma_data.tokenizers.base import get_tokenizer
     from hma_model.checkpoint.io import load
     from hma_model.simulate.world import World
 
-    tokenizer = get_tokenizer(checkpoint.config.tokenizer["name"])
-    robots = drivable(checkpoint, data, tokenizer)
     model = load(checkpoint.folder, sorted({robot.embodiment.id for robot in robots.values()}))
 
     confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()

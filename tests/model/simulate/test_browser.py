@@ -140,6 +140,16 @@ def test_buttons_and_their_keys_pause_step_reset_and_change_the_scene(page: "Pag
     assert session.number == 1 and session.start.model != first
 
 
+def test_a_clicked_setting_leaves_the_keys_to_the_robot(page: "Page", engine: Engine) -> None:
+    page.locator("input[value=fast]").check(force=True)
+    page.locator("#passes").click(position={"x": 60, "y": 10})
+    page.keyboard.down("ArrowRight")
+    frames(page, 20)
+    session = session_of(engine, page)
+    assert session.fast and session.sampling.passes > 2 and session.held[0] > 0
+    page.keyboard.up("ArrowRight")
+
+
 def test_the_mouse_steers_by_dragging_on_the_picture(page: "Page", engine: Engine) -> None:
     box = page.locator("#stage").bounding_box()
     assert box

@@ -44,7 +44,7 @@ def test_each_value_of_a_command_rests_or_stays_as_its_robot_means_it(name: str)
 
 
 def test_all_robots_of_the_embedded_model_can_be_driven() -> None:
-    robots = drivable(Checkpoint.open(EMBEDDED))
+    robots = drivable(Checkpoint.open(EMBEDDED), (), pytest.fail)
     assert len(robots) == 28 and all(isinstance(robot, LabRobot) for robot in robots.values())
 
 
@@ -74,7 +74,7 @@ def shards(
 def test_a_recordings_truth_is_known_for_its_own_commands(
     shards: ShardSet, block_tokenizer: BlockTokenizer
 ) -> None:
-    robot = RecordedRobot(shards, block_tokenizer, shards.manifest.stats, "first")
+    robot = RecordedRobot(shards, lambda: block_tokenizer, shards.manifest.stats, "first")
     one, other = robot.scene(0), robot.scene(1)
     assert not np.array_equal(one.prompt.frames, other.prompt.frames)
     assert [(dim.name, dim.kind) for dim in robot.dimensions] == [("a", "rate"), ("b", "rate"), ("c", "rate")]
@@ -93,10 +93,10 @@ def test_a_recordings_truth_is_known_for_its_own_commands(
 
 
 def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(
-    shards: ShardSet, tmp_path: Path
+    shards: ShardSet,
 ) -> None:
     with pytest.raises(UsageError, match="does not know the robot toy_arm"):
-        drivable(Checkpoint.open(EMBEDDED), [shards.folder])
+        drivable(Checkpoint.open(EMBEDDED), [shards], pytest.fail)
 
 
 @pytest.mark.slow
