@@ -96,7 +96,7 @@ class Commands:
 
     def unknown(self, rows: Floats) -> NDArray[np.bool_]:
         """Return which commands (n, A) are unknown; raise HMAError for values that mean nothing."""
-        unknown: NDArray[np.bool_] = np.isnan(rows).all(axis=1)
+        unknown = np.asarray(np.isnan(rows).all(axis=1))
         if not np.isfinite(rows[~unknown]).all():
             fault = f"of {self.embodiment} hold values that are not finite"
             raise HMAError("commands", fault, "give numbers; a command of NaN alone is unknown")

@@ -11,7 +11,7 @@ S pixels a side, V views side by side, A action dims, T pictures of an episode, 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
@@ -148,7 +148,8 @@ class Drive:
         self.picture = self.world.picture(self.session)
         self.steps, self.frames = 0, 0
         self.waiting: list[Floats] = []
-        self.past, self.done = [self.picture], [np.zeros((0, *self._chunk_shape()), np.float32)]
+        self.past: Picture = self.picture[None]  # grows by doubling; kept for a judge only
+        self.chunks: list[Floats] = []
         return self.episodes.seen(self.picture)
 
     def take(self, action: Any) -> dict[int, Floats]:
@@ -160,7 +161,8 @@ class Drive:
             return {}
         chunk = np.stack(self.waiting)
         self.waiting = []
-        self.done.append(chunk[None])
+        if self.episodes.judge is not None:
+            self.chunks.append(chunk)
         return {self.session: chunk}
 
     def finish(self, made: dict[int, Picture]) -> tuple[Picture, float, bool, bool, dict[str, Any]]:
@@ -172,16 +174,14 @@ class Drive:
             self.picture = made[self.session]
             self.frames += 1
             if self.episodes.judge is not None:
-                self.past.append(self.picture)
-                reward, terminated = self.episodes.judge(np.stack(self.past), np.concatenate(self.done))
-        if self.episodes.judge is None:
-            self.done = self.done[:1]
+                if self.frames == len(self.past):
+                    self.past = np.concatenate([self.past, np.empty_like(self.past)])
+                self.past[self.frames] = self.picture
+                seen = self.past[: self.frames + 1]
+                reward, terminated = self.episodes.judge(seen, np.stack(self.chunks))
         truncated = self.episodes.horizon is not None and self.steps >= self.episodes.horizon
         facts = {"frames": self.frames}
         return self.episodes.seen(self.picture), float(reward), bool(terminated), truncated, facts
-
-    def _chunk_shape(self) -> tuple[int, int]:
-        return self.episodes.commands.stride, len(self.episodes.commands.names)
 
     def close(self) -> None:
         """End the session."""
@@ -235,7 +235,7 @@ class WorldModelEnv(gymnasium.Env[Picture, Floats]):
         HMAError: the checkpoint lacks the embodiment, or an argument is wrong.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}  # type: ignore[misc]
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
@@ -259,7 +259,7 @@ class WorldModelEnv(gymnasium.Env[Picture, Floats]):
         )  # fmt: skip
         self.world = self.episodes.world
         self.render_mode = render_mode
-        self.metadata = {**type(self).metadata, "render_fps": self.episodes.fps}  # type: ignore[misc]
+        self.metadata = {**type(self).metadata, "render_fps": self.episodes.fps}
         self.action_space = self.episodes.action_space
         self.observation_space = self.episodes.observation_space
         self.action_names = self.episodes.commands.names
@@ -276,7 +276,7 @@ class WorldModelEnv(gymnasium.Env[Picture, Floats]):
         """Send a command, or a chunk; between chunks the last picture is shown."""
         return self.drive.finish(self.world.step(self.drive.take(action)))
 
-    def render(self) -> Picture | None:  # type: ignore[override]
+    def render(self) -> Picture | None:
         """Return the newest picture (S, V·S, 3) as the model makes it."""
         return self.drive.picture if self.render_mode == "rgb_array" else None
 
@@ -330,7 +330,7 @@ class WorldModelVectorEnv(VectorEnv[Picture, Floats, NDArray[Any]]):
         self.drives = [Drive(self.episodes) for _ in range(num_envs)]
         self.random = [seeding.np_random()[0] for _ in range(num_envs)]
         self.observations = np.zeros(self.observation_space.shape or (), np.uint8)
-        self.ended = np.zeros(num_envs, np.bool_)
+        self.ended: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -376,10 +376,10 @@ class WorldModelVectorEnv(VectorEnv[Picture, Floats, NDArray[Any]]):
                 infos = self._begin(i, infos)
             else:
                 infos = self._add_info(infos, facts, i)
-        self.ended = terminated | truncated
+        self.ended = np.logical_or(terminated, truncated)
         return self.observations.copy(), rewards, terminated, truncated, infos
 
-    def render(self) -> tuple[Picture, ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[Picture, ...] | None:
         """Return the newest picture of each environment."""
         return tuple(drive.picture for drive in self.drives) if self.render_mode == "rgb_array" else None
 

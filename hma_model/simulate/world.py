@@ -198,8 +198,10 @@ class World:
 
     def _begin(self, session: int, frames: torch.Tensor, chunks: torch.Tensor, known: torch.Tensor) -> None:
         one = self._at(session)
-        given = (chunks.unsqueeze(0), known.unsqueeze(0)) if len(chunks) else (None, None)
-        self._running().reset([one.row], frames.unsqueeze(0), *given, [one.seed], [one.embodiment])
+        actions = chunks.unsqueeze(0) if len(chunks) else None
+        self._running().reset(
+            [one.row], frames.unsqueeze(0), actions, known.unsqueeze(0), [one.seed], [one.embodiment]
+        )
 
     # -- prompts --------------------------------------------------------------------------------------------
 

@@ -45,6 +45,7 @@ def test_a_laboratory_robot_comes_with_a_prompt(model: HMA, name: str) -> None:
     assert np.array_equal(frames, again[0]) and not np.array_equal(frames, other[0])
 
 
+@pytest.mark.slow
 def test_shards_give_the_tokens_and_chunks_of_the_recording(model: HMA, shards: Path) -> None:
     pictures, chunks = starting_window(model, MOVER)
     tokens = get_tokenizer("fsq-lab").encode(pictures)
@@ -105,6 +106,7 @@ def test_prompts_that_cannot_be_read_are_refused(model: HMA, prompt: Any, messag
         read_prompt(model, MOVER, prompt)
 
 
+@pytest.mark.slow
 def test_windows_that_are_not_there_are_refused(model: HMA, shards: Path) -> None:
     with pytest.raises(HMAError, match="has no episode 7 — give 0 to 1, or an id"):
         read_prompt(model, MOVER, {"shards": shards, "episode": 7})
