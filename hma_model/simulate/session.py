@@ -20,10 +20,7 @@ from hma_model.simulate.scenes import Drivable, Floats, LabScene, Picture, descr
 
 WINDOW = 8  # frames that a restart of the model is given
 KEPT = 3000  # frames to save
-DROP, ROW = (
-    4.0,
-    3,
-)  # dB below what the tokenizer alone gives, and frames in a row: model and truth have parted
+DROP, ROW = 6.0, 3  # dB: twice the tokenizer's own error, in so many frames in a row; then they have parted
 QUALITY = 92  # of JPEG
 
 
