@@ -12,7 +12,6 @@ from urllib.parse import quote
 
 import typer
 
-from hma_data.console import interruptible
 from hma_data.errors import UsageError
 
 
@@ -58,18 +57,19 @@ def play(
     listener = _listen(host, port)
     if token is None and host not in LOOPBACK:
         token = secrets.token_urlsafe(18)
-    shown = f"[{host}]" if ":" in host else host
-    address = f"http://{shown}:{listener.getsockname()[1]}/" + (
-        f"?token={quote(token, safe='')}" if token else ""
-    )
+    shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+    query = f"?token={quote(token, safe='')}" if token else ""
+    address = f"http://{shown}:{listener.getsockname()[1]}/{query}"
 
     def ready() -> None:
         print(f"drive at {address} (Ctrl-C ends)", flush=True)
         if browser and _display():
             webbrowser.open(address)
 
-    with interruptible(lambda: "what was not saved is lost"):
+    try:
         asyncio.run(serve(opened, robots, tokenizer(), listener, host, token, ready))
+    except KeyboardInterrupt:
+        print("stopped; what was not saved is lost")
 
 
 def _listen(host: str, port: int) -> socket.socket:
