@@ -46,6 +46,7 @@ SKIPS = {
     "no real recordings": "no real recordings",
     "no paper's code": "the paper's released code",
     "another platform": "this platform",
+    "no Chromium": "no Chromium",
 }
 _skipped: list[str] = []
 

@@ -27,6 +27,7 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
     assert shown.returncode == 0
     verbs = [
         "demo",
+        "play",
         "registry",
         "inspect",
         "convert",
@@ -40,6 +41,7 @@ def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
     for verb in verbs:
         assert verb in shown.stdout
     for verb in (
+        ["play"],
         ["convert"],
         ["inspect"],
         ["train"],
@@ -72,6 +74,8 @@ for words in (
     "train nowhere --out o",
     "finetune --from nowhere --data nowhere --out o",
     "evaluate nowhere nowhere",
+    "play nowhere",
+    "play embedded nowhere",
     "generate nowhere nowhere --out film.avi",
     "mixture nowhere",
     "shards preview nowhere",

@@ -19,7 +19,7 @@ from hma_data.lab import imported
 from hma_data.lab.writers import RldsEpisode, write_rlds
 
 Floats = NDArray[np.float64]
-Driver = Callable[[float, float], float]  # (angle, speed) -> torque
+Manoeuvre = Callable[[float, float], float]  # (angle, speed) -> torque
 
 STEPS, PERIOD_S = 100, 0.05
 TORQUE = 2.0  # the environment's limit
@@ -61,7 +61,7 @@ class Pendulum:
         return float(self._env.state[1])
 
     @property
-    def observation(self) -> NDArray[np.float32]:
+    def observed(self) -> NDArray[np.float32]:
         """Return (3,) cosine and sine of the angle, and the speed: the environment's observation."""
         return np.array([np.cos(self.angle), np.sin(self.angle), self.speed], dtype=np.float32)
 
@@ -85,19 +85,29 @@ def start(seed: int, episode: int) -> tuple[Pendulum, np.random.Generator]:
     return Pendulum(rng.uniform(-np.pi, np.pi), rng.uniform(-4, 4)), rng
 
 
+def driver(world: Pendulum, rng: np.random.Generator, episode: int) -> Callable[[], NDArray[np.float32]]:
+    """Return the recorder's driver of an episode, which returns the next torque (1,)."""
+    _, manoeuvre = DRIVERS[episode % len(DRIVERS)]
+    drive = manoeuvre(rng)
+
+    def act() -> NDArray[np.float32]:
+        return np.array([np.clip(drive(world.angle, world.speed), -TORQUE, TORQUE)], dtype=np.float32)
+
+    return act
+
+
 def _episode(seed: int, episode: int) -> RldsEpisode:
     import cv2
 
     world, rng = start(seed, episode)
-    instruction, driver = DRIVERS[episode % len(DRIVERS)]
-    drive = driver(rng)
+    instruction, _ = DRIVERS[episode % len(DRIVERS)]
+    drive = driver(world, rng, episode)
     pictures, observations, actions = [], [], []
     for _ in range(STEPS):
         _, png = cv2.imencode(".png", world.picture()[..., ::-1])
         pictures.append(png.tobytes())
-        observations.append(world.observation)
-        torque = np.clip(drive(world.angle, world.speed), -TORQUE, TORQUE)
-        actions.append(np.array([torque], dtype=np.float32))
+        observations.append(world.observed)
+        actions.append(drive())
         world.advance(actions[-1])
     vectors = {"action": np.stack(actions), "observation/state": np.stack(observations)}
     return RldsEpisode({"observation/image": pictures}, vectors, instruction)
@@ -106,7 +116,7 @@ def _episode(seed: int, episode: int) -> RldsEpisode:
 # -- drivers
 
 
-def _upward(rng: np.random.Generator) -> Driver:
+def _upward(rng: np.random.Generator) -> Manoeuvre:
     """Return a driver that swings the rod up and balances it, disturbed by random knocks."""
     gain, noise, clumsy = rng.uniform(0.5, 2.0), rng.uniform(0.05, 0.4), rng.uniform(0.0, 0.04)
     knock = [0, 0.0]  # steps left, torque
@@ -125,14 +135,14 @@ def _upward(rng: np.random.Generator) -> Driver:
     return drive
 
 
-def _smooth(rng: np.random.Generator) -> Driver:
+def _smooth(rng: np.random.Generator) -> Manoeuvre:
     hz, phase = rng.uniform(0.1, 1.5, 3), rng.uniform(0, 2 * np.pi, 3)
     strength = rng.uniform(0.4, 1.6, 3)
     seconds = (step * PERIOD_S for step in count())
     return lambda angle, speed: float(strength @ np.sin(2 * np.pi * hz * next(seconds) + phase))
 
 
-def _held(torque: Callable[[], float], shortest: int, longest: int, rng: np.random.Generator) -> Driver:
+def _held(torque: Callable[[], float], shortest: int, longest: int, rng: np.random.Generator) -> Manoeuvre:
     values: list[float] = []
 
     def drive(angle: float, speed: float) -> float:
@@ -143,18 +153,18 @@ def _held(torque: Callable[[], float], shortest: int, longest: int, rng: np.rand
     return drive
 
 
-def _bang_bang(rng: np.random.Generator) -> Driver:
+def _bang_bang(rng: np.random.Generator) -> Manoeuvre:
     return _held(lambda: float(rng.choice((-TORQUE, TORQUE))), 2, 12, rng)
 
 
-def _steps(rng: np.random.Generator) -> Driver:
+def _steps(rng: np.random.Generator) -> Manoeuvre:
     def torque() -> float:
         return 0.0 if rng.random() < 0.15 else float(rng.uniform(-TORQUE, TORQUE))
 
     return _held(torque, 4, 20, rng)
 
 
-DRIVERS: tuple[tuple[str, Callable[[np.random.Generator], Driver]], ...] = (
+DRIVERS: tuple[tuple[str, Callable[[np.random.Generator], Manoeuvre]], ...] = (
     ("swing the rod up and hold it there", _upward),
     ("turn the rod with smooth torques", _smooth),
     ("turn the rod with full torque either way", _bang_bang),

@@ -125,6 +125,11 @@ class Arm:
         return np.array([upper, fore - upper])
 
     @property
+    def observed(self) -> NDArray[np.float32]:
+        """Return (2·J,) joint angles and velocities, as recorded."""
+        return np.concatenate([self.joints, self.velocities]).astype(np.float32)
+
+    @property
     def blocks(self) -> Floats:
         """Return (B, 3) x, y, angle of each block."""
         return np.array([[*body.position, body.angle] for body in self._blocks])
@@ -194,13 +199,13 @@ def start(seed: int, episode: int) -> tuple[Arm, np.random.Generator]:
 
 def _demo(seed: int, episode: int) -> Demo:
     arm, rng = start(seed, episode)
-    drive = driver(rng)
+    drive = driver(arm, rng)
     lay = arm.blocks
     rows: list[tuple[Any, ...]] = []
     for _ in range(STEPS):
         seen = arm.picture(), arm.joints, arm.velocities, arm.state
         before = arm.blocks
-        action = drive(arm).astype(np.float32)
+        action = drive()
         arm.advance(action)
         rows.append((*seen, action, _distances(before, arm.blocks).sum()))
     images, joints, velocities, states, actions, rewards = map(np.stack, zip(*rows, strict=True))
@@ -238,12 +243,15 @@ def _draw_link(image: NDArray[np.uint8], here: Floats, there: Floats, color: tup
 # -- driver
 
 
-def driver(rng: np.random.Generator) -> Manoeuvre:
-    """Return a driver that runs manoeuvres of 0.3 to 1.5 s and turns the elbow back before its stops."""
+def driver(arm: Arm, rng: np.random.Generator) -> Callable[[], NDArray[np.float32]]:
+    """Return the recorder's driver, which returns the next velocities (J,).
+
+    It runs manoeuvres of 0.3 to 1.5 s, and turns the elbow back before its stops.
+    """
     left = 0
     manoeuvre: Manoeuvre = _rest
 
-    def drive(arm: Arm) -> Floats:
+    def drive() -> NDArray[np.float32]:
         nonlocal left, manoeuvre
         if left == 0:
             kind = rng.choice(4, p=(0.45, 0.25, 0.2, 0.1))
@@ -254,7 +262,7 @@ def driver(rng: np.random.Generator) -> Manoeuvre:
         elbow = arm.joints[1]
         if abs(elbow) > ELBOW_TURN and elbow * velocities[1] > 0:
             velocities[1] = -velocities[1]
-        return velocities
+        return velocities.astype(np.float32)
 
     return drive
 

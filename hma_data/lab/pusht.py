@@ -11,7 +11,7 @@ at random. Success is the environment's own: the T covers more than 95 % of the 
 after success, or else after a fixed time.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +41,8 @@ class Look(NamedTuple):
 FAST_LOOK = Look(128, "LightSlateGray", "RoyalBlue", "RoyalBlue")
 SLOW_LOOK = Look(96, "Peru", "Crimson", "DodgerBlue")
 FAST_STEPS, SLOW_TICKS = 80, 720
+CAMERA_TICKS, COMMAND_TICKS = 8, 20  # of pusht_slow: from one picture, and one command, to the next
+FAST_PERIOD_S = 0.1
 LEAST_S, REST_S = 4.0, 0.6  # shortest episode, and time recorded after success
 
 
@@ -138,45 +140,65 @@ class Arena:
         self.success = self.success or bool(info["is_success"])
 
 
-def begin(
-    look: Look, robot: int, seed: int, episode: int, fly: bool
-) -> tuple[Arena, Planned | Wandering, np.random.Generator]:
-    """Return the arena at the start of an episode, what drives the pusher, and the generator of both."""
-    rng = np.random.default_rng((seed, robot, episode))
-    start = STARTS[episode % len(STARTS)]
-    arena = Arena(look, start, rng)
-    if start == "random":
-        return arena, Wandering(arena.agent, fly, rng), rng
-    return arena, Planned(arena.tee, arena.goal, arena.agent, SPEED, fly, rng), rng
+def _policy(arena: Arena, rng: np.random.Generator, episode: int, fly: bool) -> Planned | Wandering:
+    if STARTS[episode % len(STARTS)] == "random":
+        return Wandering(arena.agent, fly, rng)
+    return Planned(arena.tee, arena.goal, arena.agent, SPEED, fly, rng)
 
 
-def within(target: Floats) -> Floats:
-    """Return a target inside the walls."""
+def _within(target: Floats) -> Floats:
     return np.clip(target, 15.0, 497.0)
 
 
 # -- pusht_fast
 
 
-def fast_command(setpoint: Floats, ahead: Floats, period: float) -> NDArray[np.float32]:
-    """Return the target (2,) with which the pusher is at `ahead` in `period` seconds, in spite of its lag."""
-    return within(ahead + (ahead - setpoint) * ((LAG_S - period / 2) / period)).astype(np.float32)
+class FastPusher:
+    """pusht_fast: an arena whose commands are targets of the pusher, one each 0.1 s."""
+
+    def __init__(self, seed: int, episode: int) -> None:
+        self.rng = np.random.default_rng((seed, 0, episode))
+        self.arena = Arena(FAST_LOOK, STARTS[episode % len(STARTS)], self.rng)
+
+    @property
+    def observed(self) -> NDArray[np.float32]:
+        """Return the centre (2,) of the pusher, as recorded."""
+        return self.arena.agent.astype(np.float32)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Render the arena; (size, size, 3) RGB."""
+        return self.arena.picture()
+
+    def advance(self, command: NDArray[np.float32]) -> None:
+        """Simulate 0.1 s with the target at (x, y)."""
+        self.arena.advance(command.astype(np.float64), round(FAST_PERIOD_S / TICK_S))
+
+    def driver(self, episode: int) -> Callable[[], NDArray[np.float32]]:
+        """Return the recorder's driver of an episode, which returns the next command (2,)."""
+        arena, policy = self.arena, _policy(self.arena, self.rng, episode, fly=False)
+        period, setpoint = FAST_PERIOD_S, arena.agent
+
+        def drive() -> NDArray[np.float32]:
+            nonlocal setpoint
+            if arena.success:
+                return _within(setpoint).astype(np.float32)
+            ahead, _ = policy.act(arena.pose, arena.agent, period)
+            target = _within(ahead + (ahead - setpoint) * ((LAG_S - period / 2) / period))
+            setpoint = ahead
+            return target.astype(np.float32)
+
+        return drive
 
 
 def _fast_demo(seed: int, episode: int) -> Demo:
-    arena, policy, _ = begin(FAST_LOOK, 0, seed, episode, fly=False)
-    period, setpoint, stop = 0.1, arena.agent, FAST_STEPS
+    robot = FastPusher(seed, episode)
+    arena, drive = robot.arena, robot.driver(episode)
+    period, stop = FAST_PERIOD_S, FAST_STEPS
     rows: list[tuple[Any, ...]] = []
     while len(rows) < stop:
         seen = arena.picture(), arena.agent, arena.state
-        if arena.success:
-            action = within(setpoint).astype(np.float32)
-        else:
-            ahead, _ = policy.act(arena.pose, arena.agent, period)
-            action = fast_command(setpoint, ahead, period)
-            setpoint = ahead
-        before = arena.success
-        arena.advance(action.astype(np.float64), 10)
+        before, action = arena.success, drive()
+        robot.advance(action)
         rows.append((*seen, action, arena.reward))
         if arena.success and not before:
             stop = min(stop, max(round(LEAST_S / period), len(rows) + round(REST_S / period)))
@@ -194,29 +216,86 @@ def _fast_demo(seed: int, episode: int) -> Demo:
 # -- pusht_slow
 
 
+class SlowPusher:
+    """pusht_slow: an arena whose commands are the velocity of the pusher's setpoint, and whether it is up."""
+
+    def __init__(self, seed: int, episode: int) -> None:
+        self.rng = np.random.default_rng((seed, 1, episode))
+        self.arena = Arena(SLOW_LOOK, STARTS[episode % len(STARTS)], self.rng)
+        self.setpoint = self.arena.agent
+        self.velocity: Floats = np.zeros(2)
+
+    @property
+    def observed(self) -> NDArray[np.float32]:
+        """Return (3,) the centre of the pusher, and 1 if it is up, as recorded."""
+        return np.append(self.arena.agent, self.arena.raised).astype(np.float32)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Render the arena; (size, size, 3) RGB."""
+        return self.arena.picture()
+
+    def take(self, command: Floats | NDArray[np.float32]) -> None:
+        """Set the velocity (vx, vy) in px/s, and raise or lower the pusher."""
+        self.velocity = command[:2].astype(np.float64)
+        self.arena.lift(bool(command[2] > 0.5))
+
+    def run(self, ticks: int) -> None:
+        """Run the physics for `ticks` under the command in force."""
+        self.setpoint = _within(self.setpoint + self.velocity * ticks * TICK_S)
+        self.arena.advance(_within(self.setpoint + self.velocity * (LAG_S - ticks * TICK_S / 2)), ticks)
+
+    def advance(self, command: Floats | NDArray[np.float32]) -> None:
+        """Simulate the time from one picture to the next under a command (3,)."""
+        self.take(command)
+        self.run(CAMERA_TICKS)
+
+    def commander(self, episode: int) -> Callable[[], Floats]:
+        """Return the recorder's driver of an episode; it returns (3,) a command for COMMAND_TICKS."""
+        arena, policy = self.arena, _policy(self.arena, self.rng, episode, fly=True)
+        period = COMMAND_TICKS * TICK_S
+
+        def command() -> Floats:
+            ahead, up = policy.act(arena.pose, arena.agent, period)
+            if arena.success:
+                return np.zeros(3)
+            return np.append((ahead - self.setpoint) / period, up)
+
+        return command
+
+    def driver(self, episode: int) -> Callable[[], NDArray[np.float32]]:
+        """Return a driver that returns (3,) the command in force at each picture, as it is recorded."""
+        commander, due = self.commander(episode), self.arena.ticks
+        held: Floats = np.zeros(3)
+
+        def drive() -> NDArray[np.float32]:
+            nonlocal due, held
+            if self.arena.ticks >= due:
+                held, due = commander(), due + COMMAND_TICKS
+            return held.astype(np.float32)
+
+        return drive
+
+
 def _slow_schedule(rng: np.random.Generator) -> list[tuple[int, str]]:
     """Return (tick, event) in order; camera and commands jitter by a tick, and stamps give the true time."""
     events = [(tick, "joints") for tick in range(0, SLOW_TICKS, 5)]
-    events += [(tick + int(rng.integers(-1, 2)), "command") for tick in range(2, SLOW_TICKS, 20)]
-    events += [(tick + int(rng.integers(-1, 2)), "camera") for tick in range(3, SLOW_TICKS, 8)]
+    events += [(tick + int(rng.integers(-1, 2)), "command") for tick in range(2, SLOW_TICKS, COMMAND_TICKS)]
+    events += [(tick + int(rng.integers(-1, 2)), "camera") for tick in range(3, SLOW_TICKS, CAMERA_TICKS)]
     return sorted(events)
 
 
 def _slow_bag(path: Path, seed: int, episode: int) -> None:
     import cv2
 
-    arena, policy, rng = begin(SLOW_LOOK, 1, seed, episode, fly=True)
-    setpoint, stop = arena.agent, SLOW_TICKS
-    velocity: Floats = np.zeros(2)
+    robot = SlowPusher(seed, episode)
+    arena, rng, command, stop = robot.arena, robot.rng, robot.commander(episode), SLOW_TICKS
     messages: list[Message] = []
-
     for tick, event in _slow_schedule(rng):
         if tick >= stop:
             break
         if ticks := tick - arena.ticks:
             before = arena.success
-            setpoint = within(setpoint + velocity * ticks * TICK_S)
-            arena.advance(within(setpoint + velocity * (LAG_S - ticks * TICK_S / 2)), ticks)
+            robot.run(ticks)
             if arena.success and not before:
                 stop = min(stop, max(round(LEAST_S / TICK_S), tick + round(REST_S / TICK_S)))
         fields: dict[str, Any]
@@ -231,12 +310,10 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
             fields["effort"] = np.empty(0)
         else:
             topic, kind = "/command", "geometry_msgs/msg/TwistStamped"
-            ahead, up = policy.act(arena.pose, arena.agent, 0.2)
-            velocity = np.zeros(2) if arena.success else (ahead - setpoint) / 0.2
-            up = up and not arena.success
-            arena.lift(up)
+            given = command()
+            robot.take(given)
             vector = "geometry_msgs/msg/Vector3"
-            linear = ros_value(vector, *np.append(velocity, up).tolist())
+            linear = ros_value(vector, *given.tolist())
             turn = ros_value(vector, 0.0, 0.0, 0.0)
             fields = {"twist": ros_value("geometry_msgs/msg/Twist", linear=linear, angular=turn)}
         stamp = EPOCH_NS + episode * 60_000_000_000 + tick * round(TICK_S * 1e9)

@@ -180,7 +180,7 @@ class LeRobotEpisode:
 
     pictures: Mapping[str, NDArray[np.uint8]]  # camera feature -> (T, H, W, 3) RGB
     action: NDArray[np.float32]  # (T, A), the command issued at each frame
-    state: NDArray[np.float32]  # (T, S), seen at each frame
+    state: NDArray[np.float32] | None  # (T, S), seen at each frame
     task: str  # in words
 
 
@@ -191,7 +191,7 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
 
     Args:
         folder: folder to make.
-        embodiment: one that has a state, and a whole number of frames a second.
+        embodiment: one with a whole number of frames a second.
         episodes: each has the embodiment's cameras and widths.
 
     Raises:
@@ -215,10 +215,13 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
     with _quiet():
         try:
             for episode in episodes:
-                for row, (action, state) in enumerate(zip(episode.action, episode.state, strict=True)):
-                    pictures = {key: images[row] for key, images in episode.pictures.items()}
-                    numbers = {"action": action, "observation.state": state}
-                    writer.add_frame({**pictures, **numbers, "task": episode.task})
+                for row, action in enumerate(episode.action):
+                    values = {key: images[row] for key, images in episode.pictures.items()} | {
+                        "action": action
+                    }
+                    if episode.state is not None:
+                        values["observation.state"] = episode.state[row]
+                    writer.add_frame({**values, "task": episode.task})
                 writer.save_episode(parallel_encoding=False)  # otherwise it forks this process, once a camera
         finally:
             writer.finalize()  # after a failure too; else it would write to a removed folder when collected

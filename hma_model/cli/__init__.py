@@ -21,6 +21,7 @@ from hma_data.cpu import bound_spinning, take_ordinary_priority
 from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
 from hma_model.cli.hub import Json, hub_app
+from hma_model.cli.play import play
 from hma_model.cli.train import MODELS
 
 
@@ -174,6 +175,7 @@ def demo(
     print(f"open {report}")
 
 
+app.command()(play)
 mount(app)
 cli_train.mount(app)
 

@@ -10,7 +10,7 @@ frame with its action tokens, T frames of a pass.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F

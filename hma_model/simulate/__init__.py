@@ -1,4 +1,4 @@
-"""Drive a world model: sessions in pictures and commands, and as gymnasium environments.
+"""Drive a world model: sessions in pictures and commands, as gymnasium environments, and in a browser.
 
 In come a checkpoint, a prompt and commands, out come pictures. Next: `hma_model.training`.
 `import hma_model.simulate` registers the environment `hma/WorldModel-v0`.

@@ -10,17 +10,18 @@ or more from its first place. T frames, A commands, Q axes, B blocks.
 """
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver
 from hma_data.lab.family.look import SIZE, Floats
 from hma_data.lab.family.mechanisms import MAKERS, Axis
-from hma_data.lab.family.world import start
+from hma_data.lab.family.world import World, start
 from hma_data.lab.writers import Demo, Message, ros_value, write_hdf5, write_mcap
 from hma_data.registry.embodiment import Embodiment
 
@@ -160,14 +161,14 @@ def _write_bag(path: Path, body: Body, seed: int, number: int) -> None:
 def episode(body: Body, seed: int, number: int) -> Demo:
     """Simulate an episode of about SECONDS; the same seed and number give the same bytes."""
     world, rng = start(body, seed, number)
-    drive = Driver(body, world.pose, rng)
+    drive = driver(world, rng)
     lay = world.blocks.copy()
     rows: list[tuple[Any, ...]] = []
     for _ in range(round(SECONDS * body.hz)):
         seen = world.picture(), world.pose.copy(), world.state
         before = world.blocks.copy()
-        command = drive(world.pose, world.blocks, world.held >= 0).astype(np.float32)
-        world.advance(command.astype(np.float64))
+        command = drive()
+        world.advance(command)
         rows.append((*seen, command, _distances(before, world.blocks).sum()))
     images, poses, states, commands, rewards = map(np.stack, zip(*rows, strict=True))
     return Demo(
@@ -178,6 +179,12 @@ def episode(body: Body, seed: int, number: int) -> Demo:
         success=bool(_distances(lay, world.blocks).max() >= MOVED),
         facts={"seed": seed},
     )
+
+
+def driver(world: World, rng: np.random.Generator) -> Callable[[], NDArray[np.float32]]:
+    """Return the recorder's driver, which returns the next command (A,)."""
+    drive = Driver(world.body, world.pose, rng)
+    return lambda: drive(world.pose, world.blocks, world.held >= 0).astype(np.float32)
 
 
 def _distances(before: Floats, after: Floats) -> Floats:

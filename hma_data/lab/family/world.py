@@ -32,10 +32,15 @@ class World:
         """Return (Q + 2·B + 1,): pose, blocks, and the number of the carried block or -1."""
         return np.concatenate([self.pose, self.blocks.ravel(), [self.held]])
 
-    def advance(self, command: Floats) -> None:
+    @property
+    def observed(self) -> NDArray[np.float32]:
+        """Return the pose (Q,), as recorded."""
+        return self.pose.astype(np.float32)
+
+    def advance(self, command: Floats | NDArray[np.float32]) -> None:
         """Simulate one control step under a command (A,)."""
         before = self.body.holds(self.pose)
-        self.pose = self.body.moved(self.pose, command)
+        self.pose = self.body.moved(self.pose, command.astype(np.float64))
         if self.body.grip:
             self._carry(before)
         self._push()

@@ -1,0 +1,144 @@
+"""Drive a robot of the laboratory step by step, as its recorder does.
+
+    simulator = LabSimulator("mover_04", seed=0)
+    picture = simulator.reset(seed=7)              # the beginning of a scene
+    picture = simulator.step(command)              # one control step
+    picture = simulator.step(simulator.recorded()) # the same under the recorder's own driver
+
+The recorders use the same stepping, so that recorded commands give the recorded pictures. One robot differs:
+the recorder of `pusht_slow` lets pictures and commands jitter by 10 ms, which does not happen here.
+
+A values of a command, S values of a state.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import prepare
+from hma_data.errors import UsageError
+from hma_data.lab import FAMILY, family, pendulum, planar_arm, pusht
+from hma_data.registry.embodiment import Embodiment, find
+
+SIZE = 128  # pixels: the side of the pictures
+Driver = Callable[[], NDArray[np.float32]]
+
+
+class Simulation(Protocol):
+    """A robot and what is around it."""
+
+    @property
+    def observed(self) -> NDArray[np.float32]:
+        """Return the state (S,) that is recorded with a picture."""
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Draw the scene, as the camera records it."""
+
+    def advance(self, command: NDArray[np.float32], /) -> None:
+        """Simulate one control step under a command (A,)."""
+
+
+class LabSimulator:
+    """A robot of the laboratory in one scene, with pictures of the size that conversion gives.
+
+    Attributes:
+        embodiment: the robot.
+        simulation: the robot and what is around it, of a class of the robot's own.
+
+    Raises:
+        UsageError: there is no such robot.
+        MissingDependencyError: the simulator is not installed.
+    """
+
+    def __init__(self, robot: str, seed: int = 0) -> None:
+        if not simulated(robot):
+            known = f"{', '.join(_BEGINNINGS)}, and the family, such as mover_04"
+            raise UsageError(robot, "has no simulator in the laboratory", f"known: {known}")
+        self.embodiment: Embodiment = family.embodiment(robot) if FAMILY.fullmatch(robot) else find(robot)
+        self.reset(seed)
+
+    def reset(self, seed: int, episode: int = 0) -> NDArray[np.uint8]:
+        """Begin the scene of an episode that `hma_data.lab.record` numbers so; return its first picture."""
+        robot = self.embodiment.id
+        self.seed, self.episode = seed, episode
+        self.simulation, self._driver = _BEGINNINGS.get(robot, _family)(robot, seed, episode)
+        self._commands: list[NDArray[np.float32]] = []
+        return self.picture()
+
+    @property
+    def state(self) -> NDArray[np.float32]:
+        """Return the state (S,) that is recorded with the picture."""
+        return self.simulation.observed
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Return the picture of the scene as it is; (SIZE, SIZE, 3) RGB."""
+        return prepare(self.simulation.picture()[None], self.embodiment.cameras[0], SIZE)[0]
+
+    def step(self, command: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Simulate one control step under a command (A,), and return the picture after it."""
+        self.advance(command)
+        return self.picture()
+
+    def advance(self, command: NDArray[np.float32]) -> None:
+        """Simulate one control step under a command (A,), without a picture."""
+        self._commands.append(np.array(command, np.float32))
+        self.simulation.advance(self._commands[-1])
+
+    def recorded(self) -> NDArray[np.float32]:
+        """Return the command (A,) that the recorder's driver gives here; call it once a step.
+
+        From the beginning of a scene on, these are the commands of the recorded episode.
+        """
+        return self._driver()
+
+    def copy(self) -> "LabSimulator":
+        """Return another simulator in the same state, with a driver that begins anew.
+
+        The physics engines cannot copy their contacts, so the copy repeats all commands since the reset.
+        """
+        other = LabSimulator(self.embodiment.id, self.seed)
+        other.reset(self.seed, self.episode)
+        for command in self._commands:
+            other.advance(command)
+        return other
+
+
+def simulated(robot: str) -> bool:
+    """Check whether the laboratory has a simulator of a robot."""
+    return robot in _BEGINNINGS or FAMILY.fullmatch(robot) is not None
+
+
+def _family(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
+    world, rng = family.start(family.Body.of(robot), seed, episode)
+    return world, family.driver(world, rng)
+
+
+def _pendulum(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
+    world, rng = pendulum.start(seed, episode)
+    return world, pendulum.driver(world, rng, episode)
+
+
+def _planar_arm(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
+    arm, rng = planar_arm.start(seed, episode)
+    return arm, planar_arm.driver(arm, rng)
+
+
+def _pusht_fast(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
+    pusher = pusht.FastPusher(seed, episode)
+    return pusher, pusher.driver(episode)
+
+
+def _pusht_slow(robot: str, seed: int, episode: int) -> tuple[Simulation, Driver]:
+    pusher = pusht.SlowPusher(seed, episode)
+    return pusher, pusher.driver(episode)
+
+
+_BEGINNINGS: dict[str, Callable[[str, int, int], tuple[Simulation, Driver]]] = {
+    "pendulum": _pendulum,
+    "planar_arm": _planar_arm,
+    "planar_arm_lerobot": _planar_arm,
+    "pusht_fast": _pusht_fast,
+    "pusht_slow": _pusht_slow,
+}

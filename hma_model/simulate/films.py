@@ -1,0 +1,158 @@
+"""Save what was driven: as a film, or as a LeRobotDataset of one episode that converts like any recording."""
+
+import io
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from hma_data.episodes.images import decode_image
+from hma_data.episodes.sheets import write_mp4, write_text
+from hma_data.lab.writers import LeRobotEpisode, write_lerobot
+from hma_data.registry.embodiment import Embodiment
+from hma_model.simulate.scenes import Drivable, Picture
+from hma_model.simulate.session import Frame
+
+KINDS = {  # name -> media type and ending
+    "mp4": ("video/mp4", ".mp4"),
+    "gif": ("image/gif", ".gif"),
+    "lerobot": ("application/zip", ".zip"),
+}
+SIDE, HEAD, GAP = 320, 26, 8  # pixels of a panel, of its title, between panels
+GIF_SIDE, GIF_FRAMES = 192, 600  # smaller and shorter: a GIF is large
+
+
+def film(kind: str, robot: Drivable, frames: Sequence[Frame]) -> bytes:
+    """Return a file of frames.
+
+    Args:
+        kind: a key of KINDS.
+    """
+    hz = robot.embodiment.effective_hz
+    if kind == "gif":
+        return _gif(frames[-GIF_FRAMES:], hz)
+    with TemporaryDirectory(prefix="hma-play-") as folder:
+        if kind == "mp4":
+            path = Path(folder) / "film.mp4"
+            write_mp4(path, (panels(frame, SIDE) for frame in frames), hz)
+            return path.read_bytes()
+        home = Path(folder) / robot.embodiment.id
+        episode, embodiment = lerobot_episode(robot, frames)
+        write_lerobot(home, embodiment, [episode])
+        (home / "embodiment.yaml").write_text(embodiment.to_yaml(), encoding="utf-8")
+        return _zipped(home)
+
+
+def panels(frame: Frame, side: int) -> Picture:
+    """Return the model's picture, and beside it the true one if it is known, with titles."""
+    titled = [("world model", frame.model)]
+    if frame.true is not None:
+        text = "truth" if frame.psnr is None else f"truth: {frame.psnr:.1f} dB"
+        titled.append((text, frame.true))
+    shown = [_panel(title, decode_image(data, "a frame"), side) for title, data in titled]
+    gap = np.full((side + HEAD, GAP, 3), 255, np.uint8)
+    return np.concatenate(shown if len(shown) == 1 else [shown[0], gap, shown[1]], axis=1)
+
+
+def _panel(title: str, picture: Picture, side: int) -> Picture:
+    import cv2
+
+    width = round(side * picture.shape[1] / picture.shape[0])
+    large = cv2.resize(picture, (width, side), interpolation=cv2.INTER_CUBIC)
+    panel = np.full((side + HEAD, width, 3), 255, np.uint8)
+    panel[HEAD:] = large
+    write_text(panel, title, (4, HEAD - 9), 0.45)
+    return panel
+
+
+def _gif(frames: Sequence[Frame], hz: float) -> bytes:
+    from PIL import Image
+
+    wide = any(frame.true is not None for frame in frames)
+    shown = [panels(frame, GIF_SIDE) for frame in frames]
+    width = max(picture.shape[1] for picture in shown)
+    if wide:  # where the truth is unknown its place stays empty
+        shown = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in shown]
+    first, *rest = (Image.fromarray(picture).quantize(128) for picture in shown)
+    buffer = io.BytesIO()
+    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=round(1000 / hz), loop=0)
+    return buffer.getvalue()
+
+
+# -- LeRobot
+
+
+def lerobot_episode(robot: Drivable, frames: Sequence[Frame]) -> tuple[LeRobotEpisode, Embodiment]:
+    """Return what was driven at the control rate, and the embodiment that describes it.
+
+    A row holds a command and the frame before it, which stands for `stride` rows; after the last frame the
+    last command is held. A second camera, with `_true` at the end of its name, has the true pictures.
+    """
+    stride = robot.embodiment.stride
+    following = [*frames[1:], frames[-1]]
+    actions = np.concatenate([frame.commands for frame in following])
+    cameras = {"": [decode_image(frame.model, "a frame") for frame in frames]}
+    if all(frame.true is not None for frame in frames):
+        cameras["_true"] = [decode_image(frame.true or b"", "a frame") for frame in frames]
+    states = [frame.state for frame in frames if frame.state is not None]
+    own = _embodiment(robot.embodiment, list(cameras), cameras[""][0].shape[:2], len(states) == len(frames))
+    pictures = {
+        camera.key: np.stack(shown).repeat(stride, axis=0)
+        for camera, shown in zip(own.cameras, cameras.values(), strict=True)
+    }
+    state = np.stack(states).repeat(stride, axis=0) if own.state else None
+    return LeRobotEpisode(pictures, actions, state, "driven by hand in a world model"), own
+
+
+def _embodiment(
+    robot: Embodiment, cameras: Sequence[str], size: tuple[int, ...], with_state: bool
+) -> Embodiment:
+    """Return the embodiment of the saved dataset; LeRobot's rates are whole numbers."""
+    values = robot.to_dict()
+    name = robot.primary_camera.name
+    hz = max(1, round(robot.rate_hz))
+    rate = "" if hz == robot.rate_hz else f"; the robot runs at {robot.rate_hz:g} Hz"
+    kept = {key: values[key] for key in ("id", "description", "robot", "license") if key in values}
+    own: dict[str, Any] = kept | {
+        "kind": "simulation",
+        "frequency_hz": hz,
+        "stride": robot.stride,
+        "action": {"space": robot.action.space, "components": _packed(values["action"], "action")},
+        "cameras": [
+            {"name": name + end, "key": f"observation.images.{name}{end}", "size": list(size)}
+            for end in cameras
+        ],
+        "source": {"format": "lerobot"},
+        "provenance": {
+            "recording": "driven in a world model by hma play; the pictures are the model's",
+            "frequency_hz": f"the robot's control rate{rate}",
+        },
+    }
+    if with_state:
+        own["state"] = {"components": _packed(values["state"], "observation.state")}
+    return Embodiment.from_values(own, f"embodiment {robot.id}")
+
+
+def _packed(vector: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    """Return a vector's components as slices of one feature."""
+    parts, start = [], 0
+    for part in vector["components"]:
+        facts = {
+            name: part[name] for name in ("names", "unit", "range", "normalize", "gripper") if name in part
+        }
+        stop = start + part["dims"]
+        parts.append({"key": key, "dims": part["dims"], "slice": [start, stop], **facts})
+        start = stop
+    return parts
+
+
+def _zipped(folder: Path) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                archive.write(path, path.relative_to(folder.parent))
+    return buffer.getvalue()

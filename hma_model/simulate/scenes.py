@@ -1,0 +1,312 @@
+"""Offer robots to drive, and scenes in which to begin.
+
+A scene gives the prompt of a world model, and then tells what truly happens under further commands. The
+laboratory's simulators know it for any commands; a recording knows it for its own commands alone.
+
+P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chunk.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.errors import UsageError
+from hma_data.lab import FAMILY
+from hma_data.lab.simulator import SIZE, LabSimulator, simulated
+from hma_data.registry.components import Component
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.reader import ShardSet
+from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
+
+if TYPE_CHECKING:
+    from hma_data.loading.dataset import WindowDataset
+    from hma_data.tokenizers.base import Tokenizer
+
+Floats = NDArray[np.float32]
+Picture = NDArray[np.uint8]
+
+PROMPT = 4  # frames; two would show velocities, more also show what stands still
+LONGEST = 64  # frames of a window of a recording
+ARENAS = {"pusht_fast": 512.0}  # side of the picture in units of the command, for targets in the plane
+RETURNING = ("joint_velocity", "base_velocity", "joint_delta", "eef_delta")  # spaces whose rest is zero
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """One value of a command.
+
+    Attributes:
+        low, high: range to drive in.
+        kind: "rate" for a value that is zero at rest, "target" for one that stays where it was set, "switch"
+            for a target with two states.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    kind: str
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """Known frames (P, H, W, 3) uint8, and the chunks (P - 1, K) float32 between them."""
+
+    frames: Picture
+    chunks: Floats
+
+
+class Scene(Protocol):
+    """What a robot is in, and what truly happens there."""
+
+    @property
+    def prompt(self) -> Prompt:
+        """Return the beginning."""
+
+    @property
+    def command(self) -> Floats:
+        """Return the command (A,) that leaves the robot as it is after the prompt."""
+
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture | None] | None:
+        """Take the next chunk.
+
+        Args:
+            chunk: (K,) commands; None for the recorded ones.
+
+        Returns:
+            The chunk, and the true picture (H, W, 3) after it if it is known; None at a recording's end.
+        """
+
+
+class Drivable(Protocol):
+    """A robot with scenes to begin in.
+
+    Attributes:
+        key: tells it from others; letters, digits, `_`, `-`, `.` and `:`.
+        dimensions: A of them.
+    """
+
+    key: str
+    embodiment: Embodiment
+    dimensions: tuple[Dimension, ...]
+
+    @property
+    def source(self) -> str:
+        """Return "simulator" or "recordings"."""
+
+    def scene(self, number: int) -> Scene:
+        """Return the scene of that number; there is one for every number from 0 on."""
+
+
+# -- the laboratory
+
+
+class LabRobot:
+    """A robot of the laboratory, with its simulator."""
+
+    source = "simulator"
+
+    def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any]) -> None:
+        self.key, self.embodiment = embodiment.id, embodiment
+        self.dimensions = dimensions(embodiment, stats)
+
+    def scene(self, number: int) -> "LabScene":
+        return LabScene(self.embodiment, self.dimensions, number)
+
+
+class LabScene:
+    """A scene of a simulator, begun by the recorder's own driver."""
+
+    def __init__(self, embodiment: Embodiment, dims: tuple[Dimension, ...], number: int) -> None:
+        self.stride, self.width = embodiment.stride, embodiment.action_dim
+        self.simulator = LabSimulator(embodiment.id)
+        frames = [self.simulator.reset(seed=SEED, episode=number)]
+        chunks = []
+        for _ in range(PROMPT - 1):
+            chunk, frame = self.advance(None)
+            frames.append(frame)
+            chunks.append(chunk)
+        self.prompt = Prompt(np.stack(frames), np.stack(chunks))
+        held = self.prompt.chunks[-1][-self.width :]
+        self.command = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
+
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture]:
+        taken = []
+        for step in range(self.stride):
+            command = (
+                self.simulator.recorded()
+                if chunk is None
+                else chunk[step * self.width : (step + 1) * self.width]
+            )
+            self.simulator.advance(command)
+            taken.append(command)
+        return np.concatenate(taken).astype(np.float32), self.simulator.picture()
+
+
+SEED = 1_000_000  # of scenes; recordings for training have small seeds
+
+
+# -- recordings
+
+
+class RecordedRobot:
+    """A robot of a shard set; its scenes are windows of held-out episodes, or of all if none is held out."""
+
+    source = "recordings"
+
+    def __init__(
+        self, shards: ShardSet, tokenizer: Callable[[], "Tokenizer"], stats: Mapping[str, Any], cameras: Any
+    ) -> None:
+        self.embodiment = shards.embodiment
+        self.key = f"{self.embodiment.id}:recordings"
+        self.dimensions = dimensions(self.embodiment, stats)
+        self._shards, self._tokenizer, self._cameras = shards, tokenizer, cameras
+
+    @cached_property
+    def _windows(self) -> "WindowDataset":
+        from hma_data.loading.dataset import WindowDataset
+
+        splits = self._shards.manifest.splits
+        split = "val" if splits.get("val", {}).get("episodes") else "train"
+        rows = [row for row in self._shards.episodes.to_pylist() if row["split"] == split]
+        lengths = sorted(row["length"] // self._shards.row_stride for row in rows)
+        length = min(LONGEST, lengths[len(lengths) // 2]) if lengths else 0
+        if length <= PROMPT:
+            raise UsageError(
+                self._shards.folder, f"its episodes are not longer than {PROMPT} frames", "give other shards"
+            )
+        return WindowDataset(self._shards, split, length, cameras=self._cameras)
+
+    def scene(self, number: int) -> "RecordedScene":
+        """Return one of the windows; those of numbers that follow one another lie apart."""
+        from hma_model.evaluation.evaluate import decode
+
+        windows = self._windows
+        batch = windows.batch([number * (1 + round(0.382 * len(windows))) % len(windows)])
+        stored = batch.latents if batch.tokens is None else batch.tokens
+        assert stored is not None
+        frames = decode(self._tokenizer(), stored)[0]
+        return RecordedScene(self.dimensions, frames, batch.actions[0].numpy().astype(np.float32))
+
+
+class RecordedScene:
+    """A window of a recording: frames (T, H, W, 3) and chunks (T, K)."""
+
+    def __init__(self, dims: tuple[Dimension, ...], frames: Picture, chunks: Floats) -> None:
+        self._frames, self._chunks, self._at = frames, chunks, PROMPT
+        self._followed = True  # whether all commands were the recorded ones
+        self.prompt = Prompt(frames[:PROMPT], chunks[: PROMPT - 1])
+        held = chunks[PROMPT - 2, -len(dims) :]
+        self.command = np.where([dim.kind == "rate" for dim in dims], 0, held).astype(np.float32)
+
+    def advance(self, chunk: Floats | None) -> tuple[Floats, Picture | None] | None:
+        if chunk is not None:
+            self._followed = False
+            return chunk, None
+        if self._at == len(self._frames):
+            return None
+        self._at += 1
+        return self._chunks[self._at - 2], self._frames[self._at - 1] if self._followed else None
+
+
+# -- what can be driven
+
+
+def drivable(
+    checkpoint: Checkpoint, sets: Iterable[ShardSet], tokenizer: Callable[[], "Tokenizer"]
+) -> dict[str, Drivable]:
+    """Return the robots of a checkpoint that can be driven, by key.
+
+    Args:
+        sets: shard sets of its robots.
+        tokenizer: returns the checkpoint's, which decodes them.
+
+    Raises:
+        UsageError: there is none, or the checkpoint lacks the robot of a shard set.
+        CheckpointError: the shard set has other tokens than the checkpoint was trained on.
+    """
+    found: dict[str, Drivable] = {}
+    for shards in sets:
+        name = shards.embodiment.id
+        if name not in checkpoint.embodiments:
+            known = ", ".join(checkpoint.embodiments)
+            raise UsageError(
+                shards.folder, f"{checkpoint.folder} does not know the robot {name}", f"known: {known}"
+            )
+        require_tokenizer(checkpoint.config, shards.spec, shards.folder)
+        cameras = checkpoint.card(name).get("data", {}).get("cameras") or "first"
+        robot = RecordedRobot(shards, tokenizer, checkpoint.stats(name), cameras)
+        found[robot.key] = robot
+    for name in checkpoint.embodiments:
+        if simulated(name):
+            found[name] = LabRobot(checkpoint.embodiment(name), checkpoint.stats(name))
+    if not found:
+        remedy = f"give shards of it: hma play {checkpoint.folder} SHARDS"
+        raise UsageError(checkpoint.folder, "no robot of it has a simulator to begin from", remedy)
+    return found
+
+
+def dimensions(embodiment: Embodiment, stats: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    """Return the values of a robot's command, with the range of the commands seen in training."""
+    action = stats["action"]
+    mean, std = np.array(action["mean"]), np.array(action["std"])
+    low = np.array(action.get("min", mean - 2 * std))
+    high = np.array(action.get("max", mean + 2 * std))
+    parts = [part for part in embodiment.action.components for _ in range(part.dims)]
+    values = zip(embodiment.action.names(), parts, low.tolist(), high.tolist(), strict=True)
+    return tuple(_dimension(embodiment.action.space, *value) for value in values)
+
+
+def _dimension(space: str, name: str, part: Component, low: float, high: float) -> Dimension:
+    unit = part.unit or ""
+    if not part.normalize and part.range in ((0, 1), None) and (low, high) == (0, 1):
+        return Dimension(name, unit, 0.0, 1.0, "switch")
+    even = part.range is not None and part.range[0] == -part.range[1]
+    if unit.endswith("/s") or space in RETURNING or (space == "mixed" and even and unit != "rad"):
+        top = max(abs(low), abs(high))
+        return Dimension(name, unit, -top, top, "rate")
+    return Dimension(name, unit, low, high, "target")
+
+
+def pad(robot: Drivable) -> dict[str, Any] | None:
+    """Return how the picture of a robot that moves in the plane becomes a pad to drive on, else None.
+
+    Returns:
+        kind ("target": the pointer is the target, or "rate": the way from where it was pressed is the
+        velocity), the numbers of the dimensions along x and y, with `up` 1 where y grows upward, and for
+        targets the values `low` and `high` at the picture's edges.
+    """
+    names = [dim.name for dim in robot.dimensions]
+    for x, y, up in (("x", "y", 0), ("vx", "vy", 0), ("turn", "speed", 1)):
+        if x in names and y in names:
+            across, along = names.index(x), names.index(y)
+            dims = robot.dimensions[across], robot.dimensions[along]
+            values = {"kind": dims[0].kind, "x": across, "y": along, "up": up}
+            if dims[0].kind == "rate":
+                return values
+            side = ARENAS.get(robot.embodiment.id, float(SIZE))
+            known = robot.embodiment.id in ARENAS or FAMILY.fullmatch(robot.embodiment.id)
+            low = [0.0, 0.0] if known else [dim.low for dim in dims]
+            high = [side, side] if known else [dim.high for dim in dims]
+            return values | {"low": low, "high": high}
+    return None
+
+
+def describe(robot: Drivable) -> dict[str, Any]:
+    """Return what the page shows of a robot, as plain values."""
+    text = re.sub(r"^A made-up ", "", robot.embodiment.description) or robot.embodiment.id
+    return {
+        "key": robot.key,
+        "id": robot.embodiment.id,
+        "about": text[:1].upper() + text[1:],
+        "source": robot.source,
+        "hz": robot.embodiment.rate_hz,
+        "stride": robot.embodiment.stride,
+        "dimensions": [vars(dim) for dim in robot.dimensions],
+        "pad": pad(robot),
+    }

@@ -1,0 +1,130 @@
+"""Scenes to drive in: what the values of a command are, prompts, recordings, and what is saved of a drive."""
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
+from hma_data.episodes.align import to_clip
+from hma_data.errors import UsageError
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.reader import ShardSet
+from hma_data.sources.base import open_source
+from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.simulate.films import film
+from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, drivable, pad
+from hma_model.simulate.session import Session
+from tests.conftest import BlockTokenizer
+from tests.model.simulate.worlds import TrueWorld, lab_robots
+
+KINDS = {  # robot -> kinds of its values, and what its picture is as a pad
+    "mover_04": (["rate", "rate"], "rate"),
+    "mover_02": (["target", "target"], "target"),
+    "pusht_fast": (["target", "target"], "target"),
+    "pusht_slow": (["rate", "rate", "switch"], "rate"),
+    "pendulum": (["rate"], None),
+    "arm1_03": (["target"], None),
+    "arm4_04": (["target"] * 4 + ["switch"], None),
+    "crane_01": (["rate", "rate", "switch"], None),
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_each_value_of_a_command_rests_or_stays_as_its_robot_means_it(name: str) -> None:
+    (robot,) = lab_robots(name).values()
+    kinds, planar = KINDS[name]
+    assert [dim.kind for dim in robot.dimensions] == kinds
+    assert (pad(robot) or {"kind": None})["kind"] == planar
+    for dim in robot.dimensions:
+        assert dim.low < dim.high and (dim.kind != "rate" or dim.low == -dim.high)
+
+
+def test_all_robots_of_the_embedded_model_can_be_driven() -> None:
+    robots = drivable(Checkpoint.open(EMBEDDED), (), pytest.fail)
+    assert len(robots) == 28 and all(isinstance(robot, LabRobot) for robot in robots.values())
+
+
+@pytest.mark.parametrize("name", ["mover_02", "pusht_fast", "arm2_12", "pusht_slow"])
+def test_a_scene_begins_with_a_prompt_and_a_command_that_leaves_the_robot_there(name: str) -> None:
+    (robot,) = lab_robots(name).values()
+    scene = robot.scene(3)
+    assert scene.prompt.frames.shape == (PROMPT, 128, 128, 3)
+    assert scene.prompt.chunks.shape == (PROMPT - 1, robot.embodiment.chunk_dim)
+    chunk = np.tile(scene.command, robot.embodiment.stride)
+    for _ in range(25):  # a target is reached
+        still = scene.advance(chunk)
+    again = scene.advance(chunk)
+    assert still and again and still[1] is not None and again[1] is not None
+    moved = np.abs(still[1].astype(int) - again[1]).mean()
+    assert moved < 0.1
+
+
+@pytest.fixture
+def shards(
+    toy_arm: Embodiment, toy_recording: Path, block_tokenizer: BlockTokenizer, tmp_path: Path
+) -> ShardSet:
+    convert(toy_arm, toy_recording, block_tokenizer, tmp_path / "shards", settings=Settings(val_fraction=0.5))
+    return ShardSet(tmp_path / "shards")
+
+
+def test_a_recordings_truth_is_known_for_its_own_commands(
+    shards: ShardSet, block_tokenizer: BlockTokenizer
+) -> None:
+    robot = RecordedRobot(shards, lambda: block_tokenizer, shards.manifest.stats, "first")
+    one, other = robot.scene(0), robot.scene(1)
+    assert not np.array_equal(one.prompt.frames, other.prompt.frames)
+    assert [(dim.name, dim.kind) for dim in robot.dimensions] == [("a", "rate"), ("b", "rate"), ("c", "rate")]
+    frames, count = [*one.prompt.frames], 0
+    while (step := one.advance(None)) is not None:
+        chunk, picture = step
+        assert picture is not None
+        shown = picture[0, 0, 1] // 17  # the toy's picture and commands tell its frame
+        assert shown == (chunk.reshape(2, 3)[-1, 1] + 1) % 16
+        frames.append(picture)
+        count += 1
+    assert count == len(frames) - PROMPT > 0
+    assert other.advance(np.zeros(6, np.float32)) is not None
+    followed = other.advance(None)
+    assert followed is not None and followed[1] is None  # it was left
+
+
+def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(
+    shards: ShardSet,
+) -> None:
+    with pytest.raises(UsageError, match="does not know the robot toy_arm"):
+        drivable(Checkpoint.open(EMBEDDED), [shards], pytest.fail)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["arm2_12", "pusht_slow"])
+def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> None:
+    (robot,) = lab_robots(name).values()
+    world = TrueWorld()
+    session, rng = Session("s", robot, 0, world, 0.0), np.random.default_rng(0)
+    low, high = (np.array([getattr(dim, end) for dim in robot.dimensions]) for end in ("low", "high"))
+    for now in range(5):
+        session.held = rng.uniform(low, high).astype(np.float32)
+        chunk = session.next_chunk()
+        assert chunk is not None
+        session.take(world.step({session.row: chunk})[session.row], float(now), 0.0)
+    with zipfile.ZipFile(io.BytesIO(film("lerobot", robot, session.film()))) as archive:
+        archive.extractall(tmp_path)
+    own = Embodiment.load(tmp_path / name / "embodiment.yaml")
+    source = open_source("lerobot")
+    (identity,) = source.episode_ids(str(tmp_path / name))
+    clip = to_clip(source.read(str(tmp_path / name), identity, own), own)
+    stride = robot.embodiment.stride
+    assert own.stride == stride and len(clip) == 6 * stride
+    driven = np.concatenate([frame.commands for frame in session.frames])
+    np.testing.assert_array_equal(clip.actions[: len(driven)], driven)
+    assert clip.states is not None and clip.states.shape[1] == len(session.start.state)  # type: ignore[arg-type]
+    shown = [clip.frames_at(camera.name, np.arange(0, len(clip), stride)) for camera in own.cameras]
+    assert (
+        len(shown) == 2 and np.abs(shown[0].astype(int) - shown[1]).mean() < 2
+    )  # the world is without error
+    newest = world.rows[session.row].picture()
+    assert np.abs(shown[0][-1].astype(int) - newest).mean() < 4

@@ -1,0 +1,88 @@
+"""A world that knows the truth, and a viewer that keeps what it is shown."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.lab.simulator import LabSimulator
+from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.simulate.scenes import PROMPT, SEED, Drivable, LabRobot
+from hma_model.simulate.session import Frame
+
+
+class TrueWorld:
+    """A model without error, for the scenes of simulators: each row is a simulator of its own.
+
+    Attributes:
+        steps: the rows of each step.
+        sampling: passes, temperature and order of each step.
+        begun: (frames, chunks) of each open and reset.
+        blind: rows that show black.
+    """
+
+    def __init__(self) -> None:
+        self.rows: dict[int, LabSimulator] = {}
+        self.steps: list[dict[int, NDArray[np.float32]]] = []
+        self.begun: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
+        self.blind: set[int] = set()
+        self.sampling: list[tuple[int, float, str]] = []
+        self.unmask_steps, self.temperature, self.order = 0, 0.0, ""
+        self._count = 0
+
+    def open(self, embodiment: str, frames: Any, chunks: Any = None, *, seed: int = 0) -> int:
+        self._count += 1
+        self.rows[self._count] = LabSimulator(embodiment)
+        self.reset(self._count, frames, chunks)
+        return self._count
+
+    def reset(self, session: int, frames: Any, chunks: Any = None, *, seed: int | None = None) -> None:
+        """Find the scene whose beginning is the prompt; another prompt leaves the simulator as it is."""
+        self.begun.append((frames, chunks))
+        simulator = self.rows[session]
+        for number in range(4):
+            first = LabSimulator(simulator.embodiment.id)
+            if len(frames) == PROMPT and np.array_equal(first.reset(SEED, number), frames[0]):
+                for chunk in chunks:
+                    self._advance(first, chunk)
+                self.rows[session] = first
+
+    def step(self, commands: Mapping[int, NDArray[np.float32]]) -> dict[int, NDArray[np.uint8]]:
+        self.steps.append(dict(commands))
+        self.sampling.append((self.unmask_steps, self.temperature, self.order))
+        for row, chunk in commands.items():
+            self._advance(self.rows[row], chunk)
+        pictures = {row: self.rows[row].picture() for row in commands}
+        return {row: one * 0 if row in self.blind else one for row, one in pictures.items()}
+
+    def picture(self, session: int) -> NDArray[np.uint8]:
+        return self.rows[session].picture()
+
+    def close(self, session: int) -> None:
+        del self.rows[session]
+
+    def _advance(self, simulator: LabSimulator, chunk: NDArray[np.float32]) -> None:
+        for command in chunk.reshape(-1, simulator.embodiment.action_dim):
+            simulator.advance(command)
+
+
+class Watcher:
+    """A viewer that keeps everything."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self.told: list[dict[str, Any]] = []
+        self.stalled, self.behind = False, 0
+
+    def show(self, frame: Frame, facts: dict[str, Any]) -> None:
+        self.frames.append(frame)
+
+    def tell(self, message: dict[str, Any]) -> None:
+        self.told.append(message)
+
+
+def lab_robots(*names: str) -> dict[str, Drivable]:
+    """Return robots of the laboratory as the embedded checkpoint has them."""
+    checkpoint = Checkpoint.open(EMBEDDED)
+    return {name: LabRobot(checkpoint.embodiment(name), checkpoint.stats(name)) for name in names}
