@@ -6,6 +6,7 @@ frames, and the chunks (P - 1, K) between them, NaN where they are unknown.
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,14 +65,14 @@ def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int 
         return _of_mapping(model, embodiment, prompt)
     if hasattr(prompt, "render"):
         prompt = prompt.render()
-    if isinstance(prompt, str | Path):
+    if isinstance(prompt, str | PathLike):
         folder = as_path(prompt)
         if (folder / MANIFEST).is_file():
             return _of_shards(model, embodiment, folder)
         if (folder / LEROBOT).is_file():
             return _of_lerobot(model, embodiment, folder)
         prompt = [folder]
-    if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | Path):
+    if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | PathLike):
         prompt = [_picture(as_path(path)) for path in prompt]
     pictures = np.asarray(prompt)
     return (pictures[None] if pictures.ndim == 3 else pictures), None
