@@ -87,7 +87,7 @@ for words in (
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("error: ") == len(done.stderr.splitlines()) == 13
+    assert done.stderr.count("error: ") == len(done.stderr.splitlines()) == 15
 
 
 def test_a_ctrl_c_says_what_is_kept(arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,8 +76,8 @@ class Guard:
             return f"refused: the host {host[:80]!r} is not this server's"
         if not own:
             return f"refused: a page of {origin!r:.80} may not connect here"
-        given = parse_qs(scope["query_string"]).get(b"token", [b""])[0]
-        if self.token and not secrets.compare_digest(given, self.token.encode()):
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        if self.token and not secrets.compare_digest(given.encode(), self.token.encode()):
             return "refused: the token is missing or wrong; use the address that hma play printed"
         return ""
 
