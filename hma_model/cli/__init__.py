@@ -292,6 +292,10 @@ def _require_checkpoint(checkpoint: str) -> None:
         resolve(folder)
 
 
-BENCHES["mup"] = "hma_model.bench.mup:BENCH"
-BENCHES |= {name: f"hma_model.bench.speed:{name.upper()}" for name in ("generate", "train", "waiting")}
+BENCHES |= {
+    "generate": "hma_model.bench.generation:GENERATE",
+    "mup": "hma_model.bench.mup:BENCH",
+    "train": "hma_model.bench.speed:TRAIN",
+    "waiting": "hma_model.bench.waiting:WAITING",
+}
 app.add_typer(hub_app, name="hub", rich_help_panel=MODELS)
