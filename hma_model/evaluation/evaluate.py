@@ -196,7 +196,6 @@ def rollout(
     frames: int | None = None,
     *,
     prompt: int | None = None,
-    actions: Tensor | None = None,
     seed: int = 0,
     truth: NDArray[np.uint8] | None = None,
     **sampling: Unpack[Sampling],
@@ -206,10 +205,9 @@ def rollout(
     Args:
         model: in eval mode.
         tokenizer: the tokenizer that the model was trained on.
-        batch: windows of T frames; their tokens are the truth.
+        batch: windows of T frames; their tokens are the truth, and their unknown chunks are masked.
         frames: how many to predict; by default all after the prompt.
         prompt: P true frames to start from; by default a third of the window, at least one.
-        actions: (B, T, K) raw, which replace the actions of the windows.
         seed: of every random draw.
         truth: the decoded frames of another rollout of the same windows, which are then not decoded again.
         sampling: options of `HMA.generate`.
@@ -224,10 +222,13 @@ def rollout(
         raise UsageError("rollout", f"{first} + {count} frames do not fit windows of {length}")
     stored = batch.tokens if model.config.kind == "discrete" else batch.latents
     assert stored is not None
-    given, chunks = stored[:, :first].to(model.device), batch.actions if actions is None else actions
+    given, chunks = stored[:, :first].to(model.device), batch.actions
     chunks = chunks[:, : first + count].to(model.device)
     generator = torch.Generator().manual_seed(seed)
-    predicted = model.generate(given, chunks, batch.embodiment, count, generator=generator, **sampling)
+    known = batch.action_mask[:, : first + count].to(model.device)
+    predicted = model.generate(
+        given, chunks, batch.embodiment, count, generator=generator, known=known, **sampling
+    )
     if truth is None:
         truth = decode(tokenizer, stored[:, : first + count])
     made = decode(tokenizer, predicted)
@@ -282,6 +283,13 @@ def shuffled_actions(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0)
         else:
             actions[own, begin:] = source[np.roll(own, 1)]
     return actions
+
+
+def shuffled(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0) -> Batch:
+    """Return the windows with the chunks of `shuffled_actions`, which are known where they were."""
+    masks = replace(batch, actions=batch.action_mask)
+    known = shuffled_actions(masks, begin, seed, draw)
+    return replace(batch, actions=shuffled_actions(batch, begin, seed, draw), action_mask=known)
 
 
 def evaluate(
@@ -339,15 +347,15 @@ def evaluate(
     table = _losses(model, shards, chosen, cameras, draws)
     scores: dict[str, list[_Scores]] = {"true": [], "shuffled": [], "copy": []}
     for number, batch in enumerate(chosen()):
-        roll = partial(rollout, model, tokenizer, batch, prompt=first, seed=seed + number, **sampling)
-        true = roll()
+        roll = partial(rollout, model, tokenizer, prompt=first, seed=seed + number, **sampling)
+        true = roll(batch)
         still = true.predicted.copy()
         still[:, first:] = still[:, first - 1 : first]
         scores["true"].append(_Scores.of(true))
         scores["copy"].append(_Scores.of(replace(true, predicted=still)))
         for draw in range(draws):
-            other = shuffled_actions(batch, first - 1, seed, draw)
-            scores["shuffled"].append(_Scores.of(roll(actions=other, truth=true.truth)))
+            other = shuffled(batch, first - 1, seed, draw)
+            scores["shuffled"].append(_Scores.of(roll(other, truth=true.truth)))
     figures = {name: _Scores.means(parts) for name, parts in scores.items()}
     return {
         "embodiment": shards.embodiment.id,
@@ -378,14 +386,10 @@ def _losses(
     losses, accuracy = validation_losses(model, chosen())
     if model.config.kind == "continuous":
         return {"loss": losses.mean()}
-    shuffled = (
-        replace(batch, actions=shuffled_actions(batch, draw=draw))
-        for draw in range(draws)
-        for batch in chosen()
-    )
+    other = (shuffled(batch, draw=draw) for draw in range(draws) for batch in chosen())
     return {
         "loss": losses.mean(),
-        "shuffled_loss": masked_val_loss(model, shuffled),
+        "shuffled_loss": masked_val_loss(model, other),
         "baseline_loss": unconditional_baseline(
             [shards], chosen(), cameras, model.config.factored, model.config.merge
         ).mean(),

@@ -4,7 +4,7 @@ B windows, T frames, H×W pixels of a panel, A action dims.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
@@ -21,7 +21,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.evaluation.evaluate import Sampling, cameras_for, rollout, shuffled_actions, windows
+from hma_model.evaluation.evaluate import Sampling, cameras_for, rollout, shuffled, windows
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
@@ -81,16 +81,19 @@ def rollout_video(
         fault = f"has {count} windows of {length} frames in {split}, none with number {max(chosen)}"
         raise UsageError(shards.folder, fault)
     batch = dataset.batch(chosen)
-    swapped = batch.actions.clone()
-    theirs = dataset.batch(other or [(number + count // 2) % count for number in chosen]).actions
-    swapped[:, prompt - 1 :] = (batch.actions.flip(1) if count == 1 else theirs)[:, prompt - 1 :]
-    roll = partial(rollout, model, tokenizer, batch, prompt=prompt, seed=seed, **sampling)
-    true = roll()
-    changed = roll(actions=swapped, truth=true.truth)
+    theirs = dataset.batch(other or [(number + count // 2) % count for number in chosen])
+    if count == 1:
+        theirs = replace(batch, actions=batch.actions.flip(1), action_mask=batch.action_mask.flip(1))
+    swapped = replace(batch, actions=batch.actions.clone(), action_mask=batch.action_mask.clone())
+    swapped.actions[:, prompt - 1 :] = theirs.actions[:, prompt - 1 :]
+    swapped.action_mask[:, prompt - 1 :] = theirs.action_mask[:, prompt - 1 :]
+    roll = partial(rollout, model, tokenizer, prompt=prompt, seed=seed, **sampling)
+    true = roll(batch)
+    changed = roll(swapped, truth=true.truth)
     panels = (
         ("truth", true.truth, batch.actions, length),
         ("model, true actions", true.predicted, batch.actions, prompt),
-        ("model, other actions", changed.predicted, swapped, prompt),
+        ("model, other actions", changed.predicted, swapped.actions, prompt),
     )
     fps, parts = shards.embodiment.effective_hz, []
     for i in range(len(chosen)):
@@ -227,8 +230,7 @@ def write_sheets(
     for name, shards in sets.items():
         (batch,) = windows(shards, "val", frames, count, count, cameras)
         true = rollout(model, tokenizer, batch, seed=seed)
-        swapped = shuffled_actions(batch, true.prompt - 1, seed)
-        other = rollout(model, tokenizer, batch, actions=swapped, seed=seed, truth=true.truth)
+        other = rollout(model, tokenizer, shuffled(batch, true.prompt - 1, seed), seed=seed, truth=true.truth)
         films = {
             "truth": true.truth,
             f"predicted from frame {true.prompt}": true.predicted,

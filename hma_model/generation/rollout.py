@@ -1,179 +1,66 @@
 """Generate frame after frame from a prompt and actions, with a cache over time.
 
-    rollout = Rollout(model, "arm", batch=1)
+    rollout = Rollout(model, "arm", batch=2)
     rollout.prompt(tokens, actions)
-    frame = rollout.step(chunk)              # the frame that the chunk leads to
+    frames = rollout.step(chunks)            # the frames that the chunks lead to
+    rollout.reset([1], tokens, actions)      # row 1 begins anew; row 0 goes on
+
+All state belongs to a row (`hma_model.generation.state`). Rows begin, end and step independently of each
+other, and a row generates the same frames whatever its neighbours are.
 
 A frame costs one pass for each step of unmasking. The first pass also adds the frame before it, now finished,
-to the cache. Attention over time is causal, so the cached keys and values of a past frame never change. A
-frame at time t lies in slot t mod R. With rotary positions there is one slot more than the window has frames,
-for the pass that computes a finished frame and the next one together.
+to the cache. Attention over time is causal, so the cached keys and values of a past frame never change.
 
-Each pass of unmasking (arXiv 2202.04200) predicts the tokens that are still masked, and keeps some of them
-for good. The cosine schedule determines how many; they are chosen at random or by confidence.
-
-B batch, P frames of a prompt, h,w token grid, S = h*w, k tokens unmasked in a pass, C values of a patch,
-D width, K = stride * action dim, c channels, H,W latent grid, N tokens of a frame with its action tokens,
-L layers, R slots, n frames of a pass.
+B rows, n rows of a step, P frames of a prompt, h,w token grid, S = h*w, C values of a patch, D width,
+K = stride * action dim, c channels, H,W latent grid, N tokens of a frame with its action tokens, T frames of
+a pass.
 """
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.config import HMAConfig
-from hma_model.network.conditioning import ActionConditioning, Groups, condition, unknown
-from hma_model.network.head import LatentReadout, TokenReadout, uniform
+from hma_model.generation.state import RowState, Snapshot
+from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, check, masked_after
+from hma_model.network.conditioning import ActionConditioning, Groups, condition
 from hma_model.network.model import HMA
-from hma_model.network.stem import from_digits, split_tokens, unpatchify
-from hma_model.network.trunk import (
-    Conditioning,
-    LayerCache,
-    TimePositions,
-    Trunk,
-    rotary_angles,
-    window_times,
-)
-
-_NEVER = -(1 << 40)  # the time of an empty slot
-
-
-class Cache:
-    """The keys and values of every layer, and the time of the frame in each slot.
-
-    Args:
-        config: of the model.
-        batch: B.
-        tokens: N.
-        like: a tensor whose device and dtype the keys and values get.
-    """
-
-    def __init__(self, config: HMAConfig, batch: int, tokens: int, like: Tensor) -> None:
-        self.config = config
-        self.slots = config.frames + (config.time_position == "rotary")
-        time = (2, self.slots, batch, tokens, config.heads, config.head_dim)
-        action = (2, batch, config.heads, self.slots, config.head_dim)
-        crossed = "cross_attention" in config.conditioning
-        self.layers = [
-            LayerCache(like.new_zeros(time), like.new_zeros(action) if crossed else None)
-            for _ in range(config.layers)
-        ]
-        self.times = torch.full((self.slots,), _NEVER, device=like.device)
-
-    def time_positions(self, start: int, frames: int) -> TimePositions:
-        """Return the times of a pass over n consecutive frames, and record their times in their slots."""
-        positions = torch.arange(start, start + frames, device=self.times.device)
-        slots = positions % self.slots
-        self.times.index_copy_(0, slots, positions)
-        age = positions.unsqueeze(1) - self.times
-        allowed = (age >= 0) & (age < self.config.frames)
-        return TimePositions(positions, allowed, rotary_angles(self.config, positions), slots=slots)
+from hma_model.network.stem import split_tokens, unpatchify
+from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, Trunk, window_times
 
 
 @dataclass(frozen=True)
-class Decoding:
-    """The settings of unmasking.
+class Pass:
+    """What the passes over one frame share.
 
     Attributes:
-        steps: number of passes a frame.
-        temperature: 0 takes the likeliest token, else it divides the logits; for the diffusion head it is the
-            share of fresh noise in a step.
-        order: "random" or "confidence"; patches have no confidence.
-        sample_steps: sampling steps of the diffusion head; None for the configuration's.
-        generator: the generator of every random draw.
+        past: (rows, T - 1, S) the frames before the new one that the first pass computes.
+        times, conditioning: of the T frames.
+        among: numbers of the pass's rows among those of the step; None if they are the same.
+        lanes: numbers of the step's rows among those of the pass; None if they are the same.
     """
 
-    steps: int = 2
-    temperature: float = 0.0
-    order: str = "random"
-    sample_steps: int | None = None
-    generator: torch.Generator | None = None
+    past: Tensor
+    times: TimePositions
+    conditioning: Conditioning
+    among: Tensor | None = None
+    lanes: Tensor | None = None
 
-
-def masked_after(step: int, steps: int, tokens: int) -> int:
-    """Return how many tokens of a frame stay masked after step `step` of `steps` (cosine schedule)."""
-    if step + 1 >= steps:
-        return 0
-    return min(math.ceil(math.cos((step + 1) / steps * math.pi / 2) * tokens), tokens - 1)
-
-
-class TokenFrame:
-    """A frame of discrete tokens that is unmasked step by step.
-
-    Attributes:
-        values: (B, S) int64 ids of the trunk's tokens; `mask_id` means masked.
-    """
-
-    def __init__(self, values: Tensor, mask_id: int, decoding: Decoding) -> None:
-        self.values, self.mask_id, self.decoding = values, mask_id, decoding
-        self.rank = uniform(values.shape, decoding.generator, values.device)
-
-    def unmask(self, readout: TokenReadout, features: Tensor, position: Tensor, count: int) -> None:
-        """Predict tokens from the frame's features (B, S, D) at its time (1,), and keep `count` more."""
-        masked = self.values == self.mask_id
-        if self.decoding.order == "random":
-            chosen = _top(self.rank, masked, count)
-            tokens, _ = self._sample(readout, _gather(features, chosen))
-        else:
-            everything, confidence = self._sample(readout, features)
-            chosen = _top(confidence, masked, count)
-            tokens = everything.gather(1, chosen)
-        self.values = self.values.scatter(1, chosen, tokens)
-
-    def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return token ids (B, k) and the sums (B, k) of the log probabilities of their digits."""
-        digits, confidence = [], torch.zeros(features.shape[:2], device=features.device)
-        for scores in readout(features).split(list(readout.factored), dim=-1):
-            drawn = scores
-            if self.decoding.temperature > 0:  # the largest of these sums is a sample from the softmax
-                noise = uniform(scores.shape, self.decoding.generator, scores.device).clamp(min=1e-20)
-                drawn = scores / self.decoding.temperature - (-noise.log()).log()
-            digits.append(drawn.argmax(-1))
-            if self.decoding.order == "confidence":
-                confidence += scores.log_softmax(-1).gather(-1, digits[-1].unsqueeze(-1)).squeeze(-1)
-        return from_digits(torch.stack(digits, dim=-1), readout.factored), confidence
-
-
-class PatchFrame:
-    """A frame of patches that is unmasked step by step.
-
-    Attributes:
-        values: (B, S, C) scaled patches.
-        masked: (B, S) bool, True for masked patches.
-    """
-
-    def __init__(self, values: Tensor, decoding: Decoding) -> None:
-        self.values, self.decoding = values, decoding
-        self.masked = torch.ones(values.shape[:2], dtype=torch.bool, device=values.device)
-        self.rank = uniform(values.shape[:2], decoding.generator, values.device)
-
-    def unmask(self, readout: LatentReadout, features: Tensor, position: Tensor, count: int) -> None:
-        """Draw `count` more patches from the frame's features (B, S, D) at its time (1,)."""
-        chosen = _top(self.rank, self.masked, count)
-        conditions = _gather(readout(features.unsqueeze(1), position).squeeze(1), chosen).flatten(0, 1)
-        way = self.decoding
-        patches = readout.diffusion.sample(conditions, way.sample_steps, way.temperature, way.generator)
-        patches = patches.view(*chosen.shape, -1)
-        self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
-        self.masked = self.masked.scatter(1, chosen, False)
-
-
-def _top(score: Tensor, masked: Tensor, count: int) -> Tensor:
-    """Return the indices (B, k) of the masked tokens with the highest scores."""
-    return score.masked_fill(~masked, -torch.inf).topk(count, dim=1).indices
-
-
-def _gather(features: Tensor, chosen: Tensor) -> Tensor:
-    """Return the features (B, k, D) of the tokens (B, k) from (B, S, D)."""
-    return features.gather(1, chosen.unsqueeze(-1).expand(-1, -1, features.shape[-1]))
+    def lay_out(self, values: Tensor) -> Tensor:
+        """Return values of the step's rows (n, ...) as those of the pass's rows."""
+        if self.among is not None:
+            return values[self.among]
+        if self.lanes is None:
+            return values
+        laid = values.new_zeros(len(self.past), *values.shape[1:])
+        laid[self.lanes] = values
+        return laid
 
 
 class Rollout:
-    """B rollouts side by side, one frame a step.
+    """B rollouts side by side.
 
     A frame sees itself and the `frames` - 1 frames before it (`frames` of the configuration). With rotary
     positions that window moves along. With learned positions the window is recomputed for each frame beyond
@@ -181,12 +68,17 @@ class Rollout:
 
     Args:
         model: any model; it is used as it is, so call `eval()` on it before.
-        embodiment: one id for all, or one a sample.
+        embodiment: one id for all, or one a row.
         batch: B.
-        unmask_steps, temperature, order, sample_steps, generator: as in `HMA.generate`.
+        unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
+        generator: of the seeds of rows that get none.
         cache: keep keys and values of past frames.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
-            take a minute or more.
+            take a minute or more. A step of some rows then computes all of them.
+
+    Attributes:
+        decoding: the settings of unmasking; they may be replaced between steps.
+        state: the state of the rows.
     """
 
     def __init__(
@@ -204,188 +96,316 @@ class Rollout:
         compile: bool = False,
     ) -> None:
         self.model, self.config = model, model.config
-        self.decoding = Decoding(unmask_steps, temperature, order, sample_steps, generator)
-        _check(self.decoding, self.config.kind)
-        self.caching = cache
+        self.decoding = Decoding(unmask_steps, temperature, order, sample_steps)
+        check(self.decoding, self.config.kind)
+        self.batch, self.caching = batch, cache
         self.compiled = _compiled(model.trunk) if compile and cache else None
-        self.groups = Groups.of(embodiment, batch)
-        self.sorted = Groups(self.groups.parts)  # the rollout's state is kept in this order
-        self.batch = batch
-        self.width = max(model.stem(name).input.in_features for name, _ in self.groups.parts)
-        self.cache: Cache | None = None
+        Groups.of(embodiment, batch)  # checks that there are as many ids as rows
+        names = [embodiment] * batch if isinstance(embodiment, str) else embodiment
+        self.state = RowState(model, names, generator, cache)
+        self.passive: bool | None = None  # no actions at all; known from the first step on
+        self.told = False  # some prompt had actions
 
-    @torch.no_grad()
-    def prompt(self, frames: Tensor, actions: Tensor | None) -> None:
-        """Start a new rollout from known frames.
+    # -- rows ---------------------------------------------------------------------------------------------
+
+    def prompt(
+        self,
+        frames: Tensor,
+        actions: Tensor | None,
+        known: Tensor | None = None,
+        *,
+        seeds: Sequence[int] | None = None,
+    ) -> None:
+        """Start all rows anew from known frames.
 
         Args:
             frames: tokens (B, P, h, w) int64, or latents (B, P, c, H, W) as stored. If there are more than
                 the window holds, the last are used.
             actions: (B, P - 1 or more, K) raw; chunk k holds the commands from frame k to k+1. Later chunks
                 are not used. None for no actions.
+            known: (B, P - 1 or more) bool, True where a chunk is known; by default all are.
+            seeds: of each row's random numbers; by default they are drawn from the rollout's generator.
         """
-        values = self.model.frame_values(frames).to(self.model.device)
-        self.frames = self.groups.sort(values)
-        self.given = self._condition_on(actions, frames.shape[1])
-        self.passive = actions is None
-        self.begun, self.cache = False, None
-        self._keep(self.config.frames)
-        self.fresh = self.time = self.frames.shape[1]  # fresh: frames not in the cache yet
+        self.passive, self.told = None, False
+        self.reset(range(self.batch), frames, actions, known, seeds)
 
     @torch.no_grad()
-    def step(self, chunk: Tensor | None = None, following: Tensor | None = None) -> Tensor:
-        """Generate the next frame.
+    def reset(
+        self,
+        rows: Sequence[int],
+        frames: Tensor,
+        actions: Tensor | None,
+        known: Tensor | None = None,
+        seeds: Sequence[int] | None = None,
+        embodiments: Sequence[str] | None = None,
+    ) -> None:
+        """Start some rows anew; the others are undisturbed.
 
         Args:
-            chunk: (B, K) raw commands from the newest frame to the next one; None for no actions.
-            following: (B, K) raw commands after the next frame. They condition it if the configuration aligns
+            rows: n numbers of rows.
+            frames, actions, known, seeds: of these rows, as in `prompt`.
+            embodiments: the rows' new ids; by default they keep theirs.
+        """
+        chosen = self._chosen(rows)
+        values = self.model.frame_values(frames).to(self.model.device)
+        if len(values) != len(chosen):
+            raise HMAError("prompt", f"has {len(values)} samples", f"give {len(chosen)}, one for each row")
+        names = embodiments or [self.state.embodiments[row] for row in chosen]
+        given = self._condition_on(names, actions, known, values.shape[1])
+        last = slice(max(values.shape[1] - self.config.frames, 0), None)
+        self.state.begin(chosen, names, values[:, last], given.frames(last), seeds)
+        self.told = self.told or actions is not None
+
+    def fork(self, n: int) -> "Rollout":
+        """Return a new rollout that has every row n times, side by side, with the same random numbers."""
+        rows = [row for row in range(self.batch) for _ in range(n)]
+        names = [self.state.embodiments[row] for row in rows]
+        other = Rollout(
+            self.model, names, len(rows), generator=self.state.shared, cache=self.caching,
+            compile=self.compiled is not None,
+        )  # fmt: skip
+        other.decoding = self.decoding
+        other.restore(range(len(rows)), self.snapshot().take(rows))
+        return other
+
+    def snapshot(self, rows: Sequence[int] | None = None) -> Snapshot:
+        """Return a copy of the state of some rows, by default all."""
+        return replace(self.state.snapshot(self._chosen(rows)), passive=self.passive)
+
+    def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
+        """Put rows into the state of a snapshot of as many rows, from any rollout of the same model."""
+        chosen = self._chosen(rows)
+        if len(snapshot.times) != len(chosen):
+            raise HMAError("snapshot", f"has {len(snapshot.times)} rows", f"give one of {len(chosen)}")
+        if self._clashes(snapshot.passive):
+            raise HMAError(
+                "snapshot", "some rows have actions and some have none", "give them always or never"
+            )
+        self.passive = snapshot.passive if self.passive is None else self.passive
+        self.told = self.told or snapshot.passive is not True
+        self.state.restore(chosen, snapshot)
+
+    def _chosen(self, rows: Sequence[int] | None) -> list[int]:
+        chosen = list(range(self.batch) if rows is None else rows)
+        if not chosen or len(set(chosen)) < len(chosen) or not 0 <= min(chosen) <= max(chosen) < self.batch:
+            raise HMAError("rows", f"{chosen} are not rows", f"give some of 0 to {self.batch - 1}, each once")
+        return chosen
+
+    def _clashes(self, passive: bool | None) -> bool:
+        """Check whether rows with and without actions meet where their frames differ in tokens."""
+        differ = self.config.absent_action != "embedding"
+        return differ and None not in (self.passive, passive) and self.passive != passive
+
+    # -- a step -------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def step(
+        self,
+        chunk: Tensor | None = None,
+        following: Tensor | None = None,
+        *,
+        known: Tensor | None = None,
+        rows: Sequence[int] | None = None,
+    ) -> Tensor:
+        """Generate the next frame of some rows.
+
+        Args:
+            chunk: (n, K) raw commands from the newest frame to the next one; None for no actions.
+            following: (n, K) raw commands after the next frame. They condition it if the configuration aligns
                 actions with the current frame (released weights). By default `chunk` is used again.
+            known: (n,) bool, False where a row's commands are unknown; (n, 2) states `following` apart. By
+                default all are known.
+            rows: n numbers of rows, in the order of `chunk`; by default all.
 
         Returns:
-            (B, h, w) int64 tokens, or (B, c, H, W) float32 latents as stored.
+            (n, h, w) int64 tokens, or (n, c, H, W) float32 latents as stored.
         """
-        self._take(chunk, following)
-        self._slide()
-        conditioning = self._condition(self.fresh + 1)
-        frame = self._blank()
+        chosen = self._chosen(rows)
+        for row in chosen:
+            if not self.state.times[row]:
+                raise HMAError("step", f"row {row} has no prompt", "reset the row first")
+        if self.config.time_position == "learned":
+            self.state.slide(chosen)
+        if not self.caching:
+            self.state.grow(chosen)
+        self._take(chosen, chunk, following, known)
+        frame, passes = self._blank(chosen), self._passes(chosen)
         left = tokens = self.config.tokens_per_frame
         for step in range(self.decoding.steps):
             count = left - masked_after(step, self.decoding.steps, tokens)
             if count > 0:
-                features, position = self._features(frame, conditioning, first=left == tokens)
+                features, position = self._features(frame, passes, first=left == tokens)
                 own = features[:, :tokens]
                 frame.unmask(self.model.readout, own, position, count)  # type: ignore[arg-type]
                 left -= count
-        self.frames = torch.cat([self.frames, frame.values.unsqueeze(1)], dim=1)
-        self.time += 1
-        self.fresh = 1 if self.caching else self.frames.shape[1]
-        if self.caching and self.config.time_position == "rotary":
-            self._keep(1)
+        self.state.put_frame(chosen, frame.values)
         return self._show(frame.values)
 
-    # -- one pass -----------------------------------------------------------------------------------------
+    def _passes(self, rows: list[int]) -> list[Pass]:
+        """Return the pass that all rows share; without a cache, one for the rows of each time."""
+        if self.caching:
+            self._catch_up(rows)
+            if self.compiled is None or len(rows) == self.batch:
+                return [self._newest(rows)]
+            # Compiled code has one shape, so idle rows compute too. Their next step writes the slots again.
+            return [replace(self._newest(list(range(self.batch))), lanes=self.state.tensor(rows))]
+        times = self.state.times
+        ages = dict.fromkeys(times[row] for row in rows)
+        return [self._whole(rows, [i for i, row in enumerate(rows) if times[row] == age]) for age in ages]
+
+    def _catch_up(self, rows: list[int]) -> None:
+        """Add all pending frames but the newest to the cache."""
+        state = self.state
+        for count in sorted({state.pending[row] - 1 for row in rows} - {0}):
+            late = [row for row in rows if state.pending[row] == count + 1]
+            times = state.cached_times(late, [state.times[row] - count - 1 for row in late], count)
+            past = state.past(late, times.positions)
+            masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
+            conditioning = self._condition(late, times.positions)
+            self.model.trunk(self._embed(past, masked), conditioning, times, self._cache())
+            for row in late:
+                state.pending[row] = 1
+
+    def _newest(self, rows: list[int]) -> Pass:
+        """Return the pass over the newest frame and the next one with a cache."""
+        last = self.config.frames - 1 if self.config.time_position == "learned" else max(self.state.times)
+        begin = [max(min(self.state.times[row], last) - 1, 0) for row in rows]  # of idle rows any will do
+        times = self.state.cached_times(rows, begin, 2)
+        past = self.state.past(rows, times.positions[:, :1])
+        return Pass(past, times, self._condition(rows, times.positions))
+
+    def _whole(self, rows: list[int], members: list[int]) -> Pass:
+        """Return the pass over all frames and the next one of those rows of a step that are at one time."""
+        chosen = [rows[i] for i in members]
+        times = window_times(self.config, self.state.times[chosen[0]] + 1, self.model.device)
+        past = self.state.past(chosen, times.positions[:-1].unsqueeze(0))
+        conditioning = self._condition(chosen, times.positions.unsqueeze(0))
+        return Pass(past, times, conditioning, among=self.state.tensor(members))
 
     def _features(
-        self, frame: TokenFrame | PatchFrame, conditioning: Conditioning, first: bool
+        self, frame: TokenFrame | PatchFrame, passes: list[Pass], first: bool
     ) -> tuple[Tensor, Tensor]:
-        """Return the new frame's features (B, N, D) and its time (1,)."""
-        fresh = self.fresh if first or not self.caching else 0
-        x = self._embed(frame, fresh)
+        """Return the new frames' features (n, N, D) and their times (1 or n, 1)."""
+        found = [self._compute(frame, part, first) for part in passes]
+        if len(found) == 1:
+            return found[0]
+        order = torch.cat([part.among for part in passes if part.among is not None]).argsort()
+        times = torch.cat([time.expand(len(features), 1) for features, time in found])
+        return torch.cat([features for features, _ in found])[order], times[order]
+
+    def _compute(self, frame: TokenFrame | PatchFrame, part: Pass, first: bool) -> tuple[Tensor, Tensor]:
+        """Compute a pass: all its frames if it is the first or there is no cache, else the new one."""
+        whole = first or not self.caching
+        fresh = part.past if whole or self.config.masked_input == "previous" else part.past[:, :0]
+        values = torch.cat([fresh, part.lay_out(frame.values).unsqueeze(1)], dim=1)
+        masked = torch.zeros(values.shape[:3], dtype=torch.bool, device=values.device)
+        masked[:, -1] = part.lay_out(frame.masked)
+        x = self._embed(values, masked)
         if not self.caching:
-            times = window_times(self.config, fresh + 1, self.model.device)
-            features = self.model.trunk(x, conditioning, times)
-        else:
-            times = self._cache().time_positions(self.time - fresh, fresh + 1)
-            part = conditioning if first else conditioning.last()
-            trunk = self.compiled if self.compiled and x.shape[1] <= 2 else self.model.trunk
-            features = trunk(x, part, times, self._cache().layers)
-        return features[:, -1], times.positions[-1:]
+            features = self.model.trunk(x, part.conditioning, part.times)
+            return features[:, -1], part.times.positions[-1:].unsqueeze(0)
+        conditioning = part.conditioning if first else part.conditioning.last()
+        times = part.times if first else part.times.last()
+        trunk = self.compiled or self.model.trunk
+        features = trunk(x if whole else x[:, -1:], conditioning, times, self._cache())[:, -1]
+        at = times.positions[:, -1:]
+        if part.lanes is None:
+            return features, at
+        return features[part.lanes], at if len(at) == 1 else at[part.lanes]
 
-    def _embed(self, frame: TokenFrame | PatchFrame, fresh: int) -> Tensor:
-        """Embed the last `fresh` frames and the new one as (B, fresh + 1, S, D)."""
-        carries = self.config.masked_input == "previous"
-        shown = max(fresh, int(carries))  # the new frame's masked tokens may need the frame before it
-        past = self.frames[:, self.frames.shape[1] - shown :]
-        values = torch.cat([past, frame.values.unsqueeze(1)], dim=1)
-        if isinstance(frame, TokenFrame):
-            return self.model.embed_tokens(values)[:, shown - fresh :]
-        known = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
-        masked = torch.cat([known, frame.masked.unsqueeze(1)], dim=1)
-        return self.model.embed_patches(values, masked.unsqueeze(-1))[:, shown - fresh :]
+    def _embed(self, values: Tensor, masked: Tensor) -> Tensor:
+        """Embed frames (n, T, S) of which some tokens are masked, (n, T, S) bool, as (n, T, S, D)."""
+        if self.config.kind == "discrete":
+            return self.model.embed_tokens(values)  # a masked token says so by itself
+        return self.model.embed_patches(values, masked.unsqueeze(-1))
 
-    def _cache(self) -> Cache:
-        if self.cache is None:
-            appended = self.config.absent_tokens if self.passive else self.config.appended_tokens
-            like = self.model.trunk.position.detach()
-            if torch.is_autocast_enabled(like.device.type):
-                like = like.to(torch.get_autocast_dtype(like.device.type))
-            tokens = self.config.tokens_per_frame + appended
-            self.cache = Cache(self.config, self.batch, tokens, like)
-            if self.compiled is not None:  # static addresses: the compiled code writes them in place
-                for layer in self.cache.layers:
-                    for kept in (layer.time, layer.action):
-                        if kept is not None:
-                            torch._dynamo.mark_static_address(kept)
-        return self.cache
+    def _cache(self) -> list[LayerCache]:
+        appended = self.config.absent_tokens if self.passive else self.config.appended_tokens
+        like = self.model.trunk.position.detach()
+        if torch.is_autocast_enabled(like.device.type):
+            like = like.to(torch.get_autocast_dtype(like.device.type))
+        before = self.state.layers
+        layers = self.state.cache(self.config.tokens_per_frame + appended, like)
+        if self.compiled is not None and layers is not before:
+            for layer in layers:  # static addresses: the compiled code writes them in place
+                for kept in (layer.time, layer.action):
+                    if kept is not None:
+                        torch._dynamo.mark_static_address(kept)
+        return layers
 
-    # -- state --------------------------------------------------------------------------------------------
+    # -- actions ------------------------------------------------------------------------------------------
 
-    def _condition(self, frames: int) -> Conditioning:
-        """Return the conditioning of the last frames, the new one included; it is the same in every pass."""
+    def _condition(self, rows: list[int], positions: Tensor) -> Conditioning:
+        """Return the conditioning of rows at times (1 or n, T); it is the same in every pass."""
+        groups = Groups.of([self.state.embodiments[row] for row in rows], len(rows))
         skips = self.passive and self.config.absent_action != "embedding"
-        given = None if skips else self.given.frames(slice(self.given.known.shape[1] - frames, None))
-        positions = torch.arange(self.time + 1 - frames, self.time + 1, device=self.model.device)
-        return condition(self.model, given, self.sorted, positions)
+        given = None if skips else self.state.given(rows, positions)
+        return condition(self.model, given, groups, positions, unsort=True)
 
-    def _condition_on(self, actions: Tensor | None, frames: int) -> ActionConditioning:
+    def _condition_on(
+        self, names: Sequence[str], actions: Tensor | None, known: Tensor | None, frames: int
+    ) -> ActionConditioning:
         """Return the chunk at each known frame; with `current` alignment `step` adds the last chunk."""
-        given = unknown(self.model, self.sorted, frames)
+        batch, width, device = len(names), self.state.width(names), self.model.device
+        chunks = torch.zeros(batch, frames, width, device=device)
+        given = ActionConditioning(chunks, torch.zeros(batch, frames, dtype=torch.bool, device=device))
         if actions is None or frames == 1:
             return given
-        if actions.shape[1] < frames - 1 or actions.shape[2] < self.width:
+        if actions.shape[0] != batch or actions.shape[1] < frames - 1 or actions.shape[2] < width:
             fault = f"actions have the shape {tuple(actions.shape)} for a prompt of {frames} frames"
-            raise HMAError("prompt", fault, f"give (batch, {frames - 1} or more, {self.width})")
+            raise HMAError("prompt", fault, f"give ({batch}, {frames - 1} or more, {width})")
+        if known is not None and (known.shape[0] != batch or known.shape[1] < frames - 1):
+            fault = f"known has the shape {tuple(known.shape)} for a prompt of {frames} frames"
+            raise HMAError("prompt", fault, f"give ({batch}, {frames - 1} or more)")
         late = int(self.config.action_alignment == "previous")
         conditioned = given.frames(slice(late, frames - 1 + late))  # a view
-        chunks = self.groups.sort(actions.to(self.model.device))
-        conditioned.chunks[:] = chunks[:, : frames - 1, : self.width].float()
-        conditioned.known[:] = True
+        conditioned.chunks[:] = actions[:, : frames - 1, :width].to(device).float()
+        conditioned.known[:] = True if known is None else known[:, : frames - 1].to(device)
         return given
 
-    def _take(self, chunk: Tensor | None, following: Tensor | None) -> None:
-        """Store the chunk at the frame that it conditions, and add a slot for the new frame."""
-        if self.begun and self.config.absent_action != "embedding" and self.passive != (chunk is None):
+    def _take(
+        self, rows: list[int], chunk: Tensor | None, following: Tensor | None, known: Tensor | None
+    ) -> None:
+        """Store the chunk at the frame that it conditions."""
+        if self._clashes(chunk is None):
             raise HMAError("step", "some steps have actions and some have none", "give them always or never")
-        self.passive = self.passive and chunk is None
-        self.begun = True
-        new = unknown(self.model, self.sorted, 1)
-        if chunk is not None:
-            values = self._chunk(chunk)
-            if self.config.action_alignment == "current":
-                self.given.chunks[:, -1], self.given.known[:, -1] = values, True
-                values = values if following is None else self._chunk(following)
-            new.chunks[:, 0], new.known[:, 0] = values, True
-        self.given = ActionConditioning(
-            torch.cat([self.given.chunks, new.chunks], 1), torch.cat([self.given.known, new.known], 1)
-        )
+        if self.passive is None:
+            self.passive = chunk is None and not self.told
+        if chunk is None:
+            self.state.put_chunk(rows, 0, None, None)
+            return
+        if known is not None:
+            known = known.to(self.model.device, torch.bool).view(len(rows), -1)
+        now, then = (None, None) if known is None else (known[:, 0], known[:, -1])
+        values = self._chunk(rows, chunk)
+        if self.config.action_alignment == "current":
+            self.state.put_chunk(rows, 1, values, now)
+            now, values = then, values if following is None else self._chunk(rows, following)
+        self.state.put_chunk(rows, 0, values, now)
 
-    def _chunk(self, chunk: Tensor) -> Tensor:
-        if chunk.shape[0] != self.batch or chunk.shape[-1] < self.width or chunk.dim() != 2:
-            fault = f"a chunk has the shape {tuple(chunk.shape)}"
-            raise HMAError("step", fault, f"give ({self.batch}, {self.width})")
-        return self.groups.sort(chunk.to(self.model.device))[:, : self.width].float()
-
-    def _slide(self) -> None:
-        """Recompute the window when it moves with learned positions, which change for each of its frames."""
-        if self.config.time_position == "learned" and self.time == self.config.frames:
-            self._keep(self.config.frames - 1, ahead=1)
-            self.fresh = self.time = self.frames.shape[1]
-            if self.cache is not None:
-                self.cache.times.fill_(_NEVER)
-
-    def _keep(self, frames: int, ahead: int = 0) -> None:
-        """Drop all but the last frames, and all chunks but theirs and the `ahead` chunks after them."""
-        self.frames = self.frames[:, max(self.frames.shape[1] - frames, 0) :]
-        kept = self.given.frames(slice(max(self.given.known.shape[1] - frames - ahead, 0), None))
-        self.given = ActionConditioning(kept.chunks.clone(), kept.known.clone())
+    def _chunk(self, rows: list[int], chunk: Tensor) -> Tensor:
+        width = self.state.width([self.state.embodiments[row] for row in rows])
+        if chunk.dim() != 2 or chunk.shape[0] != len(rows) or chunk.shape[1] < width:
+            raise HMAError(
+                "step", f"a chunk has the shape {tuple(chunk.shape)}", f"give ({len(rows)}, {width})"
+            )
+        return chunk[:, :width].to(self.model.device).float()
 
     # -- in and out ---------------------------------------------------------------------------------------
 
-    def _blank(self) -> TokenFrame | PatchFrame:
-        """Return a new frame, wholly masked."""
-        shape, device = (self.batch, self.config.tokens_per_frame), self.model.device
+    def _blank(self, rows: list[int]) -> TokenFrame | PatchFrame:
+        """Return new frames (n, S), wholly masked."""
+        values, generators = self.state.blank(len(rows)), self.state.drawing(rows)
         if self.config.kind == "discrete":
-            mask_id = self.config.mask_id
-            return TokenFrame(torch.full(shape, mask_id, device=device), mask_id, self.decoding)
-        return PatchFrame(torch.zeros(*shape, self.config.patch_dim, device=device), self.decoding)
+            return TokenFrame(values, self.config.mask_id, self.decoding, generators)
+        return PatchFrame(values, self.decoding, generators)
 
     def _show(self, values: Tensor) -> Tensor:
-        values = self.groups.unsort(values)
-        if self.config.kind == "discrete":
-            config = self.config
+        config = self.config
+        if config.kind == "discrete":
             return split_tokens(values, config.merge, config.vocab_size, config.token_grid)
-        latents = unpatchify(values.unsqueeze(1), self.config.patch, self.config.token_grid)
-        return latents.squeeze(1) / self.config.latent_scale
+        latents = unpatchify(values.unsqueeze(1), config.patch, config.token_grid)
+        return latents.squeeze(1) / config.latent_scale
 
 
 def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
@@ -401,23 +421,13 @@ def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
     return call
 
 
-def _check(decoding: Decoding, kind: str) -> None:
-    orders = ("random", "confidence") if kind == "discrete" else ("random",)
-    for name, value, allowed, remedy in (
-        ("unmask_steps", decoding.steps, decoding.steps >= 1, "give at least 1"),
-        ("temperature", decoding.temperature, decoding.temperature >= 0, "give at least 0"),
-        ("order", decoding.order, decoding.order in orders, f"a {kind} model takes {' or '.join(orders)}"),
-    ):
-        if not allowed:
-            raise HMAError(name, f"{value!r} is not allowed", remedy)
-
-
 def generate(
     model: HMA,
     prompt: Tensor,
     actions: Tensor | None,
     embodiment: str | Sequence[str],
     frames: int,
+    mask: Tensor | None = None,
     **decoding: object,
 ) -> Tensor:
     """Continue a prompt by `frames` frames; `HMA.generate` explains the arguments."""
@@ -429,6 +439,9 @@ def generate(
             fault = f"there are {actions.shape[1]} chunks for {known} + {frames} frames"
             raise HMAError("actions", fault, f"give {known + frames}")
         chunks = [*actions.unbind(1), None]
-    rollout.prompt(prompt, actions)
-    made = [rollout.step(chunks[i], chunks[i + 1]) for i in range(known - 1, known - 1 + frames)]
+    rollout.prompt(prompt, actions, mask)
+    made = [
+        rollout.step(chunks[i], chunks[i + 1], known=None if mask is None else mask[:, i : i + 2])
+        for i in range(known - 1, known - 1 + frames)
+    ]
     return torch.stack(made, dim=1)

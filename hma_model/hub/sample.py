@@ -1,6 +1,7 @@
 """Make the sample picture of a model card: the truth, a short rollout, and one with other actions."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,7 +64,8 @@ def _picture(checkpoint: Path, shards: "ShardSet") -> bytes:
     batch = _window(shards, model.config.frames, cameras_for(model, shards))
     tokenizer = tokenizer_of(shards)
     true = rollout(model, tokenizer, batch)
-    other = rollout(model, tokenizer, batch, actions=batch.actions.flip(1), truth=true.truth)
+    backwards = replace(batch, actions=batch.actions.flip(1), action_mask=batch.action_mask.flip(1))
+    other = rollout(model, tokenizer, backwards, truth=true.truth)
     picks = np.unique(np.linspace(0, true.truth.shape[1] - 1, COLUMNS).astype(int))
     rows = {
         "truth": true.truth[0],

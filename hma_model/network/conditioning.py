@@ -112,7 +112,7 @@ def unknown(model: "HMA", groups: Groups, frames: int) -> ActionConditioning:
 
 
 def condition(
-    model: "HMA", given: ActionConditioning | None, groups: Groups, positions: Tensor
+    model: "HMA", given: ActionConditioning | None, groups: Groups, positions: Tensor, unsort: bool = False
 ) -> Conditioning:
     """Return the trunk's conditioning for the samples, in the order of `groups`.
 
@@ -120,15 +120,19 @@ def condition(
         model: the model, whose stems and modulation are used once per embodiment.
         given: in the batch's order; None for no actions at all.
         groups: the batch's embodiments.
-        positions: (T,) int64, the times of the frames.
+        positions: (T,) int64, the times of the frames; (B, T) in the batch's order if the samples' differ.
+        unsort: return it in the batch's own order.
     """
-    config, absent = model.config, rows_at(model.trunk.absent, positions)
+    config, frames = model.config, positions.shape[-1]
+    absent = rows_at(model.trunk.absent, positions).expand(groups.batch, frames, -1)
     if given is None:
         if config.absent_action == "skip":
             return Conditioning()
         if config.absent_action == "tokens":
-            return Conditioning(tokens=absent.expand(groups.batch, len(positions), -1))
-        given = unknown(model, groups, len(positions))
+            return Conditioning(tokens=absent if unsort else groups.sort(absent))
+        given = unknown(model, groups, frames)
+    if positions.dim() > 1:
+        absent = groups.sort(absent)
     chunks, known = groups.sort(given.chunks), groups.sort(given.known).unsqueeze(-1)
     shown = torch.ones_like(known) if config.absent_action == "tokens" else known
     embeddings, modulations, outs = [], [], []
@@ -139,7 +143,7 @@ def condition(
             fault = f"a chunk has {chunks.shape[-1]} values, but {name} needs {width}"
             raise HMAError("actions", fault, "flatten stride x action_dim values into a chunk")
         embedded = stem(chunks[span, :, :width].masked_fill(~shown[span], 0))
-        embedding = torch.where(shown[span], embedded, absent)
+        embedding = torch.where(shown[span], embedded, absent[span])
         embeddings.append(embedding)
         if stem.modulation is None:
             continue
@@ -150,7 +154,13 @@ def condition(
     tokens = torch.where(known, embedding, absent) if config.appended_tokens else None
     if model.trunk.modulation is not None:
         modulations = [model.trunk.modulation(embedding)]
-    return Conditioning(embedding, _cat(modulations, 1) if modulations else None, outs or None, tokens)
+    modulation = _cat(modulations, 1) if modulations else None
+    if not unsort or groups.inverse is None:
+        return Conditioning(embedding, modulation, outs or None, tokens)
+    order = torch.tensor([groups.order, groups.inverse], device=embedding.device)
+    embedding, tokens = embedding[order[1]], None if tokens is None else tokens[order[1]]
+    modulation = None if modulation is None else modulation[:, order[1]]
+    return Conditioning(embedding, modulation, outs or None, tokens, (order[0], order[1]) if outs else None)
 
 
 def _cat(parts: list[Tensor], dim: int) -> Tensor:

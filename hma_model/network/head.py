@@ -7,7 +7,7 @@ M rows, C values of a sample, W width of the diffusion head.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -19,16 +19,26 @@ from hma_model.network.trunk import rows_at
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
 
 
-def uniform(
-    shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str = "cpu"
-) -> Tensor:
+type Generators = torch.Generator | Sequence[torch.Generator] | None  # several draw equal parts of axis 0
+
+
+def uniform(shape: Sequence[int], generator: Generators, device: torch.device | str = "cpu") -> Tensor:
     """Return float32 numbers in [0, 1), drawn on the generator's device and moved to `device`."""
-    return torch.rand(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+    return _draw(torch.rand, shape, generator, device)
 
 
-def randn(shape: Sequence[int], generator: torch.Generator | None, device: torch.device | str) -> Tensor:
+def randn(shape: Sequence[int], generator: Generators, device: torch.device | str) -> Tensor:
     """Return standard normal float32 numbers, drawn on the generator's device and moved to `device`."""
-    return torch.randn(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+    return _draw(torch.randn, shape, generator, device)
+
+
+def _draw(
+    draw: Callable[..., Tensor], shape: Sequence[int], generator: Generators, device: torch.device | str
+) -> Tensor:
+    if generator is None or isinstance(generator, torch.Generator):
+        return draw(tuple(shape), generator=generator, device=device_of(generator)).to(device)
+    part = (shape[0] // len(generator), *shape[1:])
+    return torch.cat([draw(part, generator=one, device=one.device) for one in generator]).to(device)
 
 
 def device_of(generator: torch.Generator | None) -> torch.device | str:
@@ -216,7 +226,7 @@ class DiffusionHead(nn.Module):
         condition: Tensor,
         steps: int | None = None,
         temperature: float = 0.0,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> Tensor:
         """Draw samples by DDIM.
 
@@ -247,7 +257,7 @@ class DiffusionHead(nn.Module):
         share: float,
         after: float,
         eta: float,
-        generator: torch.Generator | None,
+        generator: Generators,
     ) -> Tensor:
         """Make one DDIM step from a level whose signal share is `share` to one where it is `after`."""
         signal, spread = math.sqrt(share), math.sqrt(1 - share)

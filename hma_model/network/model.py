@@ -312,6 +312,7 @@ class HMA(nn.Module):
         order: str = "random",
         cache: bool = True,
         sample_steps: int | None = None,
+        known: Tensor | None = None,
     ) -> Tensor:
         """Continue a prompt, frame by frame.
 
@@ -326,6 +327,8 @@ class HMA(nn.Module):
             order: the order in which tokens are unmasked, "random" or "confidence".
             cache: keep keys and values of past frames; False recomputes everything, with the same result.
             sample_steps: sampling steps of the diffusion head.
+            known: (B, P + frames) bool, False where a chunk is unknown, as `action_mask` in training; by
+                default all are known.
 
         Returns:
             (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
@@ -333,8 +336,8 @@ class HMA(nn.Module):
         from hma_model.generation.rollout import generate
 
         return generate(
-            self, prompt, actions, embodiment, frames, unmask_steps=unmask_steps, temperature=temperature,
-            generator=generator, order=order, cache=cache, sample_steps=sample_steps,
+            self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
+            temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
         )  # fmt: skip
 
     # -- parts that training and decoding share -----------------------------------------------------------

@@ -31,30 +31,37 @@ class Conditioning:
         modulation: (L, B, T, 2D) shift and gain.
         out: for each group of samples, in batch order: its size and the embodiment's projections after the
             modulated norm, (L, D, D) and (L, D). None if the trunk has them.
+        order: indices (B,) that sort the samples into the groups of `out`, and that undo it; None if they are
+            sorted.
     """
 
     embedding: Tensor | None = None
     modulation: Tensor | None = None
     out: list[tuple[int, Tensor, Tensor]] | None = None
     tokens: Tensor | None = None
+    order: tuple[Tensor, Tensor] | None = None
 
     def last(self) -> "Conditioning":
         """Return the conditioning of the last frame alone."""
         embedding, tokens = (None if x is None else x[:, -1:] for x in (self.embedding, self.tokens))
         modulation = None if self.modulation is None else self.modulation[:, :, -1:]
-        return Conditioning(embedding, modulation, self.out, tokens)
+        return Conditioning(embedding, modulation, self.out, tokens, self.order)
 
 
 @dataclass
 class TimePositions:
     """The times of the frames of a pass, and which frames each may see.
 
+    Samples whose times differ have a first axis B in every attribute; where they agree, it is 1 or absent.
+
     Attributes:
         positions: (T,) int64, the times of the frames.
         allowed: (T, keys) bool, which key frames each frame may see.
         rotary: cos and sin (T, head_dim / 2) of the rotary angles.
         causal: `allowed` is the plain lower triangle.
-        slots: (T,) int64, the cache slots for the frames' keys and values; None without a cache.
+        slots: (B, T) int64, slot · rows of the cache + row, the places of the frames' keys and values; None
+            without a cache.
+        rows: the samples' rows of the cache; None for all.
     """
 
     positions: Tensor
@@ -62,19 +69,35 @@ class TimePositions:
     rotary: tuple[Tensor, Tensor]
     causal: bool = False
     slots: Tensor | None = None
+    rows: slice | Tensor | None = None
+
+    def last(self) -> "TimePositions":
+        """Return the times of the last frame alone."""
+        cos, sin = (angle[..., -1:, :] for angle in self.rotary)
+        slots = None if self.slots is None else self.slots[:, -1:]
+        allowed = self.allowed[..., -1:, :]
+        return TimePositions(self.positions[..., -1:], allowed, (cos, sin), slots=slots, rows=self.rows)
 
 
 @dataclass
 class LayerCache:
-    """The cached keys and values of one layer.
+    """The cached keys and values of one layer; the values of a frame are contiguous, as computed.
 
     Attributes:
-        time: (2, R, B, N, heads, head_dim); the values of a frame are contiguous, as computed.
-        action: (2, B, heads, R, head_dim); None without cross-attention.
+        time: (2, R, B, N, heads, head_dim).
+        action: (2, R, B, heads, head_dim); None without cross-attention.
     """
 
     time: Tensor
     action: Tensor | None = None
+
+
+def remember(cache: Tensor, new: tuple[Tensor, Tensor], times: TimePositions) -> Tensor:
+    """Write keys and values (B, T, ...) into a cache (2, R, rows, ...); return that of the pass's rows."""
+    assert times.slots is not None
+    for values, kept in zip(new, cache):
+        kept.flatten(0, 1).index_copy_(0, times.slots.flatten(), values.flatten(0, 1))
+    return cache if times.rows is None else cache[:, :, times.rows]
 
 
 def rows_at(table: Tensor, positions: Tensor) -> Tensor:
@@ -83,7 +106,7 @@ def rows_at(table: Tensor, positions: Tensor) -> Tensor:
 
 
 def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cos and sin, float32 (T, head_dim / 2), of the rotary angles at the times (T,)."""
+    """Return cos and sin, float32 (..., head_dim / 2), of the rotary angles at the times (...)."""
     half = max(config.head_dim // 2, 1)
     steps = torch.arange(half, device=positions.device, dtype=torch.float32) / half
     angles = positions.float().unsqueeze(-1) * config.rotary_base**-steps
@@ -142,10 +165,10 @@ def rotate_qkv(
 
     Args:
         qkv: (..., T, 3, heads, head_dim), or `within` frames (..., T, N, 3, heads, head_dim).
-        rotary: cos and sin (T, head_dim / 2).
+        rotary: cos and sin (T, head_dim / 2), or (B, T, head_dim / 2).
         within: whether there is an axis of places between the times and the axis of size 3.
     """
-    cos, sin = (angle.unsqueeze(1) if within else angle for angle in rotary)
+    cos, sin = (angle.unsqueeze(-2) if within else angle for angle in rotary)
     if qkv.dtype != torch.float32 or torch.compiler.is_compiling():
         q, k, v = qkv.unbind(-3)
         return rotate(q, (cos, sin)), rotate(k, (cos, sin)), v
@@ -216,28 +239,29 @@ class TemporalAttention(Attention):
         rotary = times.rotary if self.rotary else None
         if cache is not None:
             q, k, v = self.project(x, norm, rotary, within=True)
-            assert times.slots is not None
-            for values, kept in zip((k, v), cache.time):
-                kept.index_copy_(0, times.slots, values.transpose(0, 1))
-            return self.proj(self._recall(q, times, cache.time))
+            return self.proj(self._recall(q, times, remember(cache.time, (k, v), times)))
         b, t, n, width = x.shape
         q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), norm, rotary)
         mask = None if times.causal else times.allowed
         return self.merge(q, k, v, mask, times.causal).view(b, n, t, width).transpose(1, 2)
 
     def _recall(self, q: Tensor, times: TimePositions, cache: Tensor) -> Tensor:
-        """Attend from queries (B, T, N, heads, head_dim) to the whole cache; return (B, T, N, D)."""
+        """Attend from queries (B, T, N, heads, head_dim) to the rows' cache; return (B, T, N, D)."""
         b, t, n, heads, size = q.shape
+        allowed = times.allowed if times.allowed.dim() == 3 else times.allowed.unsqueeze(0)
         if q.device.type != "cpu" or q.dtype != torch.float32:
             queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
             k, v = cache.flatten(2, 3).permute(0, 2, 3, 1, 4)
-            mixed = F.scaled_dot_product_attention(queries, k, v, times.allowed, scale=self.scale)
+            mask = allowed if len(allowed) == 1 else allowed.repeat_interleave(n, dim=0)
+            mixed = F.scaled_dot_product_attention(queries, k, v, mask.unsqueeze(1), scale=self.scale)
             return mixed.view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
         # On a CPU with so few frames a place, batched products take half as long as the fused kernel. The
         # softmax takes a tenth of the time if its vectors run over places instead of frames.
         rows = q.permute(0, 2, 3, 1, 4).reshape(-1, t, size)
         k, v = cache.flatten(2, 4).transpose(1, 2)  # (B*N*heads, R, head_dim)
-        hidden = torch.zeros_like(times.allowed, dtype=q.dtype).masked_fill(~times.allowed, -torch.inf)
+        hidden = torch.zeros_like(allowed, dtype=q.dtype).masked_fill(~allowed, -torch.inf)
+        if len(hidden) > 1:
+            hidden = hidden.repeat_interleave(n * heads, dim=0)
         scores = torch.baddbmm(hidden, rows, k.transpose(1, 2), alpha=self.scale)
         weights = scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
         return torch.bmm(weights, v).view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
@@ -259,14 +283,17 @@ class ActionAttention(nn.Module):
         """Attend from tokens (B, T, N, D) to action embeddings (B, T, D); return (B, T, N, D)."""
         b, t, n, _ = x.shape
         q = self.q(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        q = rotate(q, times.rotary)  # (B, N, T, heads, head_dim)
+        cos, sin = (angle.unsqueeze(-3) for angle in times.rotary)
+        q = rotate(q, (cos, sin))  # (B, N, T, heads, head_dim)
         k, v = self.kv(embedding).unflatten(-1, (2, self.heads, -1)).unbind(2)
-        k, v = rotate(k, times.rotary).transpose(1, 2), v.transpose(1, 2)
+        k = rotate(k, times.rotary)
         if cache is not None and cache.action is not None:
-            assert times.slots is not None
-            k, v = (c.index_copy_(2, times.slots, new) for c, new in zip(cache.action, (k, v)))
+            k, v = remember(cache.action, (k, v), times).transpose(1, 2)
+        k, v = k.transpose(1, 2), v.transpose(1, 2)  # (B, heads, keys, head_dim)
         queries = q.permute(0, 3, 2, 1, 4).flatten(2, 3)  # (B, heads, T*N, head_dim)
-        mask = times.allowed.repeat_interleave(n, dim=0)
+        mask = times.allowed.repeat_interleave(n, dim=-2)
+        if mask.dim() == 3:
+            mask = mask.unsqueeze(1)
         mixed = F.scaled_dot_product_attention(queries, k, v, mask, scale=self.scale)
         return self.proj(mixed.transpose(1, 2).flatten(-2)).view(b, t, n, -1)
 
@@ -341,9 +368,12 @@ class Block(nn.Module):
         if self.modulation_out is not None:
             return self.modulation_out(modulated)
         assert conditioning.out is not None
+        if conditioning.order is not None:
+            modulated = modulated[conditioning.order[0]]
         parts = modulated.split([size for size, _, _ in conditioning.out])
         projected = [F.linear(part, w[layer], b[layer]) for part, (_, w, b) in zip(parts, conditioning.out)]
-        return projected[0] if len(projected) == 1 else torch.cat(projected)
+        joined = projected[0] if len(projected) == 1 else torch.cat(projected)
+        return joined if conditioning.order is None else joined[conditioning.order[1]]
 
 
 class Trunk(nn.Module):
@@ -395,7 +425,7 @@ class Trunk(nn.Module):
         if conditioning.tokens is not None:
             copies = conditioning.tokens.unsqueeze(2).expand(-1, -1, config.action_tokens, -1)
             x = torch.cat([x, copies.to(x.dtype)], dim=2)
-        x = self.embed_norm(x + rows_at(self.position, times.positions)[:, : x.shape[2]])
+        x = self.embed_norm(x + rows_at(self.position, times.positions)[..., : x.shape[2], :])
         for layer, block in enumerate(self.blocks):
             cache = None if caches is None else caches[layer]
             if self.checkpointing and self.training and torch.is_grad_enabled():

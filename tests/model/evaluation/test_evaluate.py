@@ -18,6 +18,7 @@ from hma_model.evaluation.evaluate import (
     evaluate,
     masked_val_loss,
     rollout,
+    shuffled,
     shuffled_actions,
     unconditional_baseline,
     validation_losses,
@@ -211,6 +212,21 @@ def test_the_ways_of_decoding_reach_the_model(model, batch, monkeypatch):
     assert told[0].items() >= ways.items()
 
 
+def test_a_rollout_masks_the_chunks_that_are_unknown(model, batch):
+    hidden = replace(batch, action_mask=torch.zeros_like(batch.action_mask))
+    values = replace(hidden, actions=torch.zeros_like(batch.actions))
+    one, same, seen = (rollout(model, Blocks(), windows, prompt=2) for windows in (hidden, values, batch))
+    assert (one.predicted == same.predicted).all() and (one.predicted != seen.predicted).any()
+
+
+def test_shuffled_chunks_are_known_where_they_were(batch):
+    known = torch.rand(batch.action_mask.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+    marked = replace(batch, actions=batch.actions.masked_fill(~known.unsqueeze(-1), 0), action_mask=known)
+    other = shuffled(marked, begin=2)
+    assert torch.equal((other.actions != 0).any(-1), other.action_mask)
+    assert torch.equal(other.action_mask[:, :2], known[:, :2]) and not torch.equal(other.action_mask, known)
+
+
 def test_each_picture_is_decoded_once(data, model):
     class Counting(Blocks):
         decoded = 0
@@ -239,9 +255,9 @@ def test_a_rollout_longer_than_the_window_is_refused(model, batch):
 def test_shuffled_actions_are_another_windows_of_the_same_embodiment(batch):
     mixed = replace(batch, embodiment=["arm", "hand", "arm", "hand", "arm"])
     mixed.actions[:, 0, 0] = torch.arange(5.0)
-    shuffled = shuffled_actions(mixed)[:, 0, 0].long().tolist()
-    assert sorted(shuffled) == [0, 1, 2, 3, 4]
-    assert all(a != b and (a - b) % 2 == 0 for a, b in enumerate(shuffled))
+    other = shuffled_actions(mixed)[:, 0, 0].long().tolist()
+    assert sorted(other) == [0, 1, 2, 3, 4]
+    assert all(a != b and (a - b) % 2 == 0 for a, b in enumerate(other))
 
 
 def test_every_draw_shuffles_anew(batch):
@@ -265,9 +281,9 @@ def test_figures_of_shuffled_actions_are_means_over_the_draws(data, model, monke
 
 
 def test_shuffling_keeps_the_actions_among_the_prompt(batch):
-    shuffled = shuffled_actions(batch, begin=2)
-    assert torch.equal(shuffled[:, :2], batch.actions[:, :2])
-    assert not torch.equal(shuffled[:, 2:], batch.actions[:, 2:])
+    other = shuffled_actions(batch, begin=2)
+    assert torch.equal(other[:, :2], batch.actions[:, :2])
+    assert not torch.equal(other[:, 2:], batch.actions[:, 2:])
 
 
 def test_a_perfect_model_has_the_highest_psnr_and_loses_it_with_shuffled_actions(data):

@@ -1,0 +1,280 @@
+"""Hold the state of a rollout row by row: time, frames, chunks, random numbers, and the cache.
+
+A frame at time t lies in slot t mod R of its row: its tokens, its chunk, and its keys and values. With rotary
+positions there is one slot more than the window has frames, for the pass that computes a finished frame and
+the next one together. The times of the slots follow from the time of the newest frame, so a row that begins
+anew only sets its time back.
+
+B rows, n some rows, R slots, S tokens of a frame, C values of a patch, K = stride * action dim, N tokens of a
+frame with its action tokens, T frames of a pass.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from hma_model.network.conditioning import ActionConditioning
+from hma_model.network.head import device_of
+from hma_model.network.model import HMA
+from hma_model.network.trunk import LayerCache, TimePositions, rotary_angles
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A copy of the state of n rows.
+
+    Attributes:
+        embodiments, times, pending: as of `RowState`.
+        generators: the states of the generators.
+        frames, chunks, known: the rows of the buffers.
+        layers: the rows of the cache; empty if there is none yet.
+        passive: whether the rollout has no actions; None if it has made no step.
+    """
+
+    embodiments: tuple[str, ...]
+    times: tuple[int, ...]
+    pending: tuple[int, ...]
+    generators: tuple[Tensor | None, ...]
+    frames: Tensor
+    chunks: Tensor
+    known: Tensor
+    layers: tuple[LayerCache, ...] = ()
+    passive: bool | None = None
+
+    def take(self, rows: Sequence[int]) -> "Snapshot":
+        """Return a copy of some of the rows, in this order; a row may be taken several times."""
+        index = torch.tensor(rows, device=self.frames.device)
+        layers = [
+            LayerCache(part.time[:, :, index], None if part.action is None else part.action[:, :, index])
+            for part in self.layers
+        ]
+        lists = {
+            name: tuple(getattr(self, name)[row] for row in rows)
+            for name in ("embodiments", "times", "pending", "generators")
+        }
+        buffers = {name: getattr(self, name)[index] for name in ("frames", "chunks", "known")}
+        return replace(self, **lists, **buffers, layers=tuple(layers))
+
+
+class RowState:
+    """The state of B rows.
+
+    Args:
+        model: the model of the rollout.
+        embodiments: the id of each row.
+        generator: of the seeds of rows that get none.
+        caching: False keeps all frames, so that R grows.
+
+    Attributes:
+        embodiments: the id of each row.
+        times: the time of each row's next frame; 0 if the row has no prompt.
+        pending: how many of each row's newest frames are not in the cache yet.
+        generators: of each row's random numbers; None until a row without a seed draws.
+        frames: (B, R, S) ids of the trunk's tokens, or scaled patches (B, R, S, C).
+        chunks, known: (B, R, K) float32 raw and (B, R) bool, the chunk in force at each frame.
+        layers: the cache; empty until the first pass.
+    """
+
+    def __init__(
+        self, model: HMA, embodiments: Sequence[str], generator: torch.Generator | None, caching: bool
+    ) -> None:
+        self.model, self.config, self.shared, self.caching = model, model.config, generator, caching
+        self.embodiments = list(embodiments)
+        batch, config = len(self.embodiments), model.config
+        self.times, self.pending = [0] * batch, [0] * batch
+        self.generators: list[torch.Generator | None] = [None] * batch
+        slots = config.frames + (config.time_position == "rotary")
+        blank = self.blank(batch).unsqueeze(1)
+        self.frames = torch.zeros_like(blank).repeat(1, slots, *[1] * (blank.dim() - 2))
+        self.chunks = torch.zeros(batch, slots, self.width(self.embodiments), device=model.device)
+        self.known = torch.zeros(batch, slots, dtype=torch.bool, device=model.device)
+        self.layers: list[LayerCache] = []
+
+    @property
+    def slots(self) -> int:
+        """Return R."""
+        return self.frames.shape[1]
+
+    def width(self, names: Sequence[str]) -> int:
+        """Return the largest K of these embodiments."""
+        return max(self.model.stem(name).input.in_features for name in set(names))
+
+    def blank(self, rows: int) -> Tensor:
+        """Return frames (n, S) of masked tokens, or of zero patches (n, S, C)."""
+        shape, device = (rows, self.config.tokens_per_frame), self.model.device
+        if self.config.kind == "discrete":
+            return torch.full(shape, self.config.mask_id, device=device)
+        return torch.zeros(*shape, self.config.patch_dim, device=device)
+
+    def tensor(self, values: Sequence[int]) -> Tensor:
+        """Return int64 numbers (n,) on the model's device; if they are equal or in order, without a copy."""
+        first, count, device = values[0], len(values), self.model.device
+        if all(value == first for value in values):
+            return torch.full((count,), first, device=device)
+        if list(values) == list(range(first, first + count)):
+            return torch.arange(first, first + count, device=device)
+        return torch.tensor(values, device=device)
+
+    # -- frames and chunks --------------------------------------------------------------------------------
+
+    def begin(
+        self,
+        rows: Sequence[int],
+        names: Sequence[str],
+        frames: Tensor,
+        given: ActionConditioning,
+        seeds: Sequence[int] | None,
+    ) -> None:
+        """Start rows anew at time 0 with frames (n, P, S) and the chunks (n, P, K) in force at them."""
+        self._widen(given.chunks.shape[2])
+        index, count, width = self.tensor(rows), frames.shape[1], given.chunks.shape[2]
+        self.frames[index, :count] = frames
+        self.chunks[index, :count, :width], self.known[index, :count] = given.chunks, given.known
+        for i, row in enumerate(rows):
+            self.embodiments[row] = names[i]
+            self.times[row] = self.pending[row] = count
+            self.generators[row] = None if seeds is None else self._seeded(seeds[i])
+
+    def put_chunk(self, rows: Sequence[int], late: int, chunk: Tensor | None, known: Tensor | None) -> None:
+        """Set the chunk (n, K) of the frame `late` before the next one; None for one that is not known."""
+        index, slot = self.tensor(rows), self._slot(rows, late)
+        if chunk is None:
+            self.known[index, slot] = False
+            return
+        self.chunks[index, slot, : chunk.shape[1]] = chunk
+        self.known[index, slot] = True if known is None else known
+
+    def put_frame(self, rows: Sequence[int], frames: Tensor) -> None:
+        """Add the next frame (n, S) of each row."""
+        self.frames[self.tensor(rows), self._slot(rows)] = frames
+        for row in rows:
+            self.times[row], self.pending[row] = self.times[row] + 1, 1
+
+    def given(self, rows: Sequence[int], positions: Tensor) -> ActionConditioning:
+        """Return the chunks (n, T, K) at times (n or 1, T)."""
+        index, slots = self.tensor(rows).unsqueeze(1), positions % self.slots
+        return ActionConditioning(self.chunks[index, slots], self.known[index, slots])
+
+    def past(self, rows: Sequence[int], positions: Tensor) -> Tensor:
+        """Return the frames (n, T, S) at times (n or 1, T)."""
+        return self.frames[self.tensor(rows).unsqueeze(1), positions % self.slots]
+
+    def slide(self, rows: Sequence[int]) -> None:
+        """Drop the oldest frame of rows whose window is full, and give the others the times before theirs.
+
+        Learned positions then change for each frame, so all of them are to be computed again.
+        """
+        full = [row for row in rows if self.times[row] == self.config.frames]
+        if not full:
+            return
+        index = self.tensor(full)
+        for buffer in (self.frames, self.chunks, self.known):
+            buffer[index] = buffer[index].roll(-1, dims=1)
+        for row in full:
+            self.times[row] = self.pending[row] = self.config.frames - 1
+
+    def grow(self, rows: Sequence[int]) -> None:
+        """Make slots for the next frame of rows that keep all their frames."""
+        if max(self.times[row] for row in rows) >= self.slots:
+            self._reserve(2 * self.slots)
+
+    def _reserve(self, slots: int) -> None:
+        more = slots - self.slots
+        if more > 0:
+            frames, chunks, known = (
+                torch.cat([x, x.new_zeros(len(x), more, *x.shape[2:])], dim=1)
+                for x in (self.frames, self.chunks, self.known)
+            )
+            self.frames, self.chunks, self.known = frames, chunks, known
+
+    def _widen(self, width: int) -> None:
+        self.chunks = F.pad(self.chunks, (0, max(0, width - self.chunks.shape[2])))
+
+    def _slot(self, rows: Sequence[int], late: int = 0) -> Tensor:
+        return (self.tensor([self.times[row] for row in rows]) - late) % self.slots
+
+    # -- random numbers -----------------------------------------------------------------------------------
+
+    def drawing(self, rows: Sequence[int]) -> list[torch.Generator]:
+        """Return the generator of each row; a row without one gets a seed."""
+        found = []
+        for row in rows:
+            generator = self.generators[row]
+            if generator is None:
+                device = device_of(self.shared)
+                seed = torch.randint(2**62, (), generator=self.shared, device=device)
+                generator = self.generators[row] = self._seeded(int(seed))
+            found.append(generator)
+        return found
+
+    def _seeded(self, seed: int) -> torch.Generator:
+        return torch.Generator(device_of(self.shared)).manual_seed(seed)
+
+    # -- the cache ----------------------------------------------------------------------------------------
+
+    def cache(self, tokens: int, like: Tensor) -> list[LayerCache]:
+        """Return the cache for frames of N tokens; it stays in place unless N, dtype or device change."""
+        config, batch = self.config, len(self.times)
+        shape = (2, self.slots, batch, tokens, config.heads, config.head_dim)
+        if self.layers:
+            kept = self.layers[0].time
+            if (kept.shape, kept.dtype, kept.device) == (shape, like.dtype, like.device):
+                return self.layers
+        crossed = "cross_attention" in config.conditioning
+        self.layers = [
+            LayerCache(like.new_zeros(shape), like.new_zeros(shape[:3] + shape[4:]) if crossed else None)
+            for _ in range(config.layers)
+        ]
+        return self.layers
+
+    def cached_times(self, rows: Sequence[int], begin: Sequence[int], frames: int) -> TimePositions:
+        """Return the times of a pass over T frames of each row, from the times `begin` on."""
+        positions = self.tensor(begin).unsqueeze(1) + torch.arange(frames, device=self.model.device)
+        newest, batch = positions[:, -1:], len(self.times)
+        held = newest - (newest - torch.arange(self.slots, device=newest.device)) % self.slots  # (n, R) times
+        age = positions.unsqueeze(2) - held.unsqueeze(1)
+        allowed = (held >= 0).unsqueeze(1) & (age >= 0) & (age < self.config.frames)
+        places = positions % self.slots * batch + self.tensor(rows).unsqueeze(1)
+        whole = len(rows) == batch and list(rows) == list(range(batch))
+        chosen = None if whole else _span(rows, self.tensor(rows))
+        return TimePositions(
+            positions, allowed, rotary_angles(self.config, positions), slots=places, rows=chosen
+        )
+
+    # -- snapshots ----------------------------------------------------------------------------------------
+
+    def snapshot(self, rows: Sequence[int]) -> Snapshot:
+        """Return a copy of the state of rows."""
+        states = tuple(None if one is None else one.get_state() for one in self.generators)
+        lists = tuple(self.embodiments), tuple(self.times), tuple(self.pending), states
+        return Snapshot(*lists, self.frames, self.chunks, self.known, tuple(self.layers)).take(rows)
+
+    def restore(self, rows: Sequence[int], kept: Snapshot) -> None:
+        """Put rows into the state of a snapshot."""
+        index, length, width = self.tensor(rows), kept.frames.shape[1], kept.chunks.shape[2]
+        self._reserve(length)
+        self._widen(width)
+        self.frames[index, :length], self.known[index, :length] = kept.frames, kept.known
+        self.chunks[index, :length, :width] = kept.chunks
+        if kept.layers:
+            like = kept.layers[0].time
+            for own, other in zip(self.cache(like.shape[3], like), kept.layers):
+                own.time[:, :, index] = other.time
+                if own.action is not None and other.action is not None:
+                    own.action[:, :, index] = other.action
+        for i, row in enumerate(rows):
+            self.embodiments[row] = kept.embodiments[i]
+            self.times[row], self.pending[row] = kept.times[i], kept.pending[i]
+            state, self.generators[row] = kept.generators[i], None
+            if state is not None:
+                generator = self.generators[row] = self._seeded(0)
+                generator.set_state(state)
+
+
+def _span(rows: Sequence[int], index: Tensor) -> slice | Tensor:
+    """Return rows as a slice, which needs no copy, if they are in order."""
+    inside = list(rows) == list(range(rows[0], rows[0] + len(rows)))
+    return slice(rows[0], rows[0] + len(rows)) if inside else index
