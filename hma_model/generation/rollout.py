@@ -20,9 +20,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hma_data.errors import HMAError
+from hma_model.generation.packed import has_bfloat16, packed, packs
 from hma_model.generation.state import RowState, Snapshot
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, check, masked_after
 from hma_model.network.conditioning import ActionConditioning, Groups, condition
@@ -67,7 +68,8 @@ class Rollout:
     its length.
 
     Args:
-        model: any model; it is used as it is, so call `eval()` on it before.
+        model: any model; it is used as it is now, so call `eval()` on it before. Later changes of its weights
+            may not reach the rollout.
         embodiment: one id for all, or one a row.
         batch: B.
         unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
@@ -75,6 +77,7 @@ class Rollout:
         cache: keep keys and values of past frames.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
             take a minute or more. A step of some rows then computes all of them.
+        precision: "float32", or "bf16" for products in bfloat16.
 
     Attributes:
         decoding: the settings of unmasking; they may be replaced between steps.
@@ -94,11 +97,14 @@ class Rollout:
         generator: torch.Generator | None = None,
         cache: bool = True,
         compile: bool = False,
+        precision: str = "float32",
     ) -> None:
         self.model, self.config = model, model.config
         self.decoding = Decoding(unmask_steps, temperature, order, sample_steps)
         check(self.decoding, self.config.kind)
         self.batch, self.caching = batch, cache
+        self.precision = precision
+        self.trunk, self.readout, self.casts = _prepared(model, precision, compile)
         self.compiled = _compiled(model.trunk) if compile and cache else None
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
         names = [embodiment] * batch if isinstance(embodiment, str) else embodiment
@@ -162,7 +168,7 @@ class Rollout:
         names = [self.state.embodiments[row] for row in rows]
         other = Rollout(
             self.model, names, len(rows), generator=self.state.shared, cache=self.caching,
-            compile=self.compiled is not None,
+            compile=self.compiled is not None, precision=self.precision,
         )  # fmt: skip
         other.decoding = self.decoding
         other.restore(range(len(rows)), self.snapshot().take(rows))
@@ -236,7 +242,7 @@ class Rollout:
             if count > 0:
                 features, position = self._features(frame, passes, first=left == tokens)
                 own = features[:, :tokens]
-                frame.unmask(self.model.readout, own, position, count)  # type: ignore[arg-type]
+                frame.unmask(self.readout, own, position, count)  # type: ignore[arg-type]
                 left -= count
         self.state.put_frame(chosen, frame.values)
         return self._show(frame.values)
@@ -262,7 +268,7 @@ class Rollout:
             past = state.past(late, times.positions)
             masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
             conditioning = self._condition(late, times.positions)
-            self.model.trunk(self._embed(past, masked), conditioning, times, self._cache())
+            self.trunk(self._embed(past, masked), conditioning, times, self._cache())
             for row in late:
                 state.pending[row] = 1
 
@@ -302,11 +308,11 @@ class Rollout:
         masked[:, -1] = part.lay_out(frame.masked)
         x = self._embed(values, masked)
         if not self.caching:
-            features = self.model.trunk(x, part.conditioning, part.times)
+            features = self.trunk(x, part.conditioning, part.times)
             return features[:, -1], part.times.positions[-1:].unsqueeze(0)
         conditioning = part.conditioning if first else part.conditioning.last()
         times = part.times if first else part.times.last()
-        trunk = self.compiled or self.model.trunk
+        trunk = self.compiled or self.trunk
         features = trunk(x if whole else x[:, -1:], conditioning, times, self._cache())[:, -1]
         at = times.positions[:, -1:]
         if part.lanes is None:
@@ -406,6 +412,20 @@ class Rollout:
             return split_tokens(values, config.merge, config.vocab_size, config.token_grid)
         latents = unpatchify(values.unsqueeze(1), config.patch, config.token_grid)
         return latents.squeeze(1) / config.latent_scale
+
+
+def _prepared(model: HMA, precision: str, compile: bool) -> tuple[Trunk, nn.Module, bool]:
+    """Return the trunk and the readout to generate with, and whether they are to run under autocast."""
+    device = model.device
+    dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(precision)
+    if dtype is None:
+        raise HMAError("precision", f"{precision!r} is unknown", "give float32 or bf16")
+    if dtype == torch.bfloat16 and device.type == "cpu" and not has_bfloat16():
+        raise HMAError("precision", "this processor has no products of bfloat16", "use float32")
+    whole = next(model.trunk.parameters()).dtype == torch.float32
+    if packs(device) and whole and not compile and not torch.is_autocast_enabled("cpu"):
+        return packed(model.trunk, dtype), packed(model.readout), False
+    return model.trunk, model.readout, dtype == torch.bfloat16
 
 
 def _compiled(trunk: Trunk) -> Callable[..., Tensor]:

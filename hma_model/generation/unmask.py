@@ -73,17 +73,17 @@ class TokenFrame:
         self.values = self.values.scatter(1, chosen, tokens)
 
     def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return token ids (B, k) and the sums (B, k) of the log probabilities of their digits."""
-        digits, confidence = [], torch.zeros(features.shape[:2], device=features.device)
-        for scores in readout(features).split(list(readout.factored), dim=-1):
-            drawn = scores
-            if self.decoding.temperature > 0:  # the largest of these sums is a sample from the softmax
-                noise = uniform(scores.shape, self.generators, scores.device).clamp(min=1e-20)
-                drawn = scores / self.decoding.temperature - (-noise.log()).log()
-            digits.append(drawn.argmax(-1))
-            if self.decoding.order == "confidence":
-                confidence += scores.log_softmax(-1).gather(-1, digits[-1].unsqueeze(-1)).squeeze(-1)
-        return from_digits(torch.stack(digits, dim=-1), readout.factored), confidence
+        """Return token ids (B, k) and, if the order asks for them, the log probabilities (B, k) of these."""
+        scores = readout.split(readout(features)).transpose(1, 2)  # (B, F, k, V)
+        drawn = scores
+        if self.decoding.temperature > 0:  # the largest of these sums is a sample from the softmax
+            noise = uniform(scores.shape, self.generators, scores.device).clamp(min=1e-20)
+            drawn = scores / self.decoding.temperature - (-noise.log()).log()
+        digits = drawn.argmax(-1, keepdim=True)
+        confidence = features
+        if self.decoding.order == "confidence":
+            confidence = scores.log_softmax(-1).gather(-1, digits).sum(1).squeeze(-1)
+        return from_digits(digits.squeeze(-1).transpose(1, 2), readout.factored), confidence
 
 
 class PatchFrame:
