@@ -160,6 +160,7 @@ class Frames:
         rollout = Rollout(
             self.model, self.robot, self.batch, unmask_steps=way["unmask_steps"],
             sample_steps=way["ddim_steps"], cache=way["cache"], compile=compile,
+            precision="bf16" if way["precision"] == "bf16" else "float32",
         )  # fmt: skip
         rollout.prompt(self.prompt, self.actions)
         return rollout

@@ -138,8 +138,16 @@ SampleSteps = Annotated[
     int | None,
     typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
 ]
-
-
+Precision = Annotated[
+    Literal["float32", "bf16"],
+    typer.Option(
+        "--precision", help="Of the products in rollouts; bf16 wants a processor or GPU that has it."
+    ),
+]
+Compile = Annotated[
+    bool,
+    typer.Option("--compile", help="Compile the trunk for rollouts; pays on a GPU, after a minute or more."),
+]
 Cameras = Annotated[
     str | None,
     typer.Option(
@@ -192,6 +200,8 @@ def evaluate(
     ] = None,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
+    precision: Precision = "float32",
+    compile: Compile = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
     cameras: Cameras = None,
     json: Json = False,
@@ -206,7 +216,8 @@ def evaluate(
 
     found = run(
         *opened, split=split, count=windows, frames=frames, prompt=prompt, seed=seed,
-        unmask_steps=unmask_steps, sample_steps=sample_steps, cameras=_names(cameras),
+        unmask_steps=unmask_steps, sample_steps=sample_steps, cameras=_names(cameras), precision=precision,
+        compile=compile,
     )  # fmt: skip
     if json:
         print_json(found)
@@ -240,6 +251,8 @@ def generate(
     temperature: Annotated[
         float, typer.Option("--temperature", min=0, help="0 takes the likeliest token.")
     ] = 0.0,
+    precision: Precision = "float32",
+    compile: Compile = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollout.")] = 0,
     cameras: Cameras = None,
 ) -> None:
@@ -255,7 +268,7 @@ def generate(
     film = rollout_video(
         *opened, split=split, window=window, frames=frames, prompt=prompt, seed=seed,
         unmask_steps=unmask_steps, sample_steps=sample_steps, temperature=temperature,
-        cameras=_names(cameras),
+        cameras=_names(cameras), precision=precision, compile=compile,
     )  # fmt: skip
     write_video(out, film)
     about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"

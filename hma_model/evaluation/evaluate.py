@@ -46,6 +46,8 @@ class Sampling(TypedDict, total=False):
     temperature: float
     order: str
     sample_steps: int | None
+    precision: str
+    compile: bool
 
 
 @dataclass

@@ -16,20 +16,20 @@ K = stride * action dim, c channels, H,W latent grid, N tokens of a frame with i
 a pass.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.generation.packed import has_bfloat16, packed, packs
+from hma_model.generation.engine import Engine
 from hma_model.generation.state import RowState, Snapshot
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, check, masked_after
 from hma_model.network.conditioning import ActionConditioning, Groups, condition
 from hma_model.network.model import HMA
 from hma_model.network.stem import split_tokens, unpatchify
-from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, Trunk, window_times
+from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, window_times
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,7 @@ class Rollout:
         self.decoding = Decoding(unmask_steps, temperature, order, sample_steps)
         check(self.decoding, self.config.kind)
         self.batch, self.caching = batch, cache
-        self.precision = precision
-        self.trunk, self.readout, self.casts = _prepared(model, precision, compile)
-        self.compiled = _compiled(model.trunk) if compile and cache else None
+        self.engine = Engine(model, precision, compile and cache)
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
         names = [embodiment] * batch if isinstance(embodiment, str) else embodiment
         self.state = RowState(model, names, generator, cache)
@@ -168,7 +166,7 @@ class Rollout:
         names = [self.state.embodiments[row] for row in rows]
         other = Rollout(
             self.model, names, len(rows), generator=self.state.shared, cache=self.caching,
-            compile=self.compiled is not None, precision=self.precision,
+            compile=self.engine.compiled is not None, precision=self.engine.precision,
         )  # fmt: skip
         other.decoding = self.decoding
         other.restore(range(len(rows)), self.snapshot().take(rows))
@@ -235,23 +233,29 @@ class Rollout:
         if not self.caching:
             self.state.grow(chosen)
         self._take(chosen, chunk, following, known)
-        frame, passes = self._blank(chosen), self._passes(chosen)
+        with self.engine.computing(len(chosen)):
+            values = self._frame(chosen)
+        self.state.put_frame(chosen, values)
+        return self._show(values.clone())  # what is made in inference mode could not be changed in place
+
+    def _frame(self, rows: list[int]) -> Tensor:
+        """Return the next frame (n, S) of rows, unmasked."""
+        frame, passes = self._blank(rows), self._passes(rows)
         left = tokens = self.config.tokens_per_frame
         for step in range(self.decoding.steps):
             count = left - masked_after(step, self.decoding.steps, tokens)
             if count > 0:
                 features, position = self._features(frame, passes, first=left == tokens)
                 own = features[:, :tokens]
-                frame.unmask(self.readout, own, position, count)  # type: ignore[arg-type]
+                frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
                 left -= count
-        self.state.put_frame(chosen, frame.values)
-        return self._show(frame.values)
+        return frame.values
 
     def _passes(self, rows: list[int]) -> list[Pass]:
         """Return the pass that all rows share; without a cache, one for the rows of each time."""
         if self.caching:
             self._catch_up(rows)
-            if self.compiled is None or len(rows) == self.batch:
+            if self.engine.compiled is None or len(rows) == self.batch:
                 return [self._newest(rows)]
             # Compiled code has one shape, so idle rows compute too. Their next step writes the slots again.
             return [replace(self._newest(list(range(self.batch))), lanes=self.state.tensor(rows))]
@@ -268,7 +272,7 @@ class Rollout:
             past = state.past(late, times.positions)
             masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
             conditioning = self._condition(late, times.positions)
-            self.trunk(self._embed(past, masked), conditioning, times, self._cache())
+            self.engine.trunk(self._embed(past, masked), conditioning, times, self._cache())
             for row in late:
                 state.pending[row] = 1
 
@@ -308,11 +312,11 @@ class Rollout:
         masked[:, -1] = part.lay_out(frame.masked)
         x = self._embed(values, masked)
         if not self.caching:
-            features = self.trunk(x, part.conditioning, part.times)
+            features = self.engine.trunk(x, part.conditioning, part.times)
             return features[:, -1], part.times.positions[-1:].unsqueeze(0)
         conditioning = part.conditioning if first else part.conditioning.last()
         times = part.times if first else part.times.last()
-        trunk = self.compiled or self.trunk
+        trunk = self.engine.compiled or self.engine.trunk
         features = trunk(x if whole else x[:, -1:], conditioning, times, self._cache())[:, -1]
         at = times.positions[:, -1:]
         if part.lanes is None:
@@ -331,8 +335,9 @@ class Rollout:
         if torch.is_autocast_enabled(like.device.type):
             like = like.to(torch.get_autocast_dtype(like.device.type))
         before = self.state.layers
-        layers = self.state.cache(self.config.tokens_per_frame + appended, like)
-        if self.compiled is not None and layers is not before:
+        with torch.inference_mode(False), torch.no_grad():
+            layers = self.state.cache(self.config.tokens_per_frame + appended, like)
+        if self.engine.compiled is not None and layers is not before:
             for layer in layers:  # static addresses: the compiled code writes them in place
                 for kept in (layer.time, layer.action):
                     if kept is not None:
@@ -412,33 +417,6 @@ class Rollout:
             return split_tokens(values, config.merge, config.vocab_size, config.token_grid)
         latents = unpatchify(values.unsqueeze(1), config.patch, config.token_grid)
         return latents.squeeze(1) / config.latent_scale
-
-
-def _prepared(model: HMA, precision: str, compile: bool) -> tuple[Trunk, nn.Module, bool]:
-    """Return the trunk and the readout to generate with, and whether they are to run under autocast."""
-    device = model.device
-    dtype = {"float32": torch.float32, "bf16": torch.bfloat16}.get(precision)
-    if dtype is None:
-        raise HMAError("precision", f"{precision!r} is unknown", "give float32 or bf16")
-    if dtype == torch.bfloat16 and device.type == "cpu" and not has_bfloat16():
-        raise HMAError("precision", "this processor has no products of bfloat16", "use float32")
-    whole = next(model.trunk.parameters()).dtype == torch.float32
-    if packs(device) and whole and not compile and not torch.is_autocast_enabled("cpu"):
-        return packed(model.trunk, dtype), packed(model.readout), False
-    return model.trunk, model.readout, dtype == torch.bfloat16
-
-
-def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
-    """Return the trunk compiled for passes of a fixed shape; a result is valid until the next pass."""
-    mode = "reduce-overhead" if trunk.position.device.type == "cuda" else "default"
-    compiled = torch.compile(trunk, dynamic=False, mode=mode)
-
-    def call(*arguments: object) -> Tensor:
-        torch.compiler.cudagraph_mark_step_begin()
-        features: Tensor = compiled(*arguments)
-        return features
-
-    return call
 
 
 def generate(

@@ -19,7 +19,8 @@ from torch import Tensor
 from hma_model.network.conditioning import ActionConditioning
 from hma_model.network.head import device_of
 from hma_model.network.model import HMA
-from hma_model.network.trunk import LayerCache, TimePositions, rotary_angles
+from hma_model.network.rotary import rotary_angles
+from hma_model.network.trunk import LayerCache, TimePositions
 
 
 @dataclass(frozen=True)
@@ -211,7 +212,9 @@ class RowState:
         return found
 
     def _seeded(self, seed: int) -> torch.Generator:
-        return torch.Generator(device_of(self.shared)).manual_seed(seed)
+        """Return a generator that draws where the rollout's does; without one, on the model's device."""
+        device = self.model.device if self.shared is None else self.shared.device
+        return torch.Generator(device).manual_seed(seed)
 
     # -- the cache ----------------------------------------------------------------------------------------
 

@@ -313,6 +313,8 @@ class HMA(nn.Module):
         cache: bool = True,
         sample_steps: int | None = None,
         known: Tensor | None = None,
+        precision: str = "float32",
+        compile: bool = False,
     ) -> Tensor:
         """Continue a prompt, frame by frame.
 
@@ -329,6 +331,8 @@ class HMA(nn.Module):
             sample_steps: sampling steps of the diffusion head.
             known: (B, P + frames) bool, False where a chunk is unknown, as `action_mask` in training; by
                 default all are known.
+            precision: "float32", or "bf16" for products in bfloat16.
+            compile: compile the trunk; the first frames then take a minute or more.
 
         Returns:
             (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
@@ -338,6 +342,7 @@ class HMA(nn.Module):
         return generate(
             self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
             temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
+            precision=precision, compile=compile,
         )  # fmt: skip
 
     # -- parts that training and decoding share -----------------------------------------------------------

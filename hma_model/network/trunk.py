@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
+from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv, turns_of
 from hma_model.network.stem import LatentEmbedding, Modulation, TokenEmbedding
 
 
@@ -42,9 +43,11 @@ class Conditioning:
     order: tuple[Tensor, Tensor] | None = None
 
     def last(self) -> "Conditioning":
-        """Return the conditioning of the last frame alone."""
-        embedding, tokens = (None if x is None else x[:, -1:] for x in (self.embedding, self.tokens))
-        modulation = None if self.modulation is None else self.modulation[:, :, -1:]
+        """Return the conditioning of the last frame alone, in memory of its own as a compiler wants it."""
+        embedding, tokens = (
+            None if x is None else x[:, -1:].contiguous() for x in (self.embedding, self.tokens)
+        )
+        modulation = None if self.modulation is None else self.modulation[:, :, -1:].contiguous()
         return Conditioning(embedding, modulation, self.out, tokens, self.order)
 
 
@@ -81,10 +84,10 @@ class TimePositions:
 
     def last(self) -> "TimePositions":
         """Return the times of the last frame alone."""
-        cos, sin = (angle[..., -1:, :] for angle in self.rotary)
-        slots = None if self.slots is None else self.slots[:, -1:]
-        allowed = self.allowed[..., -1:, :]
-        return TimePositions(self.positions[..., -1:], allowed, (cos, sin), slots=slots, rows=self.rows)
+        cos, sin = (angle[..., -1:, :].contiguous() for angle in self.rotary)
+        slots = None if self.slots is None else self.slots[:, -1:].contiguous()
+        allowed, positions = self.allowed[..., -1:, :].contiguous(), self.positions[..., -1:].contiguous()
+        return TimePositions(positions, allowed, (cos, sin), slots=slots, rows=self.rows)
 
 
 @dataclass
@@ -111,14 +114,6 @@ def remember(cache: Tensor, new: tuple[Tensor, Tensor], times: TimePositions) ->
 def rows_at(table: Tensor, positions: Tensor) -> Tensor:
     """Return the rows of a table at absolute times, or its only row if it does not depend on time."""
     return table if table.shape[0] == 1 else table[positions]
-
-
-def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cos and sin, float32 (..., head_dim / 2), of the rotary angles at the times (...)."""
-    half = max(config.head_dim // 2, 1)
-    steps = torch.arange(half, device=positions.device, dtype=torch.float32) / half
-    angles = positions.float().unsqueeze(-1) * config.rotary_base**-steps
-    return angles.cos(), angles.sin()
 
 
 def window_times(config: HMAConfig, frames: int, device: torch.device | str) -> TimePositions:
@@ -154,45 +149,6 @@ def sinusoids(grid: tuple[int, int], width: int) -> Tensor:
     angles = places.unsqueeze(-1) * (2 * math.pi / waves)  # (S, 2, D / 4)
     values = torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(1)
     return values[:, :width] * 0.5**0.5
-
-
-def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
-    """Rotate neighbouring pairs of x (..., T, heads, head_dim) by each frame's angles."""
-    cos, sin = (angle.to(x.dtype).unsqueeze(-2) for angle in rotary)
-    even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
-    return torch.stack([even * cos - odd * sin, odd * cos + even * sin], dim=-1).flatten(-2)
-
-
-def turns_of(rotary: tuple[Tensor, Tensor], heads: int, within: bool = False) -> Tensor:
-    """Return the rotation that `rotate_qkv` applies, complex (..., T, 3 * heads * head_dim / 2)."""
-    cos, sin = (angle.unsqueeze(-2) if within else angle for angle in rotary)
-    turn = torch.complex(cos, sin)
-    turns = torch.stack([turn, turn, torch.ones_like(turn)], dim=-2).unsqueeze(-2)
-    return turns.expand(*turns.shape[:-2], heads, -1).flatten(-3)
-
-
-def rotate_qkv(
-    qkv: Tensor, rotary: tuple[Tensor, Tensor], within: bool = False, turns: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotate queries and keys, and return them with the unchanged values.
-
-    Without a compiler to fuse the operations, one complex product over contiguous memory is several times as
-    fast.
-
-    Args:
-        qkv: (..., T, 3, heads, head_dim), or `within` frames (..., T, N, 3, heads, head_dim).
-        rotary: cos and sin (T, head_dim / 2), or (B, T, head_dim / 2).
-        within: whether there is an axis of places between the times and the axis of size 3.
-        turns: `turns_of` these, if they are at hand.
-    """
-    if qkv.dtype != torch.float32 or torch.compiler.is_compiling():
-        cos, sin = (angle.unsqueeze(-2) if within else angle for angle in rotary)
-        q, k, v = qkv.unbind(-3)
-        return rotate(q, (cos, sin)), rotate(k, (cos, sin)), v
-    turns = turns_of(rotary, qkv.shape[-2], within) if turns is None else turns
-    flat = torch.view_as_complex(qkv.view(*qkv.shape[:-3], -1, 2)) * turns
-    q, k, v = torch.view_as_real(flat).view_as(qkv).unbind(-3)
-    return q, k, v
 
 
 def light(function: Callable[..., Tensor], *inputs: Any) -> Tensor:
@@ -270,6 +226,8 @@ class TemporalAttention(Attention):
         """Attend from queries (B, T, N, heads, head_dim) to the rows' cache; return (B, T, N, D)."""
         b, t, n, heads, size = q.shape
         allowed = times.allowed if times.allowed.dim() == 3 else times.allowed.unsqueeze(0)
+        if torch.compiler.is_compiling():
+            return self._recall_fused(q, allowed, cache)
         if q.device.type != "cpu" or q.dtype != torch.float32:
             queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
             k, v = cache.flatten(2, 3).permute(0, 2, 3, 1, 4)
@@ -284,6 +242,14 @@ class TemporalAttention(Attention):
         scores = torch.baddbmm(hidden, rows, k.transpose(1, 2), alpha=self.scale)
         weights = scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
         return torch.bmm(weights, v).view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
+
+    def _recall_fused(self, q: Tensor, allowed: Tensor, cache: Tensor) -> Tensor:
+        """Do as `_recall` in operations that a compiler makes two kernels of, each reading the cache once."""
+        k, v = cache.unsqueeze(2)  # (R, 1, B, N, heads, head_dim)
+        scores = (q.transpose(0, 1) * k).float().sum(-1) * self.scale  # (R, T, B, N, heads)
+        hidden = ~allowed.permute(2, 1, 0)[..., None, None]
+        weights = scores.masked_fill(hidden, -torch.inf).softmax(0).unsqueeze(-1)
+        return (weights * v).sum(0).to(q.dtype).transpose(0, 1).flatten(-2)
 
     @staticmethod
     def _hidden(allowed: Tensor, rows: int) -> Tensor:
