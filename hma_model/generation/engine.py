@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -9,6 +10,8 @@ from torch import Tensor, nn
 from hma_data.errors import HMAError
 from hma_data.tokenizers.network import one_thread
 from hma_model.generation.packed import has_bfloat16, packed, packs
+from hma_model.generation.unmask import TokenFrame
+from hma_model.network.head import TokenReadout
 from hma_model.network.model import HMA
 from hma_model.network.trunk import Trunk
 
@@ -29,6 +32,7 @@ class Engine:
     Attributes:
         trunk, readout: the modules to call.
         compiled: the compiled trunk, for passes of one shape; None without.
+        whole: the compiled trunk, readout and choice of tokens, `unmasked_by`; None without.
     """
 
     def __init__(self, model: HMA, precision: str, compile: bool) -> None:
@@ -42,8 +46,15 @@ class Engine:
         pack = whole and not compile and packs(device)
         self.trunk: Trunk = packed(model.trunk, dtype) if pack else model.trunk
         self.readout: nn.Module = packed(model.readout) if pack else model.readout
-        self.compiled = _compiled(model.trunk) if compile else None
+        self.compiled = _compiled(model.trunk, device) if compile else None
+        self.whole = _compiled(self.unmasked_by, device) if compile else None
         self._casts = dtype == torch.bfloat16 and not pack
+
+    def unmasked_by(self, frame: TokenFrame, count: int, *given: Any) -> Tensor:
+        """Return a frame's tokens (B, S) after a pass of the trunk over `given` that unmasks `count`."""
+        features = self.trunk(*given)[:, -1, : self.config.tokens_per_frame]
+        assert isinstance(self.readout, TokenReadout)
+        return frame.unmasked(self.readout, features, count)
 
     @contextmanager
     def computing(self, rows: int) -> Iterator[None]:
@@ -60,14 +71,14 @@ class Engine:
             yield
 
 
-def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
-    """Return the trunk compiled for passes of a fixed shape; a result is valid until the next pass."""
-    mode = "reduce-overhead" if trunk.position.device.type == "cuda" else "default"
-    compiled = torch.compile(trunk, dynamic=False, mode=mode)
+def _compiled(function: Callable[..., Tensor], device: torch.device) -> Callable[..., Tensor]:
+    """Return a function compiled for passes of a fixed shape; a result is valid until the next pass."""
+    mode = "reduce-overhead" if device.type == "cuda" else "default"
+    compiled = torch.compile(function, dynamic=False, mode=mode)
 
     def call(*arguments: object) -> Tensor:
         torch.compiler.cudagraph_mark_step_begin()
-        features: Tensor = compiled(*arguments)
-        return features
+        made: Tensor = compiled(*arguments)
+        return made
 
     return call

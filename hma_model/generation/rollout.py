@@ -17,47 +17,19 @@ a pass.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.generation.engine import Engine
-from hma_model.generation.state import RowState, Snapshot
+from hma_model.generation.state import Pass, RowState, Snapshot
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, check, masked_after
 from hma_model.network.conditioning import ActionConditioning, Groups, condition
 from hma_model.network.model import HMA
 from hma_model.network.stem import split_tokens, unpatchify
 from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, window_times
-
-
-@dataclass(frozen=True)
-class Pass:
-    """What the passes over one frame share.
-
-    Attributes:
-        past: (rows, T - 1, S) the frames before the new one that the first pass computes.
-        times, conditioning: of the T frames.
-        among: numbers of the pass's rows among those of the step; None if they are the same.
-        lanes: numbers of the step's rows among those of the pass; None if they are the same.
-    """
-
-    past: Tensor
-    times: TimePositions
-    conditioning: Conditioning
-    among: Tensor | None = None
-    lanes: Tensor | None = None
-
-    def lay_out(self, values: Tensor) -> Tensor:
-        """Return values of the step's rows (n, ...) as those of the pass's rows."""
-        if self.among is not None:
-            return values[self.among]
-        if self.lanes is None:
-            return values
-        laid = values.new_zeros(len(self.past), *values.shape[1:])
-        laid[self.lanes] = values
-        return laid
 
 
 class Rollout:
@@ -245,11 +217,22 @@ class Rollout:
         for step in range(self.decoding.steps):
             count = left - masked_after(step, self.decoding.steps, tokens)
             if count > 0:
-                features, position = self._features(frame, passes, first=left == tokens)
-                own = features[:, :tokens]
-                frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
+                self._unmask(frame, passes, count, first=left == tokens)
                 left -= count
         return frame.values
+
+    def _unmask(self, frame: TokenFrame | PatchFrame, passes: list[Pass], count: int, first: bool) -> None:
+        """Predict and keep `count` more tokens of a frame."""
+        if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.temperature:
+            (part,) = passes
+            laid = [part.lay_out(x) for x in (frame.values, frame.rank)]
+            seen = TokenFrame(laid[0], frame.mask_id, self.decoding, None, rank=laid[1])
+            made = self.engine.whole(seen, count, *self._inputs(frame, part, first)).clone()
+            frame.values = made if part.lanes is None else made[part.lanes]
+            return
+        features, position = self._features(frame, passes, first)
+        own = features[:, : self.config.tokens_per_frame]
+        frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
 
     def _passes(self, rows: list[int]) -> list[Pass]:
         """Return the pass that all rows share; without a cache, one for the rows of each time."""
@@ -305,6 +288,17 @@ class Rollout:
 
     def _compute(self, frame: TokenFrame | PatchFrame, part: Pass, first: bool) -> tuple[Tensor, Tensor]:
         """Compute a pass: all its frames if it is the first or there is no cache, else the new one."""
+        x, conditioning, times, layers = self._inputs(frame, part, first)
+        trunk = self.engine.compiled or self.engine.trunk
+        features, at = trunk(x, conditioning, times, layers)[:, -1], times.positions[..., -1:].view(-1, 1)
+        if part.lanes is None:
+            return features, at
+        return features[part.lanes], at if len(at) == 1 else at[part.lanes]
+
+    def _inputs(
+        self, frame: TokenFrame | PatchFrame, part: Pass, first: bool
+    ) -> tuple[Tensor, Conditioning, TimePositions, list[LayerCache] | None]:
+        """Return the inputs of the trunk for a pass."""
         whole = first or not self.caching
         fresh = part.past if whole or self.config.masked_input == "previous" else part.past[:, :0]
         values = torch.cat([fresh, part.lay_out(frame.values).unsqueeze(1)], dim=1)
@@ -312,16 +306,10 @@ class Rollout:
         masked[:, -1] = part.lay_out(frame.masked)
         x = self._embed(values, masked)
         if not self.caching:
-            features = self.engine.trunk(x, part.conditioning, part.times)
-            return features[:, -1], part.times.positions[-1:].unsqueeze(0)
+            return x, part.conditioning, part.times, None
         conditioning = part.conditioning if first else part.conditioning.last()
         times = part.times if first else part.times.last()
-        trunk = self.engine.compiled or self.engine.trunk
-        features = trunk(x if whole else x[:, -1:], conditioning, times, self._cache())[:, -1]
-        at = times.positions[:, -1:]
-        if part.lanes is None:
-            return features, at
-        return features[part.lanes], at if len(at) == 1 else at[part.lanes]
+        return x if whole else x[:, -1:].contiguous(), conditioning, times, self._cache()
 
     def _embed(self, values: Tensor, masked: Tensor) -> Tensor:
         """Embed frames (n, T, S) of which some tokens are masked, (n, T, S) bool, as (n, T, S, D)."""

@@ -20,7 +20,7 @@ from hma_model.network.conditioning import ActionConditioning
 from hma_model.network.head import device_of
 from hma_model.network.model import HMA
 from hma_model.network.rotary import rotary_angles
-from hma_model.network.trunk import LayerCache, TimePositions
+from hma_model.network.trunk import Conditioning, LayerCache, TimePositions
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,34 @@ class Snapshot:
         }
         buffers = {name: getattr(self, name)[index] for name in ("frames", "chunks", "known")}
         return replace(self, **lists, **buffers, layers=tuple(layers))
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What the passes over one frame share.
+
+    Attributes:
+        past: (rows, T - 1, S) the frames before the new one that the first pass computes.
+        times, conditioning: of the T frames.
+        among: numbers of the pass's rows among those of the step; None if they are the same.
+        lanes: numbers of the step's rows among those of the pass; None if they are the same.
+    """
+
+    past: Tensor
+    times: TimePositions
+    conditioning: Conditioning
+    among: Tensor | None = None
+    lanes: Tensor | None = None
+
+    def lay_out(self, values: Tensor) -> Tensor:
+        """Return values of the step's rows (n, ...) as those of the pass's rows."""
+        if self.among is not None:
+            return values[self.among]
+        if self.lanes is None:
+            return values
+        laid = values.new_zeros(len(self.past), *values.shape[1:])
+        laid[self.lanes] = values
+        return laid
 
 
 class RowState:

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.network.head import Generators, LatentReadout, TokenReadout, uniform
-from hma_model.network.stem import from_digits
 
 
 @dataclass(frozen=True)
@@ -50,10 +49,17 @@ class TokenFrame:
         values: (B, S) int64 ids of the trunk's tokens; `mask_id` means masked.
     """
 
-    def __init__(self, values: Tensor, mask_id: int, decoding: Decoding, generators: Generators) -> None:
+    def __init__(
+        self,
+        values: Tensor,
+        mask_id: int,
+        decoding: Decoding,
+        generators: Generators,
+        rank: Tensor | None = None,
+    ) -> None:
         self.values, self.mask_id, self.decoding = values, mask_id, decoding
         self.generators = generators
-        self.rank = uniform(values.shape, generators, values.device)
+        self.rank = uniform(values.shape, generators, values.device) if rank is None else rank
 
     @property
     def masked(self) -> Tensor:
@@ -62,6 +68,10 @@ class TokenFrame:
 
     def unmask(self, readout: TokenReadout, features: Tensor, position: Tensor, count: int) -> None:
         """Predict tokens from features (B, S, D) of frames at times (1 or B, 1), and keep `count` more."""
+        self.values = self.unmasked(readout, features, count)
+
+    def unmasked(self, readout: TokenReadout, features: Tensor, count: int) -> Tensor:
+        """Return the tokens (B, S) with `count` more of them predicted from features (B, S, D)."""
         masked = self.masked
         if self.decoding.order == "random":
             chosen = _top(self.rank, masked, count)
@@ -70,7 +80,7 @@ class TokenFrame:
             everything, confidence = self._sample(readout, features)
             chosen = _top(confidence, masked, count)
             tokens = everything.gather(1, chosen)
-        self.values = self.values.scatter(1, chosen, tokens)
+        return self.values.scatter(1, chosen, tokens)
 
     def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return token ids (B, k) and, if the order asks for them, the log probabilities (B, k) of these."""
@@ -83,7 +93,7 @@ class TokenFrame:
         confidence = features
         if self.decoding.order == "confidence":
             confidence = scores.log_softmax(-1).gather(-1, digits).sum(1).squeeze(-1)
-        return from_digits(digits.squeeze(-1).transpose(1, 2), readout.factored), confidence
+        return readout.ids(digits.squeeze(-1).transpose(1, 2)), confidence
 
 
 class PatchFrame:

@@ -8,6 +8,8 @@ M rows, C values of a sample, W width of the diffusion head.
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import accumulate
+from operator import mul
 
 import torch
 import torch.nn.functional as F
@@ -49,17 +51,27 @@ def device_of(generator: torch.Generator | None) -> torch.device | str:
 class TokenReadout(nn.Module):
     """The readout of the discrete model: scores of every digit's values, and their cross-entropy."""
 
+    worth: Tensor
+
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.factored, self.smoothing = config.digits, config.label_smoothing
         self.multiplier = config.base_width / config.width if config.mup else 1.0
         self.linear = nn.Linear(config.width, sum(config.digits))
+        worth = torch.tensor([1, *accumulate(config.digits[:-1], mul)])
+        self.register_buffer(
+            "worth", worth, persistent=False
+        )  # a tensor of the device, where code is compiled
         nn.init.normal_(self.linear.weight, std=0.02)
         nn.init.zeros_(self.linear.bias)
 
     def forward(self, features: Tensor) -> Tensor:
         """Map features (..., D) to scores (..., sum of V) float32, digit after digit, low digit first."""
         return self.linear(features * self.multiplier if self.multiplier != 1 else features).float()
+
+    def ids(self, digits: Tensor) -> Tensor:
+        """Return the ids (...) of digits (..., F)."""
+        return (digits * self.worth).sum(-1)
 
     def split(self, scores: Tensor) -> Tensor:
         """Split scores (..., sum of V) into (..., F, max V); pad shorter digits with the lowest number."""

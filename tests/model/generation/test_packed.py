@@ -90,3 +90,24 @@ def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
     frame[0] = 0
     weight = torch.ones((), requires_grad=True)
     (weight * frame).sum().backward()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ["random", "confidence"])
+def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
+    order: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, compile, graphs = small_model(masked_input="previous"), torch.compile, []
+
+    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
+        graphs.append(graph)
+        return graph
+
+    def traced(function: object, **how: object) -> object:
+        return compile(function, backend=backend, fullgraph=True, dynamic=False)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(torch, "compile", traced)
+    torch._dynamo.reset()
+    made = _frames(model, compile=True, order=order)
+    assert torch.equal(made, _frames(model, order=order))
+    assert len(graphs) == 2  # over two frames, and over one
