@@ -7,16 +7,15 @@ that takes a second took minutes or did not end.
 GCC's OpenMP, which torch brings, lets a thread that has done its share of a matrix product spin in a loop
 before it sleeps. Sleeping at once (OMP_WAIT_POLICY=PASSIVE) costs one wake-up per product, which slows small
 products. Spinning long takes the core from the thread that is waited for, where other processes use the
-machine too. So the loop is short, and ten times as long where nothing else runs when the process starts.
-`hma bench waiting` compares the choices; figures are in docs/results.md.
+machine too. So the loop is short. It is not made longer where the machine is quiet at the start: the gain is
+small, and what comes later would find long loops. Generation uses one thread where a second brings next to
+nothing (`hma_model.generation.engine`). `hma bench waiting` compares the choices; figures are in
+docs/results.md.
 """
 
 import os
-import time
-from pathlib import Path
 
-SPINS, QUIET_SPINS = 1_000, 10_000  # turns of the loop, beside other work and on a quiet machine
-_QUIET, _LOOK = 0.25, 0.05  # cores that others may keep busy on a quiet machine; seconds for which we look
+SPINS = 1_000  # turns of the loop: on a quiet machine nearly as quick as more, on a busy one as PASSIVE
 
 
 def take_ordinary_priority() -> None:
@@ -27,25 +26,8 @@ def take_ordinary_priority() -> None:
 
 def bound_spinning() -> None:
     """Bound how long threads spin, unless the environment does; call this before importing torch."""
-    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys():
-        os.environ["GOMP_SPINCOUNT"] = str(QUIET_SPINS if busy_cores(_LOOK) <= _QUIET else SPINS)
-
-
-def busy_cores(seconds: float) -> float:
-    """Return how many cores other processes keep busy, measured for so long while this one sleeps."""
-    before, began = _busy_ticks(), time.monotonic()
-    time.sleep(seconds)
-    return (_busy_ticks() - before) / (os.sysconf("SC_CLK_TCK") * (time.monotonic() - began))
-
-
-def _busy_ticks() -> float:
-    """Return the clock ticks in which any core of the machine was busy; without Linux's /proc, the time."""
-    try:
-        line = Path("/proc/stat").read_text(encoding="ascii").partition("\n")[0]
-    except OSError:
-        return time.monotonic() * os.sysconf("SC_CLK_TCK")
-    user, nice, system, _, _, irq, softirq, *_ = map(int, line.split()[1:])
-    return user + nice + system + irq + softirq
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", str(SPINS))
 
 
 def usable_cores() -> int:
