@@ -158,8 +158,12 @@ class Rollout:
                 "snapshot", "some rows have actions and some have none", "give them always or never"
             )
         self.passive = snapshot.passive if self.passive is None else self.passive
-        self.told = self.told or snapshot.passive is not True
+        self.told = self.told or bool(snapshot.known.any())
         self.state.restore(chosen, snapshot)
+
+    def newest(self, rows: Sequence[int] | None = None) -> Tensor:
+        """Return the newest frame of some rows, by default all, in the form of `step`."""
+        return self._show(self.state.newest(self._chosen(rows)))
 
     def _chosen(self, rows: Sequence[int] | None) -> list[int]:
         chosen = list(range(self.batch) if rows is None else rows)

@@ -10,7 +10,7 @@ frame with its action tokens, T frames of a pass.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -52,12 +52,17 @@ class Snapshot:
             LayerCache(part.time[:, :, index], None if part.action is None else part.action[:, :, index])
             for part in self.layers
         ]
-        lists = {
-            name: tuple(getattr(self, name)[row] for row in rows)
-            for name in ("embodiments", "times", "pending", "generators")
-        }
-        buffers = {name: getattr(self, name)[index] for name in ("frames", "chunks", "known")}
-        return replace(self, **lists, **buffers, layers=tuple(layers))
+        return Snapshot(
+            tuple(self.embodiments[row] for row in rows),
+            tuple(self.times[row] for row in rows),
+            tuple(self.pending[row] for row in rows),
+            tuple(self.generators[row] for row in rows),
+            self.frames[index],
+            self.chunks[index],
+            self.known[index],
+            tuple(layers),
+            self.passive,
+        )
 
 
 @dataclass(frozen=True)
@@ -181,6 +186,10 @@ class RowState:
         self.frames[self.tensor(rows), self._slot(rows)] = frames
         for row in rows:
             self.times[row], self.pending[row] = self.times[row] + 1, 1
+
+    def newest(self, rows: Sequence[int]) -> Tensor:
+        """Return the newest frame (n, S) of each row."""
+        return self.frames[self.tensor(rows), self._slot(rows, 1)]
 
     def given(self, rows: Sequence[int], positions: Tensor) -> ActionConditioning:
         """Return the chunks (n, T, K) at times (n or 1, T)."""

@@ -1,0 +1,158 @@
+"""Describe the commands that an embodiment takes: names, bounds, and the range seen in training.
+
+A action dims, K = stride · A values of a chunk.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hma_data.errors import HMAError
+from hma_data.registry.embodiment import Embodiment, find
+from hma_model.checkpoint.folder import Checkpoint
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Commands:
+    """The commands of one embodiment of a model.
+
+    Attributes:
+        embodiment: its id.
+        names: A names.
+        stride: commands in a chunk.
+        rate_hz: of the commands; None if nobody states it.
+        low, high: (A,) the bounds: the range that the YAML states, else that seen in training, else infinite.
+        seen: (2, A) the least and the largest value seen in training; None if the checkpoint has none.
+    """
+
+    embodiment: str
+    names: tuple[str, ...]
+    stride: int
+    rate_hz: float | None
+    low: Floats
+    high: Floats
+    seen: Floats | None
+
+    @classmethod
+    def of(cls, model: "HMA", embodiment: str) -> "Commands":
+        """Return the commands of an embodiment of a model.
+
+        Raises:
+            HMAError: the model lacks it.
+        """
+        robot = described(model, embodiment)
+        space = model.embodiments[embodiment]
+        seen = _seen(model, embodiment)
+        low, high = np.full((2, space.action_dim), (-np.inf, np.inf), np.float32).T if seen is None else seen
+        names: list[str] = [f"action_{i}" for i in range(space.action_dim)]
+        if robot is not None:
+            names, at = robot.action.names(), 0
+            low, high = low.copy(), high.copy()
+            for part in robot.action.components:
+                if part.range:
+                    low[at : at + part.dims], high[at : at + part.dims] = part.range
+                at += part.dims
+        rate = None if robot is None else robot.rate_hz
+        return cls(embodiment, tuple(names), space.stride, rate, low, high, seen)
+
+    def read(self, commands: ArrayLike) -> tuple[Floats, bool]:
+        """Return commands as a chunk (K,), and whether it is known.
+
+        Args:
+            commands: (K,) or (stride, A) raw. A command of NaN is unknown, and then the whole chunk is.
+
+        Raises:
+            HMAError: the shape is another one, or values are infinite or partly NaN.
+        """
+        values = np.asarray(commands, np.float32)
+        shape = (self.stride, len(self.names))
+        if values.shape not in (shape, (shape[0] * shape[1],)):
+            fault = f"of {self.embodiment} have the shape {values.shape}"
+            raise HMAError("commands", fault, f"give ({shape[0] * shape[1]},) or {shape}")
+        rows = values.reshape(shape)
+        if self.unknown(rows).any():
+            return np.zeros(values.size, np.float32), False
+        return rows.reshape(-1), True
+
+    def one(self, command: ArrayLike) -> Floats:
+        """Return one command (A,), checked; of NaN if it is unknown.
+
+        Raises:
+            HMAError: the shape is another one, or values are infinite or partly NaN.
+        """
+        values = np.asarray(command, np.float32)
+        if values.shape != (len(self.names),):
+            fault = f"of {self.embodiment} has the shape {values.shape}"
+            raise HMAError("command", fault, f"give ({len(self.names)},): {', '.join(self.names)}")
+        self.unknown(values[None])
+        return values
+
+    def unknown(self, rows: Floats) -> NDArray[np.bool_]:
+        """Return which commands (n, A) are unknown; raise HMAError for values that mean nothing."""
+        unknown = np.asarray(np.isnan(rows).all(axis=1))
+        if not np.isfinite(rows[~unknown]).all():
+            fault = f"of {self.embodiment} hold values that are not finite"
+            raise HMAError("commands", fault, "give numbers; a command of NaN alone is unknown")
+        return unknown
+
+    def outside(self, commands: Floats) -> str:
+        """Return in words which commands (..., A) leave the range seen in training, and the range."""
+        if self.seen is None:
+            return ""
+        low, high = self.seen
+        slack = 1e-4 * (high - low) + 1e-6
+        with np.errstate(invalid="ignore"):
+            beyond = ((commands < low - slack) | (commands > high + slack)).reshape(-1, len(low)).any(axis=0)
+        said = [f"{self.names[i]} {low[i]:g} to {high[i]:g}" for i in np.flatnonzero(beyond)]
+        return ", ".join(said)
+
+    def clip(self, commands: Floats) -> Floats:
+        """Return commands (..., A) inside the range seen in training; NaN stays."""
+        return commands if self.seen is None else np.clip(commands, *self.seen)
+
+
+def described(model: "HMA", embodiment: str) -> Embodiment | None:
+    """Return the YAML of an embodiment of a model: its checkpoint's, else the registry's; None without one.
+
+    Raises:
+        HMAError: the model lacks the embodiment.
+    """
+    if embodiment not in model.embodiments:
+        there = ", ".join(model.embodiments) or "none"
+        remedy = "choose one of them, or add yours: hma finetune --from CHECKPOINT --data SHARDS --out RUN"
+        raise HMAError(embodiment, f"is not in the model, which has: {there}", remedy)
+    kept = _checkpoint(model, embodiment)
+    if kept is not None:
+        return kept.embodiment(embodiment)
+    try:
+        return find(embodiment)
+    except HMAError:
+        return None
+
+
+def card(model: "HMA", embodiment: str) -> dict[str, Any]:
+    """Return the card of an embodiment of a model; empty if the model is not from a checkpoint."""
+    kept = _checkpoint(model, embodiment)
+    return {} if kept is None else kept.card(embodiment)
+
+
+def _checkpoint(model: "HMA", embodiment: str) -> Checkpoint | None:
+    if "origin" not in vars(model):
+        return None
+    kept = Checkpoint.open(vars(model)["origin"])
+    return kept if embodiment in kept.embodiments else None
+
+
+def _seen(model: "HMA", embodiment: str) -> Floats | None:
+    kept = _checkpoint(model, embodiment)
+    action = {} if kept is None else kept.stats(embodiment)["action"]
+    if "min" not in action or "max" not in action:
+        return None
+    return np.array([action["min"], action["max"]], np.float32)

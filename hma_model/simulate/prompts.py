@@ -1,0 +1,255 @@
+"""Read the frames that a session starts from: shards, pictures, recordings, simulators.
+
+A prompt is pictures (P, H, W, 3) uint8, or tokens as a shard set stores them, at the rate of the model's
+frames, and the chunks (P - 1, K) between them, NaN where they are unknown.
+"""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hma_data.episodes.align import to_clip
+from hma_data.episodes.episode import Clip
+from hma_data.episodes.images import decode_image, prepared
+from hma_data.errors import HMAError, UsageError
+from hma_data.lab import FAMILY, RECORDERS, record
+from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.manifest import MANIFEST
+from hma_data.shards.reader import EpisodeReader, ShardSet
+from hma_data.sources.base import open_source
+from hma_data.storage.paths import StrPath, as_path
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.checkpoint.folder import require_tokenizer
+from hma_model.evaluation.evaluate import cameras_for
+from hma_model.simulate.commands import card, described
+
+if TYPE_CHECKING:
+    from hma_model.network.model import HMA
+
+Prompt = tuple[NDArray[Any], NDArray[np.float32] | None]
+WAYS = (
+    "give a picture or pictures, a picture's file, a folder of shards or of a LeRobotDataset, an environment "
+    "with render(), or a mapping; hma_model.simulate.read_prompt describes them"
+)
+LEROBOT = "meta/info.json"
+
+
+def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int = 0) -> Prompt:
+    """Return the frames and chunks of a prompt.
+
+    Args:
+        model: whose embodiment is to be prompted.
+        embodiment: its id.
+        prompt: one of
+            None: what comes along, see `starting_window`;
+            pictures (H, W, 3) or (P, H, W, 3) uint8, or the str or path of a picture's file, or several;
+            the str or path of a shard set, or of a LeRobotDataset: the first frames of its first episode;
+            a mapping: "shards" or "lerobot": that folder, and if wanted "episode": number or id, "start": its
+            first frame as recorded, "frames": P;
+            a mapping: "frames": pictures at the model's rate, and "chunks": (P - 1, K);
+            a mapping: "frames": pictures at the control rate, T of them, and "actions": (T - 1, A);
+            an environment whose render() returns a picture.
+        seed: of a simulated prompt.
+
+    Raises:
+        HMAError: the prompt cannot be read.
+    """
+    if prompt is None:
+        return starting_window(model, embodiment, seed)
+    if isinstance(prompt, Mapping):
+        return _of_mapping(model, embodiment, prompt)
+    if hasattr(prompt, "render"):
+        prompt = prompt.render()
+    if isinstance(prompt, str | Path):
+        folder = as_path(prompt)
+        if (folder / MANIFEST).is_file():
+            return _of_shards(model, embodiment, folder)
+        if (folder / LEROBOT).is_file():
+            return _of_lerobot(model, embodiment, folder)
+        prompt = [folder]
+    if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | Path):
+        prompt = [_picture(as_path(path)) for path in prompt]
+    pictures = np.asarray(prompt)
+    return (pictures[None] if pictures.ndim == 3 else pictures), None
+
+
+def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
+    """Return a prompt that comes along: the first frames of an episode of a laboratory robot.
+
+    The robot is simulated: episode 0 of `hma_data.lab.record` with this seed.
+
+    Raises:
+        HMAError: the model lacks the embodiment, or it is no robot of the laboratory.
+    """
+    robot = described(model, embodiment)
+    if robot is None or not (embodiment in RECORDERS or FAMILY.fullmatch(embodiment)):
+        raise HMAError(f"prompt of {embodiment}", "none comes along: it is no robot of the laboratory", WAYS)
+    with tempfile.TemporaryDirectory() as folder:
+        return _of_recording(model, robot, record(embodiment, folder, 1, seed))
+
+
+def default_frames(model: "HMA") -> int:
+    """Return P of a prompt from a recording: half the model's window, at least one."""
+    return max(1, model.config.frames // 2)
+
+
+def _of_mapping(model: "HMA", embodiment: str, prompt: Mapping[str, Any]) -> Prompt:
+    given = dict(prompt)
+    where = {key: given[key] for key in ("episode", "start", "frames") if key in given}
+    if "shards" in given:
+        return _of_shards(model, embodiment, given["shards"], **where)
+    if "lerobot" in given:
+        return _of_lerobot(model, embodiment, given["lerobot"], **where)
+    if "frames" not in given or given.keys() - {"frames", "chunks", "actions"}:
+        raise HMAError("prompt", f"has the keys {', '.join(map(str, given))}", WAYS)
+    frames = np.asarray(given["frames"])
+    if "actions" in given:
+        return _strided(model, embodiment, frames, given["actions"])
+    return frames, None if given.get("chunks") is None else np.asarray(given["chunks"], np.float32)
+
+
+def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
+    """Return every stride-th frame, the last one included, and the chunks between them."""
+    described(model, embodiment)
+    space, commands = model.embodiments[embodiment], np.asarray(actions, np.float32)
+    if commands.shape != (len(frames) - 1, space.action_dim):
+        fault = f"has actions of the shape {commands.shape} for {len(frames)} frames"
+        raise HMAError("prompt", fault, f"give ({len(frames) - 1}, {space.action_dim})")
+    steps = (len(frames) - 1) // space.stride
+    first = len(frames) - 1 - steps * space.stride
+    return frames[first :: space.stride], commands[first:].reshape(steps, space.chunk_dim)
+
+
+def _picture(path: Path) -> NDArray[np.uint8]:
+    try:
+        return decode_image(path.read_bytes(), str(path))
+    except OSError as fault:
+        raise UsageError(path, f"cannot be read: {fault.strerror}", WAYS) from fault
+
+
+# -- episodes
+
+
+def _of_shards(
+    model: "HMA",
+    embodiment: str,
+    folder: StrPath,
+    episode: int | str | None = None,
+    start: int = 0,
+    frames: int | None = None,
+) -> Prompt:
+    shards = ShardSet(folder)
+    require_tokenizer(model.config, shards.spec, shards.folder)
+    described(model, embodiment)
+    space, robot = model.embodiments[embodiment], shards.embodiment
+    if (robot.stride, robot.action_dim) != (space.stride, space.action_dim):
+        fault = f"is of {robot.id}, with {robot.stride} actions of {robot.action_dim} values in a chunk"
+        raise HMAError(shards.folder, fault, f"{embodiment} takes {space.stride} of {space.action_dim}")
+    rows = shards.episodes.to_pylist()
+    chosen = next((row for row in rows if episode in (None, row["episode_index"], row["id"])), None)
+    if chosen is None:
+        raise UsageError(shards.folder, f"has no episode {episode!r}", f"give 0 to {len(rows) - 1}, or an id")
+    cameras = cameras_for(model, shards)
+    names = [cameras] if isinstance(cameras, str) else cameras
+    names = [shards.manifest.cameras[0] if name not in shards.manifest.cameras else name for name in names]
+    views = []
+    for name in names:
+        columns = EpisodeReader(shards, shards.columns([name])).episode(chosen, name)
+        (stored,) = (columns[key] for key in columns if key in ("tokens", "latents"))
+        views.append(shards.tokens(stored))
+    at = _grid(len(views[0]), start // shards.manifest.frame_stride, shards.row_stride, frames, model)
+    spans = at[:-1, None] + np.arange(shards.row_stride)
+    chunks = columns["action"][spans].reshape(len(at) - 1, space.chunk_dim)
+    if "action_known" in columns:
+        chunks[~columns["action_known"][spans].all(axis=1)] = np.nan
+    return np.concatenate([view[at] for view in views], axis=-2), chunks
+
+
+def _of_lerobot(
+    model: "HMA",
+    embodiment: str,
+    folder: StrPath,
+    episode: int | str | None = None,
+    start: int = 0,
+    frames: int | None = None,
+) -> Prompt:
+    robot = described(model, embodiment)
+    if robot is None:
+        raise HMAError(embodiment, "has no YAML, which says how its recordings are read", "load a checkpoint")
+    if robot.source.format != "lerobot":
+        robot = _as_lerobot(robot, folder)
+    return _of_recording(model, robot, as_path(folder), episode, start, frames)
+
+
+def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
+    """Return an embodiment that finds its action and its cameras, in their order, in a LeRobotDataset."""
+    keys = [key.key for key in open_source("lerobot").inspect(folder, 1).keys if key.kind == "camera"]
+    if len(keys) < len(robot.cameras):
+        raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", WAYS)
+    values, at, parts = robot.to_dict(), 0, []
+    for part in robot.action.components:
+        parts.append({"key": "action", "dims": part.dims, "slice": [at, at + part.dims]})
+        at += part.dims
+    cameras = [
+        {"name": camera.name, "key": key, "resize": camera.resize} for camera, key in zip(robot.cameras, keys)
+    ]
+    action = {"space": robot.action.space, "components": parts}
+    changed = {"action": action, "cameras": cameras, "source": {"format": "lerobot"}, "state": None}
+    kept = {key: value for key, value in values.items() if key not in ("state", "sync", "quality")}
+    return Embodiment.from_values({**kept, **changed}, f"{folder}, as {robot.id}")
+
+
+def _of_recording(
+    model: "HMA",
+    robot: Embodiment,
+    recording: Path,
+    episode: int | str | None = None,
+    start: int = 0,
+    frames: int | None = None,
+) -> Prompt:
+    """Return frames of an episode of a recording, in the format that the robot's YAML names."""
+    source = open_source(robot.source.format)
+    ids = source.episode_ids(recording)
+    chosen = ids[episode or 0] if not isinstance(episode, str) and (episode or 0) < len(ids) else episode
+    if chosen not in ids:
+        raise UsageError(recording, f"has no episode {episode!r}", f"give 0 to {len(ids) - 1}, or an id")
+    clip = to_clip(source.read(recording, str(chosen), robot), robot)
+    at = _grid(len(clip), start, robot.stride, frames, model)
+    chunks = clip.actions[at[:-1, None] + np.arange(robot.stride)].reshape(len(at) - 1, -1)
+    if clip.action_known is not None:
+        known = clip.action_known[at[:-1, None] + np.arange(robot.stride)].all(axis=1)
+        chunks[~known] = np.nan
+    return _pictures(model, robot, clip, at), chunks
+
+
+def _pictures(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]) -> NDArray[np.uint8]:
+    spec = TokenizerSpec.from_json(dict(model.config.tokenizer))
+    cameras = card(model, robot.id).get("data", {}).get("cameras", "first")
+    names = [robot.primary_camera.name] if isinstance(cameras, str) else cameras
+    if isinstance(cameras, str) and cameras in [camera.name for camera in robot.cameras]:
+        names = [cameras]
+    views = [
+        prepared(
+            clip.episode.streams[name],
+            clip.frame_indices[name][at],
+            robot.camera(name),
+            spec.image_size,
+            spec.resize_filter,
+        )
+        for name in names
+    ]
+    return np.concatenate(views, axis=2)
+
+
+def _grid(length: int, start: int, stride: int, frames: int | None, model: "HMA") -> NDArray[np.int64]:
+    """Return the rows (P,) of a prompt's frames in an episode."""
+    count = default_frames(model) if frames is None else frames
+    last = start + (count - 1) * stride
+    if count < 1 or start < 0 or last >= length:
+        fault = f"{count} frames, {stride} steps apart, from {start} on do not fit an episode of {length}"
+        raise UsageError("prompt", fault, "choose another start or fewer frames")
+    return np.arange(start, last + 1, stride)

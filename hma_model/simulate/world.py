@@ -1,0 +1,257 @@
+"""Keep sessions of a world model side by side, in pictures and commands.
+
+    world = load_world("embedded")
+    session = world.open("pusht_fast", *starting_window(world.model, "pusht_fast"))
+    pictures = world.step({session: commands})   # the picture that the commands lead to
+
+A session is a row of a rollout. Rows are added as sessions open, and used again as sessions close.
+
+P frames of a prompt, H×W pixels, S pixels a side of the tokenizer's pictures, V views side by side, A action
+dims, K = stride · A, n sessions of a step.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from hma_data.episodes.images import resize
+from hma_data.errors import HMAError
+from hma_data.storage.paths import StrPath
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint.folder import require_tokenizer
+from hma_model.evaluation.evaluate import decode
+from hma_model.generation.rollout import Rollout
+from hma_model.generation.state import Snapshot as Snapshot
+from hma_model.generation.unmask import Decoding, check
+from hma_model.simulate.commands import Commands, described
+
+if TYPE_CHECKING:
+    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.network.model import HMA
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class _Session:
+    row: int
+    embodiment: str
+    seed: int
+
+
+class World:
+    """Sessions of a world model. Not thread-safe.
+
+    Args:
+        model: in eval mode.
+        tokenizer: the tokenizer that the model was trained on.
+        unmask_steps, temperature, order, sample_steps: as in `HMA.generate`.
+        compile: as in `Rollout`; for a GPU.
+
+    Attributes:
+        unmask_steps, temperature, order, sample_steps: may be set between steps; they count for all sessions.
+        picture_shape: (S, V·S, 3) of every picture.
+    """
+
+    def __init__(
+        self,
+        model: "HMA",
+        tokenizer: "Tokenizer",
+        *,
+        unmask_steps: int = 2,
+        temperature: float = 0.0,
+        order: str = "random",
+        sample_steps: int | None = None,
+        compile: bool = False,
+    ) -> None:
+        require_tokenizer(model.config, tokenizer.spec, "the model")
+        self.model, self.tokenizer, self.compile = model, tokenizer, compile
+        self.unmask_steps, self.temperature = unmask_steps, temperature
+        self.order, self.sample_steps = order, sample_steps
+        self._decoding()
+        size = tokenizer.spec.image_size
+        self.picture_shape = (size, model.config.views * size, 3)
+        self._rollout: Rollout | None = None
+        self._sessions: dict[int, _Session] = {}
+        self._opened = 0
+        self._commands: dict[str, Commands] = {}
+
+    @property
+    def sessions(self) -> dict[int, str]:
+        """Return the open sessions and their embodiments."""
+        return {number: one.embodiment for number, one in self._sessions.items()}
+
+    def commands(self, embodiment: str) -> Commands:
+        """Return what commands an embodiment takes; an HMAError says that the model lacks it."""
+        if embodiment not in self._commands:
+            self._commands[embodiment] = Commands.of(self.model, embodiment)
+        return self._commands[embodiment]
+
+    def open(
+        self, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None = None, *, seed: int = 0
+    ) -> int:
+        """Open a session that starts from known frames, and return its number.
+
+        Args:
+            embodiment: an id of the model.
+            frames: pictures (P, H, W, 3) uint8 RGB, at the rate of the model's frames; another size is
+                resized as in a conversion. Or tokens or latents as stored, (P, h, w) or (P, c, h, w).
+            chunks: (P - 1, K) raw; chunk k holds the commands from frame k to k+1. NaN where they are
+                unknown. None: all are.
+            seed: of the session's random numbers.
+
+        Raises:
+            HMAError: the model lacks the embodiment, or frames or chunks do not fit.
+        """
+        prompt = self._prompt(embodiment, frames, chunks)
+        taken = {one.row for one in self._sessions.values()}
+        row = next(row for row in range(len(taken) + 1) if row not in taken)
+        self._reserve(row, embodiment)
+        session, self._opened = self._opened, self._opened + 1
+        self._sessions[session] = _Session(row, embodiment, seed)
+        self._begin(session, *prompt)
+        return session
+
+    def reset(
+        self, session: int, frames: NDArray[Any], chunks: ArrayLike | None = None, *, seed: int | None = None
+    ) -> None:
+        """Start a session anew, as `open` does; without a seed, with the one that it had."""
+        one = self._at(session)
+        prompt = self._prompt(one.embodiment, frames, chunks)
+        self._sessions[session] = replace(one, seed=one.seed if seed is None else seed)
+        self._begin(session, *prompt)
+
+    def close(self, session: int) -> None:
+        """End a session; its row is free for another."""
+        self._at(session)
+        del self._sessions[session]
+
+    def step(self, commands: Mapping[int, ArrayLike]) -> dict[int, Picture]:
+        """Generate the next picture of some sessions, in one pass.
+
+        Args:
+            commands: session → (K,) or (stride, A) raw commands from its newest picture to the next one. A
+                command of NaN is unknown, and then the whole chunk is.
+
+        Returns:
+            session → (S, V·S, 3) uint8 RGB.
+        """
+        if not commands:
+            return {}
+        order = sorted(commands, key=lambda session: self._at(session).row)
+        read = [self.commands(self._at(one).embodiment).read(commands[one]) for one in order]
+        chunks = np.zeros((len(order), max(len(chunk) for chunk, _ in read)), np.float32)
+        for row, (chunk, _) in zip(chunks, read):
+            row[: len(chunk)] = chunk
+        rollout = self._running()
+        rollout.decoding = self._decoding()
+        known = torch.tensor([known for _, known in read])
+        rows = [self._at(session).row for session in order]
+        frames = rollout.step(torch.from_numpy(chunks), known=known, rows=rows)
+        return dict(zip(order, decode(self.tokenizer, frames.unsqueeze(1))[:, 0]))
+
+    def picture(self, session: int) -> Picture:
+        """Return the newest picture of a session; after `open`, the last of its prompt."""
+        newest = self._running().newest([self._at(session).row])
+        return decode(self.tokenizer, newest.unsqueeze(1))[0, 0]
+
+    def snapshot(self, session: int) -> Snapshot:
+        """Return a copy of a session's state."""
+        return self._running().snapshot([self._at(session).row])
+
+    def restore(self, session: int, snapshot: Snapshot) -> None:
+        """Put a session into the state of a snapshot, of itself or of another session of the same model."""
+        one = self._at(session)
+        self._running().restore([one.row], snapshot)
+        self._sessions[session] = replace(one, embodiment=snapshot.embodiments[0])
+
+    # -- rows -----------------------------------------------------------------------------------------------
+
+    def _at(self, session: int) -> _Session:
+        if session not in self._sessions:
+            there = ", ".join(map(str, self._sessions)) or "none"
+            raise HMAError(f"session {session}", f"is not open; open are: {there}", "open one first")
+        return self._sessions[session]
+
+    def _running(self) -> Rollout:
+        assert self._rollout is not None
+        return self._rollout
+
+    def _decoding(self) -> Decoding:
+        decoding = Decoding(self.unmask_steps, self.temperature, self.order, self.sample_steps)
+        check(decoding, self.model.config.kind)
+        return decoding
+
+    def _reserve(self, row: int, embodiment: str) -> None:
+        """Make sure that the rollout has a row; rows double."""
+        before = self._rollout
+        if before is not None and row < before.batch:
+            return
+        batch = 1 if before is None else 2 * before.batch
+        self._rollout = Rollout(self.model, embodiment, batch, compile=self.compile)
+        if before is not None:
+            self._rollout.restore(range(before.batch), before.snapshot())
+
+    def _begin(self, session: int, frames: torch.Tensor, chunks: torch.Tensor, known: torch.Tensor) -> None:
+        one = self._at(session)
+        actions = chunks.unsqueeze(0) if len(chunks) else None
+        self._running().reset(
+            [one.row], frames.unsqueeze(0), actions, known.unsqueeze(0), [one.seed], [one.embodiment]
+        )
+
+    # -- prompts --------------------------------------------------------------------------------------------
+
+    def _prompt(
+        self, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return stored frames (P, ...), chunks (P - 1, K), and which are known (P - 1,)."""
+        commands = self.commands(embodiment)
+        stored = self._stored(embodiment, np.asarray(frames))[-self.model.config.frames :]
+        rows = [] if chunks is None else [commands.read(chunk) for chunk in np.asarray(chunks)]
+        if chunks is None:
+            rows = [(np.zeros(commands.stride * len(commands.names), np.float32), False)] * (len(stored) - 1)
+        elif len(rows) != len(frames) - 1:
+            fault = f"has {len(rows)} chunks for {len(frames)} frames"
+            raise HMAError("prompt", fault, f"give {len(frames) - 1}, one from each frame to the next")
+        rows = rows[len(rows) - len(stored) + 1 :]
+        known = torch.tensor([known for _, known in rows], dtype=torch.bool)
+        values = np.stack([chunk for chunk, _ in rows]) if rows else np.zeros((0, 1), np.float32)
+        return torch.from_numpy(stored), torch.from_numpy(values), known
+
+    def _stored(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return frames as the model stores them; encode pictures."""
+        config, spec = self.model.config, self.tokenizer.spec
+        if len(frames) and frames.shape[1:] == config.frame_shape:
+            return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
+        if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not len(frames):
+            fault = f"frames are {frames.dtype} of the shape {frames.shape}"
+            raise HMAError("prompt", fault, "give pictures (P, H, W, 3) uint8, or stored tokens")
+        frames = frames[-config.frames :]
+        if frames.shape[1:] != self.picture_shape:
+            if config.views > 1:
+                fault = f"pictures are {frames.shape[2]}×{frames.shape[1]}"
+                size = f"{self.picture_shape[1]}×{self.picture_shape[0]}"
+                raise HMAError("prompt", fault, f"give {config.views} views side by side, {size}")
+            robot = described(self.model, embodiment)
+            rule = "short_side_crop" if robot is None else robot.primary_camera.resize
+            frames = resize(frames, spec.image_size, rule, spec.resize_filter)
+        views = [self.tokenizer.encode(view) for view in np.split(frames, config.views, axis=2)]
+        return np.concatenate(views, axis=-2).astype(np.int64 if config.kind == "discrete" else np.float32)
+
+
+def load_world(checkpoint: StrPath = "embedded", *, device: str = "cpu", **settings: Any) -> World:
+    """Return a world of a checkpoint with all its embodiments, and of its tokenizer.
+
+    Args:
+        checkpoint: str or path of a checkpoint or training run, a URI, a hub repository, or `embedded`.
+        device: of the network and of the tokenizer.
+        settings: of `World`.
+    """
+    from hma_model.network.model import HMA
+
+    model = HMA.from_pretrained(checkpoint, device=device)
+    return World(model, get_tokenizer(model.config.tokenizer["name"], device=device), **settings)

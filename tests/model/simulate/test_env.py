@@ -1,0 +1,268 @@
+"""The world model as gymnasium environments: checked by gymnasium, and against the world itself."""
+
+import re
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RecordVideo
+
+from hma_data.errors import HMAError
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.network.model import HMA
+from hma_model.simulate import World, WorldModelEnv, WorldModelVectorEnv, starting_window
+
+PUSH = "pusht_fast"
+
+
+@pytest.fixture(scope="module")
+def model() -> HMA:
+    return HMA.from_pretrained("embedded", [PUSH])
+
+
+@pytest.fixture(scope="module")
+def window(model: HMA) -> tuple[Any, Any]:
+    return starting_window(model, PUSH)
+
+
+@pytest.fixture
+def world(model: HMA) -> World:
+    return World(model, get_tokenizer(model.config.tokenizer["name"]))
+
+
+def prompt(window: tuple[Any, Any]) -> dict[str, Any]:
+    return {"frames": window[0], "chunks": window[1]}
+
+
+def actions(count: int, *shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(60, 450, (count, *shape, 2)).astype(np.float32)
+
+
+@pytest.mark.filterwarnings("ignore")  # of a space that is not from -1 to 1
+@pytest.mark.parametrize("control", ["frame", "chunk"])
+def test_gymnasium_finds_nothing_wrong(control: str, window: tuple[Any, Any]) -> None:
+    env = gymnasium.make(
+        "hma/WorldModel-v0", checkpoint="embedded", embodiment=PUSH, prompt=prompt(window), control=control,
+        horizon=5, render_mode="rgb_array",
+    )  # fmt: skip
+    check_env(env.unwrapped, skip_close_check=True)
+    assert env.metadata["render_fps"] == (10 if control == "frame" else 2.5)
+    assert env.unwrapped.action_names == ("x", "y")  # type: ignore[attr-defined]
+    low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
+    assert low.shape == ((2,) if control == "frame" else (4, 2)) and (low == 0).all() and (high == 512).all()
+    env.close()
+
+
+@pytest.mark.parametrize("control", ["frame", "chunk"])
+def test_steps_show_what_the_world_shows(world: World, window: tuple[Any, Any], control: str) -> None:
+    env = WorldModelEnv(
+        embodiment=PUSH,
+        world=world,
+        prompt=prompt(window),
+        control=control,
+        horizon=8,
+        render_mode="rgb_array",
+    )
+    first, _ = env.reset(seed=3)
+    chunks = actions(2, 4)
+    session = world.open(PUSH, *window, seed=world._sessions[env.drive.session].seed)  # type: ignore[index]
+    assert np.array_equal(first, world.picture(session))
+    made = [world.step({session: chunk})[session] for chunk in chunks]
+    seen = [env.step(action) for action in (chunks if control == "chunk" else chunks.reshape(-1, 2))]
+    pictures = [picture for picture, *_ in seen]
+    if control == "frame":  # a picture comes with every fourth command; the last one is shown between
+        assert all(np.array_equal(picture, first) for picture in pictures[:3])
+        assert all(np.array_equal(picture, made[0]) for picture in pictures[3:7])
+        pictures = [pictures[3], pictures[7]]
+        assert [truncated for *_, truncated, _ in seen] == [False] * 7 + [True]
+    assert all(np.array_equal(a, b) for a, b in zip(pictures, made, strict=True))
+    assert np.array_equal(env.render(), made[-1])  # type: ignore[arg-type]
+
+
+def test_a_judge_sees_the_episode_and_ends_it(world: World, window: tuple[Any, Any]) -> None:
+    shapes = []
+
+    def judge(pictures: np.ndarray, commands: np.ndarray) -> tuple[float, bool]:
+        shapes.append((pictures.shape, commands.shape))
+        return float(commands[-1, 0, 0]), len(commands) == 2
+
+    env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window), control="chunk", judge=judge)
+    chunks = actions(2, 4)
+    for _ in range(2):
+        env.reset(seed=0)
+        assert env.step(chunks[0])[1:4] == (chunks[0, 0, 0], False, False)
+        assert env.step(chunks[1])[1:4] == (chunks[1, 0, 0], True, False)
+    assert shapes == [((2, 128, 128, 3), (1, 4, 2)), ((3, 128, 128, 3), (2, 4, 2))] * 2
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(
+    model: HMA, window: tuple[Any, Any], mode: AutoresetMode
+) -> None:
+    def judge(pictures: np.ndarray, commands: np.ndarray) -> tuple[float, bool]:
+        return float(pictures[-1].mean()), bool(commands[-1, 0, 0] > 300)  # episodes end at different steps
+
+    tokenizer = get_tokenizer(model.config.tokenizer["name"])
+    how: dict[str, Any] = {
+        "embodiment": PUSH, "prompt": prompt(window), "control": "chunk", "horizon": 4, "judge": judge,
+        "world": World(model, tokenizer, temperature=0.5),
+    }  # fmt: skip
+    ours = WorldModelVectorEnv(3, autoreset_mode=mode, **how)
+    theirs = SyncVectorEnv([lambda: WorldModelEnv(**how)] * 3, autoreset_mode=mode)
+    assert ours.observation_space == theirs.observation_space and ours.action_space == theirs.action_space
+    found = [env.reset(seed=5) for env in (ours, theirs)]
+    assert np.array_equal(found[0][0], found[1][0])
+    ends = 0
+    for action in actions(8, 3, 4):
+        mine, other = (env.step(action) for env in (ours, theirs))
+        assert all(np.array_equal(a, b) for a, b in zip(mine[:4], other[:4]))
+        assert mine[4].keys() == other[4].keys()
+        for i in np.flatnonzero(mine[4].get("_final_obs", np.zeros(3))):
+            assert np.array_equal(mine[4]["final_obs"][i], other[4]["final_obs"][i])
+        ends += int((mine[2] | mine[3]).sum())
+    assert 3 < ends < 24
+
+
+def test_a_vector_without_autoreset_starts_those_that_are_asked_for(
+    world: World, window: tuple[Any, Any]
+) -> None:
+    env = WorldModelVectorEnv(
+        2, embodiment=PUSH, world=world, prompt=prompt(window), control="chunk", horizon=2,
+        autoreset_mode="Disabled",
+    )  # fmt: skip
+    first, _ = env.reset(seed=0)
+    chunks = actions(3, 2, 4)
+    env.step(chunks[0])
+    mask = np.array([True, False])
+    again, _ = env.reset(seed=0, options={"reset_mask": mask})
+    assert np.array_equal(again[0], first[0]) and not np.array_equal(again[1], first[1])
+    assert env.step(chunks[1])[3].tolist() == [False, True]
+    with pytest.raises(HMAError, match=r"the episodes of \[1\] have ended"):
+        env.step(chunks[2])
+    made = gymnasium.make_vec(
+        "hma/WorldModel-v0", 2, "vector_entry_point", embodiment=PUSH, world=world, prompt=prompt(window)
+    )
+    assert isinstance(made, WorldModelVectorEnv) and made.reset()[0].shape == (2, 128, 128, 3)
+
+
+def test_a_policy_of_gym_pusht_runs_unchanged(world: World) -> None:
+    import gym_pusht  # noqa: F401
+
+    def policy(picture: np.ndarray) -> np.ndarray:
+        """Go to the darkest place of the picture."""
+        y, x = np.unravel_index(picture.sum(axis=-1).argmin(), picture.shape[:2])
+        return (np.array([x, y]) * (512 / len(picture))).astype(np.float32)
+
+    def run(env: gymnasium.Env) -> list[np.ndarray]:
+        picture, _ = env.reset(seed=1)
+        seen = [picture]
+        for _ in range(8):
+            picture, *_ = env.step(policy(picture))
+            seen.append(picture)
+        return seen
+
+    real = gymnasium.make("gym_pusht/PushT-v0", obs_type="pixels", render_mode="rgb_array")
+    dreamt = WorldModelEnv(embodiment=PUSH, world=world, prompt=real, size=96)
+    assert dreamt.action_space == real.action_space and dreamt.observation_space == real.observation_space
+    pictures = [run(env) for env in (real, dreamt)]
+    assert all(seen[0].shape == (96, 96, 3) for seen in pictures)
+    moved = [np.abs(seen[-1].astype(int) - seen[0]).mean() for seen in pictures]
+    assert min(moved) > 0.1 and np.abs(pictures[0][0].astype(int) - pictures[1][0]).mean() < 12
+
+
+def test_a_wrapper_records_the_pictures(
+    world: World, window: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clips = []
+
+    class Clip:  # moviepy is no dependency
+        def __init__(self, frames: list[np.ndarray], fps: float) -> None:
+            clips.append((np.stack(frames), fps))
+
+        def write_videofile(self, *args: Any, **options: Any) -> None:
+            pass
+
+    for name in ("moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules["moviepy.video.io.ImageSequenceClip"].ImageSequenceClip = Clip  # type: ignore[attr-defined]
+    env: Any = WorldModelEnv(
+        embodiment=PUSH,
+        world=world,
+        prompt=prompt(window),
+        control="chunk",
+        horizon=2,
+        render_mode="rgb_array",
+    )
+    env = RecordVideo(env, str(tmp_path), episode_trigger=lambda number: True)
+    env.reset(seed=0)
+    pictures = [env.step(chunk)[0] for chunk in actions(2, 4)]
+    env.close()
+    ((frames, fps),) = clips
+    assert fps == 2.5 and np.array_equal(frames[1:], np.stack(pictures))
+
+
+def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_asked(
+    world: World, window: tuple[Any, Any]
+) -> None:
+    how: dict[str, Any] = {"embodiment": PUSH, "world": world, "prompt": prompt(window), "control": "chunk"}
+    wild, edge = np.full((4, 2), 700.0), np.tile(world.commands(PUSH).seen[1], (4, 1))  # type: ignore[index]
+    free, clipped, at_edge = (WorldModelEnv(**how, clip=clip) for clip in (False, True, False))
+    for env in (free, clipped, at_edge):
+        env.reset(seed=0)
+    with pytest.warns(UserWarning, match=r"x 15 to 497, y 15 to 497"):
+        free.step(wild)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        free.step(wild)
+        pictures = [clipped.step(wild)[0], at_edge.step(edge)[0]]
+    assert np.array_equal(*pictures)
+
+
+def test_an_unknown_command_is_nan(world: World, window: tuple[Any, Any]) -> None:
+    env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window))
+    env.reset(seed=0)
+    session = world.open(PUSH, *window, seed=world._sessions[env.drive.session].seed)  # type: ignore[index]
+    command = np.array([300.0, 200.0])
+    for action in (command, command, np.full(2, np.nan), command):
+        picture, *_ = env.step(action)
+    assert np.array_equal(picture, world.step({session: np.full(8, np.nan)})[session])
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(3), r"has the shape \(3,\) — give \(2,\): x, y"),
+        (np.array([np.nan, 1.0]), "not finite"),
+        (np.array([np.inf, 1.0]), "not finite"),
+    ],
+)
+def test_bad_actions_are_refused_and_the_episode_goes_on(
+    world: World, window: tuple[Any, Any], action: np.ndarray, message: str
+) -> None:
+    env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window))
+    with pytest.raises(HMAError, match=re.escape("call reset() first")):
+        env.step(np.zeros(2))
+    env.reset()
+    with pytest.raises(HMAError, match=message):
+        env.step(action)
+    env.step(np.array([100.0, 100.0]))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"embodiment": None}, "embodiment: is not given — give embodiment=ID; the model has: pusht_fast"),
+        ({"embodiment": "ur5"}, "ur5: is not in the model"),
+        ({"control": "second"}, "'second' is unknown — give frame or chunk"),
+    ],
+)
+def test_bad_settings_are_refused(world: World, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(HMAError, match=message):
+        WorldModelEnv(**{"embodiment": PUSH, "world": world, **change})

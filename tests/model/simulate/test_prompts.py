@@ -1,0 +1,119 @@
+"""Prompts from everything that an episode may start from."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hma_data.episodes.sheets import write_png
+from hma_data.errors import HMAError
+from hma_data.lab import record
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.checkpoint.folder import Checkpoint
+from hma_model.cli import main
+from hma_model.network.model import HMA
+from hma_model.simulate import read_prompt, starting_window
+from tests.model.network_parts import small_model
+
+MOVER, ARM = "mover_59", "planar_arm"
+
+
+@pytest.fixture(scope="module")
+def model() -> HMA:
+    return HMA.from_pretrained("embedded", [MOVER, ARM])
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Episode 0 and 1 of the mover, recorded and converted."""
+    folder = tmp_path_factory.mktemp("mover")
+    yaml = folder / f"{MOVER}.yaml"
+    yaml.write_text(Checkpoint.open("embedded").embodiment(MOVER).to_yaml())
+    source = str(record(MOVER, folder, 2))
+    words = ["convert", "-e", str(yaml), "--source", source, "--tokenizer", "fsq-lab", "--out"]
+    assert main([*words, str(folder / "shards"), "--workers", "1"]) == 0
+    return folder / "shards"
+
+
+@pytest.mark.parametrize("name", [MOVER, ARM])
+def test_a_laboratory_robot_comes_with_a_prompt(model: HMA, name: str) -> None:
+    frames, chunks = starting_window(model, name, seed=4)
+    assert frames.shape == (4, 128, 128, 3) and frames.dtype == np.uint8 and frames.std() > 10
+    assert chunks is not None and chunks.shape == (3, model.embodiments[name].chunk_dim)
+    again, other = starting_window(model, name, seed=4), starting_window(model, name, seed=5)
+    assert np.array_equal(frames, again[0]) and not np.array_equal(frames, other[0])
+
+
+def test_shards_give_the_tokens_and_chunks_of_the_recording(model: HMA, shards: Path) -> None:
+    pictures, chunks = starting_window(model, MOVER)
+    tokens = get_tokenizer("fsq-lab").encode(pictures)
+    whole = read_prompt(model, MOVER, shards)
+    later = read_prompt(model, MOVER, {"shards": str(shards), "episode": 0, "start": 2, "frames": 3})
+    assert np.array_equal(whole[0], tokens) and np.array_equal(whole[1], chunks)
+    assert np.array_equal(later[0], tokens[1:]) and np.array_equal(later[1], chunks[1:])
+    assert not np.array_equal(read_prompt(model, MOVER, {"shards": shards, "episode": 1})[0], tokens)
+
+
+def test_pictures_come_as_arrays_files_and_from_environments(model: HMA, tmp_path: Path) -> None:
+    pictures, _ = starting_window(model, MOVER)
+    for i in range(2):
+        write_png(tmp_path / f"{i}.png", pictures[i])
+
+    class Environment:
+        def render(self) -> np.ndarray:
+            return pictures[0]
+
+    one = [pictures[0], tmp_path / "0.png", str(tmp_path / "0.png"), Environment()]
+    several = [pictures[:2], [tmp_path / "0.png", tmp_path / "1.png"], {"frames": pictures[:2]}]
+    for prompts, count in ((one, 1), (several, 2)):
+        for prompt in prompts:
+            frames, chunks = read_prompt(model, MOVER, prompt)
+            assert np.array_equal(frames, pictures[:count]) and chunks is None
+
+
+def test_frames_at_the_control_rate_become_chunks_that_end_at_the_last_frame(model: HMA) -> None:
+    frames = np.arange(6, dtype=np.uint8)[:, None, None, None].repeat(3, axis=3)
+    actions = np.arange(10, dtype=np.float32).reshape(5, 2)
+    kept, chunks = read_prompt(model, MOVER, {"frames": frames, "actions": actions})
+    assert kept[:, 0, 0, 0].tolist() == [1, 3, 5]
+    assert chunks is not None and chunks.tolist() == [[2, 3, 4, 5], [6, 7, 8, 9]]
+
+
+@pytest.mark.slow
+def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(
+    model: HMA, tmp_path: Path
+) -> None:
+    dataset = record("planar_arm_lerobot", tmp_path, 2)
+    pictures, chunks = starting_window(model, ARM)
+    frames, found = read_prompt(model, ARM, dataset)
+    assert np.array_equal(found, chunks) and np.abs(frames.astype(int) - pictures).mean() < 8  # lossy video
+    other, _ = read_prompt(model, ARM, {"lerobot": dataset, "episode": 1, "start": 3})
+    assert other.shape == frames.shape and np.abs(other.astype(int) - pictures).mean() > 8
+
+
+@pytest.mark.parametrize(
+    ("prompt", "message"),
+    [
+        ({"pictures": 3}, "has the keys pictures — give a picture or pictures"),
+        ("no/such.png", "cannot be read: No such file or directory — give a picture"),
+        ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "actions": np.zeros((3, 2))}, r"give \(2, 2\)"),
+    ],
+)
+def test_prompts_that_cannot_be_read_are_refused(model: HMA, prompt: Any, message: str) -> None:
+    with pytest.raises(HMAError, match=message):
+        read_prompt(model, MOVER, prompt)
+
+
+def test_windows_that_are_not_there_are_refused(model: HMA, shards: Path) -> None:
+    with pytest.raises(HMAError, match="has no episode 7 — give 0 to 1, or an id"):
+        read_prompt(model, MOVER, {"shards": shards, "episode": 7})
+    with pytest.raises(HMAError, match="4 frames, 2 steps apart, from 900 on do not fit an episode of"):
+        read_prompt(model, MOVER, {"shards": shards, "start": 900})
+    with pytest.raises(HMAError, match="2 actions of 2 values in a chunk — planar_arm takes 3 of 2"):
+        read_prompt(model, ARM, shards)
+
+
+def test_another_robot_needs_a_prompt() -> None:
+    with pytest.raises(HMAError, match="none comes along: it is no robot of the laboratory — give a picture"):
+        starting_window(small_model(), "arm")

@@ -1,0 +1,184 @@
+"""Sessions in pictures: side by side as alone, and as `HMA.generate` makes them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hma_data.episodes.images import resize
+from hma_data.errors import HMAError
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.evaluation.evaluate import decode
+from hma_model.network.model import HMA
+from hma_model.simulate import World, load_world, starting_window
+
+ARM, PUSH = "arm2_07", "pusht_fast"
+
+
+@pytest.fixture(scope="module")
+def model() -> HMA:
+    return HMA.from_pretrained("embedded", [ARM, PUSH])
+
+
+@pytest.fixture(scope="module")
+def windows(model: HMA) -> dict[str, Any]:
+    return {name: starting_window(model, name) for name in (ARM, PUSH)}
+
+
+def make(model: HMA, **settings: Any) -> World:
+    return World(model, get_tokenizer(model.config.tokenizer["name"]), **settings)
+
+
+def drawn(model: HMA, name: str, count: int, seed: int = 0) -> np.ndarray:
+    """Return chunks (count, K) within a deviation of the mean."""
+    space, rng = model.embodiments[name], np.random.default_rng(seed)
+    values = rng.uniform(-1, 1, (count, space.stride, space.action_dim)) * space.std + space.mean
+    return values.reshape(count, -1).astype(np.float32)
+
+
+def test_sessions_get_the_pictures_that_they_get_alone(model: HMA, windows: dict[str, Any]) -> None:
+    world, made = make(model, temperature=0.5), {}
+    names = [PUSH, ARM, ARM, PUSH]
+    chunks = {seed: drawn(model, name, 5, seed) for seed, name in enumerate(names)}
+    sessions: dict[int, int] = {}
+    for seed, name in enumerate(names):  # one more in each step, beyond the rows that there are
+        session = world.open(name, *windows[name], seed=seed)
+        sessions[session], made[seed] = seed, []
+        for number, picture in world.step(
+            {one: chunks[of][len(made[of])] for one, of in sessions.items()}
+        ).items():
+            made[sessions[number]].append(picture)
+        if seed == 1:
+            world.close(session)
+            del sessions[session]
+    assert [len(made[seed]) for seed in range(4)] == [4, 1, 2, 1]
+    for seed, name in enumerate(names):
+        alone = make(model, temperature=0.5)
+        session = alone.open(name, *windows[name], seed=seed)
+        for chunk, picture in zip(chunks[seed], made[seed]):
+            assert np.array_equal(alone.step({session: chunk})[session], picture)
+
+
+def test_a_session_of_stored_tokens_goes_on_as_generation_does(model: HMA, windows: dict[str, Any]) -> None:
+    world = make(model, unmask_steps=1)
+    pictures, before = windows[PUSH]
+    tokens, chunks = world.tokenizer.encode(pictures), drawn(model, PUSH, 3)
+    session = world.open(PUSH, tokens, before)
+    assert np.array_equal(world.picture(session), world.tokenizer.decode(tokens[-1:])[0])
+    made = [world.step({session: chunk.reshape(4, 2)})[session] for chunk in chunks]
+    actions = torch.from_numpy(np.concatenate([before, chunks]))[None]
+    stored = torch.from_numpy(tokens.astype(np.int64))[None]
+    expected = decode(world.tokenizer, model.generate(stored, actions, PUSH, 3, unmask_steps=1))[0]
+    assert np.array_equal(np.stack(made), expected)
+    assert np.array_equal(world.picture(session), made[-1])
+
+
+def test_a_snapshot_brings_a_session_back(model: HMA, windows: dict[str, Any]) -> None:
+    world = make(model, temperature=0.5)
+    first, second = (world.open(name, *windows[name], seed=3) for name in (PUSH, ARM))
+    chunks = drawn(model, ARM, 3)
+    world.step({second: chunks[0], first: drawn(model, PUSH, 1)[0]})
+    kept = world.snapshot(second)
+    made = [world.step({second: chunk})[second] for chunk in chunks]
+    world.restore(first, kept)
+    world.restore(second, kept)
+    for chunk, picture in zip(chunks, made):
+        assert all(
+            np.array_equal(again, picture) for again in world.step({first: chunk, second: chunk}).values()
+        )
+    assert world.sessions == {first: ARM, second: ARM}
+
+
+def test_a_reset_gives_the_same_pictures_again_and_settings_count_at_once(
+    model: HMA, windows: dict[str, Any]
+) -> None:
+    world = make(model)
+    session = world.open(ARM, *windows[ARM], seed=5)
+    (chunk,) = drawn(model, ARM, 1)
+    first = world.step({session: chunk})[session]
+    world.reset(session, *windows[ARM])
+    assert np.array_equal(world.step({session: chunk})[session], first)
+    world.temperature = 3.0
+    world.reset(session, *windows[ARM])
+    assert not np.array_equal(world.step({session: chunk})[session], first)
+    world.order = "spiral"
+    with pytest.raises(HMAError, match="order"):
+        world.step({session: chunk})
+
+
+def test_a_command_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str, Any]) -> None:
+    world = make(model, unmask_steps=1)
+    pictures, before = windows[PUSH]
+    (chunk,) = drawn(model, PUSH, 1)
+    hidden = np.where(np.arange(4)[:, None] == 2, np.nan, chunk.reshape(4, 2))
+    cases = {"unknown": (hidden, before), "zero": (np.zeros(8), before), "no chunks": (hidden, None)}
+    made = {}
+    for name, (commands, chunks) in cases.items():
+        session = world.open(PUSH, pictures, chunks)
+        made[name] = world.step({session: commands})[session]
+    stored = torch.from_numpy(world.tokenizer.encode(pictures).astype(np.int64))[None]
+    actions = torch.from_numpy(np.concatenate([before, chunk[None]]))[None]
+    for name, known in (("unknown", [True] * len(before) + [False]), ("no chunks", [False] * 4)):
+        masks = torch.tensor([known])
+        expected = model.generate(stored, actions, PUSH, 1, unmask_steps=1, known=masks)
+        assert np.array_equal(decode(world.tokenizer, expected)[0, 0], made[name])
+    assert not np.array_equal(made["unknown"], made["zero"])
+
+
+def test_pictures_of_another_size_are_resized_as_in_a_conversion(model: HMA, windows: dict[str, Any]) -> None:
+    world = make(model)
+    wide = np.zeros((2, 160, 200, 3), np.uint8)
+    wide[:, ::7, ::5] = 200
+    one, other = (world.open(PUSH, frames) for frames in (wide, resize(wide, 128)))
+    assert np.array_equal(world.picture(one), world.picture(other))
+
+
+@pytest.mark.parametrize(
+    ("commands", "message"),
+    [
+        (np.zeros(7), r"commands: of pusht_fast have the shape \(7,\) — give \(8,\) or \(4, 2\)"),
+        (np.full(8, np.inf), "not finite"),
+        (np.array([[0, np.nan]] * 4), "not finite"),
+    ],
+)
+def test_commands_that_do_not_fit_are_refused(
+    model: HMA, windows: dict[str, Any], commands: np.ndarray, message: str
+) -> None:
+    world = make(model)
+    session, other = (world.open(PUSH, *windows[PUSH]) for _ in range(2))
+    with pytest.raises(HMAError, match=message):
+        world.step({session: commands, other: np.zeros(8)})
+
+
+@pytest.mark.parametrize(
+    ("frames", "chunks", "message"),
+    [
+        (np.zeros((2, 8, 8, 3), np.float32), None, r"frames are float32 of the shape \(2, 8, 8, 3\)"),
+        (np.zeros((0, 8, 8, 3), np.uint8), None, "frames are uint8"),
+        (np.zeros((3, 8, 8, 3), np.uint8), np.zeros((1, 8)), "has 1 chunks for 3 frames — give 2"),
+        (np.zeros((2, 8, 8, 3), np.uint8), np.zeros((1, 6)), r"have the shape \(6,\)"),
+    ],
+)
+def test_prompts_that_do_not_fit_are_refused(model: HMA, frames: Any, chunks: Any, message: str) -> None:
+    with pytest.raises(HMAError, match=message):
+        make(model).open(PUSH, frames, chunks)
+
+
+def test_what_is_not_there_is_said(model: HMA, windows: dict[str, Any]) -> None:
+    world = make(model)
+    with pytest.raises(HMAError, match="ur5: is not in the model, which has: arm2_07, pusht_fast"):
+        world.open("ur5", windows[PUSH][0])
+    session = world.open(PUSH, *windows[PUSH])
+    world.close(session)
+    with pytest.raises(HMAError, match=f"session {session}: is not open; open are: none"):
+        world.step({session: np.zeros(8)})
+
+
+def test_the_embedded_world_opens_without_arguments() -> None:
+    world = load_world(unmask_steps=3)
+    commands = world.commands(PUSH)
+    assert commands.names == ("x", "y") and commands.stride == 4 and commands.rate_hz == 10
+    assert commands.low.tolist() == [0, 0] and commands.high.tolist() == [512, 512]
+    assert commands.seen is not None and (commands.seen[0] >= 15).all() and (commands.seen[1] <= 497).all()
+    assert world.unmask_steps == 3 and len(world.model.embodiments) > 20
