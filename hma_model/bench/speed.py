@@ -106,7 +106,7 @@ def device_name(device: "torch.device") -> str:
     """Return the name of a GPU, or the type of another device."""
     import torch
 
-    return torch.cuda.getdevice_name(device) if device.type == "cuda" else str(device)
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)
 
 
 def memory(device: "torch.device") -> dict[str, float]:

@@ -229,7 +229,7 @@ class ParallelModel:
         self._apart = [trained[name] for name in apart]
         if len(apart) == len(trained):
             return
-        _DDP._set_params_and_buffers_to_ignore_for_model(model, apart)  # type: ignore[no-untyped-call]
+        _DDP._set_params_and_buffers_to_ignore_for_model(model, apart)
         device = [model.device] if model.device.type == "cuda" else None
         self._call = _DDP(model, device_ids=device, find_unused_parameters=not whole, broadcast_buffers=False)
 
