@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from torch import cuda
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from hma_data.errors import HMAError, ShardError, UsageError
@@ -262,6 +263,7 @@ class MixtureDataset(IterableDataset[Batch]):
             num_workers=workers,
             multiprocessing_context=context,
             prefetch_factor=4,
+            pin_memory=cuda.is_available(),  # so that copies to the GPU need not be waited for
         )
         for batch in loader:
             if isinstance(batch, HMAError):

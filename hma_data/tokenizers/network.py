@@ -10,9 +10,9 @@ network that asks for float32.
 B pictures of a batch, S side, c channels, h·w grid. Pixels inside are (B, 3, S, S) in [-1, 1].
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -90,10 +90,16 @@ class NetworkTokenizer:
         """
         starts = range(0, len(items), self.batch)
         parts = [items[start : start + self.batch] for start in starts]
-        several = alone and parts and self.device.type == "cpu"
-        with single_threads(len(parts)) if several else nullcontext() as pool:
-            for start, made in zip(starts, pool.map(step, parts) if pool else map(step, parts), strict=True):
-                out[start : start + self.batch] = made
+        if not alone or self.device.type != "cpu":
+            made: Iterable[NDArray[Any]] = map(step, parts)
+        elif len(parts) == 1:
+            with one_thread():
+                made = [step(parts[0])]
+        else:
+            with single_threads(len(parts)) as pool:
+                made = list(pool.map(step, parts))
+        for start, part in zip(starts, made, strict=True):
+            out[start : start + self.batch] = part
         return out
 
     @torch.inference_mode()
@@ -127,6 +133,19 @@ class NetworkTokenizer:
         if len(part) < self.batch:
             part = np.resize(part, (self.batch, *part.shape[1:]))
         return torch.from_numpy(part.copy()).to(self.device)  # torch takes no negative strides
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread in the block."""
+    threads = torch.get_num_threads()
+    if threads > 1:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if threads > 1:
+            torch.set_num_threads(threads)
 
 
 @contextmanager

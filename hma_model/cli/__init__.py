@@ -139,8 +139,16 @@ SampleSteps = Annotated[
     int | None,
     typer.Option("--sample-steps", min=1, help="DDIM steps of a continuous model; by default its own."),
 ]
-
-
+Precision = Annotated[
+    Literal["float32", "bf16"],
+    typer.Option(
+        "--precision", help="Of the products in rollouts; bf16 wants a processor or GPU that has it."
+    ),
+]
+Compile = Annotated[
+    bool,
+    typer.Option("--compile", help="Compile the trunk for rollouts; pays on a GPU, after a minute or more."),
+]
 Cameras = Annotated[
     str | None,
     typer.Option(
@@ -194,6 +202,8 @@ def evaluate(
     ] = None,
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
+    precision: Precision = "float32",
+    compile: Compile = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollouts.")] = 0,
     cameras: Cameras = None,
     json: Json = False,
@@ -208,7 +218,8 @@ def evaluate(
 
     found = run(
         *opened, split=split, count=windows, frames=frames, prompt=prompt, seed=seed,
-        unmask_steps=unmask_steps, sample_steps=sample_steps, cameras=_names(cameras),
+        unmask_steps=unmask_steps, sample_steps=sample_steps, cameras=_names(cameras), precision=precision,
+        compile=compile,
     )  # fmt: skip
     if json:
         print_json(found)
@@ -242,6 +253,8 @@ def generate(
     temperature: Annotated[
         float, typer.Option("--temperature", min=0, help="0 takes the likeliest token.")
     ] = 0.0,
+    precision: Precision = "float32",
+    compile: Compile = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollout.")] = 0,
     cameras: Cameras = None,
 ) -> None:
@@ -257,7 +270,7 @@ def generate(
     film = rollout_video(
         *opened, split=split, window=window, frames=frames, prompt=prompt, seed=seed,
         unmask_steps=unmask_steps, sample_steps=sample_steps, temperature=temperature,
-        cameras=_names(cameras),
+        cameras=_names(cameras), precision=precision, compile=compile,
     )  # fmt: skip
     write_video(out, film)
     about = f"{len(film.frames)} frames at {film.fps:.3g} Hz, the first {film.prompt} are the prompt"
@@ -294,7 +307,11 @@ def _require_checkpoint(checkpoint: str) -> None:
         resolve(folder)
 
 
-BENCHES["mup"] = "hma_model.bench.mup:BENCH"
-BENCHES["drift"] = "hma_model.bench.drift:BENCH"
-BENCHES |= {name: f"hma_model.bench.speed:{name.upper()}" for name in ("generate", "train", "waiting")}
+BENCHES |= {
+    "drift": "hma_model.bench.drift:BENCH",
+    "generate": "hma_model.bench.generation:GENERATE",
+    "mup": "hma_model.bench.mup:BENCH",
+    "train": "hma_model.bench.speed:TRAIN",
+    "waiting": "hma_model.bench.waiting:WAITING",
+}
 app.add_typer(hub_app, name="hub", rich_help_panel=MODELS)

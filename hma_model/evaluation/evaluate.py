@@ -48,6 +48,8 @@ class Sampling(TypedDict, total=False):
     sample_steps: int | None
     guidance: float
     noise_level: float
+    precision: str
+    compile: bool
 
 
 @dataclass

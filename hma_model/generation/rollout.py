@@ -16,49 +16,20 @@ K = stride * action dim, c channels, H,W latent grid, N tokens of a frame with i
 a pass.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_model.generation.state import RowState, Snapshot
+from hma_model.generation.engine import Engine
+from hma_model.generation.state import Pass, RowState, Snapshot
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, check, masked_after
 from hma_model.network.conditioning import ActionConditioning, Groups, condition
 from hma_model.network.model import HMA
 from hma_model.network.stem import split_tokens, unpatchify
-from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, Trunk, window_times
-
-
-@dataclass(frozen=True)
-class Pass:
-    """What the passes over one frame share.
-
-    Attributes:
-        past: (rows, T - 1, S) the frames before the new one that the first pass computes.
-        levels: (rows, T - 1) the noise that the model is told of them; None for none.
-        times, conditioning: of the T frames.
-        among: numbers of the pass's rows among those of the step; None if they are the same.
-        lanes: numbers of the step's rows among those of the pass; None if they are the same.
-    """
-
-    past: Tensor
-    levels: Tensor | None
-    times: TimePositions
-    conditioning: Conditioning
-    among: Tensor | None = None
-    lanes: Tensor | None = None
-
-    def lay_out(self, values: Tensor) -> Tensor:
-        """Return values of the step's rows (n, ...) as those of the pass's rows."""
-        if self.among is not None:
-            return values[self.among]
-        if self.lanes is None:
-            return values
-        laid = values.new_zeros(len(self.past), *values.shape[1:])
-        laid[self.lanes] = values
-        return laid
+from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, window_times
 
 
 class Rollout:
@@ -69,7 +40,8 @@ class Rollout:
     its length.
 
     Args:
-        model: any model; it is used as it is, so call `eval()` on it before.
+        model: any model; it is used as it is now, so call `eval()` on it before. Later changes of its weights
+            may not reach the rollout.
         embodiment: one id for all, or one a row.
         batch: B.
         unmask_steps, temperature, order, sample_steps, guidance, noise_level: as in `HMA.generate`. With
@@ -78,6 +50,7 @@ class Rollout:
         cache: keep keys and values of past frames.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
             take a minute or more. A step of some rows then computes all of them.
+        precision: "float32", or "bf16" for products in bfloat16.
 
     Attributes:
         decoding: the settings of unmasking; they may be replaced between steps.
@@ -99,12 +72,13 @@ class Rollout:
         generator: torch.Generator | None = None,
         cache: bool = True,
         compile: bool = False,
+        precision: str = "float32",
     ) -> None:
         self.model, self.config = model, model.config
         self.decoding = Decoding(unmask_steps, temperature, order, sample_steps, guidance, noise_level)
         check(self.decoding, self.config)
         self.batch, self.caching, self.twins = batch, cache, guidance != 1
-        self.compiled = _compiled(model.trunk) if compile and cache else None
+        self.engine = Engine(model, precision, compile and cache)
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
         names = [embodiment] * batch if isinstance(embodiment, str) else list(embodiment)
         self.state = RowState(model, names * (1 + self.twins), generator, cache)
@@ -170,7 +144,8 @@ class Rollout:
         names = [self.state.embodiments[row] for row in rows]
         other = Rollout(
             self.model, names, len(rows), guidance=self.decoding.guidance if self.twins else 1.0,
-            generator=self.state.shared, cache=self.caching, compile=self.compiled is not None,
+            generator=self.state.shared, cache=self.caching,
+            compile=self.engine.compiled is not None, precision=self.engine.precision,
         )  # fmt: skip
         other.decoding = self.decoding
         other.restore(range(len(rows)), self.snapshot().take([*rows, *self._twins(rows)]))
@@ -250,24 +225,41 @@ class Rollout:
         self._take(own, chunk, following, known)
         if self.twins:
             self.state.put_chunk(self._twins(own), 0, None, None)
-        frame, passes = self._blank(chosen), self._passes(chosen)
+        with self.engine.computing(len(chosen)):
+            values = self._frame(chosen)
+        self.state.put_frame(chosen, values)
+        # A copy, because what is made in inference mode could not be changed in place.
+        return self._show(values[: len(own)].clone())
+
+    def _frame(self, rows: list[int]) -> Tensor:
+        """Return the next frame (n, S) of rows, unmasked."""
+        frame, passes = self._blank(rows), self._passes(rows)
         left = tokens = self.config.tokens_per_frame
         for step in range(self.decoding.steps):
             count = left - masked_after(step, self.decoding.steps, tokens)
             if count > 0:
-                features, position = self._features(frame, passes, first=left == tokens)
-                seen = features[:, :tokens]
-                frame.unmask(self.model.readout, seen, position, count)  # type: ignore[arg-type]
+                self._unmask(frame, passes, count, first=left == tokens)
                 left -= count
-        self.state.put_frame(chosen, frame.values)
-        return self._show(frame.values[: len(own)])
+        return frame.values
+
+    def _unmask(self, frame: TokenFrame | PatchFrame, passes: list[Pass], count: int, first: bool) -> None:
+        """Predict and keep `count` more tokens of a frame."""
+        if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.temperature:
+            (part,) = passes
+            seen = frame.laid_out(part.lay_out)
+            made = self.engine.whole(seen, count, *self._inputs(frame, part, first)).clone()
+            frame.values = made if part.lanes is None else made[part.lanes]
+            return
+        features, position = self._features(frame, passes, first)
+        own = features[:, : self.config.tokens_per_frame]
+        frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
 
     def _passes(self, rows: list[int]) -> list[Pass]:
         """Return the pass that all rows share; without a cache, one for the rows of each time."""
         if self.caching:
             self._catch_up(rows)
             every = list(range(len(self.state.times)))
-            if self.compiled is None or len(rows) == len(every):
+            if self.engine.compiled is None or len(rows) == len(every):
                 return [self._newest(rows)]
             # Compiled code has one shape, so idle rows compute too. Their next step writes the slots again.
             return [replace(self._newest(every), lanes=self.state.tensor(rows))]
@@ -285,7 +277,7 @@ class Rollout:
             masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
             conditioning = self._condition(late, times.positions)
             x = self._tell(self._embed(past, masked), self._levels(late, times.positions))
-            self.model.trunk(x, conditioning, times, self._cache())
+            self.engine.trunk(x, conditioning, times, self._cache())
             for row in late:
                 state.pending[row] = 1
 
@@ -320,6 +312,17 @@ class Rollout:
 
     def _compute(self, frame: TokenFrame | PatchFrame, part: Pass, first: bool) -> tuple[Tensor, Tensor]:
         """Compute a pass: all its frames if it is the first or there is no cache, else the new one."""
+        x, conditioning, times, layers = self._inputs(frame, part, first)
+        trunk = self.engine.compiled or self.engine.trunk
+        features, at = trunk(x, conditioning, times, layers)[:, -1], times.positions[..., -1:].view(-1, 1)
+        if part.lanes is None:
+            return features, at
+        return features[part.lanes], at if len(at) == 1 else at[part.lanes]
+
+    def _inputs(
+        self, frame: TokenFrame | PatchFrame, part: Pass, first: bool
+    ) -> tuple[Tensor, Conditioning, TimePositions, list[LayerCache] | None]:
+        """Return the inputs of the trunk for a pass."""
         whole = first or not self.caching
         fresh = part.past if whole or self.config.masked_input == "previous" else part.past[:, :0]
         values = torch.cat([fresh, part.lay_out(frame.values).unsqueeze(1)], dim=1)
@@ -329,16 +332,10 @@ class Rollout:
         if whole and part.levels is not None:
             x = self._tell(x, torch.nn.functional.pad(part.levels, (0, 1)))  # nothing of the new frame
         if not self.caching:
-            features = self.model.trunk(x, part.conditioning, part.times)
-            return features[:, -1], part.times.positions[-1:].unsqueeze(0)
+            return x, part.conditioning, part.times, None
         conditioning = part.conditioning if first else part.conditioning.last()
         times = part.times if first else part.times.last()
-        trunk = self.compiled or self.model.trunk
-        features = trunk(x if whole else x[:, -1:], conditioning, times, self._cache())[:, -1]
-        at = times.positions[:, -1:]
-        if part.lanes is None:
-            return features, at
-        return features[part.lanes], at if len(at) == 1 else at[part.lanes]
+        return x if whole else x[:, -1:].contiguous(), conditioning, times, self._cache()
 
     def _embed(self, values: Tensor, masked: Tensor) -> Tensor:
         """Embed frames (n, T, S) of which some tokens are masked, (n, T, S) bool, as (n, T, S, D)."""
@@ -360,8 +357,9 @@ class Rollout:
         if torch.is_autocast_enabled(like.device.type):
             like = like.to(torch.get_autocast_dtype(like.device.type))
         before = self.state.layers
-        layers = self.state.cache(self.config.tokens_per_frame + appended, like)
-        if self.compiled is not None and layers is not before:
+        with torch.inference_mode(False), torch.no_grad():
+            layers = self.state.cache(self.config.tokens_per_frame + appended, like)
+        if self.engine.compiled is not None and layers is not before:
             for layer in layers:  # static addresses: the compiled code writes them in place
                 for kept in (layer.time, layer.action):
                     if kept is not None:
@@ -433,7 +431,7 @@ class Rollout:
         values = self.state.blank(len(rows))
         generators = self.state.drawing(rows[: len(rows) // (1 + self.twins)])
         if self.config.kind == "discrete":
-            return TokenFrame(values, self.config.mask_id, self.decoding, generators)
+            return TokenFrame(values, self.config.mask_id, self.decoding, generators, 1 + self.twins)
         return PatchFrame(values, self.decoding, generators)
 
     def _show(self, values: Tensor) -> Tensor:
@@ -442,19 +440,6 @@ class Rollout:
             return split_tokens(values, config.merge, config.vocab_size, config.token_grid)
         latents = unpatchify(values.unsqueeze(1), config.patch, config.token_grid)
         return latents.squeeze(1) / config.latent_scale
-
-
-def _compiled(trunk: Trunk) -> Callable[..., Tensor]:
-    """Return the trunk compiled for passes of a fixed shape; a result is valid until the next pass."""
-    mode = "reduce-overhead" if trunk.position.device.type == "cuda" else "default"
-    compiled = torch.compile(trunk, dynamic=False, mode=mode)
-
-    def call(*arguments: object) -> Tensor:
-        torch.compiler.cudagraph_mark_step_begin()
-        features: Tensor = compiled(*arguments)
-        return features
-
-    return call
 
 
 def generate(

@@ -19,7 +19,8 @@ from torch import Tensor
 from hma_model.network.conditioning import ActionConditioning
 from hma_model.network.head import device_of
 from hma_model.network.model import HMA
-from hma_model.network.trunk import LayerCache, TimePositions, rotary_angles
+from hma_model.network.rotary import rotary_angles
+from hma_model.network.trunk import Conditioning, LayerCache, TimePositions
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,36 @@ class Snapshot:
             known=self.known[index],
             layers=tuple(layers),
         )
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What the passes over one frame share.
+
+    Attributes:
+        past: (rows, T - 1, S) the frames before the new one that the first pass computes.
+        levels: (rows, T - 1) the noise that the model is told of them; None for none.
+        times, conditioning: of the T frames.
+        among: numbers of the pass's rows among those of the step; None if they are the same.
+        lanes: numbers of the step's rows among those of the pass; None if they are the same.
+    """
+
+    past: Tensor
+    levels: Tensor | None
+    times: TimePositions
+    conditioning: Conditioning
+    among: Tensor | None = None
+    lanes: Tensor | None = None
+
+    def lay_out(self, values: Tensor) -> Tensor:
+        """Return values of the step's rows (n, ...) as those of the pass's rows."""
+        if self.among is not None:
+            return values[self.among]
+        if self.lanes is None:
+            return values
+        laid = values.new_zeros(len(self.past), *values.shape[1:])
+        laid[self.lanes] = values
+        return laid
 
 
 class RowState:
@@ -228,7 +259,9 @@ class RowState:
         return found
 
     def _seeded(self, seed: int) -> torch.Generator:
-        return torch.Generator(device_of(self.shared)).manual_seed(seed)
+        """Return a generator that draws where the rollout's does; without one, on the model's device."""
+        device = self.model.device if self.shared is None else self.shared.device
+        return torch.Generator(device).manual_seed(seed)
 
     # -- the cache ----------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ B batch, S tokens of a frame, k tokens unmasked in a pass, C values of a patch, 
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +17,6 @@ from torch import Tensor
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
 from hma_model.network.head import LatentReadout, TokenReadout, uniform
-from hma_model.network.stem import from_digits
 
 
 @dataclass(frozen=True)
@@ -52,21 +51,31 @@ def masked_after(step: int, steps: int, tokens: int) -> int:
 class TokenFrame:
     """A frame of discrete tokens that is unmasked step by step.
 
-    The frames may be twice as many as the generators. The second half are then the twins without commands:
-    the scores are theirs, and `guidance` times the difference of the first half's to theirs (arXiv
-    2207.12598). A frame and its twin get the same tokens.
+    With two copies, the second half of the frames are the twins without commands: the scores are theirs, and
+    `guidance` times the difference of the first half's to theirs (arXiv 2207.12598). A frame and its twin get
+    the same tokens.
 
     Attributes:
         values: (B, S) int64 ids of the trunk's tokens; `mask_id` means masked.
     """
 
     def __init__(
-        self, values: Tensor, mask_id: int, decoding: Decoding, generators: Sequence[torch.Generator]
+        self,
+        values: Tensor,
+        mask_id: int,
+        decoding: Decoding,
+        generators: Sequence[torch.Generator],
+        copies: int = 1,
+        rank: Tensor | None = None,
     ) -> None:
         self.values, self.mask_id, self.decoding = values, mask_id, decoding
-        self.generators, self.copies = generators, len(values) // len(generators)
-        self.rank = uniform((len(generators), values.shape[1]), generators, values.device)
-        self.rank = self.rank.repeat(self.copies, 1)
+        self.generators, self.copies = generators, copies
+        self.rank = _ranks(values, generators, copies) if rank is None else rank
+
+    def laid_out(self, lay_out: Callable[[Tensor], Tensor]) -> "TokenFrame":
+        """Return the frames in other rows, for passes that draw nothing."""
+        values, rank = lay_out(self.values), lay_out(self.rank)
+        return TokenFrame(values, self.mask_id, self.decoding, (), self.copies, rank)
 
     @property
     def masked(self) -> Tensor:
@@ -75,6 +84,10 @@ class TokenFrame:
 
     def unmask(self, readout: TokenReadout, features: Tensor, position: Tensor, count: int) -> None:
         """Predict tokens from features (B, S, D) of frames at times (1 or B, 1), and keep `count` more."""
+        self.values = self.unmasked(readout, features, count)
+
+    def unmasked(self, readout: TokenReadout, features: Tensor, count: int) -> Tensor:
+        """Return the tokens (B, S) with `count` more of them predicted from features (B, S, D)."""
         masked = self.masked
         if self.decoding.order == "random":
             chosen = _top(self.rank, masked, count)
@@ -83,31 +96,33 @@ class TokenFrame:
             everything, confidence = self._sample(readout, features)
             chosen = _top(confidence, masked, count)
             tokens = everything.gather(1, chosen)
-        self.values = self.values.scatter(1, chosen, tokens)
+        return self.values.scatter(1, chosen, tokens)
 
     def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return token ids (B, k) and the sums (B, k) of the log probabilities of their digits."""
-        digits: list[Tensor] = []
-        confidence = torch.zeros(len(self.generators), features.shape[1], device=features.device)
-        for scores in self._scores(readout, features, digits):
-            drawn = scores
-            if self.decoding.temperature > 0:  # the largest of these sums is a sample from the softmax
-                noise = uniform(scores.shape, self.generators, scores.device).clamp(min=1e-20)
-                drawn = scores / self.decoding.temperature - (-noise.log()).log()
-            digits.append(drawn.argmax(-1))
-            if self.decoding.order == "confidence":
-                confidence += scores.log_softmax(-1).gather(-1, digits[-1].unsqueeze(-1)).squeeze(-1)
-        tokens = from_digits(torch.stack(digits, dim=-1), readout.factored)
-        return tokens.repeat(self.copies, 1), confidence.repeat(self.copies, 1)
+        """Return token ids (B, k) and, if the order asks for them, the log probabilities (B, k) of these."""
+        way, sure = self.decoding, []
+        noise = self._noise(readout, features) if way.temperature > 0 else None
 
-    def _scores(self, readout: TokenReadout, features: Tensor, digits: list[Tensor]) -> Iterator[Tensor]:
-        """Yield the scores of each digit, with guidance if there are twins."""
-        if self.copies == 1:
-            yield from readout.one_by_one(features, digits)
-            return
-        halves = (readout.one_by_one(half, digits) for half in features.chunk(2))
-        for commanded, free in zip(*halves, strict=True):
-            yield torch.lerp(free, commanded, self.decoding.guidance)
+        def choose(scores: Tensor, first: int) -> Tensor:
+            if self.copies > 1:
+                commanded, free = scores.chunk(2)
+                scores = torch.lerp(free, commanded, way.guidance)
+            drawn = scores  # with noise, the largest of the sums is a sample from the softmax
+            if noise is not None:
+                drawn = scores + noise[:, first : first + scores.shape[1], :, : scores.shape[-1]]
+            digits = drawn.argmax(-1)
+            if way.order == "confidence":
+                sure.append(scores.log_softmax(-1).gather(-1, digits.unsqueeze(-1)).squeeze(-1).sum(1))
+            return digits if self.copies == 1 else digits.repeat(self.copies, 1, 1)
+
+        tokens = readout.ids(readout.decide(features, choose).transpose(1, 2))
+        return tokens, sum(sure, torch.zeros(())).repeat(self.copies, 1)
+
+    def _noise(self, readout: TokenReadout, features: Tensor) -> Tensor:
+        """Return Gumbel noise (n, F, k, V), times the temperature."""
+        shape = len(self.generators), len(readout.factored), features.shape[1], max(readout.factored)
+        noise = uniform(shape, self.generators, features.device).clamp(min=1e-20)
+        return (-noise.log()).log() * -self.decoding.temperature
 
 
 class PatchFrame:
@@ -122,8 +137,7 @@ class PatchFrame:
         self.values, self.decoding, self.generators = values, decoding, generators
         self.copies = len(values) // len(generators)
         self.masked = torch.ones(values.shape[:2], dtype=torch.bool, device=values.device)
-        self.rank = uniform((len(generators), values.shape[1]), generators, values.device)
-        self.rank = self.rank.repeat(self.copies, 1)
+        self.rank = _ranks(values, generators, self.copies)
 
     def unmask(self, readout: LatentReadout, features: Tensor, position: Tensor, count: int) -> None:
         """Draw `count` more patches from features (B, S, D) of frames at times (1 or B, 1)."""
@@ -137,6 +151,11 @@ class PatchFrame:
         patches = patches.view(len(self.generators), chosen.shape[1], -1).repeat(self.copies, 1, 1)
         self.values = self.values.scatter(1, chosen.unsqueeze(-1).expand_as(patches), patches)
         self.masked = self.masked.scatter(1, chosen, False)
+
+
+def _ranks(values: Tensor, generators: Sequence[torch.Generator], copies: int) -> Tensor:
+    """Return random ranks (B, S) of frames, those of a frame's twin the same."""
+    return uniform((len(generators), values.shape[1]), generators, values.device).repeat(copies, 1)
 
 
 def _top(score: Tensor, masked: Tensor, count: int) -> Tensor:

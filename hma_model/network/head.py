@@ -7,7 +7,9 @@ M rows, C values of a sample, W width of the diffusion head.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from itertools import accumulate
+from operator import mul
 
 import torch
 import torch.nn.functional as F
@@ -46,6 +48,10 @@ def device_of(generator: torch.Generator | None) -> torch.device | str:
     return "cpu" if generator is None else generator.device
 
 
+# Chooses from the scores (B, f, k, V) of f digits, from the given one on, these digits (B, f, k).
+type Choose = Callable[[Tensor, int], Tensor]
+
+
 class DigitChain(nn.Module):
     """What a digit's scores gain from the digits before it: an MLP of the features and of their embeddings.
 
@@ -62,24 +68,30 @@ class DigitChain(nn.Module):
         self.digits = nn.ParameterList(torch.randn(values, width) * 0.5 for values in digits[:-1])
         self.output = nn.ParameterList(torch.zeros(values, width) for values in digits)
 
-    def start(self, features: Tensor) -> Tensor:
-        """Return the sum (..., D) from which the first digit is predicted, of features (..., D)."""
-        return self.input(features)
-
-    def take(self, so_far: Tensor, index: int, digit: Tensor) -> Tensor:
-        """Add digit `index` (...) to the sum (..., D)."""
-        return so_far + F.embedding(digit, self.digits[index])
-
-    def scores(self, so_far: Tensor, index: int) -> Tensor:
-        """Return what the scores (..., V) of digit `index` gain by the sum (..., D) before it."""
-        return F.linear(F.gelu(so_far + self.place[index]) * self.multiplier, self.output[index])
+    def decide(self, features: Tensor, alone: Tensor, choose: Choose) -> Tensor:
+        """Choose as `TokenReadout.decide`, from the scores `alone` (B, k, sum of V) and what they gain."""
+        # The sum includes the place of the digit at hand; so each digit adds the step to the next place too.
+        steps = self.place.diff(dim=0).unbind()
+        tables, weights = [table + step for table, step in zip(self.digits, steps)], list(self.output)
+        parts = alone.unsqueeze(1).split([len(weight) for weight in weights], dim=-1)
+        so_far = (self.input(features) + self.place[0]).unsqueeze(1)
+        digits: list[Tensor] = []
+        for index, (part, weight) in enumerate(zip(parts, weights)):
+            if index:
+                so_far = so_far + F.embedding(digits[-1], tables[index - 1])
+            digits.append(choose(part + F.linear(self._hidden(so_far), weight), index))
+        return torch.cat(digits, dim=1)
 
     def forward(self, features: Tensor, digits: Tensor) -> Tensor:
         """Return the gains (..., sum of V) of all digits, given the true digits (..., F) before each."""
         embedded = [F.embedding(digits[..., i], weight) for i, weight in enumerate(self.digits)]
-        before = torch.stack([self.start(features), *embedded], dim=-2).cumsum(-2)
-        hidden = F.gelu(before + self.place) * self.multiplier
+        before = torch.stack([self.input(features), *embedded], dim=-2).cumsum(-2)
+        hidden = self._hidden(before + self.place)
         return torch.cat([F.linear(x, w) for x, w in zip(hidden.unbind(-2), self.output)], dim=-1)
+
+    def _hidden(self, so_far: Tensor) -> Tensor:
+        hidden = F.gelu(so_far)
+        return hidden * self.multiplier if self.multiplier != 1 else hidden
 
 
 class TokenReadout(nn.Module):
@@ -88,11 +100,15 @@ class TokenReadout(nn.Module):
     With `digit_order == "chain"`, a digit's scores also depend on the digits before it.
     """
 
+    worth: Tensor
+
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.factored, self.smoothing = config.digits, config.label_smoothing
         self.multiplier = config.base_width / config.width if config.mup else 1.0
         self.linear = nn.Linear(config.width, sum(config.digits))
+        worth = torch.tensor([1, *accumulate(config.digits[:-1], mul)])
+        self.register_buffer("worth", worth, persistent=False)  # on the device, where code is compiled
         nn.init.normal_(self.linear.weight, std=0.02)
         nn.init.zeros_(self.linear.bias)
         self.chain = DigitChain(config) if config.digit_order == "chain" else None
@@ -106,26 +122,28 @@ class TokenReadout(nn.Module):
             return self._alone(features)
         if digits is not None:
             return self._alone(features) + self.chain(features, digits).float()
-        chosen: list[Tensor] = []
-        scores = []
-        for part in self.one_by_one(features, chosen):
-            scores.append(part)
-            chosen.append(part.argmax(-1))
-        return torch.cat(scores, dim=-1)
+        made: list[Tensor] = []
 
-    def one_by_one(self, features: Tensor, chosen: Sequence[Tensor]) -> Iterator[Tensor]:
-        """Yield each digit's scores (..., V); the caller appends the digit (...) it chose to `chosen`."""
-        parts = self._alone(features).split(list(self.factored), dim=-1)
+        def likeliest(scores: Tensor, first: int) -> Tensor:
+            made.append(scores)
+            return scores.argmax(-1)
+
+        self.decide(features.flatten(0, -2).unsqueeze(0), likeliest)
+        return torch.cat(made, dim=-1).view(*features.shape[:-1], -1)
+
+    def decide(self, features: Tensor, choose: Choose) -> Tensor:
+        """Return the digits (B, F, k) chosen for features (B, k, D): at once, or in a chain one by one."""
+        alone = self._alone(features)
         if self.chain is None:
-            yield from parts
-            return
-        so_far = self.chain.start(features)
-        for index, part in enumerate(parts):
-            so_far = self.chain.take(so_far, index - 1, chosen[-1]) if index else so_far
-            yield part + self.chain.scores(so_far, index).float()
+            return choose(self.split(alone).transpose(1, 2), 0)
+        return self.chain.decide(features, alone, choose)
 
     def _alone(self, features: Tensor) -> Tensor:
         return self.linear(features * self.multiplier if self.multiplier != 1 else features).float()
+
+    def ids(self, digits: Tensor) -> Tensor:
+        """Return the ids (...) of digits (..., F)."""
+        return (digits * self.worth).sum(-1)
 
     def split(self, scores: Tensor) -> Tensor:
         """Split scores (..., sum of V) into (..., F, max V); pad shorter digits with the lowest number."""

@@ -326,6 +326,8 @@ class HMA(nn.Module):
         known: Tensor | None = None,
         guidance: float = 1.0,
         noise_level: float = 0.0,
+        precision: str = "float32",
+        compile: bool = False,
     ) -> Tensor:
         """Continue a prompt, frame by frame.
 
@@ -346,6 +348,8 @@ class HMA(nn.Module):
                 with commands. Each pass then costs two. For models trained with `drop_commands`.
             noise_level: how corrupted the model is to take its own frames for, 0 to 1. For models trained
                 with `told_noise`.
+            precision: "float32", or "bf16" for products in bfloat16.
+            compile: compile the trunk; the first frames then take a minute or more.
 
         Returns:
             (B, frames, h, w) int64 tokens, or (B, frames, c, H, W) float32 latents as stored.
@@ -355,7 +359,7 @@ class HMA(nn.Module):
         return generate(
             self, prompt, actions, embodiment, frames, mask=known, unmask_steps=unmask_steps,
             temperature=temperature, generator=generator, order=order, cache=cache, sample_steps=sample_steps,
-            guidance=guidance, noise_level=noise_level,
+            guidance=guidance, noise_level=noise_level, precision=precision, compile=compile,
         )  # fmt: skip
 
     # -- parts that training and decoding share -----------------------------------------------------------

@@ -6,7 +6,9 @@ c channels, H,W latent grid, p patch side, A values of an action, K = stride*A v
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import accumulate
+from operator import mul
 
 import torch
 import torch.nn.functional as F
@@ -17,21 +19,26 @@ from hma_model.config import ActionSpace, HMAConfig
 # -- frames
 
 
+@lru_cache
+def _places(factored: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Return (F,) int64: the worth of a digit in an id, its number of values, and that of all before it."""
+    with torch.inference_mode(False):
+        worth = [1, *accumulate(factored[:-1], mul)]
+        starts = [0, *accumulate(factored[:-1])]
+        made = torch.tensor([worth, factored, starts], device=device)
+        return made[0], made[1], made[2]
+
+
 def to_digits(tokens: Tensor, factored: Sequence[int]) -> Tensor:
     """Convert token ids (...) to digits (..., F), low digit first."""
-    digits = []
-    for values in factored:
-        digits.append(tokens % values)
-        tokens = tokens // values
-    return torch.stack(digits, dim=-1)
+    worth, values, _ = _places(tuple(factored), tokens.device)
+    return tokens.unsqueeze(-1) // worth % values
 
 
 def from_digits(digits: Tensor, factored: Sequence[int]) -> Tensor:
     """Convert digits (..., F) to token ids (...)."""
-    tokens = torch.zeros_like(digits[..., 0])
-    for values, digit in zip(reversed(factored), reversed(digits.unbind(-1))):
-        tokens = tokens * values + digit
-    return tokens
+    worth, _, _ = _places(tuple(factored), digits.device)
+    return (digits * worth).sum(-1)
 
 
 def merge_tokens(tokens: Tensor, side: int, vocab_size: int) -> Tensor:
@@ -96,7 +103,7 @@ class TokenEmbedding(nn.Module):
         masked = (tokens == self.mask_id).unsqueeze(-1)
         digits = to_digits(tokens.masked_fill(masked.squeeze(-1), 0), self.factored)
         if len(self.factored) > 2:  # one sum over all digits
-            starts = torch.tensor([0, *accumulate(self.factored[:-1])], device=tokens.device)
+            starts = _places(tuple(self.factored), tokens.device)[2]
             rows = (digits + starts).flatten(0, -2)
             embedding = F.embedding_bag(rows, torch.cat(list(self.digits)), mode="sum")
             embedding = embedding.view(*tokens.shape, -1)

@@ -9,7 +9,7 @@ B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
+from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv, turns_of
 from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
 
 
@@ -42,9 +43,11 @@ class Conditioning:
     order: tuple[Tensor, Tensor] | None = None
 
     def last(self) -> "Conditioning":
-        """Return the conditioning of the last frame alone."""
-        embedding, tokens = (None if x is None else x[:, -1:] for x in (self.embedding, self.tokens))
-        modulation = None if self.modulation is None else self.modulation[:, :, -1:]
+        """Return the conditioning of the last frame alone, in memory of its own as a compiler wants it."""
+        embedding, tokens = (
+            None if x is None else x[:, -1:].contiguous() for x in (self.embedding, self.tokens)
+        )
+        modulation = None if self.modulation is None else self.modulation[:, :, -1:].contiguous()
         return Conditioning(embedding, modulation, self.out, tokens, self.order)
 
 
@@ -62,6 +65,7 @@ class TimePositions:
         slots: (B, T) int64, slot · rows of the cache + row, the places of the frames' keys and values; None
             without a cache.
         rows: the samples' rows of the cache; None for all.
+        shared: what `once` keeps.
     """
 
     positions: Tensor
@@ -70,13 +74,20 @@ class TimePositions:
     causal: bool = False
     slots: Tensor | None = None
     rows: slice | Tensor | None = None
+    shared: dict[str, Tensor] = field(default_factory=dict, repr=False)
+
+    def once(self, name: str, make: Callable[[], Tensor]) -> Tensor:
+        """Return what `make` returns; the layers of a pass share it."""
+        if name not in self.shared:
+            self.shared[name] = make()
+        return self.shared[name]
 
     def last(self) -> "TimePositions":
         """Return the times of the last frame alone."""
-        cos, sin = (angle[..., -1:, :] for angle in self.rotary)
-        slots = None if self.slots is None else self.slots[:, -1:]
-        allowed = self.allowed[..., -1:, :]
-        return TimePositions(self.positions[..., -1:], allowed, (cos, sin), slots=slots, rows=self.rows)
+        cos, sin = (angle[..., -1:, :].contiguous() for angle in self.rotary)
+        slots = None if self.slots is None else self.slots[:, -1:].contiguous()
+        allowed, positions = self.allowed[..., -1:, :].contiguous(), self.positions[..., -1:].contiguous()
+        return TimePositions(positions, allowed, (cos, sin), slots=slots, rows=self.rows)
 
 
 @dataclass
@@ -103,14 +114,6 @@ def remember(cache: Tensor, new: tuple[Tensor, Tensor], times: TimePositions) ->
 def rows_at(table: Tensor, positions: Tensor) -> Tensor:
     """Return the rows of a table at absolute times, or its only row if it does not depend on time."""
     return table if table.shape[0] == 1 else table[positions]
-
-
-def rotary_angles(config: HMAConfig, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cos and sin, float32 (..., head_dim / 2), of the rotary angles at the times (...)."""
-    half = max(config.head_dim // 2, 1)
-    steps = torch.arange(half, device=positions.device, dtype=torch.float32) / half
-    angles = positions.float().unsqueeze(-1) * config.rotary_base**-steps
-    return angles.cos(), angles.sin()
 
 
 def window_times(config: HMAConfig, frames: int, device: torch.device | str) -> TimePositions:
@@ -148,38 +151,6 @@ def sinusoids(grid: tuple[int, int], width: int) -> Tensor:
     return values[:, :width] * 0.5**0.5
 
 
-def rotate(x: Tensor, rotary: tuple[Tensor, Tensor]) -> Tensor:
-    """Rotate neighbouring pairs of x (..., T, heads, head_dim) by each frame's angles."""
-    cos, sin = (angle.to(x.dtype).unsqueeze(-2) for angle in rotary)
-    even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
-    return torch.stack([even * cos - odd * sin, odd * cos + even * sin], dim=-1).flatten(-2)
-
-
-def rotate_qkv(
-    qkv: Tensor, rotary: tuple[Tensor, Tensor], within: bool = False
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotate queries and keys, and return them with the unchanged values.
-
-    Without a compiler to fuse the operations, one complex product over contiguous memory is several times as
-    fast.
-
-    Args:
-        qkv: (..., T, 3, heads, head_dim), or `within` frames (..., T, N, 3, heads, head_dim).
-        rotary: cos and sin (T, head_dim / 2), or (B, T, head_dim / 2).
-        within: whether there is an axis of places between the times and the axis of size 3.
-    """
-    cos, sin = (angle.unsqueeze(-2) if within else angle for angle in rotary)
-    if qkv.dtype != torch.float32 or torch.compiler.is_compiling():
-        q, k, v = qkv.unbind(-3)
-        return rotate(q, (cos, sin)), rotate(k, (cos, sin)), v
-    turn = torch.complex(cos, sin)
-    turns = torch.stack([turn, turn, torch.ones_like(turn)], dim=-2).unsqueeze(-2)
-    turns = turns.expand(*turns.shape[:-2], qkv.shape[-2], -1).flatten(-3)
-    flat = torch.view_as_complex(qkv.view(*qkv.shape[:-3], -1, 2)) * turns
-    q, k, v = torch.view_as_real(flat).view_as(qkv).unbind(-3)
-    return q, k, v
-
-
 def light(function: Callable[..., Tensor], *inputs: Any) -> Tensor:
     """Call a function that ends in a product, and keep only its inputs for the backward pass.
 
@@ -206,17 +177,23 @@ class Attention(nn.Module):
         self.k_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
 
     def project(
-        self, x: Tensor, norm: nn.Module, rotary: tuple[Tensor, Tensor] | None, within: bool = False
+        self, x: Tensor, norm: nn.Module, times: TimePositions | None = None, within: bool = False
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Project (..., length, D), or `within` frames (..., T, N, D), to q, k, v (..., heads, head_dim)."""
+        """Project (..., length, D), or `within` frames (..., T, N, D), to q, k, v (..., heads, head_dim).
+
+        With `times`, queries and keys are rotated.
+        """
         qkv = light(lambda x: self.qkv(norm(x)), x).unflatten(-1, (3, self.heads, -1))
-        if rotary is not None and not self.normed:
-            return rotate_qkv(qkv, rotary, within)
-        q, k, v = qkv.unbind(-3)
-        q, k = self.q_norm(q), self.k_norm(k)
-        if rotary is not None:
-            q, k, _ = rotate_qkv(torch.stack([q, k, v], dim=-3), rotary, within)
-        return q, k, v
+        if self.normed:
+            q, k, v = qkv.unbind(-3)
+            qkv = torch.stack([self.q_norm(q), self.k_norm(k), v], dim=-3)
+        if times is None:
+            q, k, v = qkv.unbind(-3)
+            return q, k, v
+        turns, rotary = None, times.rotary
+        if not torch.compiler.is_compiling():
+            turns = times.once("turns", lambda: turns_of(rotary, self.heads, within))
+        return rotate_qkv(qkv, rotary, within, turns)
 
     def merge(
         self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None, causal: bool = False
@@ -236,12 +213,12 @@ class TemporalAttention(Attention):
 
     def forward(self, x: Tensor, norm: nn.Module, times: TimePositions, cache: LayerCache | None) -> Tensor:
         """Apply `norm` and attention over time to (B, T, N, D); keep the shape."""
-        rotary = times.rotary if self.rotary else None
+        turned = times if self.rotary else None
         if cache is not None:
-            q, k, v = self.project(x, norm, rotary, within=True)
+            q, k, v = self.project(x, norm, turned, within=True)
             return self.proj(self._recall(q, times, remember(cache.time, (k, v), times)))
         b, t, n, width = x.shape
-        q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), norm, rotary)
+        q, k, v = self.project(x.transpose(1, 2).reshape(b * n, t, width), norm, turned)
         mask = None if times.causal else times.allowed
         return self.merge(q, k, v, mask, times.causal).view(b, n, t, width).transpose(1, 2)
 
@@ -249,6 +226,8 @@ class TemporalAttention(Attention):
         """Attend from queries (B, T, N, heads, head_dim) to the rows' cache; return (B, T, N, D)."""
         b, t, n, heads, size = q.shape
         allowed = times.allowed if times.allowed.dim() == 3 else times.allowed.unsqueeze(0)
+        if torch.compiler.is_compiling():
+            return self._recall_fused(q, allowed, cache)
         if q.device.type != "cpu" or q.dtype != torch.float32:
             queries = q.transpose(1, 2).flatten(0, 1).transpose(1, 2)  # (B*N, heads, T, head_dim)
             k, v = cache.flatten(2, 3).permute(0, 2, 3, 1, 4)
@@ -259,12 +238,24 @@ class TemporalAttention(Attention):
         # softmax takes a tenth of the time if its vectors run over places instead of frames.
         rows = q.permute(0, 2, 3, 1, 4).reshape(-1, t, size)
         k, v = cache.flatten(2, 4).transpose(1, 2)  # (B*N*heads, R, head_dim)
-        hidden = torch.zeros_like(allowed, dtype=q.dtype).masked_fill(~allowed, -torch.inf)
-        if len(hidden) > 1:
-            hidden = hidden.repeat_interleave(n * heads, dim=0)
+        hidden = times.once("hidden", lambda: self._hidden(allowed, n * heads))
         scores = torch.baddbmm(hidden, rows, k.transpose(1, 2), alpha=self.scale)
         weights = scores.permute(2, 0, 1).softmax(0).permute(1, 2, 0)
         return torch.bmm(weights, v).view(b, n, heads, t, size).permute(0, 3, 1, 2, 4).flatten(-2)
+
+    def _recall_fused(self, q: Tensor, allowed: Tensor, cache: Tensor) -> Tensor:
+        """Do as `_recall` in operations that a compiler makes two kernels of, each reading the cache once."""
+        k, v = cache.unsqueeze(2)  # (R, 1, B, N, heads, head_dim)
+        scores = (q.transpose(0, 1) * k).float().sum(-1) * self.scale  # (R, T, B, N, heads)
+        hidden = ~allowed.permute(2, 1, 0)[..., None, None]
+        weights = scores.masked_fill(hidden, -torch.inf).softmax(0).unsqueeze(-1)
+        return (weights * v).sum(0).to(q.dtype).transpose(0, 1).flatten(-2)
+
+    @staticmethod
+    def _hidden(allowed: Tensor, rows: int) -> Tensor:
+        """Return (1 or B * rows, T, keys) zeros, and minus infinity where attention is not allowed."""
+        hidden = torch.zeros_like(allowed, dtype=torch.float32).masked_fill_(~allowed, -torch.inf)
+        return hidden if len(hidden) == 1 else hidden.repeat_interleave(rows, dim=0)
 
 
 class ActionAttention(nn.Module):
@@ -349,7 +340,7 @@ class Block(nn.Module):
         cache: LayerCache | None,
     ) -> Tensor:
         """Apply the block to tokens (B, T, N, D); keep the shape."""
-        qkv = self.space.project(x.flatten(0, 1), self.space_norm, None)
+        qkv = self.space.project(x.flatten(0, 1), self.space_norm)
         x = x + self.space.merge(*qkv).view(x.shape)
         if self.adds and conditioning.embedding is not None:
             x = x + conditioning.embedding.unsqueeze(2)

@@ -210,11 +210,28 @@ class ParallelModel:
         self.model, self.world = model, world
         self.sharded = mode == "fsdp" and world.size > 1
         self._call: nn.Module = model
+        self._apart: list[nn.Parameter] = []  # parameters that DDP or FSDP leaves to `average`
+        if world.size < 2:
+            return
         if self.sharded:
             _shard(model, world)
-        elif world.size > 1:
-            device = [model.device] if model.device.type == "cuda" else None
-            self._call = _DDP(model, device_ids=device, find_unused_parameters=True, broadcast_buffers=False)
+            trained = (p for p in model.parameters() if p.requires_grad)
+            self._apart = [p for p in trained if not isinstance(p, DTensor)]
+        else:
+            self._distribute()
+
+    def _distribute(self) -> None:
+        """Give the trunk's blocks to DDP; every pass uses all of them, so it searches for no unused ones."""
+        model, blocks = self.model, set(self.model.trunk.blocks.parameters())
+        whole = model.config.absent_action != "skip"  # else a pass without actions skips parts of the blocks
+        trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
+        apart = [name for name, p in trained.items() if whole and p not in blocks]
+        self._apart = [trained[name] for name in apart]
+        if len(apart) == len(trained):
+            return
+        _DDP._set_params_and_buffers_to_ignore_for_model(model, apart)
+        device = [model.device] if model.device.type == "cuda" else None
+        self._call = _DDP(model, device_ids=device, find_unused_parameters=not whole, broadcast_buffers=False)
 
     def __call__(self, *given: Any, **named: Any) -> Any:
         """Run the network's forward pass."""
@@ -230,9 +247,8 @@ class ParallelModel:
 
     def average(self) -> None:
         """Average, after the last pass, the gradients that neither DDP nor FSDP has averaged."""
-        if self.sharded:
-            trained = (p for p in self.model.parameters() if p.requires_grad)
-            _average([p for p in trained if not isinstance(p, DTensor)], self.world)
+        if self._apart:
+            _average(self._apart, self.world)
 
     def clip(self, limit: float) -> float:
         """Scale the gradients to at most this norm over all ranks, and return the norm they had."""

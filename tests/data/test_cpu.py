@@ -1,10 +1,12 @@
-"""Real-time priority that a parent had is not kept."""
+"""Real-time priority that a parent had is not kept; how threads wait is left to the environment."""
 
 import os
 import subprocess
 import sys
 
 import pytest
+
+from hma_data.cpu import bound_spinning
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no schedulers to choose from")
@@ -21,3 +23,15 @@ def test_a_command_begun_under_real_time_priority_takes_the_ordinary_one() -> No
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("name", "value"), [("OMP_WAIT_POLICY", "ACTIVE"), ("GOMP_SPINCOUNT", "7")])
+def test_how_threads_wait_is_left_to_the_environment(
+    name: str, value: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for other in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+        monkeypatch.delenv(other, raising=False)
+    monkeypatch.setenv(name, value)
+    before = dict(os.environ)
+    bound_spinning()
+    assert dict(os.environ) == before

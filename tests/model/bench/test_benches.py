@@ -1,15 +1,16 @@
-"""`hma bench generate` and `hma bench train`: what their results say."""
+"""`hma bench generate`, `train` and `waiting`: what their results say."""
 
 import json
 import os
 from typing import Any
 
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from hma_data.errors import UsageError
 from hma_data.tokenizers.network import NetworkTokenizer
-from hma_model.bench import speed
+from hma_model.bench import generation, speed, waiting, work
 from hma_model.cli import app
 
 SMALL = {
@@ -18,7 +19,7 @@ SMALL = {
 
 
 def _generate(**changes: Any) -> dict[str, Any]:
-    return speed.GENERATE.defaults | SMALL | {"frames": 1, "ddim_steps": 2} | changes
+    return generation.GENERATE.defaults | SMALL | {"frames": 1, "ddim_steps": 2} | changes
 
 
 @pytest.mark.slow
@@ -35,15 +36,40 @@ def test_a_results_settings_and_figures_are_named() -> None:
 
 
 def test_each_kind_is_measured_with_the_cache_and_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed, "in_fresh_process", lambda task, settings, *case: {"case": case})
-    cases = [result["case"] for result in speed.generate(_generate())]
+    monkeypatch.setattr(generation, "in_fresh_process", lambda task, settings: settings)
+    cases = [(case["kind"], case["cache"]) for case in generation.generate(_generate(kind="both"))]
     assert cases == [(kind, cache) for kind in ("discrete", "continuous") for cache in (True, False)]
-    assert len(speed.generate(_generate(kind="discrete", cache=False))) == 1
+    (one,) = generation.generate(_generate(kind="discrete", cache=False))
+    assert (one["batch"], one["decode"]) == (1, False)
+
+
+def test_without_a_kind_the_rows_of_the_table_are_measured_and_settings_choose_among_them() -> None:
+    rows = generation.cases(_generate())
+    told = [(row["kind"], row["batch"], row["decode"]) for row in rows if row["cache"]]
+    pairs = [(batch, decode) for batch in (1, 16) for decode in (False, True)]
+    expected = [("discrete", *pair) for pair in pairs] + [("continuous", 1, False), ("embedded", 1, True)]
+    assert told == expected
+    assert generation.cases(_generate(batch=16, decode=True)) == [generation.TABLE[4]]
+
+
+def test_the_embedded_model_is_measured_to_pictures() -> None:
+    (case,) = generation.cases(_generate(kind="embedded", cache=True))
+    result = generation.measure_frames(_generate() | case)
+    assert result["decode"] and result["window"] == 8
+    assert 0 < result["share_of_limit"] < 2 and 0.5 < result["gflop_per_frame"] < 1.5
+
+
+def test_the_work_of_a_frame_is_that_of_its_products() -> None:
+    linear, x = torch.nn.Linear(32, 48), torch.randn(2, 5, 32)
+    products = work.products_of(lambda: lambda: (linear(x), torch.bmm(x, x.mT)))
+    assert products == {("product", 10, 32, 48): 2 * 10 * 32 * 48, ("other", 0, 0, 0): 2 * 2 * 5 * 5 * 32}
+    assert work.rate_of(products, torch.device("cpu")) > 0
 
 
 @pytest.mark.parametrize("cache", [True, False])
 def test_latents_are_measured_in_either_precision(cache: bool) -> None:
-    result = speed.measure_frames(_generate(precision="bf16"), "continuous", cache)
+    case = {"kind": "continuous", "cache": cache, "batch": 1, "decode": False}
+    result = generation.measure_frames(_generate(precision="bf16") | case)
     assert (result["ddim_steps"], result["precision"], result["cache"]) == (2, "bf16", cache)
 
 
@@ -55,8 +81,8 @@ def test_frames_are_decoded_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> 
         decoded.append(decode(self, tokens).shape)
 
     monkeypatch.setattr(NetworkTokenizer, "decode", seen)
-    speed.measure_frames(_generate(decode=True, batch=2), "discrete", True)
-    assert decoded == [(2, 256, 256, 3)] * (speed.WARMUP + 1)
+    generation.measure_frames(_generate(decode=True, batch=2, kind="discrete", cache=True))
+    assert decoded == [(2, 256, 256, 3)] * (generation.WARMUP + 1)
 
 
 @pytest.mark.parametrize(
@@ -65,13 +91,14 @@ def test_frames_are_decoded_where_asked_for(monkeypatch: pytest.MonkeyPatch) -> 
         ({"precision": "fp8"}, "precision=fp8 is not allowed — give one of fp32, bf16"),
         ({"kind": "video"}, "kind=video is not allowed"),
         ({"cache": 3}, "cache=3 is not allowed — give one of True, False"),
+        ({"batch": "many"}, "batch=many is not allowed — give a number"),
         ({"frames": 0}, "frames=0 is not allowed — give at least 1"),
         ({"window": 1}, "a window of 1 has no prompt"),
     ],
 )
 def test_a_wrong_setting_is_named(change: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        speed.generate(_generate(**change))
+        generation.generate(_generate(**change))
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
@@ -87,12 +114,20 @@ def test_ways_of_waiting_are_measured_each_in_its_own_environment(monkeypatch: p
     seen = []
 
     def fake(task: Any, settings: dict[str, Any]) -> dict[str, float]:
-        seen.append({key: os.environ[key] for key in speed.OPENMP if key in os.environ})
+        seen.append({key: os.environ[key] for key in waiting.OPENMP if key in os.environ})
         return {"steps_per_second": float(len(seen))}
 
-    monkeypatch.setattr(speed, "in_fresh_process", fake)
-    results = speed.waiting(speed.WAITING.defaults | {"beside": "nothing", "rounds": 3})
-    assert seen == list(speed.WAITS.values()) * 3
-    assert [result["wait"] for result in results] == list(speed.WAITS)
-    assert results[0] == {"wait": "PASSIVE", "beside": "nothing", "steps_per_second": 1 + len(results)}
+    monkeypatch.setattr(waiting, "in_fresh_process", fake)
+    results = waiting.waiting(waiting.WAITING.defaults | {"beside": 0, "rounds": 3})
+    alone = [{"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1"}]
+    both = [values | {"OMP_NUM_THREADS": "2"} for values in waiting.WAITS.values()]
+    assert seen == (alone + both) * 3
+    assert [result["wait"] for result in results] == ["", *waiting.WAITS]
+    told = {"busy_beside": 0, "threads": 1, "wait": "", "steps_per_second": 1 + len(results)}
+    assert results[0] == told
     assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
+
+
+def test_numbers_that_are_none_are_named() -> None:
+    with pytest.raises(UsageError, match="beside=few is no list of numbers — write 0,1,2"):
+        waiting.waiting(waiting.WAITING.defaults | {"beside": "few"})

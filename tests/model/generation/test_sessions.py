@@ -109,7 +109,7 @@ def test_compiled_code_computes_idle_rows_without_a_trace(layout: str) -> None:
         shapes.add(x.shape[:2])
         return model.trunk(x, *rest)
 
-    rollout.compiled = trunk
+    rollout.engine.compiled = trunk
     for session in play(model, rollout):
         assert torch.equal(
             torch.stack(session.made), torch.stack(alone(model, session, {"temperature": 0.7}))

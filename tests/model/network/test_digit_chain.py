@@ -8,8 +8,9 @@ import torch.nn.functional as F
 
 from hma_data.loading.rows import Batch
 from hma_model.evaluation.metrics import teacher_forced
+from hma_model.generation.unmask import Decoding, TokenFrame
 from hma_model.network.head import TokenReadout
-from hma_model.network.stem import from_digits, split_tokens
+from hma_model.network.stem import from_digits, split_tokens, to_digits
 from tests.model.network_parts import small_batch, small_config, small_model
 
 NAMES = ["arm", "hand.v1", "arm"]
@@ -30,12 +31,16 @@ def test_the_loss_is_the_sum_over_digits_given_those_before(changes):
     readout, config = model.token_readout, model.config
     features = torch.randn(9, config.width, generator=_seed())
     digits = torch.stack([torch.randint(0, v, (9,), generator=_seed(v)) for v in config.digits], dim=1)
-    chosen: list[torch.Tensor] = []
     expected = torch.zeros(9)
-    for scores in readout.one_by_one(features, chosen):
-        own = digits[:, len(chosen)]
-        expected += F.cross_entropy(scores, own, reduction="none", label_smoothing=config.label_smoothing)
-        chosen.append(own)
+
+    def true_digit(scores, index):
+        nonlocal expected
+        own = digits[:, index]
+        smoothing = config.label_smoothing
+        expected += F.cross_entropy(scores[0, 0], own, reduction="none", label_smoothing=smoothing)
+        return own.view(1, 1, -1)
+
+    readout.decide(features.unsqueeze(0), true_digit)
     assert torch.allclose(readout.loss(features, digits), expected, atol=1e-4)
 
 
@@ -65,9 +70,10 @@ def test_it_learns_digits_that_agree_and_samples_them():
             optimizer.step()
         losses[order] = loss.item()
     assert abs(losses["together"] - 2 * math.log(4)) < 0.05 and abs(losses["chain"] - math.log(4)) < 0.05
-    drawn: list[torch.Tensor] = []
-    for scores in readout.one_by_one(features, drawn):
-        drawn.append(scores.softmax(-1).multinomial(1).squeeze(1))
+    decoding, seeds = Decoding(temperature=1.0), [_seed()]
+    frame = TokenFrame(torch.full((1, 256), 16), 16, decoding, seeds)
+    frame.unmask(readout, features.unsqueeze(0), torch.zeros(1, 1), 256)
+    drawn = to_digits(frame.values[0], (4, 4)).T
     assert (drawn[0] == drawn[1]).float().mean() > 0.95 and len(drawn[0].unique()) == 4
 
 

@@ -7,8 +7,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from hma_data.errors import HMAError
 from hma_model.config import ActionSpace
 from hma_model.network.model import HMA
+from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv
 from hma_model.network.stem import Normalizer
-from hma_model.network.trunk import MLP, rotary_angles, rotate, rotate_qkv
+from hma_model.network.trunk import MLP, TemporalAttention, TimePositions
 from tests.model.network_parts import ARM, HAND, small_batch, small_config, small_model
 
 LAYOUTS = [
@@ -128,6 +129,21 @@ def test_the_fast_rotation_equals_the_plain_one() -> None:
     angles = rotary_angles(small_model().config, torch.arange(5))
     fast, plain = rotate_qkv(qkv, angles), rotate_qkv(qkv.double(), angles)
     assert all(torch.allclose(a.double(), b, atol=1e-6) for a, b in zip(fast, plain))
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_attention_over_the_cache_is_the_same_when_compiled(
+    frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attention = TemporalAttention(small_model().config)
+    heads, size, slots = attention.heads, 32 // attention.heads, 5
+    q, cache = torch.randn(2, frames, 6, heads, size), torch.randn(2, slots, 2, 6, heads, size)
+    allowed = torch.rand(2, frames, slots) < 0.5
+    allowed[..., 0] = True
+    times = TimePositions(torch.zeros(2, frames), allowed, (torch.zeros(0), torch.zeros(0)))
+    plain = attention._recall(q, times, cache)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    assert torch.allclose(attention._recall(q, times, cache), plain, atol=1e-5)
 
 
 def test_a_window_longer_than_the_configured_sees_only_its_length_back() -> None:

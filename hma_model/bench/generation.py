@@ -1,0 +1,194 @@
+"""Measure generated frames, of models with random weights and of the embedded one (`hma bench generate`).
+
+Without `kind`, the results are a table: the discrete model of 32 layers with one and with 16 rollouts, with
+decoding to pixels and without, the continuous one, and the embedded model with decoding: what a person at
+`hma play` gets. With `kind`, the other settings choose the case.
+
+The prompt leaves room for one more frame in the window, so each measured frame is the last of `window`. With
+the cache, each frame follows the one before it. Without the cache, each frame is computed from the prompt
+again. In a batch, the time of a frame is the time of the step divided by the batch size.
+
+`gflop_per_frame` counts the products of a frame; `limit_gflop_per_second` is the rate at which this machine
+does them when it does nothing else (`hma_model.bench.work`); `share_of_limit` is the share of a frame's time
+that they would then take. Each case runs in its own process. The fastest step after a warm-up counts.
+"""
+
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from hma_data.bench import Bench, in_fresh_process
+from hma_data.errors import UsageError
+from hma_model.bench.speed import (
+    COMMON,
+    KINDS,
+    check_settings,
+    device_name,
+    finish,
+    make_model,
+    memory,
+    random_frames,
+    set_threads,
+)
+from hma_model.bench.work import products_of, rate_of
+
+if TYPE_CHECKING:
+    import torch
+
+    from hma_model.generation.rollout import Rollout
+    from hma_model.network.model import HMA
+
+WARMUP = 2  # generated frames before the measured ones
+CHOSEN = ("kind", "batch", "decode", "cache")
+TABLE = [
+    dict(zip(CHOSEN, row))
+    for row in (
+        ("discrete", 1, False, True),
+        ("discrete", 1, True, True),
+        ("discrete", 1, False, False),
+        ("discrete", 16, False, True),
+        ("discrete", 16, True, True),
+        ("continuous", 1, False, True),
+        ("embedded", 1, True, True),
+    )
+]
+
+
+def generate(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return one result for each case; raise UsageError for a wrong setting."""
+    flags = (None, True, False)
+    check_settings("generate", settings, kind=("all", "embedded", *KINDS), cache=flags, decode=flags)
+    if settings["window"] < 2:
+        raise UsageError("bench generate", "a window of 1 has no prompt", "give window=2 or more")
+    if not isinstance(settings["batch"], int | None):
+        raise UsageError("bench generate", f"batch={settings['batch']} is not allowed", "give a number")
+    return [in_fresh_process(measure_frames, settings | case) for case in cases(settings)]
+
+
+def cases(settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the kind, batch size, decoding and use of the cache of each case."""
+    given = {key: settings[key] for key in CHOSEN if settings[key] not in (None, "all")}
+    if settings["kind"] == "all":
+        return [row for row in TABLE if given.items() <= row.items()]
+    caches = [True, False] if settings["cache"] is None else [settings["cache"]]
+    kinds = KINDS.get(settings["kind"], [settings["kind"]])
+    usual = {"batch": 1, "decode": settings["kind"] == "embedded"}
+    return [usual | given | {"kind": kind, "cache": cache} for kind in kinds for cache in caches]
+
+
+def measure_frames(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of one case."""
+    kind = settings["kind"]
+    model = (embedded(settings) if kind == "embedded" else make_model(settings, kind)).eval()
+    made = Frames(model, settings)
+    seconds = made.seconds()
+    frame = min(seconds) / settings["batch"]
+    products = products_of(made.step)
+    gflop = sum(products.values()) / 1e9 / settings["batch"]
+    rate = rate_of(products, model.device, settings["precision"])
+    told = ("precision", "batch", "unmask_steps", "decode", "compile")
+    return {
+        "kind": kind,
+        "device": device_name(model.device),
+        "cache": settings["cache"],
+        **{key: settings[key] for key in told},
+        "window": model.config.frames,
+        "ddim_steps": settings["ddim_steps"] if model.config.kind == "continuous" else None,
+        "seconds_per_frame": round(frame, 6),
+        "median_seconds_per_frame": round(median(seconds) / settings["batch"], 6),
+        "frames_per_second": round(1 / frame, 3),
+        "gflop_per_frame": round(gflop, 3),
+        "limit_gflop_per_second": round(rate, 1),
+        "share_of_limit": round(gflop / rate / frame, 3),
+        **memory(model.device),
+    }
+
+
+def embedded(settings: dict[str, Any]) -> "HMA":
+    """Return the embedded model, on the device of the settings."""
+    from hma_model.network.model import HMA
+    from hma_model.training.runtime import choose_device
+
+    set_threads(settings)
+    return HMA.from_pretrained("embedded", device=choose_device(settings["device"]))
+
+
+class Frames:
+    """Frames that follow a random prompt, decoded if the settings ask for it."""
+
+    def __init__(self, model: "HMA", settings: dict[str, Any]) -> None:
+        import torch
+
+        self.model, self.settings = model, settings
+        self.robot, space = next(iter(model.embodiments.items()))
+        self.known, self.batch = model.config.frames - 1, settings["batch"]
+        self.prompt = random_frames(model, self.batch, self.known)
+        self.actions = torch.randn(self.batch, self.known + 1, space.chunk_dim)
+        self.tokenizer = self._tokenizer() if settings["decode"] else None
+
+    def seconds(self) -> list[float]:
+        """Return the seconds of each measured step."""
+        count, cache, seconds = self.settings["frames"], self.settings["cache"], []
+        rollout = self._rollout(self.settings["compile"])
+        for index in range(WARMUP + count if cache else 1 + count):
+            if not cache and index:
+                rollout = self._rollout(self.settings["compile"])
+            began = time.perf_counter()
+            self._show(rollout.step(self.actions[:, -1]))
+            finish(self.model.device)
+            seconds.append(time.perf_counter() - began)
+        return seconds[-count:]
+
+    def step(self) -> Callable[[], None]:
+        """Return a call that makes one more frame, without a compiler."""
+        rollout = self._rollout(False)
+        if self.settings["cache"]:
+            rollout.step(self.actions[:, -1])
+
+        def step() -> None:
+            frames = rollout.step(self.actions[:, -1])
+            if self.tokenizer is not None:
+                self.tokenizer.network.decode(frames)  # in this thread, where its products are seen
+
+        return step
+
+    def _rollout(self, compile: bool) -> "Rollout":
+        from hma_model.generation.rollout import Rollout
+
+        way = self.settings
+        rollout = Rollout(
+            self.model, self.robot, self.batch, unmask_steps=way["unmask_steps"],
+            sample_steps=way["ddim_steps"], cache=way["cache"], compile=compile,
+            precision="bf16" if way["precision"] == "bf16" else "float32",
+        )  # fmt: skip
+        rollout.prompt(self.prompt, self.actions)
+        return rollout
+
+    def _tokenizer(self) -> Any:
+        from hma_data.tokenizers.base import get_tokenizer
+
+        usual = "fsq-16" if self.model.config.kind == "discrete" else "vae-8"
+        return get_tokenizer(self.model.config.tokenizer.get("name", usual), device=str(self.model.device))
+
+    def _show(self, frames: "torch.Tensor") -> Any:
+        """Return the pictures of frames if they are to be decoded."""
+        if self.tokenizer is not None:
+            return self.tokenizer.decode(frames.cpu().numpy().astype(self.tokenizer.spec.dtype))
+        return frames
+
+
+GENERATE = Bench(
+    "seconds a generated frame, and how near that is to the time of its products alone",
+    {
+        "kind": "all",  # all (a table) | discrete | continuous | both | embedded
+        **COMMON,
+        "cache": None,  # true | false; None measures both
+        "frames": 5,  # measured, after a warm-up
+        "batch": None,  # None: 1, or those of the table
+        "unmask_steps": 2,
+        "ddim_steps": 100,
+        "decode": None,  # to pixels; None: false, with kind=embedded true
+    },
+    generate,
+)

@@ -1,0 +1,84 @@
+"""Set up a model's trunk and readout to generate with: packed, compiled, in a chosen precision."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hma_data.errors import HMAError
+from hma_data.tokenizers.network import one_thread
+from hma_model.generation.packed import has_bfloat16, packed, packs
+from hma_model.generation.unmask import TokenFrame
+from hma_model.network.head import TokenReadout
+from hma_model.network.model import HMA
+from hma_model.network.trunk import Trunk
+
+PRECISIONS = {"float32": torch.float32, "bf16": torch.bfloat16}
+ONE_THREAD = (
+    30e6  # operations of a pass's largest product, below which a second thread brings next to nothing
+)
+
+
+class Engine:
+    """The trunk and the readout of a model, as a rollout runs them.
+
+    Args:
+        model: whose weights are taken as they are now.
+        precision: of the products, a key of `PRECISIONS`.
+        compile: compile the trunk.
+
+    Attributes:
+        trunk, readout: the modules to call.
+        compiled: the compiled trunk, for passes of one shape; None without.
+        whole: the compiled trunk, readout and choice of tokens, `unmasked_by`; None without.
+    """
+
+    def __init__(self, model: HMA, precision: str, compile: bool) -> None:
+        self.config, self.device, self.precision = model.config, model.device, precision
+        if precision not in PRECISIONS:
+            raise HMAError("precision", f"{precision!r} is unknown", f"give {' or '.join(PRECISIONS)}")
+        dtype, device = PRECISIONS[precision], model.device
+        if dtype == torch.bfloat16 and device.type == "cpu" and not has_bfloat16():
+            raise HMAError("precision", "this processor has no products of bfloat16", "use float32")
+        whole = model.trunk.position.dtype == torch.float32 and not torch.is_autocast_enabled(device.type)
+        pack = whole and not compile and packs(device)
+        self.trunk: Trunk = packed(model.trunk, dtype) if pack else model.trunk
+        self.readout: nn.Module = packed(model.readout) if pack else model.readout
+        self.compiled = _compiled(model.trunk, device) if compile else None
+        self.whole = _compiled(self.unmasked_by, device) if compile else None
+        self._casts = dtype == torch.bfloat16 and not pack
+
+    def unmasked_by(self, frame: TokenFrame, count: int, *given: Any) -> Tensor:
+        """Return a frame's tokens (B, S) after a pass of the trunk over `given` that unmasks `count`."""
+        features = self.trunk(*given)[:, -1, : self.config.tokens_per_frame]
+        assert isinstance(self.readout, TokenReadout)
+        return frame.unmasked(self.readout, features, count)
+
+    @contextmanager
+    def computing(self, rows: int) -> Iterator[None]:
+        """Set torch up for the passes over frames of so many rows."""
+        config, device = self.config, self.device.type
+        largest = 4 * rows * config.tokens_per_frame * config.width**2 * config.mlp_ratio
+        with ExitStack() as stack:
+            if device == "cpu" and largest < ONE_THREAD:
+                stack.enter_context(one_thread())
+            if self._casts:
+                stack.enter_context(torch.autocast(device, torch.bfloat16))
+            if self.compiled is None:
+                stack.enter_context(torch.inference_mode())
+            yield
+
+
+def _compiled(function: Callable[..., Tensor], device: torch.device) -> Callable[..., Tensor]:
+    """Return a function compiled for passes of a fixed shape; a result is valid until the next pass."""
+    mode = "reduce-overhead" if device.type == "cuda" else "default"
+    compiled = torch.compile(function, dynamic=False, mode=mode)
+
+    def call(*arguments: object) -> Tensor:
+        torch.compiler.cudagraph_mark_step_begin()
+        made: Tensor = compiled(*arguments)
+        return made
+
+    return call

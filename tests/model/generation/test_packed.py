@@ -1,0 +1,113 @@
+"""Packed modules: what they compute, and that a row does not depend on the rows beside it."""
+
+import pytest
+import torch
+from torch import nn
+
+from hma_data.errors import HMAError
+from hma_model.generation import engine
+from hma_model.generation.packed import PackedLinear, has_bfloat16, packed, packs
+from hma_model.generation.rollout import Rollout
+from hma_model.network.model import HMA
+from tests.model.network_parts import small_batch, small_model
+
+needs_packing = pytest.mark.skipif(not packs(torch.device("cpu")), reason="this platform has no AVX-512")
+needs_bfloat16 = pytest.mark.skipif(not has_bfloat16(), reason="this platform has no products of bfloat16")
+
+
+def _frames(model: HMA, **how: object) -> torch.Tensor:
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=8)
+    rollout = Rollout(model, batch.embodiment, 2, **how)  # type: ignore[arg-type]
+    rollout.prompt(batch.tokens[:, :3], batch.actions, seeds=[1, 2])
+    return torch.stack([rollout.step(batch.actions[:, i]) for i in range(2, 7)])
+
+
+@needs_packing
+@pytest.mark.parametrize("activation", ["none", "gelu"])
+def test_a_packed_map_equals_the_map_for_any_strides(activation: str) -> None:
+    linear, wide = nn.Linear(96, 40), torch.randn(7, 5, 192)
+    for x in (wide[..., :96], wide[:, 1:3, 96:], torch.randn(96, 7).T):
+        expected = linear(x) if activation == "none" else nn.functional.gelu(linear(x))
+        assert torch.allclose(PackedLinear(linear, torch.float32, activation)(x), expected, atol=1e-5)
+
+
+@needs_packing
+@pytest.mark.parametrize("width", [128, 512, 1024])
+def test_a_row_of_a_packed_product_has_the_same_bits_beside_any_number_of_others(width: int) -> None:
+    linear, x = PackedLinear(nn.Linear(width, 160), torch.float32), torch.randn(1024, width)
+    whole = linear(x)
+    assert all(torch.equal(linear(x[:rows]), whole[:rows]) for rows in (1, 2, 16, 64, 75, 128, 512))
+
+
+def test_a_packed_trunk_shares_everything_but_its_maps_and_leaves_the_model_alone() -> None:
+    model = small_model()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    made = packed(model.trunk)
+    assert made.position is model.trunk.position
+    assert made.blocks[0].time_norm.weight is model.trunk.blocks[0].time_norm.weight
+    assert isinstance(model.trunk.blocks[0].space.qkv, nn.Linear)
+    assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
+
+
+def test_a_rollout_on_packed_maps_makes_the_frames_of_the_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = small_model()
+    quick = _frames(model, temperature=0.5)
+    monkeypatch.setattr(engine, "packs", lambda device: False)
+    assert torch.equal(_frames(model, temperature=0.5), quick)
+
+
+@needs_bfloat16
+def test_bfloat16_products_keep_the_features_near() -> None:
+    model, seen = small_model(), []
+    batch = small_batch(model.config, ["arm", "hand.v1"], frames=4)
+    for precision in ("float32", "bf16"):
+        rollout = Rollout(model, batch.embodiment, 2, precision=precision)
+        rollout.prompt(batch.tokens[:, :3], batch.actions, seeds=[1, 2])
+        rollout.step(batch.actions[:, 2])
+        seen.append(rollout.state.layers[-1].time.flatten())
+    assert torch.nn.functional.cosine_similarity(*seen, dim=0) > 0.999
+    assert not torch.equal(*seen)
+
+
+@pytest.mark.parametrize(
+    ("precision", "message"),
+    [("fp8", "'fp8' is unknown — give float32 or bf16"), ("bf16", "no products of bfloat16 — use float32")],
+)
+def test_a_precision_that_is_not_there_is_refused(
+    precision: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "has_bfloat16", lambda: False)
+    with pytest.raises(HMAError, match=message):
+        Rollout(small_model(), "arm", precision=precision)
+
+
+def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
+    model = small_model(kind="continuous")
+    batch = small_batch(model.config, ["arm"], frames=4)
+    rollout = Rollout(model, "arm", sample_steps=1)
+    rollout.prompt(batch.latents[:, :3], batch.actions)
+    frame = rollout.step(batch.actions[:, 2])
+    frame[0] = 0
+    weight = torch.ones((), requires_grad=True)
+    (weight * frame).sum().backward()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ["random", "confidence"])
+def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
+    order: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, compile, graphs = small_model(masked_input="previous"), torch.compile, []
+
+    def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
+        graphs.append(graph)
+        return graph
+
+    def traced(function: object, **how: object) -> object:
+        return compile(function, backend=backend, fullgraph=True, dynamic=False)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(torch, "compile", traced)
+    torch._dynamo.reset()
+    made = _frames(model, compile=True, order=order)
+    assert torch.equal(made, _frames(model, order=order))
+    assert len(graphs) == 2  # over two frames, and over one
