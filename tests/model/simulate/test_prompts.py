@@ -16,7 +16,7 @@ from hma_model.network.model import HMA
 from hma_model.simulate import read_prompt, starting_window
 from tests.model.network_parts import small_model
 
-MOVER, ARM = "mover_59", "planar_arm"
+MOVER, ARM = "mover_10", "planar_arm"
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ def test_each_value_of_a_command_rests_or_stays_as_its_robot_means_it(name: str)
 
 def test_all_robots_of_the_embedded_model_can_be_driven() -> None:
     robots = drivable(Checkpoint.open(EMBEDDED), (), pytest.fail)
-    assert len(robots) == 28 and all(isinstance(robot, LabRobot) for robot in robots.values())
+    assert len(robots) == 16 and all(isinstance(robot, LabRobot) for robot in robots.values())
 
 
 @pytest.mark.parametrize("name", ["mover_02", "pusht_fast", "arm2_12", "pusht_slow"])
