@@ -92,9 +92,9 @@ class NetworkTokenizer:
         parts = [items[start : start + self.batch] for start in starts]
         if not alone or self.device.type != "cpu":
             made: Iterable[NDArray[Any]] = map(step, parts)
-        elif len(parts) == 1:
+        elif len(parts) < 2:
             with one_thread():
-                made = [step(parts[0])]
+                made = [step(part) for part in parts]
         else:
             with single_threads(len(parts)) as pool:
                 made = list(pool.map(step, parts))
