@@ -26,6 +26,7 @@ LAYOUTS = {
     "cross": {"conditioning": ("add", "cross_attention")},
     "previous": {"masked_input": "previous"},
     "merged": {"merge": 2, "masked_input": "previous"},
+    "chain": {"digit_order": "chain", "factored": (4, 2, 2)},
 }  # fmt: skip
 
 

@@ -49,11 +49,16 @@ def test_a_packed_trunk_shares_everything_but_its_maps_and_leaves_the_model_alon
     assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
 
 
-def test_a_rollout_on_packed_maps_makes_the_frames_of_the_plain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = small_model()
-    quick = _frames(model, temperature=0.5)
+@pytest.mark.parametrize("guidance", [1.0, 2.0])
+@pytest.mark.parametrize("digits", ["together", "chain"])
+def test_a_rollout_on_packed_maps_makes_the_frames_of_the_plain_ones(
+    digits: str, guidance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = small_model(digit_order=digits, told_noise=True)
+    how = {"temperature": 0.5, "guidance": guidance, "noise_level": 0.2}
+    quick = _frames(model, **how)
     monkeypatch.setattr(engine, "packs", lambda device: False)
-    assert torch.equal(_frames(model, temperature=0.5), quick)
+    assert torch.equal(_frames(model, **how), quick)
 
 
 @needs_bfloat16
@@ -93,11 +98,13 @@ def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", ["random", "confidence"])
+@pytest.mark.parametrize("guidance", [1.0, 2.0])
+@pytest.mark.parametrize(("order", "digits"), [("random", "chain"), ("confidence", "together")])
 def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
-    order: str, monkeypatch: pytest.MonkeyPatch
+    order: str, digits: str, guidance: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, compile, graphs = small_model(masked_input="previous"), torch.compile, []
+    model = small_model(masked_input="previous", digit_order=digits, told_noise=True)
+    how, compile, graphs = {"order": order, "guidance": guidance, "noise_level": 0.2}, torch.compile, []
 
     def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
         graphs.append(graph)
@@ -108,6 +115,6 @@ def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
 
     monkeypatch.setattr(torch, "compile", traced)
     torch._dynamo.reset()
-    made = _frames(model, compile=True, order=order)
-    assert torch.equal(made, _frames(model, order=order))
+    made = _frames(model, compile=True, **how)
+    assert torch.equal(made, _frames(model, **how))
     assert len(graphs) == 2  # over two frames, and over one
