@@ -52,12 +52,18 @@ class Snapshot:
             LayerCache(part.time[:, :, index], None if part.action is None else part.action[:, :, index])
             for part in self.layers
         ]
-        lists = {
-            name: tuple(getattr(self, name)[row] for row in rows)
-            for name in ("embodiments", "times", "pending", "prompts", "generators")
-        }
-        buffers = {name: getattr(self, name)[index] for name in ("frames", "chunks", "known")}
-        return replace(self, **lists, **buffers, layers=tuple(layers))
+        return replace(
+            self,
+            embodiments=tuple(self.embodiments[row] for row in rows),
+            times=tuple(self.times[row] for row in rows),
+            pending=tuple(self.pending[row] for row in rows),
+            prompts=tuple(self.prompts[row] for row in rows),
+            generators=tuple(self.generators[row] for row in rows),
+            frames=self.frames[index],
+            chunks=self.chunks[index],
+            known=self.known[index],
+            layers=tuple(layers),
+        )
 
 
 class RowState:
@@ -154,6 +160,10 @@ class RowState:
         self.frames[self.tensor(rows), self._slot(rows)] = frames
         for row in rows:
             self.times[row], self.pending[row] = self.times[row] + 1, 1
+
+    def newest(self, rows: Sequence[int]) -> Tensor:
+        """Return the newest frame (n, S) of each row."""
+        return self.frames[self.tensor(rows), self._slot(rows, 1)]
 
     def given(self, rows: Sequence[int], positions: Tensor) -> ActionConditioning:
         """Return the chunks (n, T, K) at times (n or 1, T)."""
