@@ -141,7 +141,8 @@ def _fast(seed: int, number: int) -> Iterator[Step]:
 
 def _slow(seed: int, number: int) -> Iterator[Step]:
     arena, policy, rng = pusht.begin(pusht.SLOW_LOOK, 1, seed, number, fly=True)
-    setpoint, velocity, up = arena.agent, np.zeros(2), False
+    setpoint: Floats = arena.agent
+    velocity, up = np.zeros(2), False
     while True:
         if arena.ticks % 20 == 2:  # a command every 200 ms, a picture every 80 ms
             if arena.success and not isinstance(policy, Wandering):
