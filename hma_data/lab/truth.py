@@ -141,8 +141,8 @@ def _fast(seed: int, number: int) -> Iterator[Step]:
 
 def _slow(seed: int, number: int) -> Iterator[Step]:
     arena, policy, rng = pusht.begin(pusht.SLOW_LOOK, 1, seed, number, fly=True)
-    setpoint: Floats = arena.agent
-    velocity, up = np.zeros(2), False
+    velocity: Floats = np.zeros(2)
+    setpoint, up = arena.agent, False
     while True:
         if arena.ticks % 20 == 2:  # a command every 200 ms, a picture every 80 ms
             if arena.success and not isinstance(policy, Wandering):
