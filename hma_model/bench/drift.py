@@ -7,7 +7,7 @@ last frame, repeated ("copy"). A figure at a frame is the mean over the five fra
 
     error_px     distance of the robot's parts from the truth, mean over rollouts; a picture has 128 px
     median_px    the median over rollouts; low_px and high_px: 95 % interval of the mean, by bootstrap
-    share        error_px as a share of the spread; what knows nothing of the commands has 1 to 1.4
+    share        error_px as a share of the spread; what knows nothing of the commands has 1 to 1.4 late
     motion       correlation of the parts' motion from frame to frame with the true one: 1 obeys, 0 does not
     whole        how much of the robot the picture shows, by the colours of its parts; the copy shows it all
     loose_px     as error_px, of what lies about
@@ -42,11 +42,12 @@ if TYPE_CHECKING:
     from hma_model.network.model import HMA
 
 Images = NDArray[np.uint8]
-MARKS = (10, 25, 50, 100, 300, 1000, 3000)  # frames at which figures are given, and the last
+MARKS = (5, 10, 25, 50, 100, 300, 1000, 3000)  # frames at which figures are given, and the last
+EARLY = 10  # the mark that the end is compared with
 SPAN = 5  # frames up to a mark over which a figure is the mean
 SHOWN = (1, 10, 25, 50, 100, 200, 300)  # frames of a sheet
 SHEETS = 2  # rollouts of a robot on it
-LIMIT = 2.0  # of the error at the end over that at the first mark
+LIMIT = 2.0  # of the error at the end over that at EARLY
 LOST = 0.5  # share of the spread from which a robot is somewhere else
 WHOLE = 0.8  # of the wholeness at the end over the copy's
 RESAMPLES = 1000
@@ -87,9 +88,8 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
     robots = [name.strip() for name in settings["robots"].split(",")]
     for robot in robots:
         truth.embodiment(robot)
-    for key in ("frames", "rollouts"):
-        if settings[key] < (MARKS[0] if key == "frames" else 2):
-            least = MARKS[0] if key == "frames" else 2
+    for key, least in (("frames", EARLY), ("rollouts", 2)):
+        if settings[key] < least:
             raise UsageError("bench drift", f"{key}={settings[key]} is not allowed", f"give at least {least}")
     from hma_data.tokenizers.base import get_tokenizer
     from hma_data.tokenizers.network import single_threads
@@ -213,8 +213,8 @@ def rows(found: Found, seed: int) -> list[dict[str, Any]]:
     copy = table[-1]
     for i, case in enumerate(found.cases):
         if case.judged:
-            first, *_, last = table[i * len(marks) : (i + 1) * len(marks)]
-            last["verdict"] = verdict(first, last, copy)
+            own = table[i * len(marks) : (i + 1) * len(marks)]
+            own[-1]["verdict"] = verdict(own[marks.index(EARLY)], own[-1], copy)
     return table
 
 
@@ -271,7 +271,7 @@ def verdict(first: dict[str, Any], last: dict[str, Any], copy: dict[str, Any]) -
         return "none: no part of the robot can be read"
     times, whole = last["error_px"] / max(first["error_px"], 1e-9), last["whole"] / max(copy["whole"], 1e-9)
     if first["share"] > LOST:
-        follows = "lost by the first mark"
+        follows = f"lost by frame {EARLY}"
     else:
         follows = "holds" if times <= LIMIT and last["share"] <= LOST else "drifts"
     return f"{follows}, error ×{times:.1f}; {'whole' if whole >= WHOLE else 'dissolved'}, ×{whole:.2f}"
