@@ -84,10 +84,14 @@ class DigitChain(nn.Module):
 
     def forward(self, features: Tensor, digits: Tensor) -> Tensor:
         """Return the gains (..., sum of V) of all digits, given the true digits (..., F) before each."""
-        embedded = [F.embedding(digits[..., i], weight) for i, weight in enumerate(self.digits)]
-        before = torch.stack([self.input(features), *embedded], dim=-2).cumsum(-2)
+        table = torch.cat([self.input.weight.new_zeros(0, self.input.out_features), *self.digits])
+        starts = torch.tensor([0, *accumulate(len(weight) for weight in self.digits)][:-1])
+        embedded = F.embedding(digits[..., :-1] + starts[: len(self.digits)].to(digits.device), table)
+        before = torch.cat([self.input(features).unsqueeze(-2), embedded], dim=-2).cumsum(-2)
         hidden = self._hidden(before + self.place)
-        return torch.cat([F.linear(x, w) for x, w in zip(hidden.unbind(-2), self.output)], dim=-1)
+        if len({len(weight) for weight in self.output}) > 1:
+            return torch.cat([F.linear(x, w) for x, w in zip(hidden.unbind(-2), self.output)], dim=-1)
+        return torch.einsum("...fd,fvd->...fv", hidden, torch.stack(list(self.output))).flatten(-2)
 
     def _hidden(self, so_far: Tensor) -> Tensor:
         hidden = F.gelu(so_far)
