@@ -107,13 +107,13 @@ def start_linear(network: Autoencoder, crops: Tensor) -> None:
         decoder.head.weight.mul_(0.1)
 
 
-def start_from(network: Autoencoder, source: str) -> None:
-    """Set a network's weights to those of a file that a training wrote.
+def start_from(network: Autoencoder, source: StrPath) -> None:
+    """Set a network's weights to those of a file that a training wrote (str or path).
 
     Raises:
         TokenizerError: there is no such file, or its weights are of another network.
     """
-    path = Path(source).expanduser()
+    path = as_path(source).expanduser()
     fill(network, read_weights(path, network.format, network.shape)[1], path)
 
 

@@ -74,11 +74,11 @@ def test_pictures_come_as_arrays_files_and_from_environments(model: HMA, tmp_pat
 
 
 def test_frames_at_the_control_rate_become_chunks_that_end_at_the_last_frame(model: HMA) -> None:
-    frames = np.arange(6, dtype=np.uint8)[:, None, None, None].repeat(3, axis=3)
-    actions = np.arange(10, dtype=np.float32).reshape(5, 2)
-    kept, chunks = read_prompt(model, MOVER, {"frames": frames, "actions": actions})
-    assert kept[:, 0, 0, 0].tolist() == [1, 3, 5]
-    assert chunks is not None and chunks.tolist() == [[2, 3, 4, 5], [6, 7, 8, 9]]
+    frames = np.arange(12, dtype=np.uint8)[:, None, None, None].repeat(3, axis=3)
+    actions = np.arange(22, dtype=np.float32).reshape(11, 2)
+    kept, chunks = read_prompt(model, MOVER, {"frames": frames, "actions": actions})  # its stride is 5
+    assert kept[:, 0, 0, 0].tolist() == [1, 6, 11]
+    assert chunks is not None and chunks.tolist() == [list(range(2, 12)), list(range(12, 22))]
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.lab import family
 from hma_data.lab.simulator import LabSimulator
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.simulate.scenes import PROMPT, SEED, Drivable, LabRobot
@@ -83,6 +84,14 @@ class Watcher:
 
 
 def lab_robots(*names: str) -> dict[str, Drivable]:
-    """Return robots of the laboratory as the embedded checkpoint has them."""
+    """Return robots of the laboratory, with the embedded checkpoint's statistics or those of an episode."""
     checkpoint = Checkpoint.open(EMBEDDED)
-    return {name: LabRobot(checkpoint.embodiment(name), checkpoint.stats(name)) for name in names}
+    robots: dict[str, Drivable] = {}
+    for name in names:
+        if name in checkpoint.embodiments:
+            robots[name] = LabRobot(checkpoint.embodiment(name), checkpoint.stats(name))
+        else:
+            commands = family.episode(family.Body.of(name), 0, 0).actions
+            ends = {key: getattr(commands, key)(axis=0).tolist() for key in ("mean", "std", "min", "max")}
+            robots[name] = LabRobot(family.embodiment(name), {"action": ends})
+    return robots
