@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
+FIRST = "rails_03"  # the robot that a page opens with: it follows its commands longest (docs/results.md)
 MOST_VIEWERS = 32
 RATE, BURST = 200.0, 400.0  # messages of a viewer a second, and at once
 AHEAD = 2  # frames that are sent before a page says that it has shown one
@@ -242,7 +243,8 @@ class Connection:
         self._credit, self._filled = BURST, time.monotonic()
         robots = [describe(robot) for robot in self.engine.robots.values()]
         orders = list(self.engine.orders)
-        self.page.tell({"kind": "hello", "model": server.model, "robots": robots, "orders": orders})
+        hello = {"model": server.model, "robots": robots, "orders": orders, "first": FIRST}
+        self.page.tell({"kind": "hello", **hello})
 
     async def receive(self) -> None:
         """Take messages until the page leaves, or sends one that is not allowed."""

@@ -84,14 +84,15 @@ class Watcher:
 
 
 def lab_robots(*names: str) -> dict[str, Drivable]:
-    """Return robots of the laboratory, with the embedded checkpoint's statistics or those of an episode."""
+    """Return robots of the laboratory, with the embedded checkpoint's statistics or their ranges."""
     checkpoint = Checkpoint.open(EMBEDDED)
     robots: dict[str, Drivable] = {}
     for name in names:
         if name in checkpoint.embodiments:
             robots[name] = LabRobot(checkpoint.embodiment(name), checkpoint.stats(name))
         else:
-            commands = family.episode(family.Body.of(name), 0, 0).actions
-            ends = {key: getattr(commands, key)(axis=0).tolist() for key in ("mean", "std", "min", "max")}
-            robots[name] = LabRobot(family.embodiment(name), {"action": ends})
+            low, high = family.Body.of(name).ranges
+            ends = {"mean": (low + high) / 2, "std": (high - low) / 4, "min": low, "max": high}
+            stats = {"action": {key: values.tolist() for key, values in ends.items()}}
+            robots[name] = LabRobot(family.embodiment(name), stats)
     return robots

@@ -9,6 +9,7 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import pytest
@@ -245,10 +246,11 @@ def free_the_error_last(rank: int) -> None:
 
 
 class Network(torch.nn.Linear):
-    device = torch.device("cpu")
+    device, config = torch.device("cpu"), SimpleNamespace(absent_action="embedding")
 
     def __init__(self) -> None:
         super().__init__(2, 2)
+        self.trunk = SimpleNamespace(blocks=SimpleNamespace(parameters=self.parameters))
 
 
 def fail_under_ddp(world: World) -> None:
