@@ -14,6 +14,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from hma_model.network.product import has_kernels
 from hma_model.network.trunk import MLP
 
 _OPS: Any = torch.ops.mkldnn
@@ -21,8 +22,7 @@ _OPS: Any = torch.ops.mkldnn
 
 def packs(device: torch.device, dtype: torch.dtype = torch.float32) -> bool:
     """Check whether packing pays on this device, for products in float32 or bfloat16."""
-    there = device.type == "cpu" and torch.backends.mkldnn.is_available()
-    if not there or torch.backends.cpu.get_cpu_capability() != "AVX512":
+    if device.type != "cpu" or not has_kernels():
         return False
     return dtype == torch.float32 or has_bfloat16()
 

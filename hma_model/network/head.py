@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig, Readout
+from hma_model.network.product import Linear
 from hma_model.network.trunk import rows_at
 
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
@@ -62,7 +63,7 @@ class DigitChain(nn.Module):
         super().__init__()
         width, digits = config.width, config.digits
         self.multiplier = config.base_width / config.width if config.mup else 1.0
-        self.input = nn.Linear(width, width, bias=False)
+        self.input = Linear(width, width, bias=False)
         nn.init.normal_(self.input.weight, std=width**-0.5)
         self.place = nn.Parameter(torch.randn(len(digits), width) * 0.5)
         self.digits = nn.ParameterList(torch.randn(values, width) * 0.5 for values in digits[:-1])
@@ -87,8 +88,8 @@ class DigitChain(nn.Module):
         table = torch.cat([self.input.weight.new_zeros(0, self.input.out_features), *self.digits])
         starts = torch.tensor([0, *accumulate(len(weight) for weight in self.digits)][:-1])
         embedded = F.embedding(digits[..., :-1] + starts[: len(self.digits)].to(digits.device), table)
-        before = torch.cat([self.input(features).unsqueeze(-2), embedded], dim=-2).cumsum(-2)
-        hidden = self._hidden(before + self.place)
+        before = accumulate([self.input(features), *embedded.unbind(-2)], torch.add)
+        hidden = self._hidden(torch.stack(list(before), dim=-2) + self.place)
         if len({len(weight) for weight in self.output}) > 1:
             return torch.cat([F.linear(x, w) for x, w in zip(hidden.unbind(-2), self.output)], dim=-1)
         return torch.einsum("...fd,fvd->...fv", hidden, torch.stack(list(self.output))).flatten(-2)
@@ -110,7 +111,7 @@ class TokenReadout(nn.Module):
         super().__init__()
         self.factored, self.smoothing = config.digits, config.label_smoothing
         self.multiplier = config.base_width / config.width if config.mup else 1.0
-        self.linear = nn.Linear(config.width, sum(config.digits))
+        self.linear = Linear(config.width, sum(config.digits))
         worth = torch.tensor([1, *accumulate(config.digits[:-1], mul)])
         self.register_buffer("worth", worth, persistent=False)  # on the device, where code is compiled
         nn.init.normal_(self.linear.weight, std=0.02)
@@ -180,7 +181,7 @@ class LatentReadout(nn.Module):
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
-        self.proj = nn.Linear(config.width, config.width)
+        self.proj = Linear(config.width, config.width)
         self.norm = nn.LayerNorm(config.width, eps=1e-6)
         times = config.frames if config.time_position == "learned" else 1
         self.position = nn.Parameter(torch.zeros(times, config.tokens_per_frame, config.width))
@@ -207,8 +208,8 @@ class ActionHead(nn.Module):
             self.diffusion = DiffusionHead(config, space.chunk_dim)
             outputs = config.width
         self.multiplier = config.base_width / config.width if config.mup else 1.0
-        self.policy = nn.Linear(config.width, outputs)
-        self.inverse = nn.Linear(config.width, outputs)
+        self.policy = Linear(config.width, outputs)
+        self.inverse = Linear(config.width, outputs)
         for linear in (self.policy, self.inverse):
             nn.init.normal_(linear.weight, std=config.width**-0.5 if self.diffusion else 0.02)
             nn.init.zeros_(linear.bias)
@@ -249,9 +250,9 @@ class _Block(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(width, eps=1e-6)
-        self.fc1 = nn.Linear(width, width)
-        self.fc2 = nn.Linear(width, width)
-        self.modulation = nn.Linear(width, 3 * width)
+        self.fc1 = Linear(width, width)
+        self.fc2 = Linear(width, width)
+        self.modulation = Linear(width, 3 * width)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         shift, scale, gate = self.modulation(condition).chunk(3, dim=-1)
@@ -276,13 +277,13 @@ class DiffusionHead(nn.Module):
         self.values, self.clip = values, config.diffusion_clip
         self.velocity = config.diffusion_target == "velocity"
         self.repeats, self.sample_steps = config.diffusion_repeats, config.diffusion_sample_steps
-        self.input = nn.Linear(values, width)
-        self.condition = nn.Linear(config.width, width)
-        self.level_in = nn.Linear(_LEVEL_VALUES, width)
-        self.level_out = nn.Linear(width, width)
+        self.input = Linear(values, width)
+        self.condition = Linear(config.width, width)
+        self.level_in = Linear(_LEVEL_VALUES, width)
+        self.level_out = Linear(width, width)
         self.blocks = nn.ModuleList(_Block(width) for _ in range(config.diffusion_depth))
-        self.modulation = nn.Linear(width, 2 * width)
-        self.output = nn.Linear(width, values * (2 if config.diffusion_variance else 1))
+        self.modulation = Linear(width, 2 * width)
+        self.output = Linear(width, values * (2 if config.diffusion_variance else 1))
         self.register_buffer("levels", cosine_levels(config.diffusion_train_steps).float(), persistent=False)
         for name, module in self.named_modules():
             if isinstance(module, nn.Linear):

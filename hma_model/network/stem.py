@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hma_model.config import ActionSpace, HMAConfig
+from hma_model.network.product import Linear
 
 # -- frames
 
@@ -134,7 +135,7 @@ class LatentEmbedding(nn.Module):
         self.patch = config.patch
         self.carries = config.masked_input == "previous"
         self.mask = nn.Parameter(torch.randn(config.channels) * (2.0 if self.carries else 0.02))
-        self.linear = nn.Linear(config.patch_dim, config.width, bias=False)
+        self.linear = Linear(config.patch_dim, config.width, bias=False)
         nn.init.normal_(self.linear.weight, std=config.patch_dim**-0.5)
 
     def forward(self, patches: Tensor, masked: Tensor, previous: Sequence[int]) -> Tensor:
@@ -268,9 +269,9 @@ class Stem(nn.Module):
     def __init__(self, config: HMAConfig, space: ActionSpace) -> None:
         super().__init__()
         self.normalizer = Normalizer(space)
-        self.input = nn.Linear(space.chunk_dim, config.width)
+        self.input = Linear(space.chunk_dim, config.width)
         self.norm = nn.LayerNorm(config.width)
-        self.output = nn.Linear(config.width, config.width)
+        self.output = Linear(config.width, config.width)
         self.modulation: Modulation | None = None
         if "modulation" in config.conditioning and not config.shared_modulation:
             self.modulation = Modulation(config)

@@ -10,7 +10,6 @@ B batch, T frames, S tokens of a frame, N = S + action tokens, D width, L layers
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
+from hma_model.network.product import Linear, after_gelu, after_norm, light
 from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv, turns_of
 from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
 
@@ -151,18 +151,6 @@ def sinusoids(grid: tuple[int, int], width: int) -> Tensor:
     return values[:, :width] * 0.5**0.5
 
 
-def light(function: Callable[..., Tensor], *inputs: Any) -> Tensor:
-    """Call a function that ends in a product, and keep only its inputs for the backward pass.
-
-    The backward pass recomputes the operations before the product. It does not recompute the product, because
-    the recomputation stops once all tensors for the backward pass exist.
-    """
-    if not torch.is_grad_enabled():
-        return function(*inputs)
-    out: Tensor = checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)
-    return out
-
-
 class Attention(nn.Module):
     """Scaled dot-product attention with its projections."""
 
@@ -171,8 +159,8 @@ class Attention(nn.Module):
         width = config.width
         self.heads, self.normed = config.heads, config.qk_norm
         self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
-        self.qkv = nn.Linear(width, 3 * width, bias=config.qkv_bias)
-        self.proj = nn.Linear(width, width, bias=config.proj_bias)
+        self.qkv = Linear(width, 3 * width, bias=config.qkv_bias)
+        self.proj = Linear(width, width, bias=config.proj_bias)
         self.q_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
         self.k_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
 
@@ -183,7 +171,7 @@ class Attention(nn.Module):
 
         With `times`, queries and keys are rotated.
         """
-        qkv = light(lambda x: self.qkv(norm(x)), x).unflatten(-1, (3, self.heads, -1))
+        qkv = after_norm(norm, self.qkv, x).unflatten(-1, (3, self.heads, -1))
         if self.normed:
             q, k, v = qkv.unbind(-3)
             qkv = torch.stack([self.q_norm(q), self.k_norm(k), v], dim=-3)
@@ -266,9 +254,9 @@ class ActionAttention(nn.Module):
         width = config.width
         self.heads = config.heads
         self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
-        self.q = nn.Linear(width, width, bias=config.qkv_bias)
-        self.kv = nn.Linear(width, 2 * width, bias=config.qkv_bias)
-        self.proj = nn.Linear(width, width, bias=config.proj_bias)
+        self.q = Linear(width, width, bias=config.qkv_bias)
+        self.kv = Linear(width, 2 * width, bias=config.qkv_bias)
+        self.proj = Linear(width, width, bias=config.proj_bias)
 
     def forward(self, x: Tensor, embedding: Tensor, times: TimePositions, cache: LayerCache | None) -> Tensor:
         """Attend from tokens (B, T, N, D) to action embeddings (B, T, D); return (B, T, N, D)."""
@@ -295,19 +283,16 @@ class MLP(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         hidden = int(config.width * config.mlp_ratio)
-        self.fc1 = nn.Linear(config.width, hidden, bias=config.mlp_bias)
-        self.fc2 = nn.Linear(hidden, config.width, bias=config.mlp_bias)
+        self.fc1 = Linear(config.width, hidden, bias=config.mlp_bias)
+        self.fc2 = Linear(hidden, config.width, bias=config.mlp_bias)
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, x: Tensor, norm: nn.Module) -> Tensor:
         """Apply `norm` and the two maps to (..., D); keep the shape."""
-        hidden = light(lambda x: self.fc1(norm(x)), x)
+        hidden = after_norm(norm, self.fc1, x)
         if self.dropout.p:
-            return self.dropout(self._out(hidden))
-        return light(self._out, hidden)
-
-    def _out(self, hidden: Tensor) -> Tensor:
-        return self.fc2(self.dropout(F.gelu(hidden)))
+            return self.dropout(self.fc2(self.dropout(F.gelu(hidden))))
+        return after_gelu(self.fc2, hidden)
 
 
 class Block(nn.Module):
@@ -320,7 +305,7 @@ class Block(nn.Module):
         self.space = Attention(config)
         self.modulation_out: nn.Linear | None = None
         if "modulation" in config.conditioning and config.modulation_out == "trunk":
-            self.modulation_out = nn.Linear(width, width)
+            self.modulation_out = Linear(width, width)
         self.adds = "add" in config.conditioning and config.add_at == "layers"
         self.action: ActionAttention | None = None
         if "cross_attention" in config.conditioning:
@@ -345,7 +330,7 @@ class Block(nn.Module):
         if self.adds and conditioning.embedding is not None:
             x = x + conditioning.embedding.unsqueeze(2)
         if conditioning.modulation is not None:
-            x = x + light(self.modulate, x, conditioning, layer)
+            x = x + light(self.modulation_out, self.modulate, x, conditioning, layer)
         if self.action is not None and conditioning.embedding is not None:
             x = x + self.action(self.action_norm(x), conditioning.embedding, times, cache)
         x = x + self.time(x, self.time_norm, times, cache)
