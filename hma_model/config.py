@@ -140,6 +140,9 @@ class HMAConfig:
     # too). With "tokens", a single hidden chunk is hidden only in the action tokens; modulation still sees
     # it, as in the released code.
     absent_action: str = "embedding"
+    # Octaves of sines and cosines of each value of a chunk, beside the values: a sharp sense of where a command
+    # points. The longest wave is 8 standard deviations of the value.
+    action_waves: int = 0
     action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
 
     time_position: str = "rotary"  # relative, so that a cache may roll; "learned": absolute (released)
@@ -301,6 +304,8 @@ def _check_scalars(config: HMAConfig) -> None:
     for name in ("latent_scale", "rotary_base", "diffusion_clip"):
         if not (math.isfinite(value := getattr(config, name)) and value > 0):
             raise _refuse(name, value, "a positive number")
+    if not 0 <= config.action_waves <= 16:
+        raise _refuse("action_waves", config.action_waves, "a number from 0 to 16")
     if not (math.isfinite(config.action_loss_weight) and config.action_loss_weight >= 0):
         raise _refuse("action_loss_weight", config.action_loss_weight, "a number of at least 0")
 

@@ -125,6 +125,9 @@ def add_embodiment(model: "HMA", checkpoint: Checkpoint, embodiment: str) -> Non
     """Load one embodiment's stem and head beside a trunk that is already loaded."""
     space, stem, head = read_embodiment(checkpoint, embodiment)
     model.add_embodiment(space)
+    added = model.stem(embodiment).waves
+    if added is not None and not checkpoint.config.action_waves:
+        stem = {**stem, "waves.weight": added.weight.detach()}
     model.load_embodiment(embodiment, stem, head)
 
 

@@ -278,8 +278,17 @@ class Stem(nn.Module):
         for linear in (self.input, self.output):
             nn.init.normal_(linear.weight, std=linear.in_features**-0.5)
             nn.init.zeros_(linear.bias)
+        self.waves: Linear | None = None
+        if config.action_waves:  # it begins at zero, so it can be added to a trained stem
+            self.waves = Linear(2 * config.action_waves * space.chunk_dim, config.width, bias=False)
+            nn.init.zeros_(self.waves.weight)
 
     def forward(self, chunks: Tensor) -> Tensor:
         """Map raw chunks (B, T, K) to action embeddings (B, T, D)."""
         values = self.normalizer(chunks).to(self.input.weight.dtype)
-        return self.output(F.relu(self.norm(self.input(values))))
+        hidden = self.input(values)
+        if self.waves is not None:
+            octaves = torch.arange(self.waves.in_features // (2 * values.shape[-1]), device=values.device)
+            turns = values.unsqueeze(-1) * (2.0**octaves * (math.pi / 4))
+            hidden = hidden + self.waves(torch.cat([turns.sin(), turns.cos()], dim=-1).flatten(-2))
+        return self.output(F.relu(self.norm(hidden)))

@@ -47,6 +47,7 @@ ROWS: dict[str, list[str]] = {
     "told noise": ["model.told_noise=true"],
     "digits of 512 and 64": ["digits=512"],
     "digit after digit": ["model.digit_order=chain"],
+    "waves of the commands": ["model.action_waves=5"],
     "16×16 tokens": ["model.merge=1"],
     "a tenth of the windows without commands": ["model.drop_commands=0.1"],
 }

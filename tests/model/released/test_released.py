@@ -375,6 +375,7 @@ def test_a_folder_that_is_no_checkpoint_is_not_replaced(tmp_path: Path) -> None:
         ({"mup": True, "base_width": 64}, "base_width 64"),
         ({"factored": (6, 4)}, r"unequal digits \(6, 4\)"),
         ({"told_noise": True, "digit_order": "chain"}, "told_noise True; digit_order 'chain'"),
+        ({"action_waves": 2}, "action_waves 2"),
         ({"action_loss": "diffusion"}, "action_loss 'diffusion'"),
         (CONTINUOUS | {"latent_scale": 1.0}, "latent_scale 1.0"),
         (CONTINUOUS | {"mup": True}, "muP at width 32"),
