@@ -147,10 +147,11 @@ class Session:
         self._best = psnr(self._world.picture(self.row), self._true[-1])
         self.parted, self._low = None, 0
 
-    def _history(self) -> tuple[Picture, Floats]:
-        """Return the true last frames, and the chunks between them."""
+    def _history(self) -> tuple[Picture, Floats | None]:
+        """Return the true last frames, and the chunks between them; None for a single frame."""
         frames, chunks = list(self._true), list(self._chunks)
-        return np.stack(frames), np.stack(chunks[len(chunks) - len(frames) + 1 :])
+        between = chunks[len(chunks) - len(frames) + 1 :]
+        return np.stack(frames), np.stack(between) if between else None
 
     # -- one step
 
