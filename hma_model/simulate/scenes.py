@@ -221,23 +221,29 @@ class RecordedScene:
 
 
 class PicturedRobot:
-    """A robot that begins from pictures (P, H, W, 3); its commands before them are unknown."""
+    """A robot that begins from pictures (P, H, W, 3); from a single one it begins at rest.
+
+    The commands before several pictures are unknown, and so is the resting command of a robot with targets.
+    """
 
     source = "pictures"
 
     def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any], pictures: Picture) -> None:
         self.embodiment, self.key = embodiment, f"{embodiment.id}:pictures"
-        self.dimensions = dimensions(embodiment, stats)
-        unknown = np.full((len(pictures) - 1, embodiment.chunk_dim), np.nan, np.float32)
-        self._prompt, self._mean = Prompt(pictures, unknown), np.array(stats["action"]["mean"])
+        self.dimensions = dims = dimensions(embodiment, stats)
+        means = stats["action"]["mean"]
+        rest = [{"rate": 0.0, "switch": dim.low}.get(dim.kind, mean) for dim, mean in zip(dims, means)]
+        self._command = np.array(rest, np.float32)
+        before = np.full_like(self._command, np.nan)
+        if len(pictures) == 1:
+            pictures = pictures.repeat(PROMPT, axis=0)
+            if all(dim.kind != "target" for dim in dims):
+                before = self._command
+        self._prompt = Prompt(pictures, np.tile(before, (len(pictures) - 1, embodiment.stride)))
 
     def scene(self, number: int) -> "PicturedScene":
         """Return the one scene that there is."""
-        rest = [
-            {"rate": 0.0, "switch": dim.low}.get(dim.kind, value)
-            for dim, value in zip(self.dimensions, self._mean)
-        ]
-        return PicturedScene(self._prompt, np.array(rest, np.float32))
+        return PicturedScene(self._prompt, self._command)
 
 
 @dataclass(frozen=True)

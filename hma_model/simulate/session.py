@@ -147,11 +147,10 @@ class Session:
         self._best = psnr(self._world.picture(self.row), self._true[-1])
         self.parted, self._low = None, 0
 
-    def _history(self) -> tuple[Picture, Floats | None]:
-        """Return the true last frames, and the chunks between them; None for a single frame."""
+    def _history(self) -> tuple[Picture, Floats]:
+        """Return the true last frames, and the chunks between them."""
         frames, chunks = list(self._true), list(self._chunks)
-        between = chunks[len(chunks) - len(frames) + 1 :]
-        return np.stack(frames), np.stack(between) if between else None
+        return np.stack(frames), np.stack(chunks[len(chunks) - len(frames) + 1 :])
 
     # -- one step
 
