@@ -18,13 +18,14 @@ from hma_data.episodes.images import opencv
 from hma_data.storage.files import atomic_path
 
 Images = NDArray[np.uint8]
+GAP, LABEL = 4, 18  # pixels between the pictures of a grid, and of a row's label
 INK, PAPER = (30, 30, 30), (250, 250, 250)
 BAR, NEGATIVE = (0, 114, 178), (213, 94, 0)  # safe without colour vision
 
 
-def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = (), gap: int = 4) -> Images:
+def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = (), gap: int = GAP) -> Images:
     """Return a picture (H, W, 3) of pictures of one size in rows, with a label above each row."""
-    label_height = 18 if labels else 0
+    label_height = LABEL if labels else 0
     height, width = rows[0][0].shape[:2]
     columns = max(map(len, rows))
     sheet = np.full(
@@ -38,6 +39,14 @@ def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = ()
             left = gap + j * (width + gap)
             sheet[top + label_height : top + label_height + height, left : left + width] = picture
     return sheet
+
+
+def first_of_grid(sheet: Images, height: int, width: int) -> Images | None:
+    """Return the first picture (height, width, 3) of a `grid` with labels; None if it has another size."""
+    across, down = sheet.shape[1] - GAP, sheet.shape[0] - GAP
+    if across % (width + GAP) or down % (height + GAP + LABEL):
+        return None
+    return sheet[GAP + LABEL : GAP + LABEL + height, GAP : GAP + width].copy()
 
 
 def write_text(picture: Images, text: str, at: tuple[int, int], scale: float = 0.42) -> None:

@@ -13,7 +13,7 @@ _DESCRIBED = ("meta/info.json", "features.json", "dataset_info.json", "metadata.
 _USE = {
     "a recording": "hma inspect shows it, hma convert makes shards of it",
     "a shard set": "hma shards info shows it, hma train takes it as data",
-    "a checkpoint": "hma evaluate and hma generate take it",
+    "a checkpoint": "hma evaluate, hma generate and hma play take it",
     "a YAML file": "give the YAML of an embodiment by --embodiment (-e)",
 }
 

@@ -21,7 +21,7 @@ from hma_data.cpu import bound_spinning, take_ordinary_priority
 from hma_data.errors import HMAError, UsageError
 from hma_model.cli import train as cli_train
 from hma_model.cli.hub import Json, hub_app
-from hma_model.cli.play import play
+from hma_model.cli.play import play, require_checkpoint
 from hma_model.cli.train import MODELS
 
 
@@ -287,24 +287,12 @@ def _opened(checkpoint: str, data: Path) -> tuple[Any, Any, Any]:
     from hma_data.shards.reader import ShardSet
 
     shards = ShardSet(data)  # it and the checkpoint are refused before torch is imported
-    _require_checkpoint(checkpoint)
+    require_checkpoint(checkpoint)
     from hma_data.shards.preview import tokenizer_of
     from hma_model.network.model import HMA
 
     model = HMA.from_pretrained(checkpoint, embodiments=[shards.embodiment.id])
     return model.eval(), tokenizer_of(shards), shards
-
-
-def _require_checkpoint(checkpoint: str) -> None:
-    """Refuse a folder of this machine that holds no checkpoint; a name in a folder is not one of the hub."""
-    from hma_data.storage.paths import is_repository
-    from hma_model.checkpoint.folder import resolve
-
-    if "://" in checkpoint or "@" in checkpoint:
-        return
-    folder = Path(checkpoint).expanduser()
-    if folder.parent.is_dir() or not is_repository(checkpoint):
-        resolve(folder)
 
 
 BENCHES |= {

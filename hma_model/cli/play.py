@@ -17,10 +17,18 @@ from hma_data.errors import UsageError
 
 def play(
     checkpoint: Annotated[
-        str, typer.Argument(help="A checkpoint, or a run's folder; by default the one that comes along.")
+        str,
+        typer.Argument(
+            help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]); by default the one that "
+            "comes along."
+        ),
     ] = "embedded",
     data: Annotated[
         list[Path] | None, typer.Argument(help="Shard sets, whose held-out episodes give more scenes.")
+    ] = None,
+    prompt: Annotated[
+        list[Path] | None,
+        typer.Option("--prompt", help="A picture to begin from; repeat it for several, in their order."),
     ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
     host: Annotated[
@@ -40,10 +48,15 @@ def play(
     import asyncio
 
     from hma_data.shards.reader import ShardSet
-    from hma_model.checkpoint.folder import Checkpoint
-    from hma_model.simulate.scenes import drivable
+    from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+    from hma_model.hub.publish import located
+    from hma_model.simulate.pictures import read_picture
+    from hma_model.simulate.scenes import drivable, trained_on
 
-    opened = Checkpoint.open(checkpoint)  # what is wrong with it or the data is said before torch is imported
+    # what is wrong with it, the data or the pictures is said before torch is imported
+    sets, pictures = list(map(ShardSet, data or ())), list(map(read_picture, prompt or ()))
+    require_checkpoint(checkpoint)
+    opened = Checkpoint.open(located(checkpoint)[0])
 
     @cache
     def tokenizer() -> Any:
@@ -51,10 +64,11 @@ def play(
 
         return get_tokenizer(opened.config.tokenizer["name"])
 
-    robots = drivable(opened, map(ShardSet, data or ()), tokenizer)
+    robots = drivable(opened, sets or trained_on(opened), tokenizer, pictures)
     from hma_model.simulate.server import LOOPBACK, serve
 
     listener = _listen(host, port)
+    name = "the embedded model" if opened.folder == EMBEDDED else checkpoint
     if token is None and host not in LOOPBACK:
         token = secrets.token_urlsafe(18)
     shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
@@ -67,9 +81,21 @@ def play(
             webbrowser.open(address)
 
     try:
-        asyncio.run(serve(opened, robots, tokenizer(), listener, host, token, ready))
+        asyncio.run(serve(opened, name, robots, tokenizer(), listener, host, token, ready))
     except KeyboardInterrupt:
         print("stopped; what was not saved is lost")
+
+
+def require_checkpoint(checkpoint: str) -> None:
+    """Refuse a folder of this machine that holds no checkpoint; a name in a folder is not one of the hub."""
+    from hma_data.storage.paths import is_repository
+    from hma_model.checkpoint.folder import resolve
+
+    if "://" in checkpoint or "@" in checkpoint:
+        return
+    folder = Path(checkpoint).expanduser()
+    if folder.parent.is_dir() or not is_repository(checkpoint):
+        resolve(folder)
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -23,10 +23,11 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
+from hma_model.generation.chunks import prompt_chunks, step_chunk
 from hma_model.generation.engine import Engine
 from hma_model.generation.state import Pass, RowState, Snapshot
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, check, masked_after
-from hma_model.network.conditioning import ActionConditioning, Groups, condition
+from hma_model.network.conditioning import Groups, condition
 from hma_model.network.model import HMA
 from hma_model.network.stem import split_tokens, unpatchify
 from hma_model.network.trunk import Conditioning, LayerCache, TimePositions, window_times
@@ -130,7 +131,7 @@ class Rollout:
         if len(values) != len(chosen):
             raise HMAError("prompt", f"has {len(values)} samples", f"give {len(chosen)}, one for each row")
         names = list(embodiments or [self.state.embodiments[row] for row in chosen])
-        given = self._condition_on(names, actions, known, values.shape[1])
+        given = prompt_chunks(self.model, names, actions, known, values.shape[1])
         last = slice(max(values.shape[1] - self.config.frames, 0), None)
         self.state.begin(chosen, names, values[:, last], given.frames(last), seeds)
         if self.twins:
@@ -375,27 +376,6 @@ class Rollout:
         given = None if skips else self.state.given(rows, positions)
         return condition(self.model, given, groups, positions, unsort=True)
 
-    def _condition_on(
-        self, names: Sequence[str], actions: Tensor | None, known: Tensor | None, frames: int
-    ) -> ActionConditioning:
-        """Return the chunk at each known frame; with `current` alignment `step` adds the last chunk."""
-        batch, width, device = len(names), self.state.width(names), self.model.device
-        chunks = torch.zeros(batch, frames, width, device=device)
-        given = ActionConditioning(chunks, torch.zeros(batch, frames, dtype=torch.bool, device=device))
-        if actions is None or frames == 1:
-            return given
-        if actions.shape[0] != batch or actions.shape[1] < frames - 1 or actions.shape[2] < width:
-            fault = f"actions have the shape {tuple(actions.shape)} for a prompt of {frames} frames"
-            raise HMAError("prompt", fault, f"give ({batch}, {frames - 1} or more, {width})")
-        if known is not None and (known.shape[0] != batch or known.shape[1] < frames - 1):
-            fault = f"known has the shape {tuple(known.shape)} for a prompt of {frames} frames"
-            raise HMAError("prompt", fault, f"give ({batch}, {frames - 1} or more)")
-        late = int(self.config.action_alignment == "previous")
-        conditioned = given.frames(slice(late, frames - 1 + late))  # a view
-        conditioned.chunks[:] = actions[:, : frames - 1, :width].to(device).float()
-        conditioned.known[:] = True if known is None else known[:, : frames - 1].to(device)
-        return given
-
     def _take(
         self, rows: list[int], chunk: Tensor | None, following: Tensor | None, known: Tensor | None
     ) -> None:
@@ -410,19 +390,12 @@ class Rollout:
         if known is not None:
             known = known.to(self.model.device, torch.bool).view(len(rows), -1)
         now, then = (None, None) if known is None else (known[:, 0], known[:, -1])
-        values = self._chunk(rows, chunk)
+        names = [self.state.embodiments[row] for row in rows]
+        values = step_chunk(self.model, names, chunk)
         if self.config.action_alignment == "current":
             self.state.put_chunk(rows, 1, values, now)
-            now, values = then, values if following is None else self._chunk(rows, following)
+            now, values = then, values if following is None else step_chunk(self.model, names, following)
         self.state.put_chunk(rows, 0, values, now)
-
-    def _chunk(self, rows: list[int], chunk: Tensor) -> Tensor:
-        width = self.state.width([self.state.embodiments[row] for row in rows])
-        if chunk.dim() != 2 or chunk.shape[0] != len(rows) or chunk.shape[1] < width:
-            raise HMAError(
-                "step", f"a chunk has the shape {tuple(chunk.shape)}", f"give ({len(rows)}, {width})"
-            )
-        return chunk[:, :width].to(self.model.device).float()
 
     # -- in and out ---------------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from hma_model.generation.chunks import widest
 from hma_model.network.conditioning import ActionConditioning
 from hma_model.network.head import device_of
 from hma_model.network.model import HMA
@@ -128,7 +129,7 @@ class RowState:
         slots = config.frames + (config.time_position == "rotary")
         blank = self.blank(batch).unsqueeze(1)
         self.frames = torch.zeros_like(blank).repeat(1, slots, *[1] * (blank.dim() - 2))
-        self.chunks = torch.zeros(batch, slots, self.width(self.embodiments), device=model.device)
+        self.chunks = torch.zeros(batch, slots, widest(model, self.embodiments), device=model.device)
         self.known = torch.zeros(batch, slots, dtype=torch.bool, device=model.device)
         self.layers: list[LayerCache] = []
 
@@ -136,10 +137,6 @@ class RowState:
     def slots(self) -> int:
         """Return R."""
         return self.frames.shape[1]
-
-    def width(self, names: Sequence[str]) -> int:
-        """Return the largest K of these embodiments."""
-        return max(self.model.stem(name).input.in_features for name in set(names))
 
     def blank(self, rows: int) -> Tensor:
         """Return frames (n, S) of masked tokens, or of zero patches (n, S, C)."""

@@ -196,11 +196,26 @@ def from_pretrained(
     device: "str | torch.device" = "cpu",
 ) -> "HMA":
     """Load a model as `HMA.from_pretrained` does; the source may also be a training run's folder."""
+    folder, ids = located(source, embodiments, revision)
+    return checkpoints.load(folder, ids, str(device))
+
+
+def located(
+    source: StrPath, embodiments: Iterable[str] | None = None, revision: str | None = None
+) -> tuple[Path, list[str]]:
+    """Return the local folder of a checkpoint, and the requested ids; a published one is fetched.
+
+    Args:
+        source: str or path of a checkpoint or training run, a URI, `org/name` or `org/name@revision`.
+        embodiments: ids; None for all.
+
+    Raises:
+        HubError, CheckpointError: as `pull`.
+    """
     address, revision = addressed(as_address(source), revision)
     if not is_repository(address) and "://" not in str(address):
         address = resolve(Path(address).expanduser())
-    folder, ids = _pull(address, embodiments, None, revision)
-    return checkpoints.load(folder, ids, str(device))
+    return _pull(address, embodiments, None, revision)
 
 
 def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None = None) -> str:

@@ -50,14 +50,7 @@ class Episodes:
 
     Attributes:
         world: of the sessions.
-        embodiment: of all sessions.
-        prompt: as `read_prompt` takes it; None draws one of those that come along.
-        control: "frame": an action is a command (A,), and a picture comes after every `stride` of them;
-            "chunk": an action is (stride, A).
-        horizon: steps after which an episode is truncated; None for never.
-        judge: None gives no reward and never ends an episode.
-        clip: clip actions to the range seen in training.
-        size: side in pixels of observed pictures; None for the model's.
+        embodiment, prompt, control, horizon, judge, clip, size: as of `WorldModelEnv`.
     """
 
     world: World
@@ -190,25 +183,44 @@ class Drive:
             self.session = None
 
 
-def _episodes(
-    checkpoint: StrPath,
-    embodiment: str | None,
-    world: World | None,
-    device: str,
-    settings: dict[str, Any],
-    **how: Any,
-) -> Episodes:
-    if world is None:
-        world = load_world(checkpoint, device=device, **settings)
-    elif settings:
-        raise UsageError("world", f"is given with {', '.join(settings)}", "set them in the world")
-    if embodiment is None:
-        there = ", ".join(world.model.embodiments)
-        raise UsageError("embodiment", "is not given", f"give embodiment=ID; the model has: {there}")
-    return Episodes(world, embodiment, **how)
+class _Environment:
+    """What `WorldModelEnv` and `WorldModelVectorEnv` have in common; its arguments are described there."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self,
+        checkpoint: StrPath = "embedded",
+        embodiment: str | None = None,
+        prompt: Any = None,
+        control: str = "frame",
+        horizon: int | None = 300,
+        judge: Judge | None = None,
+        render_mode: str | None = None,
+        *,
+        clip: bool = False,
+        size: int | None = None,
+        world: World | None = None,
+        device: str = "cpu",
+        **settings: Any,
+    ) -> None:
+        if world is None:
+            world = load_world(checkpoint, device=device, **settings)
+        elif settings:
+            raise UsageError("world", f"is given with {', '.join(settings)}", "set them in the world")
+        if embodiment is None:
+            there = ", ".join(world.model.embodiments)
+            raise UsageError("embodiment", "is not given", f"give embodiment=ID; the model has: {there}")
+        self.world, self.render_mode = world, render_mode
+        self.episodes = Episodes(world, embodiment, prompt, control, horizon, judge, clip, size)
+        self.metadata = {**type(self).metadata, "render_fps": self.episodes.fps}
+        self.action_names = self.episodes.commands.names
+        self.action_space: gymnasium.Space[Any] = self.episodes.action_space
+        self.observation_space: gymnasium.Space[Any] = self.episodes.observation_space
+        self.drive = Drive(self.episodes)
 
 
-class WorldModelEnv(gymnasium.Env[Picture, Floats]):
+class WorldModelEnv(_Environment, gymnasium.Env[Picture, Floats]):
     """One robot in a world model, as a gymnasium environment.
 
     An observation is the newest picture (S, V·S, 3) uint8. Actions outside the range seen in training cause
@@ -235,36 +247,6 @@ class WorldModelEnv(gymnasium.Env[Picture, Floats]):
         HMAError: the checkpoint lacks the embodiment, or an argument is wrong.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
-
-    def __init__(
-        self,
-        checkpoint: StrPath = "embedded",
-        embodiment: str | None = None,
-        prompt: Any = None,
-        control: str = "frame",
-        horizon: int | None = 300,
-        judge: Judge | None = None,
-        render_mode: str | None = None,
-        *,
-        clip: bool = False,
-        size: int | None = None,
-        world: World | None = None,
-        device: str = "cpu",
-        **settings: Any,
-    ) -> None:
-        self.episodes = _episodes(
-            checkpoint, embodiment, world, device, settings,
-            prompt=prompt, control=control, horizon=horizon, judge=judge, clip=clip, size=size,
-        )  # fmt: skip
-        self.world = self.episodes.world
-        self.render_mode = render_mode
-        self.metadata = {**type(self).metadata, "render_fps": self.episodes.fps}
-        self.action_space = self.episodes.action_space
-        self.observation_space = self.episodes.observation_space
-        self.action_names = self.episodes.commands.names
-        self.drive = Drive(self.episodes)
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Picture, dict[str, Any]]:
@@ -285,49 +267,29 @@ class WorldModelEnv(gymnasium.Env[Picture, Floats]):
         self.drive.close()
 
 
-class WorldModelVectorEnv(VectorEnv[Picture, Floats, NDArray[Any]]):
+class WorldModelVectorEnv(_Environment, VectorEnv[Picture, Floats, NDArray[Any]]):
     """N robots in a world model, whose sessions step in one pass and begin and end independently.
 
     Args:
         num_envs: N.
         autoreset_mode: of gymnasium: the step after an episode's end, the same step, or disabled.
-        others: as of `WorldModelEnv`.
+        others, settings: as of `WorldModelEnv`, in its order or by name.
     """
 
     def __init__(
         self,
         num_envs: int = 1,
-        checkpoint: StrPath = "embedded",
-        embodiment: str | None = None,
-        prompt: Any = None,
-        control: str = "frame",
-        horizon: int | None = 300,
-        judge: Judge | None = None,
-        render_mode: str | None = None,
-        *,
-        clip: bool = False,
-        size: int | None = None,
-        world: World | None = None,
-        device: str = "cpu",
+        *others: Any,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **settings: Any,
     ) -> None:
-        self.episodes = _episodes(
-            checkpoint, embodiment, world, device, settings,
-            prompt=prompt, control=control, horizon=horizon, judge=judge, clip=clip, size=size,
-        )  # fmt: skip
-        self.world, self.num_envs, self.render_mode = self.episodes.world, num_envs, render_mode
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {
-            "render_modes": ["rgb_array"],
-            "render_fps": self.episodes.fps,
-            "autoreset_mode": self.autoreset_mode,
-        }
-        self.single_action_space = self.episodes.action_space
-        self.single_observation_space = self.episodes.observation_space
+        super().__init__(*others, **settings)
+        self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
+        self.metadata["autoreset_mode"] = self.autoreset_mode
+        self.single_action_space, self.single_observation_space = self.action_space, self.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.drives = [Drive(self.episodes) for _ in range(num_envs)]
+        self.drives = [self.drive, *(Drive(self.episodes) for _ in range(num_envs - 1))]
         self.random = [seeding.np_random()[0] for _ in range(num_envs)]
         self.observations = np.zeros(self.observation_space.shape or (), np.uint8)
         self.ended: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)

@@ -2,7 +2,8 @@
 
 import io
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -32,12 +33,14 @@ def film(kind: str, robot: Drivable, frames: Sequence[Frame]) -> bytes:
         kind: a key of KINDS.
     """
     hz = robot.embodiment.effective_hz
+    if all(frame.true is None for frame in frames[1:]):
+        frames = [replace(frames[0], true=None), *frames[1:]]
     if kind == "gif":
         return _gif(frames[-GIF_FRAMES:], hz)
     with TemporaryDirectory(prefix="hma-play-") as folder:
         if kind == "mp4":
             path = Path(folder) / "film.mp4"
-            write_mp4(path, (panels(frame, SIDE) for frame in frames), hz)
+            write_mp4(path, panels(frames, SIDE), hz)
             return path.read_bytes()
         home = Path(folder) / robot.embodiment.id
         episode, embodiment = lerobot_episode(robot, frames)
@@ -46,20 +49,22 @@ def film(kind: str, robot: Drivable, frames: Sequence[Frame]) -> bytes:
         return _zipped(home)
 
 
-def panels(frame: Frame, side: int) -> Picture:
-    """Return the model's picture, and beside it the true one if it is known, with titles."""
-    titled = [("world model", frame.model)]
-    if frame.true is not None:
-        text = "truth" if frame.psnr is None else f"truth: {frame.psnr:.1f} dB"
-        titled.append((text, frame.true))
-    shown = [_panel(title, decode_image(data, "a frame"), side) for title, data in titled]
-    gap = np.full((side + HEAD, GAP, 3), 255, np.uint8)
-    return np.concatenate(shown if len(shown) == 1 else [shown[0], gap, shown[1]], axis=1)
+def panels(frames: Sequence[Frame], side: int) -> Iterator[Picture]:
+    """Return the model's pictures with titles, and the true ones beside them; an unknown one is white."""
+    wide = any(frame.true is not None for frame in frames)
+    for frame in frames:
+        shown = [_panel("world model", frame.model, side)]
+        if wide:
+            text = "truth" if frame.psnr is None else f"truth: {frame.psnr:.1f} dB"
+            true = np.full_like(shown[0], 255) if frame.true is None else _panel(text, frame.true, side)
+            shown += [np.full((side + HEAD, GAP, 3), 255, np.uint8), true]
+        yield np.concatenate(shown, axis=1)
 
 
-def _panel(title: str, picture: Picture, side: int) -> Picture:
+def _panel(title: str, data: bytes, side: int) -> Picture:
     import cv2
 
+    picture = decode_image(data, "a frame")
     width = round(side * picture.shape[1] / picture.shape[0])
     large = cv2.resize(picture, (width, side), interpolation=cv2.INTER_CUBIC)
     panel = np.full((side + HEAD, width, 3), 255, np.uint8)
@@ -71,12 +76,7 @@ def _panel(title: str, picture: Picture, side: int) -> Picture:
 def _gif(frames: Sequence[Frame], hz: float) -> bytes:
     from PIL import Image
 
-    wide = any(frame.true is not None for frame in frames)
-    shown = [panels(frame, GIF_SIDE) for frame in frames]
-    width = max(picture.shape[1] for picture in shown)
-    if wide:  # where the truth is unknown its place stays empty
-        shown = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in shown]
-    first, *rest = (Image.fromarray(picture).quantize(128) for picture in shown)
+    first, *rest = (Image.fromarray(picture).quantize(128) for picture in panels(frames, GIF_SIDE))
     buffer = io.BytesIO()
     first.save(buffer, "GIF", save_all=True, append_images=rest, duration=round(1000 / hz), loop=0)
     return buffer.getvalue()

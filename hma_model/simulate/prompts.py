@@ -6,6 +6,7 @@ frames, and the chunks (P - 1, K) between them, NaN where they are unknown.
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
-from hma_data.episodes.images import decode_image, prepared
+from hma_data.episodes.images import prepared
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import FAMILY, RECORDERS, record
 from hma_data.registry.embodiment import Embodiment
@@ -27,6 +28,7 @@ from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import cameras_for
 from hma_model.simulate.commands import card, described
+from hma_model.simulate.pictures import read_picture
 
 if TYPE_CHECKING:
     from hma_model.network.model import HMA
@@ -37,6 +39,38 @@ WAYS = (
     "with render(), or a mapping; hma_model.simulate.read_prompt describes them"
 )
 LEROBOT = "meta/info.json"
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a recording or shard set that a prompt takes.
+
+    Attributes:
+        episode: number or id; None for the first.
+        start: its first frame as recorded.
+        frames: P; None for half the model's window.
+    """
+
+    episode: int | str | None = None
+    start: int = 0
+    frames: int | None = None
+
+    def number(self, ids: Sequence[str], where: StrPath) -> int:
+        """Return the number of the episode among those of the ids."""
+        found = ids.index(self.episode) if self.episode in ids else self.episode or 0
+        if isinstance(found, str) or not 0 <= found < len(ids):
+            remedy = f"give 0 to {len(ids) - 1}, or an id"
+            raise UsageError(where, f"has no episode {self.episode!r}", remedy)
+        return found
+
+    def rows(self, model: "HMA", length: int, stride: int, start: int) -> NDArray[np.int64]:
+        """Return the rows (P,) of the frames in an episode of that length, from row `start` on."""
+        count = max(1, model.config.frames // 2) if self.frames is None else self.frames
+        last = start + (count - 1) * stride
+        if count < 1 or start < 0 or last >= length:
+            fault = f"{count} frames, {stride} steps apart, from {start} on do not fit an episode of {length}"
+            raise UsageError("prompt", fault, "choose another start or fewer frames")
+        return np.arange(start, last + 1, stride)
 
 
 def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int = 0) -> Prompt:
@@ -68,13 +102,16 @@ def read_prompt(model: "HMA", embodiment: str, prompt: Any = None, *, seed: int 
     if isinstance(prompt, str | PathLike):
         folder = as_path(prompt)
         if (folder / MANIFEST).is_file():
-            return _of_shards(model, embodiment, folder)
+            return _of_shards(model, embodiment, folder, Part())
         if (folder / LEROBOT).is_file():
-            return _of_lerobot(model, embodiment, folder)
+            return _of_lerobot(model, embodiment, folder, Part())
         prompt = [folder]
     if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | PathLike):
-        prompt = [_picture(as_path(path)) for path in prompt]
-    pictures = np.asarray(prompt)
+        prompt = [read_picture(path, WAYS) for path in prompt]
+    try:
+        pictures = np.asarray(prompt)
+    except ValueError as fault:
+        raise HMAError("prompt", "its pictures differ in size", "give pictures of one size") from fault
     return (pictures[None] if pictures.ndim == 3 else pictures), None
 
 
@@ -90,21 +127,14 @@ def starting_window(model: "HMA", embodiment: str, seed: int = 0) -> Prompt:
     if robot is None or not (embodiment in RECORDERS or FAMILY.fullmatch(embodiment)):
         raise HMAError(f"prompt of {embodiment}", "none comes along: it is no robot of the laboratory", WAYS)
     with tempfile.TemporaryDirectory() as folder:
-        return _of_recording(model, robot, record(embodiment, folder, 1, seed))
-
-
-def default_frames(model: "HMA") -> int:
-    """Return P of a prompt from a recording: half the model's window, at least one."""
-    return max(1, model.config.frames // 2)
+        return _of_recording(model, robot, record(embodiment, folder, 1, seed), Part())
 
 
 def _of_mapping(model: "HMA", embodiment: str, prompt: Mapping[str, Any]) -> Prompt:
     given = dict(prompt)
-    where = {key: given[key] for key in ("episode", "start", "frames") if key in given}
-    if "shards" in given:
-        return _of_shards(model, embodiment, given["shards"], **where)
-    if "lerobot" in given:
-        return _of_lerobot(model, embodiment, given["lerobot"], **where)
+    for key, read in (("shards", _of_shards), ("lerobot", _of_lerobot)):
+        if key in given and not given.keys() - {key, *vars(Part())}:
+            return read(model, embodiment, given.pop(key), Part(**given))
     if "frames" not in given or given.keys() - {"frames", "chunks", "actions"}:
         raise HMAError("prompt", f"has the keys {', '.join(map(str, given))}", WAYS)
     frames = np.asarray(given["frames"])
@@ -125,24 +155,10 @@ def _strided(model: "HMA", embodiment: str, frames: NDArray[Any], actions: Array
     return frames[first :: space.stride], commands[first:].reshape(steps, space.chunk_dim)
 
 
-def _picture(path: Path) -> NDArray[np.uint8]:
-    try:
-        return decode_image(path.read_bytes(), str(path))
-    except OSError as fault:
-        raise UsageError(path, f"cannot be read: {fault.strerror}", WAYS) from fault
-
-
 # -- episodes
 
 
-def _of_shards(
-    model: "HMA",
-    embodiment: str,
-    folder: StrPath,
-    episode: int | str | None = None,
-    start: int = 0,
-    frames: int | None = None,
-) -> Prompt:
+def _of_shards(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Prompt:
     shards = ShardSet(folder)
     require_tokenizer(model.config, shards.spec, shards.folder)
     described(model, embodiment)
@@ -151,9 +167,7 @@ def _of_shards(
         fault = f"is of {robot.id}, with {robot.stride} actions of {robot.action_dim} values in a chunk"
         raise HMAError(shards.folder, fault, f"{embodiment} takes {space.stride} of {space.action_dim}")
     rows = shards.episodes.to_pylist()
-    chosen = next((row for row in rows if episode in (None, row["episode_index"], row["id"])), None)
-    if chosen is None:
-        raise UsageError(shards.folder, f"has no episode {episode!r}", f"give 0 to {len(rows) - 1}, or an id")
+    chosen = rows[part.number([row["id"] for row in rows], shards.folder)]
     cameras = cameras_for(model, shards)
     names = [cameras] if isinstance(cameras, str) else cameras
     names = [shards.manifest.cameras[0] if name not in shards.manifest.cameras else name for name in names]
@@ -162,28 +176,18 @@ def _of_shards(
         columns = EpisodeReader(shards, shards.columns([name])).episode(chosen, name)
         (stored,) = (columns[key] for key in columns if key in ("tokens", "latents"))
         views.append(shards.tokens(stored))
-    at = _grid(len(views[0]), start // shards.manifest.frame_stride, shards.row_stride, frames, model)
-    spans = at[:-1, None] + np.arange(shards.row_stride)
-    chunks = columns["action"][spans].reshape(len(at) - 1, space.chunk_dim)
-    if "action_known" in columns:
-        chunks[~columns["action_known"][spans].all(axis=1)] = np.nan
+    at = part.rows(model, len(views[0]), shards.row_stride, part.start // shards.manifest.frame_stride)
+    chunks = _chunks(columns["action"], columns.get("action_known"), at, shards.row_stride)
     return np.concatenate([view[at] for view in views], axis=-2), chunks
 
 
-def _of_lerobot(
-    model: "HMA",
-    embodiment: str,
-    folder: StrPath,
-    episode: int | str | None = None,
-    start: int = 0,
-    frames: int | None = None,
-) -> Prompt:
+def _of_lerobot(model: "HMA", embodiment: str, folder: StrPath, part: Part) -> Prompt:
     robot = described(model, embodiment)
     if robot is None:
         raise HMAError(embodiment, "has no YAML, which says how its recordings are read", "load a checkpoint")
     if robot.source.format != "lerobot":
         robot = _as_lerobot(robot, folder)
-    return _of_recording(model, robot, as_path(folder), episode, start, frames)
+    return _of_recording(model, robot, as_path(folder), part)
 
 
 def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
@@ -204,27 +208,24 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
     return Embodiment.from_values({**kept, **changed}, f"{folder}, as {robot.id}")
 
 
-def _of_recording(
-    model: "HMA",
-    robot: Embodiment,
-    recording: Path,
-    episode: int | str | None = None,
-    start: int = 0,
-    frames: int | None = None,
-) -> Prompt:
+def _of_recording(model: "HMA", robot: Embodiment, recording: Path, part: Part) -> Prompt:
     """Return frames of an episode of a recording, in the format that the robot's YAML names."""
     source = open_source(robot.source.format)
     ids = source.episode_ids(recording)
-    chosen = ids[episode or 0] if not isinstance(episode, str) and (episode or 0) < len(ids) else episode
-    if chosen not in ids:
-        raise UsageError(recording, f"has no episode {episode!r}", f"give 0 to {len(ids) - 1}, or an id")
-    clip = to_clip(source.read(recording, str(chosen), robot), robot)
-    at = _grid(len(clip), start, robot.stride, frames, model)
-    chunks = clip.actions[at[:-1, None] + np.arange(robot.stride)].reshape(len(at) - 1, -1)
-    if clip.action_known is not None:
-        known = clip.action_known[at[:-1, None] + np.arange(robot.stride)].all(axis=1)
-        chunks[~known] = np.nan
-    return _pictures(model, robot, clip, at), chunks
+    clip = to_clip(source.read(recording, ids[part.number(ids, recording)], robot), robot)
+    at = part.rows(model, len(clip), robot.stride, part.start)
+    return _pictures(model, robot, clip, at), _chunks(clip.actions, clip.action_known, at, robot.stride)
+
+
+def _chunks(
+    actions: NDArray[Any], known: NDArray[np.bool_] | None, at: NDArray[np.int64], stride: int
+) -> NDArray[np.float32]:
+    """Return the chunks (P - 1, K) between the rows (P,) of an episode's actions (T, ...)."""
+    spans = at[:-1, None] + np.arange(stride)
+    chunks = actions[spans].reshape(len(at) - 1, int(np.prod(actions.shape[1:])) * stride)
+    if known is not None:
+        chunks[~known[spans].all(axis=1)] = np.nan
+    return chunks
 
 
 def _pictures(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -244,13 +245,3 @@ def _pictures(model: "HMA", robot: Embodiment, clip: Clip, at: NDArray[np.int64]
         for name in names
     ]
     return np.concatenate(views, axis=2)
-
-
-def _grid(length: int, start: int, stride: int, frames: int | None, model: "HMA") -> NDArray[np.int64]:
-    """Return the rows (P,) of a prompt's frames in an episode."""
-    count = default_frames(model) if frames is None else frames
-    last = start + (count - 1) * stride
-    if count < 1 or start < 0 or last >= length:
-        fault = f"{count} frames, {stride} steps apart, from {start} on do not fit an episode of {length}"
-        raise UsageError("prompt", fault, "choose another start or fewer frames")
-    return np.arange(start, last + 1, stride)

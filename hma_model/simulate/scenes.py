@@ -1,13 +1,15 @@
 """Offer robots to drive, and scenes in which to begin.
 
 A scene gives the prompt of a world model, and then tells what truly happens under further commands. The
-laboratory's simulators know it for any commands; a recording knows it for its own commands alone.
+laboratory's simulators know it for any commands; a recording knows it for its own commands alone; nobody
+knows it for a robot that begins from pictures.
 
 P frames of a prompt, H×W pixels, A action dims, K = stride * A values of a chunk.
 """
 
+import contextlib
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
@@ -15,20 +17,21 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
+from hma_data.errors import HMAError, UsageError
 from hma_data.lab import FAMILY
 from hma_data.lab.simulator import SIZE, LabSimulator, simulated
 from hma_data.registry.components import Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
+from hma_data.storage.files import read_json
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
+from hma_model.simulate.pictures import Picture, fitted, sample_picture
 
 if TYPE_CHECKING:
     from hma_data.loading.dataset import WindowDataset
     from hma_data.tokenizers.base import Tokenizer
 
 Floats = NDArray[np.float32]
-Picture = NDArray[np.uint8]
 
 PROMPT = 4  # frames; two would show velocities, more also show what stands still
 LONGEST = 64  # frames of a window of a recording
@@ -55,7 +58,7 @@ class Dimension:
 
 @dataclass(frozen=True)
 class Prompt:
-    """Known frames (P, H, W, 3) uint8, and the chunks (P - 1, K) float32 between them."""
+    """Known frames (P, H, W, 3) uint8, and the chunks (P - 1, K) float32 between them; NaN is unknown."""
 
     frames: Picture
     chunks: Floats
@@ -97,7 +100,7 @@ class Drivable(Protocol):
 
     @property
     def source(self) -> str:
-        """Return "simulator" or "recordings"."""
+        """Return "simulator", "recordings" or "pictures"."""
 
     def scene(self, number: int) -> Scene:
         """Return the scene of that number; there is one for every number from 0 on."""
@@ -214,21 +217,69 @@ class RecordedScene:
         return self._chunks[self._at - 2], self._frames[self._at - 1] if self._followed else None
 
 
+# -- pictures
+
+
+class PicturedRobot:
+    """A robot that begins from pictures (P, H, W, 3); from a single one it begins at rest.
+
+    The commands before several pictures are unknown, and so is the resting command of a robot with targets.
+    """
+
+    source = "pictures"
+
+    def __init__(self, embodiment: Embodiment, stats: Mapping[str, Any], pictures: Picture) -> None:
+        self.embodiment, self.key = embodiment, f"{embodiment.id}:pictures"
+        self.dimensions = dims = dimensions(embodiment, stats)
+        means = stats["action"]["mean"]
+        rest = [{"rate": 0.0, "switch": dim.low}.get(dim.kind, mean) for dim, mean in zip(dims, means)]
+        self._command = np.array(rest, np.float32)
+        before = np.full_like(self._command, np.nan)
+        if len(pictures) == 1:
+            pictures = pictures.repeat(PROMPT, axis=0)
+            if all(dim.kind != "target" for dim in dims):
+                before = self._command
+        self._prompt = Prompt(pictures, np.tile(before, (len(pictures) - 1, embodiment.stride)))
+
+    def scene(self, number: int) -> "PicturedScene":
+        """Return the one scene that there is."""
+        return PicturedScene(self._prompt, self._command)
+
+
+@dataclass(frozen=True)
+class PicturedScene:
+    """Pictures, after which nobody knows what truly happens."""
+
+    prompt: Prompt
+    command: Floats
+
+    def advance(self, chunk: Floats | None) -> tuple[Floats, None] | None:
+        return None if chunk is None else (chunk, None)
+
+
 # -- what can be driven
 
 
 def drivable(
-    checkpoint: Checkpoint, sets: Iterable[ShardSet], tokenizer: Callable[[], "Tokenizer"]
+    checkpoint: Checkpoint,
+    sets: Iterable[ShardSet],
+    tokenizer: Callable[[], "Tokenizer"],
+    pictures: Sequence[Picture] = (),
 ) -> dict[str, Drivable]:
     """Return the robots of a checkpoint that can be driven, by key.
+
+    A robot without simulator and shards begins from the first picture of its sample in the checkpoint.
 
     Args:
         sets: shard sets of its robots.
         tokenizer: returns the checkpoint's, which decodes them.
+        pictures: (H, W, 3) of one size, in their order at the rate of the model's frames; every robot begins
+            from them too.
 
     Raises:
         UsageError: there is none, or the checkpoint lacks the robot of a shard set.
         CheckpointError: the shard set has other tokens than the checkpoint was trained on.
+        HMAError: the pictures do not fit the model.
     """
     found: dict[str, Drivable] = {}
     for shards in sets:
@@ -242,13 +293,40 @@ def drivable(
         cameras = checkpoint.card(name).get("data", {}).get("cameras") or "first"
         robot = RecordedRobot(shards, tokenizer, checkpoint.stats(name), cameras)
         found[robot.key] = robot
+    recorded = {robot.embodiment.id for robot in found.values()}
     for name in checkpoint.embodiments:
+        embodiment, stats = checkpoint.embodiment(name), checkpoint.stats(name)
+        begun = list(pictures)
         if simulated(name):
-            found[name] = LabRobot(checkpoint.embodiment(name), checkpoint.stats(name))
+            found[name] = LabRobot(embodiment, stats)
+        elif not begun and name not in recorded and (sample := sample_picture(checkpoint, name)) is not None:
+            begun = [sample]
+        if begun:
+            pictured = PicturedRobot(
+                embodiment, stats, fitted(np.stack(begun), checkpoint.config, embodiment)
+            )
+            found[pictured.key] = pictured
     if not found:
-        remedy = f"give shards of it: hma play {checkpoint.folder} SHARDS"
+        remedy = "give shards of it, hma play CHECKPOINT SHARDS, or a picture of it, --prompt PICTURE"
         raise UsageError(checkpoint.folder, "no robot of it has a simulator to begin from", remedy)
     return found
+
+
+def trained_on(checkpoint: Checkpoint) -> list[ShardSet]:
+    """Return the shard sets of a training run whose robots have no simulator, as far as they are here.
+
+    Args:
+        checkpoint: one of the run's; of any other there are none.
+    """
+    path = checkpoint.folder.parent.parent / "recipe.json"
+    if checkpoint.folder.parent.name != "checkpoints" or not path.is_file():
+        return []
+    sets = []
+    for folder in read_json(path).get("data", ()):
+        with contextlib.suppress(HMAError):  # it was moved or removed
+            sets.append(ShardSet(folder))
+    known = [one for one in sets if one.embodiment.id in checkpoint.embodiments]
+    return [one for one in known if not simulated(one.embodiment.id)]
 
 
 def dimensions(embodiment: Embodiment, stats: Mapping[str, Any]) -> tuple[Dimension, ...]:

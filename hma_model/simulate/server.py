@@ -28,7 +28,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hma_data.errors import HMAError, UsageError
-from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
+from hma_model.checkpoint.folder import Checkpoint
 from hma_model.simulate import messages
 from hma_model.simulate.engine import Engine
 from hma_model.simulate.films import KINDS, film
@@ -357,6 +357,7 @@ class Connection:
 
 async def serve(
     checkpoint: Checkpoint,
+    name: str,
     robots: Mapping[str, Drivable],
     tokenizer: "Tokenizer",
     listener: socket.socket,
@@ -367,6 +368,7 @@ async def serve(
     """Serve a checkpoint until the process is interrupted.
 
     Args:
+        name: for the model, shown on the page.
         robots: those that can be driven.
         tokenizer: the checkpoint's.
         listener: a socket that listens.
@@ -382,7 +384,6 @@ async def serve(
 
     confidence = ("confidence",) if checkpoint.config.kind == "discrete" else ()
     engine = Engine(World(model, tokenizer), robots, orders=("random", *confidence))
-    name = "the embedded model" if checkpoint.folder == EMBEDDED else checkpoint.folder.name
     engine.start()
     try:
         await run(Server(engine, name, host, token).app, listener, lambda server: ready())

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
 from hma_data.storage.paths import StrPath
 from hma_data.tokenizers.base import get_tokenizer
@@ -28,12 +27,11 @@ from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
 from hma_model.generation.unmask import Decoding, check
 from hma_model.simulate.commands import Commands, described
+from hma_model.simulate.pictures import Picture, fitted, picture_shape
 
 if TYPE_CHECKING:
     from hma_data.tokenizers.base import Tokenizer
     from hma_model.network.model import HMA
-
-Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -73,8 +71,7 @@ class World:
         self.unmask_steps, self.temperature = unmask_steps, temperature
         self.order, self.sample_steps = order, sample_steps
         self._decoding()
-        size = tokenizer.spec.image_size
-        self.picture_shape = (size, model.config.views * size, 3)
+        self.picture_shape = picture_shape(model.config)
         self._rollout: Rollout | None = None
         self._sessions: dict[int, _Session] = {}
         self._opened = 0
@@ -224,21 +221,10 @@ class World:
 
     def _stored(self, embodiment: str, frames: NDArray[Any]) -> NDArray[Any]:
         """Return frames as the model stores them; encode pictures."""
-        config, spec = self.model.config, self.tokenizer.spec
+        config = self.model.config
         if len(frames) and frames.shape[1:] == config.frame_shape:
             return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
-        if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not len(frames):
-            fault = f"frames are {frames.dtype} of the shape {frames.shape}"
-            raise HMAError("prompt", fault, "give pictures (P, H, W, 3) uint8, or stored tokens")
-        frames = frames[-config.frames :]
-        if frames.shape[1:] != self.picture_shape:
-            if config.views > 1:
-                fault = f"pictures are {frames.shape[2]}×{frames.shape[1]}"
-                size = f"{self.picture_shape[1]}×{self.picture_shape[0]}"
-                raise HMAError("prompt", fault, f"give {config.views} views side by side, {size}")
-            robot = described(self.model, embodiment)
-            rule = "short_side_crop" if robot is None else robot.primary_camera.resize
-            frames = resize(frames, spec.image_size, rule, spec.resize_filter)
+        frames = fitted(frames[-config.frames :], config, described(self.model, embodiment))
         views = [self.tokenizer.encode(view) for view in np.split(frames, config.views, axis=2)]
         return np.concatenate(views, axis=-2).astype(np.int64 if config.kind == "discrete" else np.float32)
 

@@ -97,6 +97,10 @@ def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(
     ("prompt", "message"),
     [
         ({"pictures": 3}, "has the keys pictures — give a picture or pictures"),
+        ({"lerobot": "data", "episde": 1}, "has the keys lerobot, episde"),
+        ([np.zeros((8, 8, 3), np.uint8), np.zeros((9, 8, 3), np.uint8)], "its pictures differ in size"),
+        ("tests", "tests: is a folder, not a picture — give a picture or pictures"),
+        ("README.md", "README.md: is not a picture — give a picture or pictures"),
         ("no/such.png", "cannot be read: No such file or directory — give a picture"),
         ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "actions": np.zeros((3, 2))}, r"give \(2, 2\)"),
     ],
@@ -110,6 +114,8 @@ def test_prompts_that_cannot_be_read_are_refused(model: HMA, prompt: Any, messag
 def test_windows_that_are_not_there_are_refused(model: HMA, shards: Path) -> None:
     with pytest.raises(HMAError, match="has no episode 7 — give 0 to 1, or an id"):
         read_prompt(model, MOVER, {"shards": shards, "episode": 7})
+    with pytest.raises(HMAError, match="has no episode -1 — give 0 to 1, or an id"):
+        read_prompt(model, MOVER, {"shards": shards, "episode": -1})
     with pytest.raises(HMAError, match="4 frames, 5 steps apart, from 900 on do not fit an episode of"):
         read_prompt(model, MOVER, {"shards": shards, "start": 900})
     with pytest.raises(HMAError, match="5 actions of 2 values in a chunk — planar_arm takes 3 of 2"):

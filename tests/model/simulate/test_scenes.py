@@ -10,6 +10,7 @@ import pytest
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.episodes.align import to_clip
+from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
@@ -19,6 +20,7 @@ from hma_model.simulate.films import film
 from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, drivable, pad
 from hma_model.simulate.session import Session
 from tests.conftest import BlockTokenizer
+from tests.model.robots import save
 from tests.model.simulate.worlds import TrueWorld, lab_robots
 
 KINDS = {  # robot -> kinds of its values, and what its picture is as a pad
@@ -97,6 +99,28 @@ def test_a_robot_without_simulator_and_shards_of_another_model_are_refused(
 ) -> None:
     with pytest.raises(UsageError, match="does not know the robot toy_arm"):
         drivable(Checkpoint.open(EMBEDDED), [shards], pytest.fail)
+
+
+def test_a_robot_without_simulator_begins_from_its_sample_or_from_pictures(tmp_path: Path) -> None:
+    save(tmp_path / "model", {"arm_a": 2, "arm_b": 2})
+    opened = Checkpoint.open(tmp_path / "model")
+    with pytest.raises(UsageError, match="no robot of it has a simulator to begin from — give shards of it"):
+        drivable(opened, (), pytest.fail)
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 256, (6, 16, 16, 3), dtype=np.uint8)
+    sheet = png_bytes(grid([list(pictures)] * 3, ["truth", "predicted", "other"]))
+    (opened.folder / "embodiments/arm_a/sample.png").write_bytes(sheet)
+    (robot,) = drivable(opened, (), pytest.fail).values()
+    scene = robot.scene(0)
+    assert (robot.embodiment.id, robot.source) == ("arm_a", "pictures")
+    assert np.array_equal(scene.prompt.frames, pictures[:1].repeat(PROMPT, axis=0))
+    chunk = np.ones(robot.embodiment.chunk_dim, np.float32)
+    assert scene.advance(chunk) == (chunk, None) and scene.advance(None) is None
+    large = pictures[:2].repeat(2, axis=1).repeat(2, axis=2)
+    robots = drivable(opened, (), pytest.fail, list(large))
+    assert list(robots) == ["arm_a:pictures", "arm_b:pictures"]
+    begun = robots["arm_b:pictures"].scene(1).prompt
+    assert np.array_equal(begun.frames, pictures[:2]) and np.isnan(begun.chunks).all()
 
 
 @pytest.mark.slow

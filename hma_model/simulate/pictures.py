@@ -1,0 +1,80 @@
+"""Read pictures to begin from: files, and the sample of a checkpoint; fit them to a model.
+
+P pictures, H×W pixels, S pixels a side of the tokenizer's pictures, V views side by side.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hma_data.episodes.images import decode_image, resize
+from hma_data.episodes.sheets import first_of_grid
+from hma_data.errors import EpisodeError, HMAError, UsageError
+from hma_data.storage.kinds import misplaced
+from hma_data.storage.paths import StrPath, as_path
+from hma_data.tokenizers.base import TokenizerSpec
+from hma_model.checkpoint.folder import SAMPLE, Checkpoint
+from hma_model.config import HMAConfig
+
+if TYPE_CHECKING:
+    from hma_data.registry.embodiment import Embodiment
+
+Picture = NDArray[np.uint8]
+REMEDY = "give a PNG, a JPEG or another still picture"
+
+
+def read_picture(path: StrPath, remedy: str = REMEDY) -> Picture:
+    """Return the picture (H, W, 3) RGB of a file.
+
+    Args:
+        remedy: what the error says can be given.
+
+    Raises:
+        UsageError: it cannot be read, or is no picture.
+    """
+    path = as_path(path)
+    try:
+        return decode_image(path.read_bytes(), str(path))
+    except OSError as fault:
+        text = "is a folder, not a picture" if path.is_dir() else f"cannot be read: {fault.strerror}"
+        raise UsageError(path, *(misplaced(path, "a picture") or (text, remedy))) from fault
+    except EpisodeError as fault:
+        raise UsageError(path, *(misplaced(path, "a picture") or ("is not a picture", remedy))) from fault
+
+
+def picture_shape(config: HMAConfig) -> tuple[int, int, int]:
+    """Return (S, V·S, 3) of a model's pictures."""
+    size = TokenizerSpec.from_json(dict(config.tokenizer)).image_size
+    return size, config.views * size, 3
+
+
+def fitted(pictures: NDArray[Any], config: HMAConfig, robot: "Embodiment | None") -> Picture:
+    """Return pictures (P, H, W, 3) uint8 as (P, S, V·S, 3), resized as in a conversion.
+
+    Args:
+        robot: whose camera they are of; None crops them to squares.
+
+    Raises:
+        HMAError: they are no such pictures, or show several views in another size.
+    """
+    if pictures.ndim != 4 or pictures.shape[-1] != 3 or pictures.dtype != np.uint8 or not len(pictures):
+        fault = f"frames are {pictures.dtype} of the shape {pictures.shape}"
+        raise HMAError("prompt", fault, "give pictures (P, H, W, 3) uint8, or stored tokens")
+    spec, shape = TokenizerSpec.from_json(dict(config.tokenizer)), picture_shape(config)
+    if pictures.shape[1:] == shape:
+        return pictures
+    if config.views > 1:
+        fault = f"pictures are {pictures.shape[2]}×{pictures.shape[1]}"
+        raise HMAError("prompt", fault, f"give {config.views} views side by side, {shape[1]}×{shape[0]}")
+    rule = "short_side_crop" if robot is None else robot.primary_camera.resize
+    return resize(pictures, spec.image_size, rule, spec.resize_filter)
+
+
+def sample_picture(checkpoint: Checkpoint, embodiment: str) -> Picture | None:
+    """Return the first true picture (S, V·S, 3) of an embodiment's sample sheet; None without a sheet."""
+    path = checkpoint.folder / "embodiments" / embodiment / SAMPLE
+    if not path.is_file():
+        return None
+    sheet, (height, width, _) = read_picture(path), picture_shape(checkpoint.config)
+    return first_of_grid(sheet, height, width)
