@@ -140,8 +140,8 @@ class HMAConfig:
     # too). With "tokens", a single hidden chunk is hidden only in the action tokens; modulation still sees
     # it, as in the released code.
     absent_action: str = "embedding"
-    # Octaves of sines and cosines of each value of a chunk, beside the values: a sharp sense of where a command
-    # points. The longest wave is 8 standard deviations of the value.
+    # Octaves of sines and cosines of each value of a chunk, beside the values: a sharp sense of where a
+    # command points. The longest wave is 8 standard deviations of the value.
     action_waves: int = 0
     action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
 
