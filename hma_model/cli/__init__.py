@@ -251,8 +251,9 @@ def generate(
     unmask_steps: UnmaskSteps = 2,
     sample_steps: SampleSteps = None,
     temperature: Annotated[
-        float, typer.Option("--temperature", min=0, help="0 takes the likeliest token.")
-    ] = 0.0,
+        float | None,
+        typer.Option("--temperature", min=0, help="0 takes the likeliest token; default 0.5, of latents 0."),
+    ] = None,
     precision: Precision = "float32",
     compile: Compile = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rollout.")] = 0,

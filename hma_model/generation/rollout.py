@@ -26,7 +26,14 @@ from hma_data.errors import HMAError
 from hma_model.generation.chunks import prompt_chunks, step_chunk
 from hma_model.generation.engine import Engine
 from hma_model.generation.state import Pass, RowState, Snapshot
-from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, check, masked_after
+from hma_model.generation.unmask import (
+    Decoding,
+    PatchFrame,
+    TokenFrame,
+    check,
+    default_temperature,
+    masked_after,
+)
 from hma_model.network.conditioning import Groups, condition
 from hma_model.network.model import HMA
 from hma_model.network.stem import split_tokens, unpatchify
@@ -65,7 +72,7 @@ class Rollout:
         batch: int = 1,
         *,
         unmask_steps: int = 2,
-        temperature: float = 0.0,
+        temperature: float | None = None,
         order: str = "random",
         sample_steps: int | None = None,
         guidance: float = 1.0,
@@ -76,7 +83,8 @@ class Rollout:
         precision: str = "float32",
     ) -> None:
         self.model, self.config = model, model.config
-        self.decoding = Decoding(unmask_steps, temperature, order, sample_steps, guidance, noise_level)
+        warmth = default_temperature(model.config) if temperature is None else temperature
+        self.decoding = Decoding(unmask_steps, warmth, order, sample_steps, guidance, noise_level)
         check(self.decoding, self.config)
         self.batch, self.caching, self.twins = batch, cache, guidance != 1
         self.engine = Engine(model, precision, compile and cache)
@@ -245,9 +253,9 @@ class Rollout:
 
     def _unmask(self, frame: TokenFrame | PatchFrame, passes: list[Pass], count: int, first: bool) -> None:
         """Predict and keep `count` more tokens of a frame."""
-        if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.temperature:
+        if self.engine.whole is not None and isinstance(frame, TokenFrame):
             (part,) = passes
-            seen = frame.laid_out(part.lay_out)
+            seen = frame.laid_out(part.lay_out, self.model.token_readout, count)
             made = self.engine.whole(seen, count, *self._inputs(frame, part, first)).clone()
             frame.values = made if part.lanes is None else made[part.lanes]
             return

@@ -18,6 +18,15 @@ from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
 from hma_model.network.head import LatentReadout, TokenReadout, uniform
 
+# The likeliest tokens leave out what is small and moves, because each of its places is unlikely: a pusher's
+# disc is gone after a frame. Draws by the trained frequencies scatter specks over the picture.
+TEMPERATURE = 0.5
+
+
+def default_temperature(config: HMAConfig) -> float:
+    """Return the temperature at which a model's frames are drawn unless the caller says otherwise."""
+    return TEMPERATURE if config.kind == "discrete" else 0.0
+
 
 @dataclass(frozen=True)
 class Decoding:
@@ -34,7 +43,7 @@ class Decoding:
     """
 
     steps: int = 2
-    temperature: float = 0.0
+    temperature: float = TEMPERATURE
     order: str = "random"
     sample_steps: int | None = None
     guidance: float = 1.0
@@ -67,15 +76,22 @@ class TokenFrame:
         generators: Sequence[torch.Generator],
         copies: int = 1,
         rank: Tensor | None = None,
+        noise: Tensor | None = None,
     ) -> None:
         self.values, self.mask_id, self.decoding = values, mask_id, decoding
         self.generators, self.copies = generators, copies
         self.rank = _ranks(values, generators, copies) if rank is None else rank
+        self.noise = noise
 
-    def laid_out(self, lay_out: Callable[[Tensor], Tensor]) -> "TokenFrame":
-        """Return the frames in other rows, for passes that draw nothing."""
+    def laid_out(
+        self, lay_out: Callable[[Tensor], Tensor], readout: TokenReadout, count: int
+    ) -> "TokenFrame":
+        """Return the frames in other rows, with all draws made for a pass that keeps `count` more tokens."""
         values, rank = lay_out(self.values), lay_out(self.rank)
-        return TokenFrame(values, self.mask_id, self.decoding, (), self.copies, rank)
+        asked = count if self.decoding.order == "random" else values.shape[1]
+        noise = self._noise(readout, asked)
+        noise = None if noise is None else lay_out(noise.repeat(self.copies, 1, 1, 1))
+        return TokenFrame(values, self.mask_id, self.decoding, (), self.copies, rank, noise)
 
     @property
     def masked(self) -> Tensor:
@@ -101,7 +117,7 @@ class TokenFrame:
     def _sample(self, readout: TokenReadout, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return token ids (B, k) and, if the order asks for them, the log probabilities (B, k) of these."""
         way, sure = self.decoding, []
-        noise = self._noise(readout, features) if way.temperature > 0 else None
+        noise = self._noise(readout, features.shape[1]) if self.noise is None else self.noise
 
         def choose(scores: Tensor, first: int) -> Tensor:
             if self.copies > 1:
@@ -109,19 +125,22 @@ class TokenFrame:
                 scores = torch.lerp(free, commanded, way.guidance)
             drawn = scores  # with noise, the largest of the sums is a sample from the softmax
             if noise is not None:
-                drawn = scores + noise[:, first : first + scores.shape[1], :, : scores.shape[-1]]
-            digits = drawn.argmax(-1)
+                n, digits, _, values = scores.shape
+                drawn = scores + noise[:n, first : first + digits, :, :values]
+            taken = drawn.argmax(-1)
             if way.order == "confidence":
-                sure.append(scores.log_softmax(-1).gather(-1, digits.unsqueeze(-1)).squeeze(-1).sum(1))
-            return digits if self.copies == 1 else digits.repeat(self.copies, 1, 1)
+                sure.append(scores.log_softmax(-1).gather(-1, taken.unsqueeze(-1)).squeeze(-1).sum(1))
+            return taken if self.copies == 1 else taken.repeat(self.copies, 1, 1)
 
         tokens = readout.ids(readout.decide(features, choose).transpose(1, 2))
         return tokens, sum(sure, torch.zeros(())).repeat(self.copies, 1)
 
-    def _noise(self, readout: TokenReadout, features: Tensor) -> Tensor:
-        """Return Gumbel noise (n, F, k, V), times the temperature."""
-        shape = len(self.generators), len(readout.factored), features.shape[1], max(readout.factored)
-        noise = uniform(shape, self.generators, features.device).clamp(min=1e-20)
+    def _noise(self, readout: TokenReadout, tokens: int) -> Tensor | None:
+        """Return Gumbel noise (n, F, k, V) for k tokens, times the temperature; None at 0."""
+        if not self.decoding.temperature:
+            return None
+        shape = len(self.generators), len(readout.factored), tokens, max(readout.factored)
+        noise = uniform(shape, self.generators, self.values.device).clamp(min=1e-20)
         return (-noise.log()).log() * -self.decoding.temperature
 
 

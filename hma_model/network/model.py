@@ -318,7 +318,7 @@ class HMA(nn.Module):
         embodiment: str | Sequence[str],
         frames: int,
         unmask_steps: int = 2,
-        temperature: float = 0.0,
+        temperature: float | None = None,
         generator: torch.Generator | None = None,
         order: str = "random",
         cache: bool = True,
@@ -337,7 +337,8 @@ class HMA(nn.Module):
             embodiment: one id for all, or one a sample.
             frames: how many to add.
             unmask_steps: passes a frame.
-            temperature: 0 takes the likeliest token, else it divides the logits (continuous: share of noise).
+            temperature: 0 takes the likeliest token, else it divides the logits (continuous: share of noise);
+                by default 0.5 for tokens, 0 for latents.
             generator: of every random draw.
             order: the order in which tokens are unmasked, "random" or "confidence".
             cache: keep keys and values of past frames; False recomputes everything, with the same result.

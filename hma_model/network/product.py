@@ -72,12 +72,13 @@ def light(linear: nn.Module | None, function: Callable[..., Tensor], x: Tensor, 
 
 def _quick(linear: nn.Module, x: Tensor) -> bool:
     """Check whether oneDNN is to compute this product."""
+    if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu"):
+        return False
     if x.device.type != "cpu" or x.dtype != torch.float32 or x.numel() < ROWS * x.shape[-1]:
         return False
     if not isinstance(linear, Linear) or linear.weight.dtype != torch.float32 or not has_kernels():
         return False
-    plain = type(linear.weight) is nn.Parameter  # FSDP's shards are of another type
-    return plain and not torch.is_autocast_enabled("cpu") and not torch.compiler.is_compiling()
+    return type(linear.weight) is nn.Parameter  # FSDP's shards are of another type
 
 
 def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:

@@ -49,7 +49,7 @@ class Engine:
         idle_s: float = IDLE_S,
     ) -> None:
         self.robots, self.orders, self.most, self.idle_s = robots, orders, most, idle_s
-        self._world = world
+        self._world, self._sampling = world, Sampling(world.unmask_steps, world.temperature, world.order)
         self.sessions: dict[str, Session] = {}
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -97,7 +97,9 @@ class Engine:
                 fault = f"all {self.most} places are taken"
                 raise UsageError("sessions", fault, "close another page, or try again in a few minutes")
             self.close(min(left, key=lambda session: session.touched).name, "its place was needed")
-        session = Session(secrets.token_urlsafe(18), robot, number, self._world, time.monotonic())
+        session = Session(
+            secrets.token_urlsafe(18), robot, number, self._world, self._sampling, time.monotonic()
+        )
         self.sessions[session.name] = session
         return session
 

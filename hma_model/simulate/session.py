@@ -46,9 +46,9 @@ class World(Protocol):
 class Sampling:
     """How a frame is decoded: passes, temperature, and the order random or confidence."""
 
-    passes: int = 2
-    temperature: float = 0.0
-    order: str = "random"
+    passes: int
+    temperature: float
+    order: str
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,10 @@ class Session:
         touched: when a person did something last.
     """
 
-    def __init__(self, name: str, robot: Drivable, number: int, world: World, now: float) -> None:
-        self.name, self.robot, self.sampling, self._world = name, robot, Sampling(), world
+    def __init__(
+        self, name: str, robot: Drivable, number: int, world: World, sampling: Sampling, now: float
+    ) -> None:
+        self.name, self.robot, self._world, self.sampling = name, robot, world, sampling
         self.viewer: Viewer | None = None
         self.due = self.touched = now
         self.paused, self.replays, self.fast = True, False, False

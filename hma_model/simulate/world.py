@@ -25,7 +25,7 @@ from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.evaluate import decode
 from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
-from hma_model.generation.unmask import Decoding, check
+from hma_model.generation.unmask import Decoding, check, default_temperature
 from hma_model.simulate.commands import Commands, described
 from hma_model.simulate.pictures import Picture, fitted, picture_shape
 
@@ -61,14 +61,15 @@ class World:
         tokenizer: "Tokenizer",
         *,
         unmask_steps: int = 2,
-        temperature: float = 0.0,
+        temperature: float | None = None,
         order: str = "random",
         sample_steps: int | None = None,
         compile: bool = False,
     ) -> None:
         require_tokenizer(model.config, tokenizer.spec, "the model")
         self.model, self.tokenizer, self.compile = model, tokenizer, compile
-        self.unmask_steps, self.temperature = unmask_steps, temperature
+        self.unmask_steps = unmask_steps
+        self.temperature = default_temperature(model.config) if temperature is None else temperature
         self.order, self.sample_steps = order, sample_steps
         self._decoding()
         self.picture_shape = picture_shape(model.config)

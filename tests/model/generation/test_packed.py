@@ -98,13 +98,14 @@ def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("guidance", [1.0, 2.0])
+@pytest.mark.parametrize(("guidance", "temperature"), [(1.0, 0.0), (2.0, 0.5)])
 @pytest.mark.parametrize(("order", "digits"), [("random", "chain"), ("confidence", "together")])
 def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
-    order: str, digits: str, guidance: float, monkeypatch: pytest.MonkeyPatch
+    order: str, digits: str, guidance: float, temperature: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = small_model(masked_input="previous", digit_order=digits, told_noise=True)
-    how, compile, graphs = {"order": order, "guidance": guidance, "noise_level": 0.2}, torch.compile, []
+    how = {"order": order, "guidance": guidance, "temperature": temperature, "noise_level": 0.2}
+    compile, graphs = torch.compile, []
 
     def backend(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> torch.fx.GraphModule:
         graphs.append(graph)

@@ -70,7 +70,8 @@ def test_the_scores_go_beyond_those_with_commands(order):
     batch = small_batch(model.config, NAMES)
     window = batch.tokens[:, :3].clone()
     window[:, 2] = model.config.vocab_size
-    made = model.generate(batch.tokens[:, :2], batch.actions, NAMES, 1, unmask_steps=1, guidance=2.5)[:, 0]
+    how = {"unmask_steps": 1, "temperature": 0, "guidance": 2.5}
+    made = model.generate(batch.tokens[:, :2], batch.actions, NAMES, 1, **how)[:, 0]
     none = torch.zeros(3, 3, dtype=torch.bool)
     with_commands, without = (
         model.video_logits(window, batch.actions[:, :3], NAMES, known, _last(window, made))[:, 2]

@@ -136,12 +136,12 @@ def test_sync_restarts_the_model_from_the_true_frames_and_their_commands() -> No
 def test_sessions_of_another_sampling_have_a_pass_of_their_own() -> None:
     bench = Bench(orders=("random",))
     one, other, third = (bench.open()[0] for _ in range(3))
-    bench.engine.change(other, Sampling(passes=4, temperature=0.5))
+    bench.engine.change(other, Sampling(4, 0.5, "random"))
     bench.step()
     assert bench.world.sampling == [(2, 0.0, "random"), (4, 0.5, "random")]
     assert [set(step) for step in bench.world.steps] == [{one.row, third.row}, {other.row}]
     with pytest.raises(UsageError, match="no 'confidence'"):
-        bench.engine.change(one, Sampling(order="confidence"))
+        bench.engine.change(one, Sampling(2, 0.0, "confidence"))
 
 
 def test_a_new_scene_begins_anew_and_the_same_scene_is_the_same() -> None:

@@ -18,7 +18,7 @@ from hma_data.sources.base import open_source
 from hma_model.checkpoint.folder import EMBEDDED, Checkpoint
 from hma_model.simulate.films import film
 from hma_model.simulate.scenes import PROMPT, LabRobot, RecordedRobot, drivable, pad
-from hma_model.simulate.session import Session
+from hma_model.simulate.session import Sampling, Session
 from tests.conftest import BlockTokenizer
 from tests.model.robots import save
 from tests.model.simulate.worlds import TrueWorld, lab_robots
@@ -128,7 +128,7 @@ def test_a_robot_without_simulator_begins_from_its_sample_or_from_pictures(tmp_p
 def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> None:
     (robot,) = lab_robots(name).values()
     world = TrueWorld()
-    session, rng = Session("s", robot, 0, world, 0.0), np.random.default_rng(0)
+    session, rng = Session("s", robot, 0, world, Sampling(2, 0.0, "random"), 0.0), np.random.default_rng(0)
     low, high = (np.array([getattr(dim, end) for dim in robot.dimensions]) for end in ("low", "high"))
     for now in range(5):
         session.held = rng.uniform(low, high).astype(np.float32)

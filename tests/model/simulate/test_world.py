@@ -14,6 +14,7 @@ from hma_model.network.model import HMA
 from hma_model.simulate import World, load_world, starting_window
 
 ARM, PUSH = "arm2_07", "pusht_fast"
+SURE: dict[str, Any] = {"unmask_steps": 1, "temperature": 0.0}  # draws nothing
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def test_sessions_get_the_pictures_that_they_get_alone(model: HMA, windows: dict
 
 
 def test_a_session_of_stored_tokens_goes_on_as_generation_does(model: HMA, windows: dict[str, Any]) -> None:
-    world = make(model, unmask_steps=1)
+    world = make(model, **SURE)
     pictures, before = windows[PUSH]
     tokens, chunks = world.tokenizer.encode(pictures), drawn(model, PUSH, 3)
     session = world.open(PUSH, tokens, before)
@@ -69,7 +70,7 @@ def test_a_session_of_stored_tokens_goes_on_as_generation_does(model: HMA, windo
     made = [world.step({session: chunk.reshape(4, 2)})[session] for chunk in chunks]
     actions = torch.from_numpy(np.concatenate([before, chunks]))[None]
     stored = torch.from_numpy(tokens.astype(np.int64))[None]
-    expected = decode(world.tokenizer, model.generate(stored, actions, PUSH, 3, unmask_steps=1))[0]
+    expected = decode(world.tokenizer, model.generate(stored, actions, PUSH, 3, **SURE))[0]
     assert np.array_equal(np.stack(made), expected)
     assert np.array_equal(world.picture(session), made[-1])
 
@@ -108,7 +109,7 @@ def test_a_reset_gives_the_same_pictures_again_and_settings_count_at_once(
 
 
 def test_a_command_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str, Any]) -> None:
-    world = make(model, unmask_steps=1)
+    world = make(model, **SURE)
     pictures, before = windows[PUSH]
     (chunk,) = drawn(model, PUSH, 1)
     hidden = np.where(np.arange(4)[:, None] == 2, np.nan, chunk.reshape(4, 2))
@@ -121,7 +122,7 @@ def test_a_command_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str,
     actions = torch.from_numpy(np.concatenate([before, chunk[None]]))[None]
     for name, known in (("unknown", [True] * len(before) + [False]), ("no chunks", [False] * 4)):
         masks = torch.tensor([known])
-        expected = model.generate(stored, actions, PUSH, 1, unmask_steps=1, known=masks)
+        expected = model.generate(stored, actions, PUSH, 1, known=masks, **SURE)
         assert np.array_equal(decode(world.tokenizer, expected)[0, 0], made[name])
     assert not np.array_equal(made["unknown"], made["zero"])
 

@@ -29,7 +29,7 @@ class TrueWorld:
         self.begun: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
         self.blind: set[int] = set()
         self.sampling: list[tuple[int, float, str]] = []
-        self.unmask_steps, self.temperature, self.order = 0, 0.0, ""
+        self.unmask_steps, self.temperature, self.order = 2, 0.0, "random"
         self._count = 0
 
     def open(self, embodiment: str, frames: Any, chunks: Any = None, *, seed: int = 0) -> int:
