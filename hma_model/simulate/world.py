@@ -225,7 +225,7 @@ class World:
         config = self.model.config
         if len(frames) and frames.shape[1:] == config.frame_shape:
             return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
-        frames = fitted(frames[-config.frames :], config, described(self.model, embodiment))
+        frames = fitted(frames, config, described(self.model, embodiment))[-config.frames :]
         views = [self.tokenizer.encode(view) for view in np.split(frames, config.views, axis=2)]
         return np.concatenate(views, axis=-2).astype(np.int64 if config.kind == "discrete" else np.float32)
 
