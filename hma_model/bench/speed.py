@@ -40,7 +40,7 @@ COMMON: dict[str, Any] = {
 }
 ATTENTION = ("attention", "flash", "fmha")  # in the names of operators and kernels
 KINDS = {"both": ["discrete", "continuous"], "discrete": ["discrete"], "continuous": ["continuous"]}
-PRODUCTS = ("::mm", "addmm", "bmm", "gemm", "cutlass")
+PRODUCTS = ("::mm", "addmm", "bmm", "gemm", "cutlass", "mkldnn")
 
 
 def check_settings(bench: str, settings: dict[str, Any], **allowed: tuple[Any, ...]) -> None:
