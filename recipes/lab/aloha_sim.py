@@ -3,7 +3,7 @@
 # dependencies = ["hma-toolkit", "gym-aloha==0.1.5"]
 #
 # [tool.uv]
-# override-dependencies = ["opencv-python ; sys_platform == 'never'"]  # it would overwrite the headless OpenCV
+# override-dependencies = ["opencv-python ; sys_platform == 'never'"]  # it overwrites the headless OpenCV
 #
 # [tool.uv.sources]
 # hma-toolkit = {path = "../..", editable = true}
@@ -33,10 +33,8 @@ class Aloha:
     """The environment; commands are those of gym-aloha: six joints and the gripper of each arm, left first."""
 
     robot = "aloha_sim"
-    low, high = (
-        np.tile([-3.14, -1.85, -1.76, -3.14, -1.87, -3.14, 0.0], 2),
-        np.tile([3.14, 1.25, 1.6, 3.14, 2.23, 3.14, 1.0], 2),
-    )
+    low = np.tile([-3.14, -1.85, -1.76, -3.14, -1.87, -3.14, 0.0], 2)
+    high = np.tile([3.14, 1.25, 1.6, 3.14, 2.23, 3.14, 1.0], 2)
     noise = np.tile([0.05, 0.04, 0.04, 0.08, 0.06, 0.08, 0.0], 2)
     centre = np.tile([0.0, -0.96, 1.16, 0.0, -0.3, 0.0, 0.5], 2)
     spread = np.tile([0.25, 0.25, 0.25, 0.3, 0.3, 0.4, 0.5], 2)
@@ -75,7 +73,7 @@ class Aloha:
         right = (  # frame, then as START; the pitch is downward
             (0, *START), (40, x, y, 0.1, 1.05, 0.0, 1.0), (65, x, y, 0.02, 1.05, 0.0, 1.0),
             (80, x, y, 0.02, 1.05, 0.0, 0.0), (120, *MEET, 1.05, 0.0, 0.0), (160, *MEET, 1.05, 0.0, 0.0),
-            (172, *MEET, 1.05, 0.0, 1.0), (195, *MEET + (0.12, 0.0, 0.02), 1.05, 0.0, 1.0),
+            (172, *MEET, 1.05, 0.0, 1.0), (195, 0.12, 0.5, 0.27, 1.05, 0.0, 1.0),
         )  # fmt: skip
         aside = MEET - (0.12, 0.0, 0.0)
         left = (

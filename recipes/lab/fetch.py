@@ -70,7 +70,7 @@ class Fetch:
         if aside > 0.04 or above > 0.1:
             self._held = 0
         if aside > 0.015 and above > 0.03 and not self._held:
-            target = block + [0.0, 0.0, 0.08]
+            target = block + np.array([0.0, 0.0, 0.08])
         elif above > 0.012 and not self._held:
             target = block
         else:

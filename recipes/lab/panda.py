@@ -32,6 +32,7 @@ from hma_data.lab import recorder
 SIZE = 128  # pixels: the side of the pictures
 TASKS = {"Lift": "lift the red cube", "Stack": "stack the red cube on the green one"}
 REACH, TURN = 12.0, 1.5  # commands for each metre and radian to go; 1 moves the hand by 0.05 m or 0.5 rad
+UP = np.array([0.0, 0.0, 1.0])
 CLOSING = 6  # frames in which the fingers close or open
 
 
@@ -53,14 +54,10 @@ class Panda:
                 name,
                 robots="Panda",
                 control_freq=20,
-                camera_names="agentview",
-                camera_heights=SIZE,
-                camera_widths=SIZE,
                 has_renderer=False,
                 has_offscreen_renderer=True,
-                use_camera_obs=True,
+                use_camera_obs=False,
                 ignore_done=True,
-                hard_reset=False,
             )
             for name in TASKS
         ]
@@ -68,10 +65,7 @@ class Panda:
     def reset(self, seed):
         which = seed % len(TASKS)
         self._env = self._envs[which]
-        rng = np.random.default_rng(seed)
-        self._env.rng = self._env.placement_initializer.rng = rng
-        for sampler in getattr(self._env.placement_initializer, "samplers", {}).values():
-            sampler.rng = rng
+        self._env.rng = self._env.placement_initializer.rng = np.random.default_rng(seed)
         self._seen = self._env.reset()
         self._stage, self._waited = 0, 0
         return list(TASKS.values())[which]
@@ -82,7 +76,10 @@ class Panda:
             [seen["robot0_joint_pos"], seen["robot0_gripper_qpos"], seen["robot0_eef_pos"]]
         )
         cubes = [self._cube("cubeA" if "cubeA_pos" in seen else "cube"), self._cube("cubeB")]
-        return seen["agentview_image"][::-1], state, np.concatenate(cubes)
+        simulation = self._env.sim
+        simulation._render_context_offscreen.gl_ctx.make_current()  # the other task may have drawn last
+        picture = simulation.render(SIZE, SIZE, camera_name="agentview")
+        return picture[::-1], state, np.concatenate(cubes)
 
     def _cube(self, name):
         """Return the place and turn (7,) of a cube; zeros where the task has none."""
@@ -94,16 +91,16 @@ class Panda:
         hand, quat = self._seen["robot0_eef_pos"], self._seen["robot0_eef_quat"]
         cube = self._cube("cubeA" if "cubeA_pos" in self._seen else "cube")
         other = self._cube("cubeB")[:3]
-        over = other + [0.0, 0.0, 0.1] if other.any() else np.append(cube[:2], 0.95)
+        over = other + UP * 0.1 if other.any() else np.append(cube[:2], 0.95)
         stages = [  # target, whether the fingers are closed, tolerance in metres
-            (cube[:3] + [0.0, 0.0, 0.07], False, 0.02),
-            (cube[:3] - [0.0, 0.0, 0.005], False, 0.012),
-            (cube[:3] - [0.0, 0.0, 0.005], True, None),
+            (cube[:3] + UP * 0.07, False, 0.02),
+            (cube[:3] - UP * 0.005, False, 0.012),
+            (cube[:3] - UP * 0.005, True, None),
             (np.append(hand[:2], 0.98), True, 0.03),
             (over, True, 0.015),
-            (other + [0.0, 0.0, 0.05], True, 0.01),
-            (other + [0.0, 0.0, 0.05], False, None),
-            (over + [0.0, 0.0, 0.05], False, 0.0),
+            (other + UP * 0.05, True, 0.01),
+            (other + UP * 0.05, False, None),
+            (over + UP * 0.05, False, 0.0),
         ]
         target, closed, near = stages[self._stage]
         self._waited += 1

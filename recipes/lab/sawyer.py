@@ -17,9 +17,9 @@
     uv run recipes/lab/sawyer.py build/lab --episodes 40
     hma convert -e sawyer --source build/lab/sawyer --out build/lab/shards/sawyer
 
-The physics, the look, the success and the scripted experts are Meta-World's, but its shadows are coarser, which
-takes a third off the time of a picture. The camera is corner2, moved nearer; as there, it hangs upside down. A command is held for four steps of the environment, and the experts
-move at half the speed that they ask for.
+The physics, the look, the success and the scripted experts are Meta-World's, but its shadows are coarser,
+which takes a third off the time of a picture. The camera is corner2, moved nearer; as there, it hangs upside
+down. A command is held for four steps of the environment, and the experts move at 0.4 of the full speed at most.
 """
 
 import warnings
@@ -75,6 +75,8 @@ class Sawyer:
         return list(TASKS.values())[which]
 
     def observe(self):
+        if viewer := self._env.mujoco_renderer.viewer:
+            viewer.make_context_current()  # else it draws the things of the environment that drew last
         return self._env.render(), self._seen[:4], np.concatenate([self._seen[4:18], self._seen[36:]])
 
     def expert(self):
