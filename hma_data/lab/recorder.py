@@ -1,8 +1,8 @@
 """Record a third-party simulator: scripted, noised, random episodes, and copies under perturbed commands.
 
-A recipe (recipes/lab/*.py) describes its simulator as a `Simulator` and calls `main`. Each episode is kept in a
-file of its own until all are there, so that a recording that was stopped continues at the next episode; then
-`hma_data.lab.formats` writes them in the format of the robot's embodiment.
+A recipe (recipes/lab/*.py) describes its simulator as a `Simulator` and calls `main`. Each episode is kept in
+a file of its own until all are there, so that a recording that was stopped continues at the next episode;
+then `hma_data.lab.formats` writes them in the format of the robot's embodiment.
 
 Of ten episodes, six are driven by the simulator's scripted expert, two by the expert with smooth noise on its
 commands, and two by smooth random commands. Copy k of an episode begins in the same state; its commands are

@@ -30,7 +30,7 @@ START = (0.183, 0.5, 0.31, 0.1, 0.0, 0.0)  # of the right hand: x, y, z, pitch, 
 
 
 class Aloha:
-    """The environment; commands are those of gym-aloha: six joints and the gripper of each arm, left first."""
+    """The environment; commands are gym-aloha's: six joints and the gripper of each arm, left first."""
 
     robot = "aloha_sim"
     low = np.tile([-3.14, -1.85, -1.76, -3.14, -1.87, -3.14, 0.0], 2)

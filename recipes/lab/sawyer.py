@@ -19,7 +19,7 @@
 
 The physics, the look, the success and the scripted experts are Meta-World's, but its shadows are coarser,
 which takes a third off the time of a picture. The camera is corner2, moved nearer; as there, it hangs upside
-down. A command is held for four steps of the environment, and the experts move at 0.4 of the full speed at most.
+down. A command is held for four steps of the environment; the experts move at 0.4 of full speed at most.
 """
 
 import warnings
