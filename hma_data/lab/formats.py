@@ -133,12 +133,11 @@ def as_bags(path: Path, embodiment: Embodiment, episodes: Iterable[Recorded]) ->
     path.mkdir()
     for episode in episodes:
         rng = np.random.default_rng((episode.seed, episode.number, episode.copy))
-        starts = EPOCH_NS + episode.number * 60_000_000_000
-        starts += np.arange(len(episode.commands)) * round(1e9 / embodiment.rate_hz)
+        start, period = EPOCH_NS + episode.number * 60_000_000_000, round(1e9 / embodiment.rate_hz)
         messages = [
             message
-            for row, stamp in enumerate(starts.tolist())
-            for message in _messages(embodiment, episode, row, stamp, rng)
+            for row in range(len(episode.commands))
+            for message in _messages(embodiment, episode, row, start + row * period, rng)
         ]
         facts = {key: str(value) for key, value in episode.facts.items()}
         facts |= {

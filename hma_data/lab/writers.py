@@ -111,7 +111,8 @@ def write_rlds(
         episodes: all have the same keys.
     """
     folder.mkdir(parents=True)
-    count, widths, facts = 0, {}, {}
+    count, widths = 0, {}
+    facts: Mapping[str, bool | int | str] = {}
     with (folder / f"{name}-train.tfrecord-00000-of-00001").open("wb") as file:
         for episode in episodes:
             file.write(_record(_example(episode)))
@@ -251,7 +252,7 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
     with _quiet():
         try:
             for episode in chain([first], rest):
-                seen = episode.pictures | episode.further
+                seen = {**episode.pictures, **episode.further}
                 for row, action in enumerate(episode.action):
                     values = {key: array[row] for key, array in seen.items()} | {"action": action}
                     if episode.state is not None:
