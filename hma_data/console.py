@@ -220,20 +220,22 @@ class _Lines:
         self._start = self._shown = time.monotonic()
         self._first: float | None = None
         self._done, self._extra = 0.0, ""
+        self._told = False  # whether the last call has been shown
 
     def __call__(self, done: float, extra: str = "", total: float | None = None) -> None:
         self._done, self._extra, self._total = done, extra, total or self._total
+        self._told = False
         if self._first is None:
             self._first = done  # work of an earlier run does not count for the rate
         if time.monotonic() - self._shown >= 10:
             self._show()
 
     def close(self) -> None:
-        if self._first is not None:
+        if self._first is not None and not self._told:
             self._show()
 
     def _show(self) -> None:
-        self._shown = time.monotonic()
+        self._shown, self._told = time.monotonic(), True
         elapsed = self._shown - self._start
         rate = (self._done - (self._first or 0)) / max(elapsed, 1e-9)
         missing = self._total - self._done

@@ -49,7 +49,7 @@ def runs(key: KeyInfo) -> bool:
 def actions(found: list[KeyInfo]) -> Choice:
     """Choose the topics that command the robot; where there are none, what is measured, with a question."""
     ranked = [(_rank(topic), topic) for topic in _topics(found)]
-    commanding = sorted((pair for pair in ranked if pair[0][0] > 0), key=lambda pair: pair[0], reverse=True)
+    commanding = sorted((pair for pair in ranked if pair[0][0] > 0), key=_order, reverse=True)
     if not commanding:
         return _measured(found)
     best = commanding[0][1]
@@ -105,6 +105,12 @@ def _rank(topic: Topic) -> tuple[int, bool, float, int]:
     elif _COMMAND_TYPE.search(first.topic.type if first.topic else "") and not said & MEASURED:
         clear = max(clear, 2)
     return clear, first.hz is not None, first.hz or 0.0, first.count or 0
+
+
+def _order(pair: tuple[tuple[int, bool, float, int], Topic]) -> tuple[float, ...]:
+    """Return the order of a topic with its rank; of equally strong ones, a gripper is behind its arm."""
+    (clear, *others), topic = pair
+    return (clear, not is_gripper(_name(topic)), *others)
 
 
 def _other_side(topic: Topic, best: Topic) -> bool:

@@ -60,15 +60,26 @@ def record(
     final = as_path(out) / name
     if final.exists():
         raise OutputError(final, "exists already", "remove it or record into another folder")
+    with whole(final) as part:
+        import_module(module).record(part, robot, _counted(episodes, on_progress), seed)
+    return final
+
+
+@contextmanager
+def whole(final: Path) -> Iterator[Path]:
+    """Give a path to write a recording to, a file or a folder; it becomes `final` when the block ends.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=final.parent, prefix=f".{name}-") as folder:
-            import_module(module).record(Path(folder) / name, robot, _counted(episodes, on_progress), seed)
-            (Path(folder) / name).rename(final)
+        with tempfile.TemporaryDirectory(dir=final.parent, prefix=f".{final.name}-") as folder:
+            yield Path(folder) / final.name
+            (Path(folder) / final.name).rename(final)
     except OSError as fault:
         remedy = "check the free space and the permissions"
         raise OutputError(final, f"cannot be written: {fault}", remedy) from fault
-    return final
 
 
 def _counted(episodes: int, on_progress: Progress | None) -> Iterator[int]:

@@ -10,8 +10,9 @@ import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, reduce
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,7 @@ class RldsEpisode:
     pictures: Mapping[str, list[bytes]]  # path inside a step -> T files, JPEG or PNG
     vectors: Mapping[str, NDArray[np.float32]]  # path inside a step -> (T, A)
     instruction: str  # the task in words
+    facts: Mapping[str, bool | int | str] = field(default_factory=dict)  # stored as episode_metadata
 
 
 def write_rlds(
@@ -110,19 +112,24 @@ def write_rlds(
     """
     folder.mkdir(parents=True)
     count, widths = 0, {}
+    facts: Mapping[str, bool | int | str] = {}
     with (folder / f"{name}-train.tfrecord-00000-of-00001").open("wb") as file:
         for episode in episodes:
             file.write(_record(_example(episode)))
             widths = {key: values.shape[1] for key, values in episode.vectors.items()}
+            facts = episode.facts
             count += 1
-    (folder / "features.json").write_text(json.dumps(_features(sizes, codec, widths)))
+    (folder / "features.json").write_text(json.dumps(_features(sizes, codec, widths, facts)))
     splits = [{"name": "train", "shardLengths": [str(count)]}]
     info = {"name": name, "version": "1.0.0", "fileFormat": "tfrecord", "splits": splits}
     (folder / "dataset_info.json").write_text(json.dumps(info))
 
 
-def _features(sizes: Mapping[str, tuple[int, int]], codec: str, widths: Mapping[str, int]) -> dict[str, Any]:
-    leaves: dict[str, Any] = {"language_instruction": {"pythonClassName": f"{_CORE}.Text", "text": {}}}
+def _features(
+    sizes: Mapping[str, tuple[int, int]], codec: str, widths: Mapping[str, int], facts: Mapping[str, Any]
+) -> dict[str, Any]:
+    words = {"pythonClassName": f"{_CORE}.Text", "text": {}}
+    leaves: dict[str, Any] = {"language_instruction": words}
     for key, (height, width) in sizes.items():
         shape = {"dimensions": [str(height), str(width), "3"]}
         image = {"shape": shape, "dtype": "uint8", "encodingFormat": codec}
@@ -135,7 +142,18 @@ def _features(sizes: Mapping[str, tuple[int, int]], codec: str, widths: Mapping[
         *parents, last = path.split("/")
         reduce(lambda at, parent: at.setdefault(parent, {}), parents, nested)[last] = leaf
     steps = {"feature": _dict(nested), "length": "-1"}
-    return _dict({"steps": {"pythonClassName": f"{_CORE}.Dataset", "sequence": steps}})
+    episode: dict[str, Any] = {"steps": {"pythonClassName": f"{_CORE}.Dataset", "sequence": steps}}
+    if facts:
+        episode["episode_metadata"] = {
+            key: words if isinstance(value, str) else _scalar("bool" if isinstance(value, bool) else "int64")
+            for key, value in facts.items()
+        }
+    return _dict(episode)
+
+
+def _scalar(dtype: str) -> dict[str, Any]:
+    tensor = {"shape": {}, "dtype": dtype, "encoding": "none"}
+    return {"pythonClassName": f"{_CORE}.Scalar", "tensor": tensor}
 
 
 def _dict(items: dict[str, Any]) -> dict[str, Any]:
@@ -153,17 +171,28 @@ def _example(episode: RldsEpisode) -> bytes:
     for key, values in episode.vectors.items():
         lists[f"steps/{key}"] = _field(2, _field(1, np.ascontiguousarray(values, "<f4").tobytes()))
     lists["steps/language_instruction"] = _field(1, _field(1, episode.instruction.encode()) * length)
+    for key, fact in episode.facts.items():
+        value = (
+            _field(1, _field(1, fact.encode()))
+            if isinstance(fact, str)
+            else _field(3, _field(1, _varint(fact)))
+        )
+        lists[f"episode_metadata/{key}"] = value
     entries = (_field(1, name.encode()) + _field(2, content) for name, content in lists.items())
     return _field(1, b"".join(_field(1, entry) for entry in entries))
 
 
 def _field(number: int, content: bytes) -> bytes:
     """Return a field of bytes: its number and type, the length as a varint, the content."""
-    head, length = bytearray([number << 3 | 2]), len(content)
-    while length > 0x7F:
-        head.append(length & 0x7F | 0x80)
-        length >>= 7
-    return bytes(head) + bytes([length]) + content
+    return bytes([number << 3 | 2]) + _varint(len(content)) + content
+
+
+def _varint(value: int) -> bytes:
+    head = bytearray()
+    while value > 0x7F:
+        head.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes(head) + bytes([value])
 
 
 def _record(data: bytes) -> bytes:
@@ -182,17 +211,19 @@ class LeRobotEpisode:
     action: NDArray[np.float32]  # (T, A), the command issued at each frame
     state: NDArray[np.float32] | None  # (T, S), seen at each frame
     task: str  # in words
+    further: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # other features -> (T, values)
 
 
 def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRobotEpisode]) -> None:
     """Write a LeRobotDataset v3.0 with lerobot's own writer; videos are H.264.
 
-    The features are those that `hma registry export --to lerobot-features` prints for the embodiment.
+    The features are those that `hma registry export --to lerobot-features` prints for the embodiment, and
+    the further ones of the first episode.
 
     Args:
         folder: folder to make.
         embodiment: one with a whole number of frames a second.
-        episodes: each has the embodiment's cameras and widths.
+        episodes: at least one; each has the embodiment's cameras and widths, and the same further features.
 
     Raises:
         MissingDependencyError: lerobot cannot be imported.
@@ -202,10 +233,16 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
         from lerobot.configs.video import RGBEncoderConfig
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    rest = iter(episodes)
+    first = next(rest)
+    further = {
+        key: {"dtype": str(values.dtype), "shape": values.shape[1:], "names": None}
+        for key, values in first.further.items()
+    }
     writer = LeRobotDataset.create(
         f"lab/{embodiment.id}",
         int(embodiment.frequency_hz),
-        lerobot_features(embodiment),
+        lerobot_features(embodiment) | further,
         root=folder,
         robot_type=embodiment.robot,
         video_backend="pyav",
@@ -214,11 +251,10 @@ def write_lerobot(folder: Path, embodiment: Embodiment, episodes: Iterable[LeRob
     )
     with _quiet():
         try:
-            for episode in episodes:
+            for episode in chain([first], rest):
+                seen = {**episode.pictures, **episode.further}
                 for row, action in enumerate(episode.action):
-                    values = {key: images[row] for key, images in episode.pictures.items()} | {
-                        "action": action
-                    }
+                    values = {key: array[row] for key, array in seen.items()} | {"action": action}
                     if episode.state is not None:
                         values["observation.state"] = episode.state[row]
                     writer.add_frame({**values, "task": episode.task})

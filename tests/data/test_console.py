@@ -18,6 +18,7 @@ def test_progress_tells_elapsed_from_remaining_time(
         assert capsys.readouterr().err == (
             "convert arm: 100/400 frames, 8.3/s, 12 s so far, 36 s left, 3/9 episodes\n"
         )
+    assert capsys.readouterr().err == ""  # what has been shown is not shown again at the end
 
 
 def test_bytes_have_their_own_unit_and_an_unknown_total_is_left_out(

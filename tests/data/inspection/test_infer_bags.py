@@ -79,6 +79,23 @@ def test_both_arms_and_their_grippers_form_the_action(tmp_path: Path, form: str)
     assert first_clip(path, values).actions.shape[1] == 5
 
 
+def test_a_gripper_that_is_commanded_more_often_does_not_replace_its_arm(tmp_path: Path) -> None:
+    topics = {
+        "/camera/image": (picture_of(), 20),
+        "/gripper/command": (joints_of("gripper"), 21),
+        "/servo/command": (twist(), 20),
+        "/joint_states": (joints_of("a"), 20),
+    }
+    path = bag(tmp_path / "run", topics)
+    values = inferred(path)
+    assert keys(values, "action") == [
+        "/servo/command.linear",
+        "/servo/command.angular",
+        "/gripper/command.position",
+    ]
+    assert first_clip(path, values).actions.shape[1] == 7
+
+
 def test_several_commands_are_a_question_that_names_the_others(tmp_path: Path) -> None:
     path = bag(
         tmp_path / "run",

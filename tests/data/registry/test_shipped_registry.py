@@ -215,5 +215,9 @@ def test_the_yaml_reads_a_recording_of_the_features_its_dataset_lists(name: str,
 
 def test_every_rlds_yaml_has_its_features_listed() -> None:
     rlds = {name for name, path in FILES.items() if Embodiment.load(path).source.format == "rlds"}
-    elsewhere = {"bridge_data_v2", "pendulum"}  # read from recordings in test_real.py and test_lab_robots.py
+    elsewhere = {
+        "bridge_data_v2",
+        "pendulum",
+        "panda",
+    }  # read from recordings in test_real.py and tests/data/lab
     assert rlds - set(LISTED) <= elsewhere
