@@ -12,7 +12,7 @@ import torch
 from hma_data.errors import CheckpointError, UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.shards.reader import ShardSet
-from hma_model.evaluation import evaluate as module
+from hma_model.evaluation import commands
 from hma_model.evaluation.evaluate import (
     digit_frequencies,
     evaluate,
@@ -238,7 +238,7 @@ def test_each_picture_is_decoded_once(data, model):
     tokenizer = Counting()
     found = evaluate(model, tokenizer, data, count=5, prompt=1, batch_size=2, draws=3)
     truth, predicted = found["windows"] * 4, found["windows"] * 3
-    assert tokenizer.decoded == truth + (1 + 3) * predicted  # with the true actions and with three others
+    assert tokenizer.decoded == truth + (1 + 3 + 1) * predicted  # true, three others, none
 
 
 def test_a_rollout_over_a_truth_that_is_known_is_the_same(model, batch):
@@ -267,12 +267,14 @@ def test_every_draw_shuffles_anew(batch):
 
 
 def test_figures_of_shuffled_actions_are_means_over_the_draws(data, model, monkeypatch):
-    real = module.shuffled_actions
+    real = commands.shuffled_actions
     one = []
     for draw in range(3):
-        monkeypatch.setattr(module, "shuffled_actions", lambda *a, draw=0, only=draw: real(*a[:3], draw=only))
+        monkeypatch.setattr(
+            commands, "shuffled_actions", lambda *a, draw=0, only=draw: real(*a[:3], draw=only)
+        )
         one.append(evaluate(model, Blocks(), data, count=5, prompt=1, batch_size=2, draws=1))
-    monkeypatch.setattr(module, "shuffled_actions", real)
+    monkeypatch.setattr(commands, "shuffled_actions", real)
     found = evaluate(model, Blocks(), data, count=5, prompt=1, batch_size=2, draws=3)
     assert found["true"] == one[0]["true"] and found["draws"] == 3
     for key in ("psnr_last", "ssim"):
