@@ -165,7 +165,7 @@ def measure(
     predicted: dict[str, list[torch.Tensor]] = {"true": [], "shuffled": [], "none": []}
     judge, still = Judge(networks or Networks()), 0
     for number, batch in enumerate(batches):
-        own = partial(roll, prompt=first, seed=seed + number)
+        own = _counted(partial(roll, prompt=first, seed=seed + number), on_frames)
         true = own(batch)
         judge.add("truth", true.truth[:, first:])
         still += int((true.truth[:, first:] == true.truth[:, first - 1 : first]).all(axis=(1, 2, 3, 4)).sum())
@@ -186,7 +186,6 @@ def measure(
         scores["none"].append(keep("none", none))
         for name, made in (("true", true), ("shuffled", others[0]), ("none", none)):
             predicted[name].append(made.stored)
-        on_frames(true.finite.size * (2 + draws))
     joined = {name: _Scores.join(parts) for name, parts in scores.items()}
     figures = {name: joined[name].figures(seed) for name in ROLLOUTS}
     for name, part in joined.items():
@@ -221,6 +220,17 @@ def measure(
         "seconds_a_frame": round(1 / shards.embodiment.effective_hz, 6),
     }
     return Measured(found, by_window, batches, predicted)
+
+
+def _counted(roll: Callable[..., Pictures], on_frames: Callable[[int], None]) -> Callable[..., Pictures]:
+    """Return a function that rolls out, and then tells how many frames it predicted."""
+
+    def counting(batch: Batch, **options: Any) -> Pictures:
+        made = roll(batch, **options)
+        on_frames(made.finite.size)
+        return made
+
+    return counting
 
 
 def verdict(found: Mapping[str, Any]) -> str:
@@ -284,7 +294,7 @@ def _paper(
     """Follow the paper's protocol: its perplexity, and ΔPSNR of a last frame under Gaussian actions."""
     scores: dict[str, list[_Scores]] = {"true": [], "gaussian": []}
     for number, batch in enumerate(batches):
-        last = partial(roll, prompt=batch.actions.shape[1] - 1, seed=seed + number)
+        last = _counted(partial(roll, prompt=batch.actions.shape[1] - 1, seed=seed + number), on_frames)
         true = last(batch)
         scores["true"].append(_Scores.of(true))
         drawn = (
@@ -294,7 +304,6 @@ def _paper(
         scores["gaussian"].append(
             _Scores.mean([_Scores.of(last(other, truth=true.truth)) for other in drawn])
         )
-        on_frames(len(batch) * (1 + draws))
     true_db, gaussian_db = (_Scores.join(scores[name]).psnr[:, 0] for name in ("true", "gaussian"))
     by_window["paper.delta_psnr"] = true_db - gaussian_db
     found = summary("psnr_last", true_db, seed) | summary("gaussian_psnr_last", gaussian_db, seed)
