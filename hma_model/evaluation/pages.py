@@ -236,9 +236,8 @@ def over_horizon(
         style, marker = STYLES[i % len(STYLES)], MARKERS[i % len(MARKERS)]
         axes.plot(time, values, color=colour, ls=style, marker=marker, ms=5, label=name)
         axes.fill_between(time, low, high, color=colour, alpha=0.15, lw=0)
-    figure.legend(
-        *axes.get_legend_handles_labels(), loc="outside upper left", frameon=False, fontsize=9, ncols=2
-    )
+    handles = axes.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper left", frameon=False, fontsize=9, ncols=2)
     return svg_bytes(figure)
 
 

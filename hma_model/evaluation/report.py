@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.console import human_count
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.pages import Page, over_horizon
@@ -48,12 +49,10 @@ def page(parts: Sequence[Part], command: str) -> str:
     labels = list(dict.fromkeys(part.checkpoint for part in parts))
     robots = list(dict.fromkeys(part.found["embodiment"] for part in parts))
     first = parts[0].found
-    counted = (
-        f"{len(labels)} checkpoint{'s' * (len(labels) > 1)}, {len(robots)} robot{'s' * (len(robots) > 1)}"
-    )
+    counted = f"{human_count(len(labels), 'checkpoint')}, {human_count(len(robots), 'robot')}"
     lead = (
-        f"{counted}; windows of {first['frames']} frames of {first['split']}, of which the model gets the first "
-        f"{first['prompt']}. Pictures are compared with those decoded from the true tokens."
+        f"{counted}; windows of {first['frames']} frames of {first['split']}, of which the model gets the "
+        f"first {first['prompt']}. Pictures are compared with those decoded from the true tokens."
     )
     made = Page(f"Evaluation of {', '.join(labels)}", lead)
     _headline(made, parts)
@@ -160,8 +159,8 @@ def _strips(made: Page, parts: Sequence[Part]) -> None:
             f"What was recorded is not shown: {first.unread}. The strips begin with what the tokens keep."
         )
     made.text(
-        f"Grey line: frames that the model gets. Green line: frames that it predicts. The difference is that of "
-        f"the prediction to the reconstruction: black is none, yellow is {REACH:.0f} of 255 and more."
+        f"Grey line: frames that the model gets. Green line: frames that it predicts. The difference is that "
+        f"of the prediction to the reconstruction: black is none, yellow is {REACH:.0f} of 255 and more."
     )
 
 
