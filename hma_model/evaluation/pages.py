@@ -41,7 +41,8 @@ p { max-width:48rem } .soft, figcaption, th { color:var(--soft) } a { color:var(
 table { border-collapse:collapse; margin:.6rem 0; font-variant-numeric:tabular-nums }
 th, td { text-align:left; padding:.34rem .9rem .34rem 0; border-bottom:1px solid var(--line);
   white-space:nowrap }
-td.n, th.n { text-align:right } th { font-weight:600; font-size:.86rem }
+td.n, th.n { text-align:right } td { vertical-align:top }
+td small { color:var(--soft) } th { font-weight:600; font-size:.86rem }
 figure { margin:1rem 0 } figcaption { font-size:.9rem; margin-top:.3rem; max-width:48rem }
 img { max-width:100%; height:auto; border-radius:8px; border:1px solid var(--line) }
 .plot img { background:#fff; padding:.5rem }
@@ -83,7 +84,7 @@ class Page:
         self._parts.append(f"<p>{_text(text)}</p>")
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-        """Add a table; columns of numbers are aligned to the right."""
+        """Add a table; columns of numbers are aligned to the right. A second line of a cell is small."""
         numeric = [all(isinstance(row[i], int | float) for row in rows) for i in range(len(columns))]
         styles = [" class=n" if right else "" for right in numeric]
         lines = ["".join(f"<th{s}>{_text(name)}</th>" for name, s in zip(columns, styles, strict=True))]
@@ -146,7 +147,10 @@ def _cell(value: Any) -> str:
         return "–"
     if isinstance(value, float):
         return f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
-    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else _text(str(value))
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    figure, _, below = _text(str(value)).partition("\n")
+    return f"{figure}<br><small>{below}</small>" if below else figure
 
 
 def loss_curves(

@@ -18,7 +18,7 @@ from hma_data.console import human_count
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.pages import Page, over_horizon
-from hma_model.evaluation.showcase import Showcase
+from hma_model.evaluation.showcase import Showcase, choose
 from hma_model.evaluation.suite import RESULTS, Part
 from hma_model.evaluation.tables import WORDS, absences, markdown, results, rows, value
 
@@ -58,16 +58,27 @@ def page(parts: Sequence[Part], command: str) -> str:
     _headline(made, parts)
     made.section("Figures", "In brackets: 95 % intervals of the means over windows, by bootstrap.")
     names, lines = rows(parts)
-    made.table(names, lines)
+    made.table(names, [[_below(cell) for cell in line] for line in lines])
     made.definitions([(name, WORDS[name]) for name in names if name in WORDS])
     if said := absences(parts):
         made.section("Not measured, and to be known")
         made.definitions(said)
+    made.section(
+        "How to read the strips",
+        "Each strip is a window. Grey line: frames that the model gets; green line: frames that it predicts. "
+        "The difference is that of the prediction to what the tokens keep: black is none, yellow is "
+        f"{REACH:.0f} of 255 and more. Other commands are those of another window.",
+    )
     for robot in robots:
         _robot(made, [part for part in parts if part.found["embodiment"] == robot])
     made.section("The command")
     made.commands(command)
     return made.html()
+
+
+def _below(cell: Any) -> Any:
+    """Put the interval of a figure below it."""
+    return cell.replace(" [", "\n", 1).rstrip("]").replace(", ", " to ") if isinstance(cell, str) else cell
 
 
 def _headline(made: Page, parts: Sequence[Part]) -> None:
@@ -100,9 +111,7 @@ def _robot(made: Page, parts: Sequence[Part]) -> None:
             made.picture(over_horizon(curves, seconds, unit), "svg+xml", caption)
     for part in parts:
         _state(made, part, seconds)
-    shown = [part for part in parts if part.showcase is not None]
-    if shown:
-        _strips(made, shown)
+    _strips(made, parts)
 
 
 def _curves(parts: Sequence[Part], name: str) -> dict[str, tuple[Any, Any]]:
@@ -144,34 +153,29 @@ def _state(made: Page, part: Part, seconds: float) -> None:
 
 
 def _strips(made: Page, parts: Sequence[Part]) -> None:
-    """Add the first part's windows as strips, and the other checkpoints' below where they chose the same."""
+    """Add the best, the median and the worst window of the first checkpoint, as all predict them."""
+    case = choose(parts)
+    for i, name in enumerate(case.names):
+        said = [part.by_window["true.psnr_last"][case.numbers[i]] for part in parts]
+        figures = ", ".join(f"{db:.1f} dB" for db in said)
+        whose = f" of {parts[0].checkpoint}" if len(parts) > 1 else ""
+        title = f"The {name} window{whose}"
+        made.strips(title, f"{figures} on the last frame; {case.titles[i]}", _rows(case, i, parts))
+    if case.unread:
+        made.text(f"The recorded pictures are not shown: {case.unread}. Strips begin with what tokens keep.")
+
+
+def _rows(case: Showcase, i: int, parts: Sequence[Part]) -> list[tuple[str, bytes]]:
+    truth, prompt = case.truth[i], parts[0].found["prompt"]
+    columns = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MOST)).astype(int))
+    films = {} if case.recorded is None else {"recorded": case.recorded[i]}
+    films["from its tokens"] = truth
     for part in parts:
-        case = part.showcase
-        assert case is not None
-        for i, name in enumerate(case.names):
-            title = f"{part.checkpoint}: the {name} window"
-            text = f"{case.psnr_last[i]:.1f} dB on the last frame; {case.titles[i]}"
-            made.strips(title, text, _rows(case, i, part))
-    first = parts[0].showcase
-    assert first is not None
-    if first.unread:
-        made.text(
-            f"What was recorded is not shown: {first.unread}. The strips begin with what the tokens keep."
-        )
-    made.text(
-        f"Grey line: frames that the model gets. Green line: frames that it predicts. The difference is that "
-        f"of the prediction to the reconstruction: black is none, yellow is {REACH:.0f} of 255 and more."
-    )
-
-
-def _rows(case: Showcase, i: int, part: Part) -> list[tuple[str, bytes]]:
-    truth = case.films["reconstruction"][i]
-    prompt, count = part.found["prompt"], len(truth)
-    columns = np.unique(np.linspace(0, count - 1, min(count, MOST)).astype(int))
-    films = {"recorded": case.films["recorded"][i]} if "recorded" in case.films else {}
-    films |= {"tokenizer": truth, "prediction": case.films["true"][i]}
-    films["difference"] = difference(truth, case.films["true"][i])
-    films["other commands"] = case.films["shuffled"][i]
+        mark = f", {part.checkpoint}" if len(parts) > 1 else ""
+        made = case.made[part.checkpoint, "true"][i]
+        films[f"prediction{mark}"] = made
+        films[f"difference{mark}"] = difference(truth, made)
+        films[f"other commands{mark}"] = case.made[part.checkpoint, "shuffled"][i]
     return [(name, strip(film[columns], columns, prompt)) for name, film in films.items()]
 
 

@@ -1,98 +1,87 @@
 """Choose the windows that a report shows: the best, the median and the worst by the last frame's PSNR.
 
-T frames, S pixels a side.
+W windows, T frames, S pixels a side.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.images import prepare
 from hma_data.errors import HMAError
 from hma_data.loading.dataset import Batch
+from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
-from hma_model.evaluation.evaluate import Measured
+from hma_model.evaluation.losses import windows
 from hma_model.evaluation.rollouts import decode
 
 if TYPE_CHECKING:
-    from hma_data.tokenizers.base import Tokenizer
+    from hma_model.evaluation.suite import Part
 
-PLACES = ("best", "median", "worst")
 Images = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Showcase:
-    """Some windows of a part.
+    """Some windows of a shard set, as several checkpoints predict them.
 
     Attributes:
         names: of the windows: best, median, worst.
-        psnr_last: (W,) dB of the last frame.
+        numbers: of the windows, among those that were evaluated.
         titles: where each window is from.
-        films: (W, T, S, S, 3) by what they show: `recorded` (absent where the recording is not at hand),
-            `reconstruction`, and the rollouts `true`, `shuffled` and `none`.
+        truth: (W, T, S, S, 3), decoded from the true tokens.
+        recorded: the same as recorded; None where the recording is not at hand.
+        made: (W, T, S, S, 3) by checkpoint and kind of rollout; the prompt is true.
         unread: why the recording is not shown; empty if it is.
     """
 
     names: tuple[str, ...]
-    psnr_last: NDArray[np.float64]
+    numbers: tuple[int, ...]
     titles: tuple[str, ...]
-    films: dict[str, Images]
-    unread: str = ""
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the same as arrays of a .npz file."""
-        words = {
-            "names": np.array(self.names),
-            "titles": np.array(self.titles),
-            "unread": np.array(self.unread),
-        }
-        return (
-            words | {"psnr_last": self.psnr_last} | {f"film_{key}": film for key, film in self.films.items()}
-        )
-
-    @classmethod
-    def of(cls, arrays: dict[str, NDArray[Any]]) -> "Showcase":
-        """Return the showcase of the arrays of a file."""
-        films = {key.removeprefix("film_"): film for key, film in arrays.items() if key.startswith("film_")}
-        names, titles = (tuple(map(str, arrays[key])) for key in ("names", "titles"))
-        return cls(names, arrays["psnr_last"], titles, films, str(arrays["unread"]))
+    truth: Images
+    recorded: Images | None
+    made: dict[tuple[str, str], Images]
+    unread: str
 
 
-def choose(measured: Measured, tokenizer: "Tokenizer", shards: ShardSet) -> Showcase:
-    """Return the best, the median and the worst window of a part; fewer if it has fewer."""
-    ranked = measured.by_window["true.psnr_last"]
-    order = np.argsort(np.nan_to_num(ranked, nan=-1.0), kind="stable")[::-1]
-    chosen = dict.fromkeys(int(order[place]) for place in (0, len(order) // 2, len(order) - 1))
-    names = PLACES if len(chosen) == 3 else PLACES[:: len(PLACES) - 1][: len(chosen)]
-    offsets = np.cumsum([0, *(len(batch) for batch in measured.batches)])
-    films: dict[str, list[Images]] = {}
-    recorded: list[Images] = []
-    titles, unread = [], ""
-    for number in chosen:
-        at = int(np.searchsorted(offsets, number, side="right")) - 1
-        row, batch = number - int(offsets[at]), measured.batches[at]
-        stored = batch.latents if batch.tokens is None else batch.tokens
-        assert stored is not None and batch.episode is not None and batch.frame is not None
-        true = decode(tokenizer, stored[row : row + 1])
-        films.setdefault("reconstruction", []).append(true)
-        for kind, parts in measured.predicted.items():
-            made = decode(tokenizer, parts[at][row : row + 1].nan_to_num(0, 0, 0))
-            begin = true.shape[1] - made.shape[1]
-            films.setdefault(kind, []).append(np.concatenate([true[:, :begin], made], axis=1))
-        titles.append(f"episode {int(batch.episode[row])}, frame {int(batch.frame[row])}")
-        try:
-            recorded.append(recorded_frames(shards, batch, row))
-        except (HMAError, OSError, ImportError) as fault:
-            unread = " ".join(str(fault).split())
-    shown = {kind: np.concatenate(parts) for kind, parts in films.items()}
-    if not unread and recorded[0].shape == shown["reconstruction"].shape[1:]:
-        shown = {"recorded": np.stack(recorded)} | shown
-    return Showcase(names, ranked[list(chosen)], tuple(titles), shown, unread)
+def choose(parts: "Sequence[Part]") -> Showcase:
+    """Return the best, the median and the worst window of the first part, as all parts predict them.
+
+    Args:
+        parts: of one shard set.
+    """
+    found, shards = parts[0].found, ShardSet(parts[0].data)
+    names = found["cameras"].split(", ")
+    cameras = names if len(names) > 1 else names[0]
+    batches = windows(shards, found["split"], found["frames"], found["windows"], found["windows"], cameras)
+    (batch,), tokenizer = batches, tokenizer_of(shards)
+    order = np.argsort(np.nan_to_num(parts[0].by_window["true.psnr_last"], nan=-1.0), kind="stable")[::-1]
+    places = {int(order[at]): name for at, name in ((0, "best"), (len(order) // 2, "median"), (-1, "worst"))}
+    numbers = list(places)
+    stored = batch.latents if batch.tokens is None else batch.tokens
+    assert stored is not None and batch.episode is not None and batch.frame is not None
+    truth = decode(tokenizer, stored[numbers])
+    made: dict[tuple[str, str], Images] = {}
+    for part in parts:
+        for kind, predicted in part.predicted.items():
+            values = torch.from_numpy(predicted[numbers].astype(stored.numpy().dtype)).nan_to_num(0, 0, 0)
+            frames = decode(tokenizer, values)
+            made[part.checkpoint, kind] = np.concatenate([truth[:, : found["prompt"]], frames], axis=1)
+    titles = tuple(f"episode {int(batch.episode[n])}, frame {int(batch.frame[n])}" for n in numbers)
+    recorded, unread = None, ""
+    try:
+        recorded = np.stack([recorded_frames(shards, batch, number) for number in numbers])
+    except (HMAError, OSError, ImportError) as fault:
+        unread = " ".join(str(fault).split())
+    if recorded is not None and recorded.shape != truth.shape:
+        recorded, unread = None, "the model sees several cameras"
+    return Showcase(tuple(places.values()), tuple(numbers), titles, truth, recorded, made, unread)
 
 
 def recorded_frames(shards: ShardSet, batch: Batch, row: int) -> Images:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from hma_data.console import Update, progress
@@ -36,7 +37,6 @@ from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.evaluation.evaluate import DRAWS, measure
 from hma_model.evaluation.perceptual import Networks
 from hma_model.evaluation.rollouts import cameras_for, default_prompt
-from hma_model.evaluation.showcase import Showcase, choose
 from hma_model.evaluation.simulated import measure_state
 
 if TYPE_CHECKING:
@@ -69,15 +69,15 @@ class Part:
 
     Attributes:
         found: the figures.
-        by_window: values of each window, by the figure's name.
-        showcase: the pictures of some windows; None where no folder is written.
+        by_window: values (N,) of the windows, by the figure's name.
+        predicted: the predicted tokens or latents (N, P, …) of the windows, by the kind of rollout.
     """
 
     checkpoint: str
     data: str
     found: dict[str, Any]
     by_window: dict[str, NDArray[np.float64]]
-    showcase: Showcase | None
+    predicted: dict[str, NDArray[Any]]
 
 
 def evaluate_all(
@@ -94,7 +94,7 @@ def evaluate_all(
         data: the str or path of each shard set, or its URI; each of another embodiment.
         settings: options.
         networks: what measures LPIPS, FID and FVD.
-        out: the folder that keeps finished parts; None keeps nothing and shows no pictures.
+        out: the folder that keeps finished parts; None keeps nothing.
 
     Raises:
         CheckpointError: a checkpoint was trained on another tokenizer, or lacks an embodiment.
@@ -125,7 +125,7 @@ def evaluate_all(
             if part is None:
                 update(done, about)
                 counter = _Counter(update, done, about)
-                part = _measured(label, model, shards, settings, networks, folder is not None, counter)
+                part = _measured(label, model, shards, settings, networks, counter)
                 if folder:
                     _keep(folder, mark, part)
             parts.append(part)
@@ -207,7 +207,6 @@ def _measured(
     shards: ShardSet,
     settings: Settings,
     networks: Networks,
-    drawn: bool,
     on_frames: Callable[[int], None],
 ) -> Part:
     tokenizer = _tokenizer(str(shards.folder))
@@ -232,9 +231,11 @@ def _measured(
     found = {"checkpoint": label, "data": str(shards.folder), **found}
     if networks.facts:
         found["networks"] = networks.facts
-    showcase = choose(measured, tokenizer, shards) if drawn else None
     rows = {name: values.round(6) for name, values in measured.by_window.items()}
-    return Part(label, str(shards.folder), finite(found), rows, showcase)
+    predicted = {kind: torch.cat(made).cpu().numpy() for kind, made in measured.predicted.items()}
+    if model.config.kind == "discrete":
+        predicted = {kind: values.astype(np.uint32) for kind, values in predicted.items()}
+    return Part(label, str(shards.folder), finite(found), rows, predicted)
 
 
 # -- the folder
@@ -248,12 +249,11 @@ def _folder(out: Path) -> Path:
 
 
 def _keep(folder: Path, mark: str, part: Part) -> None:
-    """Write a part: its pictures first, so that the figures' file says that it is whole."""
+    """Write a part: its predictions first, so that the figures' file says that it is whole."""
     stem = folder / PARTS / f"{part.found['embodiment']}-{mark}"
-    if part.showcase is not None:
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **part.showcase.arrays())  # type: ignore[arg-type]
-        write_atomic(stem.with_suffix(".npz"), buffer.getvalue())
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **part.predicted)  # type: ignore[arg-type]
+    write_atomic(stem.with_suffix(".npz"), buffer.getvalue())
     rows = {name: values.tolist() for name, values in part.by_window.items()}
     content = {"fingerprint": mark, "found": part.found, "by_window": finite(rows)}
     write_atomic(stem.with_suffix(".json"), to_json(content))
@@ -266,7 +266,7 @@ def _kept(folder: Path, mark: str, label: str, shards: ShardSet) -> Part | None:
         return None
     content = read_json(stem.with_suffix(".json"), OutputError)
     with np.load(stem.with_suffix(".npz")) as arrays:
-        showcase = Showcase.of(dict(arrays))
+        predicted = dict(arrays)
     rows = {name: np.array(values, float) for name, values in content["by_window"].items()}
     found = content["found"] | {"checkpoint": label, "data": str(shards.folder)}
-    return Part(label, str(shards.folder), found, rows, showcase)
+    return Part(label, str(shards.folder), found, rows, predicted)

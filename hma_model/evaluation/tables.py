@@ -131,7 +131,8 @@ def absences(parts: Sequence[Part]) -> list[tuple[str, str]]:
         for part in parts
         if (words := value(part.found, "state.missing")) is not None
     ]
-    return list(dict.fromkeys(said))
+    words = dict.fromkeys(text for _, text in said)
+    return [(", ".join(dict.fromkeys(name for name, other in said if other == text)), text) for text in words]
 
 
 def markdown(parts: Sequence[Part], command: str) -> str:
