@@ -42,7 +42,9 @@ table { border-collapse:collapse; margin:.6rem 0; font-variant-numeric:tabular-n
 th, td { text-align:left; padding:.34rem .9rem .34rem 0; border-bottom:1px solid var(--line);
   white-space:nowrap }
 td.n, th.n { text-align:right } td { vertical-align:top }
-td small { color:var(--soft) } th { font-weight:600; font-size:.86rem }
+td small { color:var(--soft) }
+.dense { font-size:.8rem } .dense th { font-size:.76rem } .dense th, .dense td { padding-right:.55rem }
+.dense small { font-size:.66rem } th { font-weight:600; font-size:.86rem }
 figure { margin:1rem 0 } figcaption { font-size:.9rem; margin-top:.3rem; max-width:48rem }
 img { max-width:100%; height:auto; border-radius:8px; border:1px solid var(--line) }
 .plot img { background:#fff; padding:.5rem }
@@ -91,7 +93,8 @@ class Page:
         for row in rows:
             lines.append("".join(f"<td{s}>{_cell(v)}</td>" for v, s in zip(row, styles, strict=True)))
         body = "".join(f"<tr>{line}</tr>" for line in lines)
-        self._parts.append(f"<div class=scroll><table>{body}</table></div>")
+        style = " class=dense" if len(columns) > 10 else ""
+        self._parts.append(f"<div class=scroll><table{style}>{body}</table></div>")
 
     def picture(self, data: bytes, kind: str, caption: str) -> None:
         """Add an embedded picture.
