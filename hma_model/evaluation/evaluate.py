@@ -268,7 +268,7 @@ def _losses(
     table |= _perplexity("perplexity", by_window["loss"], seed)
     table |= summary("accuracy", by_window["accuracy"], seed, digits=6)
     table |= _perplexity("masked_perplexity", masked_nats, seed)
-    table |= summary("masked_accuracy", masked_hits, seed, digits=6)
+    table |= summary("masked_accuracy", masked_hits[np.isfinite(masked_hits)], seed, digits=6)
     table |= {"loss_by_frame": rounded(nats.mean(axis=0)), "accuracy_by_frame": rounded(hits.mean(axis=0))}
     return table, by_window
 

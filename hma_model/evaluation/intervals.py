@@ -7,6 +7,7 @@ N windows, R resamples.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,17 @@ RESAMPLES, LEVELS = 1000, (2.5, 97.5)
 
 def resampled_means(values: NDArray[Any], seed: int = 0) -> Floats:
     """Return means (R, …) of resamples of values (N, …)."""
-    chosen = np.random.default_rng(seed).integers(len(values), size=(RESAMPLES, len(values)))
-    means: Floats = np.stack([values[rows].mean(axis=0) for rows in chosen])
+    flat = values.reshape(len(values), -1).astype(np.float64)
+    means: Floats = (_shares(len(values), seed) @ flat).reshape(RESAMPLES, *values.shape[1:])
     return means
+
+
+@lru_cache(maxsize=8)
+def _shares(count: int, seed: int) -> Floats:
+    """Return the share (R, N) that each of N values has in each resample."""
+    chosen = np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
+    cells = chosen + count * np.arange(RESAMPLES)[:, None]
+    return np.bincount(cells.ravel(), minlength=RESAMPLES * count).reshape(RESAMPLES, count) / count
 
 
 def interval(values: NDArray[Any], seed: int = 0) -> Floats:
@@ -44,8 +53,9 @@ def summary(name: str, values: NDArray[Any], seed: int = 0, digits: int = 4) -> 
 def over_datasets(sets: Sequence[NDArray[Any]], seed: int = 0) -> tuple[float, list[float]]:
     """Return the mean over datasets of their means of values (N,), and its interval.
 
-    Each dataset counts once; windows are resampled within theirs.
+    Each dataset counts once; windows are resampled within theirs. Values that are not finite are left out.
     """
+    sets = [values[np.isfinite(values)] for values in sets]
     means = [resampled_means(values, seed + number) for number, values in enumerate(sets)]
     low, high = np.percentile(np.mean(means, axis=0), LEVELS)
     return float(np.mean([values.mean() for values in sets])), [float(low), float(high)]
