@@ -184,6 +184,7 @@ def test_perturbed_commands_keep_the_prompt() -> None:
     assert (noisy - chunks)[:, 2:].std() == pytest.approx(4 * PERTURBATION, rel=0.05)
 
 
+@pytest.mark.slow
 def test_recorded_pictures_are_those_of_the_windows_frames(tmp_path: Path) -> None:
     from hma_data.conversion.job import convert
     from hma_data.loading.dataset import WindowDataset
